@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from result_tables import named
 
 RESULTS = Path(__file__).resolve().parent / "results"
 OURS, THEIRS = "#1f77b4", "#999999"
@@ -58,10 +59,10 @@ def ase_step() -> Figure:
 
 
 def openmm_gpu() -> Figure:
-    rows = load("openmm_platforms")["measurements"][1]["rows"]
-    values = [row["ratio"] for row in rows.values()]
+    rows = named(load("openmm_platforms")["measurements"][1]["rows"])
+    values = [row["ratio"] for row in rows]
     label = "speed on a GPU, of VerletIntegrator (DHFR in water, HBonds, mixed precision)"
-    return bars(list(rows), values, label, lambda name: "kcons" in name, ".2f")
+    return bars([row["name"] for row in rows], values, label, lambda name: "kcons" in name, ".2f")
 
 
 def openmm_hold() -> Figure:

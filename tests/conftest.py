@@ -76,6 +76,14 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.set_threshold(50_000, 20, 20)
 
 
+@pytest.fixture
+def without_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where there is no compiler: a test of what the CustomIntegrator does, unless it gives device=True."""
+    from kcons.openmm.device import build
+
+    monkeypatch.setattr(build, "reluctance", lambda: "there is no C++ compiler")
+
+
 def pytest_runtest_setup() -> None:
     # The Fourier transforms of OpenMM's OpenCL (VkFFT) leave the process in the C locale, in which texts are ASCII.
     locale.setlocale(locale.LC_ALL, LOCALE)

@@ -45,7 +45,7 @@ def test_data_are_plain_numbers():
 def test_what_is_not_known_has_a_value_that_says_so():
     error = ConvergenceError("no")
     assert np.isnan(error.residual) and np.isnan(error.tolerance)
-    assert (error.row, error.cluster, error.atoms, error.step, error.singular) == (-1, -1, (), None, False)
+    assert (error.row, error.cluster, error.atoms, error.step) == (-1, -1, (), None)
     assert InputError("no").item == "" and InputError("no").atoms == ()
 
 

@@ -125,7 +125,7 @@ def bonds_and_angles(place: str, full: bool) -> Iterator[dict[str, Any]]:
     plain, positions = protein(VILLIN, app.HBonds)
     start = start_of(plain, positions, place, 2000 if full else 20)
     system, _ = protein(VILLIN, app.HBonds)
-    move_constraints(system, "all")
+    move_constraints(system)
     topology = app.PDBFile(str(VILLIN)).topology
     held = constraints_of(topology, start.getPositions(), "allangles", system=system)
     integrator, again = (ProjectedIntegrator(2 * STEP, parts=list(held), device=True) for _ in range(2))

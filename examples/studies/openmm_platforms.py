@@ -25,7 +25,7 @@ import openmm
 import pandas as pd
 from openmm import app, unit
 
-from kcons.openmm import Isokinetic, Langevin, Precision, ProjectedIntegrator, RattleIntegrator, positions_of
+from kcons.openmm import Isokinetic, Langevin, Precision, ProjectedIntegrator, positions_of
 from kcons.thermostats.correlated_series import slope
 
 DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
@@ -33,7 +33,6 @@ TEMPERATURE, FRICTION, STEP = 300.0, 1.0, 0.002
 #: Integrators by name; those of OpenMM are given the tolerance that kcons takes by itself.
 INTEGRATORS: dict[str, Callable[[], openmm.Integrator]] = {
     "VerletIntegrator": lambda: openmm.VerletIntegrator(STEP),
-    "kcons RattleIntegrator": lambda: RattleIntegrator(STEP),
     "kcons rattle": lambda: ProjectedIntegrator(STEP),
     "LangevinMiddleIntegrator": lambda: openmm.LangevinMiddleIntegrator(TEMPERATURE, FRICTION, STEP),
     "kcons Langevin": lambda: ProjectedIntegrator(STEP, ensemble=Langevin(TEMPERATURE, FRICTION)),
@@ -42,7 +41,7 @@ INTEGRATORS: dict[str, Callable[[], openmm.Integrator]] = {
 #: Villin in water.
 VILLIN = Path(app.__file__).parent / "data" / "test.pdb"
 #: Those at constant energy.
-CONSERVING = ("VerletIntegrator", "kcons RattleIntegrator", "kcons rattle")
+CONSERVING = ("VerletIntegrator", "kcons rattle")
 
 
 # -- systems ----------------------------------------------------------------------------------------

@@ -89,7 +89,6 @@ def plain_water(full: bool) -> Iterator[dict[str, Any]]:
         "VerletIntegrator": openmm.VerletIntegrator(0.002),
         "LangevinMiddleIntegrator": openmm.LangevinMiddleIntegrator(300, 1, 0.002),
         "kcons rattle": ProjectedIntegrator(0.002),
-        "kcons leapfrog": ProjectedIntegrator(0.002, "leapfrog"),
         "kcons geodesic": ProjectedIntegrator(0.002, "geodesic"),
     }
     rows = race(system, positions, integrators, 10, 50 if full else 2)

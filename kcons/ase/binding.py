@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
 from threading import local
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import ase.constraints
 import numpy as np
@@ -120,7 +120,6 @@ def refuse_not_finite(values: FloatArray, what: str) -> None:
 def bind(
     given: Sequence[Constraint],
     atoms: Atoms,
-    degenerate: Literal["convert", "raise"],
     time: float = 0.0,
 ) -> Binding:
     """A new engine for `given` on `atoms`."""
@@ -129,7 +128,7 @@ def bind(
     held = ConstraintSet(
         given, x, atoms.get_masses(), cell=atoms.cell.array if periodic else None, pbc=atoms.pbc, time=time
     )
-    motion = Motion(held, x, degenerate=degenerate, time=time)
+    motion = Motion(held, x, time=time)
     touched = touched_atoms(held.constraints)
     name = "masses" if "masses" in atoms.arrays else "numbers"
     return Binding(
@@ -147,7 +146,7 @@ def bind(
 
 
 class _Recent(local):
-    """Engines that were built last in this thread, each with the rows as they were given and what `degenerate` was."""
+    """Engines that were built last in this thread, each with the rows as they were given."""
 
     def __init__(self) -> None:
         self.known: deque[tuple[bytes, Binding]] = deque(maxlen=RECENT)
@@ -156,7 +155,7 @@ class _Recent(local):
 _recent = _Recent()
 
 
-def shared(given: Sequence[Constraint], atoms: Atoms, degenerate: Literal["convert", "raise"]) -> Binding:
+def shared(given: Sequence[Constraint], atoms: Atoms) -> Binding:
     """An engine as `bind` gives it, or one that was built before for the same rows, masses and cell.
 
     Frames of a file need one engine together. Only rows whose engine depends on no positions have it in common: targets
@@ -164,14 +163,14 @@ def shared(given: Sequence[Constraint], atoms: Atoms, degenerate: Literal["conve
     """
     settled = all(item.target is not None for item in given)
     try:
-        content = pickle.dumps((tuple(given), degenerate)) if settled else b""
+        content = pickle.dumps(tuple(given)) if settled else b""
     except (pickle.PicklingError, AttributeError, TypeError):  # functions of the user
         content = b""
     for known, bound in _recent.known:
         same_cell = not bound.periodic or atoms.cell.array.tobytes() == bound.cell
         if content == known and same_cell and bound.fits(atoms):
             return bound
-    bound = bind(given, atoms, degenerate)
+    bound = bind(given, atoms)
     motion = bound.motion
     plain = motion.constraint_set.images is None and all(item.cell_offsets is None for item in bound.given)
     if content and plain and not motion.conversions:

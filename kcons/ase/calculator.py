@@ -40,9 +40,6 @@ class ConstrainedCalculator(Calculator):
     constraints : Constraints or sequence of Constraint
         Targets that are open are taken from the positions at the first calculation. Rows must not depend on
         time or velocities.
-    project : bool
-        Whether to move positions that are off the constraints. If False, f + z is formed at the positions as
-        they are, with the rows there, and energies are those of the inner calculator there.
 
     Raises
     ------
@@ -50,8 +47,6 @@ class ConstrainedCalculator(Calculator):
         At the first use: rows that need time or velocities.
     ConvergenceError
         Positions from which the constraints cannot be reached.
-    InputError
-        The inner calculator returned forces of a wrong shape, or NaN.
 
     Notes
     -----
@@ -59,14 +54,11 @@ class ConstrainedCalculator(Calculator):
     strain after which the constraints are restored. Per-atom properties are passed on.
     """
 
-    def __init__(
-        self, inner: Any, constraints: Constraints | Constraint | Iterable[Constraint], *, project: bool = True
-    ) -> None:
+    def __init__(self, inner: Any, constraints: Constraints | Constraint | Iterable[Constraint]) -> None:
         super().__init__()
         self.inner = inner
         given = constraints if isinstance(constraints, Constraints) else Constraints(constraints)
         self.constraints = given.copy()
-        self.project = project
         #: What the results belong to, beside the atoms.
         self._known = self._asked()
         #: Positions and cell at which stress was asked for last.
@@ -74,7 +66,7 @@ class ConstrainedCalculator(Calculator):
 
     def _asked(self) -> tuple[Any, ...]:
         """What gives the results, and where the inner calculator keeps what it found: another object after a reset."""
-        return self.inner, self.constraints, self.project, getattr(self.inner, "results", None)
+        return self.inner, self.constraints, getattr(self.inner, "results", None)
 
     @property
     def implemented_properties(self) -> list[str]:  # type: ignore[override]
@@ -108,7 +100,7 @@ class ConstrainedCalculator(Calculator):
             before, self._stressed = self._stressed, (x.copy(), work.cell.array.copy())
             if before is not None:
                 refuse_taken_along(motion, *before, *self._stressed)
-        if self.project and held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
+        if held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
             motion.project_positions(x, x.copy(), out=x)
         wanted = set(properties)
         if "stress" in wanted:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 from weakref import ref
 
 import ase.constraints
@@ -29,7 +29,7 @@ from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions,
 from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import as_float_array, checked
+from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
@@ -58,9 +58,6 @@ class Constraints(FixConstraint):
     constraints : sequence of Constraint
         What is held (or the plain data that `todict` writes). Fixed atoms belong here too, as
         `FixedAtoms`.
-    degenerate : {'convert', 'raise'}
-        What to do about rows that are singular to first order, such as three distances in a collinear
-        triatomic: hold the same with linear rows, or refuse.
     repeated : optional
         Set in files that were written between `repeat` and the first use; not for people.
 
@@ -77,16 +74,13 @@ class Constraints(FixConstraint):
     velocities from the difference of positions, which loses accuracy far from the origin.
     """
 
-    @checked
     def __init__(
         self,
         constraints: Constraint | Iterable[Constraint | Mapping[str, Any]] = (),
         *,
-        degenerate: Literal["convert", "raise"] = "convert",
         repeated: tuple[Sequence[int], int] | None = None,
     ) -> None:
         self.constraints = listed(constraints)
-        self.degenerate = degenerate
         self._repeated: tuple[tuple[int, int, int], int] | None = None
         if repeated is not None:
             (a, b, c), n = repeated
@@ -141,7 +135,7 @@ class Constraints(FixConstraint):
     def _bind(self, atoms: Atoms, make: Callable[..., Binding] = shared) -> Binding:
         given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
         _refuse_moving(given)
-        bound = make(given, atoms, self.degenerate)
+        bound = make(given, atoms)
         if bound.owner() is None:
             bound.owner = ref(self)
         if make is bind:  # for another cell alone: rows, and what knows them, stay
@@ -437,11 +431,11 @@ def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
     repeated, bound = held._repeated, held._binding
     # ASE counts rows as they are given, also those that depend on others.
     independent = bound is None or bound.motion.rank == sum(item.n_rows for item in held.constraints)
-    if repeated is None and held.degenerate == "convert" and independent:
+    if repeated is None and independent:
         form = file_form(held.constraints)
         if form is not None:
             return form
-    kwargs: dict[str, Any] = {"constraints": rows, "degenerate": held.degenerate}
+    kwargs: dict[str, Any] = {"constraints": rows}
     if repeated is not None:
         kwargs["repeated"] = [list(repeated[0]), repeated[1]]
     return {"name": REGISTERED_NAME, "kwargs": kwargs}
@@ -499,7 +493,6 @@ def constrain(
     constraints: str | Constraint | Iterable[Constraint],
     *,
     project: bool = False,
-    degenerate: Literal["convert", "raise"] = "convert",
 ) -> Constraints:
     """Hold `constraints` on `atoms` from now on, checked at once.
 
@@ -515,8 +508,6 @@ def constrain(
     project : bool
         Whether to move atoms that are off their explicit targets onto them instead of raising; see
         `Constraints.restore`.
-    degenerate : {'convert', 'raise'}
-        See `Constraints`.
 
     Returns
     -------
@@ -534,7 +525,7 @@ def constrain(
     named = None
     if isinstance(constraints, str):
         constraints = named = named_rows(atoms, constraints)
-    held = Constraints(constraints, degenerate=degenerate)
+    held = Constraints(constraints)
     with unchanged_on_failure(atoms):
         atoms.set_constraint([*atoms.constraints, held])
         if project:
@@ -555,8 +546,7 @@ def constrain(
     return held
 
 
-@checked
-def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] = "raise") -> list[FixConstraint]:
+def to_ase_constraints(atoms: Atoms) -> list[FixConstraint]:
     """Objects of ASE that hold what the constraints of kcons on `atoms` hold, for programs that know ASE's alone.
 
     Fixed atoms become FixAtoms; distances FixBondLengths, or with their differences, angles and dihedrals FixInternals;
@@ -571,13 +561,11 @@ def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] =
     Parameters
     ----------
     atoms : ase.Atoms
-    missing : {'raise', 'leave out'}
-        What to do about rows that no object of ASE holds.
 
     Raises
     ------
     UnsupportedError
-        Such rows, named.
+        Rows that no object of ASE holds, named.
     """
     require_atoms(atoms)
     result: list[FixConstraint] = []
@@ -587,11 +575,8 @@ def to_ase_constraints(atoms: Atoms, *, missing: Literal["raise", "leave out"] =
             continue
         item.engine(atoms)  # settles targets that are open
         forms, left = ase_forms(item.constraints)
-        if left and missing == "raise":
-            raise UnsupportedError(
-                f"no object of ASE holds {left[0]!r}; leave it out with missing='leave out', or keep the constraints "
-                "of kcons"
-            )
+        if left:
+            raise UnsupportedError(f"no object of ASE holds {left[0]!r}; keep the constraints of kcons")
         result += [ase.constraints.dict2constraint(form) for form in forms]
     return result
 

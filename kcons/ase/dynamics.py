@@ -8,12 +8,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from operator import is_
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from ase import Atoms, units
 from ase.md.md import MolecularDynamics
-from numpy.typing import ArrayLike
 
 from kcons.ase.binding import (
     FORCES_ONLY,
@@ -28,7 +27,7 @@ from kcons.ase.binding import (
 from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
-from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
+from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import finite_array, finite_number, refuse_other
@@ -73,18 +72,11 @@ class ConstrainedDynamics(MolecularDynamics):
         which ASE has no place. ASE's temperature does not know of these: use `get_temperature` of this object.
     time : float
         Time at the start, for targets that move.
-    forces : array_like, shape (n_atoms, 3), optional
-        Applied forces at the start, if known (from a trajectory); saves one evaluation.
     state : State, optional
         Go on from here: what `state` of another run gave, or `State.load` read. Positions, momenta, time and the number
-        of steps are taken from it, `time` and `forces` are not looked at. Forces are asked of the calculator.
-    degenerate : {'convert', 'raise'}
-        See `Constraints`.
+        of steps are taken from it, `time` is not looked at. Forces are asked of the calculator.
     check_every : int, optional
         As for `kcons.run`: steps from one certificate of the state to the next.
-    friction : array_like, shape () or (n_atoms,)
-        Rates at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
-        come to rest; for a temperature use `ConstrainedLangevin`.
     trajectory, logfile, loginterval, **kwargs
         As for all dynamics of ASE; the log is a `ConstraintLogger`, with the temperature of `get_temperature`.
 
@@ -118,11 +110,8 @@ class ConstrainedDynamics(MolecularDynamics):
         *,
         constraints: Constraint | Iterable[Constraint] = (),
         time: float = 0.0,
-        forces: ArrayLike | None = None,
         state: State | None = None,
-        degenerate: Literal["convert", "raise"] = "convert",
         check_every: int | None = None,
-        friction: ArrayLike = 0.0,
         **kwargs: Any,
     ) -> None:
         require_atoms(atoms)
@@ -131,7 +120,6 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time = finite_number(time, "time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         require_stepper(self.stepper)
-        self._degenerate, self._friction = degenerate, friction
         self._more = listed(constraints)
         self._present: Company | None = None
         self._bound: Binding | None = None
@@ -141,7 +129,6 @@ class ConstrainedDynamics(MolecularDynamics):
         self._asked: tuple[Any, ...] = ()  # calculators, and where each keeps what it found
         self._size = len(atoms)
         self._momenta = self._masses = np.zeros((0, 3))  # momenta as written last; masses, 0 for fixed atoms
-        self._forces = None if forces is None else finite_array(forces, len(atoms), "forces")
         with unchanged_on_failure(atoms):
             self._prepare(atoms, timestep, state)
             # Files last: to open one for writing ends what an older run left there.
@@ -227,10 +214,6 @@ class ConstrainedDynamics(MolecularDynamics):
         freedom = self.degrees_of_freedom
         return 2 * self.get_kinetic_energy() / (freedom * units.kB) if freedom else 0.0
 
-    def applied_forces(self) -> FloatArray:
-        """Forces of the calculator, of ASE objects that add some, and of `friction`; not those of the constraints."""
-        return self._systems().resisted(applied_forces(self.atoms), velocities_of(self.atoms))
-
     def todict(self) -> dict[str, Any]:
         """As ASE stores it in trajectories."""
         return {**super().todict(), "stepper": repr(self.stepper)}
@@ -314,10 +297,7 @@ class ConstrainedDynamics(MolecularDynamics):
         v = np.divide(p, self._masses, out=np.zeros_like(p), where=self._masses != 0.0)
         require_on_surface(system.motion.constraint_set, x, self.time)
         state = system.initial_state(x, v, time=self.time, project=True)
-        forces = last.forces if last is not None and same and not system.velocity_dependent else self._forces
-        self._forces = None
-        if not np.array_equal(state.positions, x):
-            forces = None
+        forces = last.forces if last is not None and same and np.array_equal(state.positions, x) else None
         thermostat = self._thermostat_after_change(last)
         if np.array_equal(state.velocities, v):
             self._momenta = p.copy()
@@ -382,7 +362,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if bound is None or not bound.fits(atoms):
             self._refuse_fewer(len(atoms))
             rows = [*_rows(atoms, present), *self._more]
-            bound = bind(rows, atoms, self._degenerate, self.time)
+            bound = bind(rows, atoms, self.time)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, company(present), None
@@ -400,15 +380,15 @@ class ConstrainedDynamics(MolecularDynamics):
     def _refuse_fewer(self, now: int) -> None:
         """Refuse fewer atoms than before where something was given by their numbers."""
         before, self._size = self._size, now
-        if now < before and (self._more or np.ndim(self._friction) or getattr(self.stepper, "atoms", None) is not None):
+        if now < before and (self._more or getattr(self.stepper, "atoms", None) is not None):
             raise InputError(
-                f"{before - now} of {before} atoms were removed, and constraints, friction or indices that the "
-                "dynamics was given name atoms by their numbers, which are others now; make a new one",
+                f"{before - now} of {before} atoms were removed, and constraints or indices that the dynamics was "
+                "given name atoms by their numbers, which are others now; make a new one",
                 item="atoms",
             )
 
     def _made(self, motion: Motion) -> System:
-        return System(motion, self._force, potential=self._energy, friction=self._friction, far=FAR)
+        return System(motion, self._force, potential=self._energy, far=FAR)
 
     def _energy(self, x: FloatArray, time: float) -> float:
         """Of the calculator, and of Hookean and ExternalForce."""

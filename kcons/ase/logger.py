@@ -38,8 +38,7 @@ class ConstraintLogger(MDLogger):
     logfile : path, text file or '-'
     coordinates : mapping of str to Constraint
         What is held, each named by an object of the same kind on the same atoms, whatever its target. Each row of it is
-        a column: its multiplier, in eV by angstrom or by radian, the force along the coordinate that holds it, against
-        friction too.
+        a column: its multiplier, in eV by angstrom or by radian, the force along the coordinate that holds it.
     **kwargs
         As for `ase.md.MDLogger`: header, stress, peratom, mode.
 
@@ -95,9 +94,8 @@ class ConstraintLogger(MDLogger):
         if self.coordinates:
             motion = _motion(dyn, atoms)
             x, v = atoms.positions, velocities_of(atoms)
-            f = dyn.applied_forces() if hasattr(dyn, "motion") else applied_forces(atoms)
             time = 0.0 if dyn is None else dyn.get_time()
-            row += motion.multipliers(x, v, f, time)[self._rows(motion)].tolist()
+            row += motion.multipliers(x, v, applied_forces(atoms), time)[self._rows(motion)].tolist()
         self.logfile.write(self.fmt % tuple(row))
         self.logfile.flush()
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from ase import units
@@ -69,8 +68,6 @@ class PressureReporter:
     ----------
     dynamics : ConstrainedDynamics
         Or any of the thermostats. It needs no barostat.
-    file : path or text file, optional
-        Where to write time (fs), volume (A^3) and pressure (bar, as in `mean`), a line for each call.
     virial : {'molecular', 'atomic', 'difference'}
         See `kcons.thermostats.instantaneous_pressure`; 'difference' is for calculators without stress.
     molecules : array_like of int, shape (n, 2), optional
@@ -83,17 +80,11 @@ class PressureReporter:
     values : list of ndarray, shape (3, 3)
         Pressure tensors in eV/A^3.
     volumes : list of float
-
-    Raises
-    ------
-    InputError
-        An unknown virial; `temperature_K` with 'atomic'; dynamics of ASE, which do not know all rows.
     """
 
     def __init__(
         self,
         dynamics: ConstrainedDynamics,
-        file: str | Path | IO[str] | None = None,
         *,
         virial: Virial = "molecular",
         molecules: ArrayLike | None = None,
@@ -103,17 +94,9 @@ class PressureReporter:
         refuse_other(dynamics, ConstrainedDynamics, "dynamics", "a dynamics object of kcons.ase")
         self.dynamics, self.virial, self.molecules = dynamics, virial, molecules
         self.thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")
-        self._own = isinstance(file, str | Path)
-        self._file = Path(file).open("w") if isinstance(file, str | Path) else file  # noqa: SIM115
-        if self._file is not None:
-            print("# time/fs  volume/A^3  pressure/bar", file=self._file)
         self._known: tuple[Any, AtomsSystem, BarostatBodies | None] | None = None
         self.values: list[FloatArray] = []
         self.volumes: list[float] = []
-
-    def __del__(self) -> None:
-        if getattr(self, "_own", False) and self._file is not None:
-            self._file.close()
 
     def __call__(self) -> None:
         dynamics, atoms = self.dynamics, self.dynamics.atoms
@@ -123,10 +106,6 @@ class PressureReporter:
             instantaneous_pressure(system, state, self.virial, pieces=pieces, thermal_energy=self.thermal)
         )
         self.volumes.append(float(atoms.get_volume()))
-        if self._file is not None:
-            bar = mean_pressure(self.values[-1:], self._axes) / units.bar
-            line = f"{dynamics.get_time() / units.fs:.3f} {self.volumes[-1]:.6f} {bar:.6g}"
-            print(line, file=self._file, flush=True)
 
     @property
     def mean(self) -> float:

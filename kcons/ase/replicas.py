@@ -26,13 +26,7 @@ def within(constraints: Sequence[Constraint], atoms: IntArray, n_atoms: int) -> 
 
 
 def tiled(constraints: Sequence[Constraint], times: tuple[int, int, int], n: int) -> tuple[Constraint, ...]:
-    """The rows of all replicas of a cell of `n` atoms.
-
-    Raises
-    ------
-    UnsupportedError
-        For surfaces and other rows with a place in space, of which ASE does not say where the replicas lie.
-    """
+    """The rows of all replicas of a cell of `n` atoms; `UnsupportedError` as of `Constraints.repeat`."""
     copies = times[0] * times[1] * times[2]
     result = []
     for item in constraints:

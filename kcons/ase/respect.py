@@ -131,10 +131,7 @@ class AcceptedPositions:
     def ask(self, held: ConstraintSet, old: FloatArray, new: FloatArray) -> int:
         """Remember positions before they are corrected; what `compared` finds of them.
 
-        Raises
-        ------
-        UnsupportedError
-            The last correction, and those before it, were larger than any usable time step makes them.
+        `UnsupportedError` where the last corrections were larger than any usable time step makes them.
         """
         found = compared(old, self._positions, new, self.asked)
         if self._momenta_since:
@@ -159,13 +156,7 @@ class AcceptedPositions:
             self._repeats, self._again = 0, False
 
     def note_momenta(self) -> None:
-        """Momenta are about to be set at positions that were looked at.
-
-        Raises
-        ------
-        UnsupportedError
-            The MD engine keeps asking for its own uncorrected positions.
-        """
+        """Momenta are set; `UnsupportedError` where an MD engine keeps asking for its own uncorrected positions."""
         self._momenta_since = True
         if self._again and self._repeats:
             self._repeats, self._again = 0, False
@@ -206,11 +197,7 @@ def require_on_surface(
 ) -> None:
     """Refuse positions that are off the constraints, or not finite there, and say `why`.
 
-    Raises
-    ------
-    InputError
-    UnsupportedError
-        They are off, and were moved there by a dynamics class.
+    With `UnsupportedError` where a dynamics class moved them there.
     """
     worst = _worst_row(held, x, time)
     if worst is not None:

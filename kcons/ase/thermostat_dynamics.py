@@ -38,7 +38,7 @@ from kcons.thermostats import (
     thermal_velocities,
     tune,
 )
-from kcons.thermostats.freedom import Momentum, open_directions
+from kcons.thermostats.freedom import Momentum
 from kcons.thermostats.isokinetic.isokinetic import Convention
 from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
 
@@ -116,8 +116,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
     def _made(self, motion: Motion) -> System:
         if self.barostat is None:
             return super()._made(motion)
-        if np.any(self._friction):
-            raise UnsupportedError("friction takes out heat beside the thermostat; leave it out")
         system = AtomsSystem(self, motion)
         self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
         return system
@@ -135,10 +133,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         """g: 3 N less the rank of the rows and less the components of total momentum that are left alone."""
         if isinstance(self.stepper, Isokinetic | NoseHooverChain):
             return int(self._variables()[-1])
-        count = self.degrees_of_freedom
-        if getattr(self.stepper, "conserve_momentum", False):
-            count -= len(open_directions(self._systems().motion, self.atoms.positions, self.time))
-        return count
+        return self.degrees_of_freedom
 
     def _variables(self) -> FloatArray:
         """Those of the thermostat, which begins anew where masses or constraints have changed."""
@@ -186,12 +181,8 @@ class IsokineticDynamics(ThermostattedDynamics):
 
     Raises
     ------
-    InputError
-        Temperature not positive, all momenta zero.
     OverdeterminedError
         g is 1.
-    UnsupportedError
-        A constraint couples `indices` to other atoms.
     """
 
     def __init__(
@@ -237,8 +228,6 @@ class ConstrainedLangevin(ThermostattedDynamics):
     rng : int, numpy.random.Generator or None
         A seed, or what one is drawn from, which `seed` then tells; None takes it from the operating system. A run
         continued from a trajectory needs another; with `restart` the noise goes on.
-    fixcm : bool
-        Friction and noise leave total momentum alone, which then takes degrees of freedom.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
     """
@@ -251,13 +240,12 @@ class ConstrainedLangevin(ThermostattedDynamics):
         friction: float,
         *,
         rng: Rng = None,
-        fixcm: bool = False,
         substeps: int = 3,
         **kwargs: Any,
     ) -> None:
         #: Seed of the noise.
         self.seed = seed_from(rng)
-        make = partial(Langevin, friction=friction, rng=self.seed, substeps=substeps, conserve_momentum=fixcm)
+        make = partial(Langevin, friction=friction, rng=self.seed, substeps=substeps)
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
 
@@ -278,13 +266,6 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
         Links of the chain.
     momentum : {'auto', 'conserved', 'free'}
         As for `IsokineticDynamics`.
-
-    Raises
-    ------
-    InputError
-        Temperature or time constant not positive.
-    UnsupportedError
-        Targets that move.
     """
 
     def __init__(
@@ -315,7 +296,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
 
     Parameters
     ----------
-    atoms, timestep, temperature_K, rng, fixcm, **kwargs
+    atoms, timestep, temperature_K, rng, **kwargs
         As for `ConstrainedLangevin`; forces of the calculator are the gradient of its energy, and `tune` finds a time
         step.
     steps : int or (int, int)
@@ -326,13 +307,6 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         The part of the velocities that a proposal keeps, from 0 to less than 1.
     tolerance : float
         Largest difference of a time step taken back.
-
-    Raises
-    ------
-    InputError
-        Temperature not positive, fewer than one step, `keep` out of range, a negative time step.
-    UnsupportedError
-        A stepper that is not reversible and symplectic; targets that move, rows that hold velocities, friction.
     """
 
     def __init__(
@@ -345,20 +319,13 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         stepper: Stepper | None = None,
         keep: float = 0.0,
         rng: Rng = None,
-        fixcm: bool = False,
         tolerance: float = 1e-9,
         **kwargs: Any,
     ) -> None:
         #: Seed of the random numbers.
         self.seed = seed_from(rng)
         make = partial(
-            HamiltonianMonteCarlo,
-            steps=steps,
-            rng=self.seed,
-            stepper=stepper,
-            keep=keep,
-            conserve_momentum=fixcm,
-            tolerance=tolerance,
+            HamiltonianMonteCarlo, steps=steps, rng=self.seed, stepper=stepper, keep=keep, tolerance=tolerance
         )
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
@@ -388,13 +355,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         return found
 
     def get_conserved_energy(self) -> NoReturn:
-        """Nothing is conserved.
-
-        Raises
-        ------
-        UnsupportedError
-            Always.
-        """
+        """`UnsupportedError`: nothing is conserved."""
         raise UnsupportedError(
             "Monte Carlo conserves no energy; look at counts.mean_square, that of its change over kT"
         )
@@ -424,10 +385,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     spheres : {'split', 'axes', 'cluster', 'global'}
     auxiliary : int
         For spheres, see `IsokineticSpheres`.
-    order : {2, 4}
-        Of the small steps, with 1 or 6 calls of `fast` in each.
     substeps : int
-        Flights along the constraints in each half of a small step, for order 2.
+        Flights along the constraints in each half of a small step.
     slow_kicks : {'ends', 'middle'}
         With 'middle' the atoms are halfway between two slow kicks at the end of a step, where averages are better; what
         is logged there costs a call of `slow`.
@@ -435,11 +394,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     Raises
     ------
     InputError
-        One calculator given twice; calculators of other atoms; bad numbers of steps, friction or
-        temperature; options of the other bath. The atoms are then as they were. While it runs: the atoms got another
-        calculator.
-    UnsupportedError
-        Spheres with constraints that move or that hold velocities.
+        One calculator given twice; calculators of other atoms; options of the other bath. While it runs: the atoms got
+        another calculator.
     """
 
     @checked
@@ -538,13 +494,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         return float(kinetic_energy_of(self.atoms) / expected * stepper.thermal_energy / units.kB)
 
     def get_conserved_energy(self) -> float:
-        """Total energy less the heat in eV, for Langevin dynamics.
-
-        Raises
-        ------
-        UnsupportedError
-            On spheres, where forces of the bath do work.
-        """
+        """Total energy less the heat in eV; `UnsupportedError` on spheres, whose bath does work."""
         if isinstance(self.stepper, IsokineticSpheres):
             raise UnsupportedError("nothing like an energy is conserved on spheres; look at averages instead")
         return super().get_conserved_energy()
@@ -579,7 +529,6 @@ def draw_velocities(
     temperature_K: float,
     rng: Rng = None,
     *,
-    exact: bool = False,
     zero_momentum: bool = False,
     constraints: Constraint | Iterable[Constraint] = (),
 ) -> None:
@@ -594,8 +543,6 @@ def draw_velocities(
         On their constraints.
     temperature_K : float
     rng : int, numpy.random.Generator or None
-    exact : bool
-        Scale to 2K = g kT exactly.
     zero_momentum : bool
         Take total momentum out, in the directions in which no constraint knows a place in space.
     constraints : sequence of Constraint, optional
@@ -604,7 +551,7 @@ def draw_velocities(
     Raises
     ------
     InputError
-        Temperature not positive; atoms off their constraints.
+        Atoms off their constraints.
     UnsupportedError
         `zero_momentum` where atoms are held in space.
     """
@@ -614,15 +561,8 @@ def draw_velocities(
     try:
         atoms.set_momenta(np.zeros_like(momenta), apply_constraint=False)
         held = ConstrainedDynamics(atoms, 0.0, constraints=constraints)
-        system = held._systems()
-        wanted = None
-        if exact:
-            count = held.degrees_of_freedom
-            if zero_momentum:
-                count -= len(open_directions(system.motion, atoms.positions))
-            wanted = 0.5 * count * thermal or None
         v = thermal_velocities(
-            system, atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum, kinetic_energy=wanted
+            held._systems(), atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum
         )
         momenta = v * held._masses
     finally:

@@ -99,8 +99,7 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None,
     Raises
     ------
     InputError
-        No `Atoms`, no water in it, or one whose hydrogens are nearer than any are (positions in nm); a geometry or a
-        reach that is none.
+        No water, or one whose hydrogens are nearer than any are (positions in nm).
     """
     require_atoms(atoms)
     shape = None if geometry is None else Holding("none", water_geometry=geometry).geometry()[0]
@@ -211,11 +210,6 @@ def bonds_of(atoms: Atoms) -> IntArray:
     """Bonds of `atoms`: the pairs in ``atoms.info['bonds']``, otherwise guessed, shape (n, 2).
 
     Atoms of elements that form no covalent bonds, and those whose position is not finite, have none.
-
-    Raises
-    ------
-    InputError
-        Bonds that name atoms which do not exist; two atoms on top of each other.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -283,7 +277,7 @@ def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0, *, water: bool = 
     Raises
     ------
     InputError
-        A mass that is not positive; a heavy atom would be lighter than its hydrogens. Nothing is changed then.
+        A heavy atom would be lighter than its hydrogens. Nothing is changed then.
     """
     mass = positive(mass, "mass")
     bonds = bonds_of(atoms)

@@ -39,8 +39,6 @@ def from_ase_constraints(atoms: Atoms) -> list[Constraint]:
 
     Raises
     ------
-    InputError
-        No `Atoms`.
     UnsupportedError
         For any other ASE constraint, named.
     """

@@ -17,8 +17,8 @@ from kcons.errors import with_extra
 
 try:
     from kcons.batched.batch import Batch, Solved
-    from kcons.batched.steps import drift, gbaoab, kick, rattle
+    from kcons.batched.steps import gbaoab, rattle
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.batched") from error
 
-__all__ = ["Batch", "Solved", "drift", "gbaoab", "kick", "rattle"]
+__all__ = ["Batch", "Solved", "gbaoab", "rattle"]

@@ -143,8 +143,8 @@ class Batch:
         parts: dict[Any, list[Any]] = {}
         for motion, numbers in self._numbers.items():
             for pattern, kind in kinds_of(motion, velocity_rows).items():
-                where = np.array(numbers), self.atom_starts[numbers], self.row_starts[numbers]
-                parts.setdefault(pattern, []).append((kind, *where))
+                where = np.stack([numbers, self.atom_starts[numbers], self.row_starts[numbers]], axis=1)
+                parts.setdefault(pattern, []).append((kind, where))
         return [Group(pattern, each, self.masses, self.compiled) for pattern, each in parts.items()]
 
     @cached_property
@@ -192,10 +192,8 @@ class Batch:
         """
         whole = torch.as_tensor(cells, dtype=self.dtype, device=self.device)
         if self._lattice is None or whole.shape not in ((3, 3), (self.n_systems, 3, 3)):
-            raise InputError(
-                f"cells have shape {tuple(whole.shape)}; give (3, 3) or ({self.n_systems}, 3, 3), where Motions have one",
-                item="cells",
-            )
+            wanted = f"(3, 3) or ({self.n_systems}, 3, 3), where Motions have one"
+            raise InputError(f"cells have shape {tuple(whole.shape)}; give {wanted}", item="cells")
         periodic = self._lattice[:, 1].any(1, keepdim=True)
         whole = torch.where(periodic.transpose(1, 2), whole.expand(self.n_systems, 3, 3), self._lattice[:, 0])
         self._lattice = torch.stack([whole, torch.linalg.inv(whole) * periodic], 1)
@@ -214,25 +212,20 @@ class Batch:
 
     def _flat(self, x: Tensor, item: str) -> Tensor:
         if not isinstance(x, Tensor) or x.shape[-1:] != (3,) or x.numel() != 3 * self.n_atoms:
-            raise InputError(
-                f"{item} must be a tensor of shape ({self.n_atoms}, 3) or (copies, atoms, 3), not "
-                f"{tuple(getattr(x, 'shape', ())) or type(x).__name__}",
-                item=item,
-            )
+            shape = tuple(getattr(x, "shape", ())) or type(x).__name__
+            wanted = f"a tensor of shape ({self.n_atoms}, 3) or (copies, atoms, 3)"
+            raise InputError(f"{item} must be {wanted}, not {shape}", item=item)
         if x.dtype != self.dtype or x.device.type != self.device.type:
-            raise InputError(
-                f"{item}: {x.dtype} on {x.device}, but this batch is {self.dtype} on {self.device}; use Batch.to",
-                item=item,
-            )
+            here = f"{self.dtype} on {self.device}; use Batch.to"
+            raise InputError(f"{item}: {x.dtype} on {x.device}, but this batch is {here}", item=item)
         return x.reshape(-1, 3)
 
     def _all(self, values: Tensor, count: int, item: str) -> Tensor:
         """Numbers of all systems, from those or from the numbers of one of many copies."""
         sizes = {count, count // self.n_systems} if len(self._numbers) == 1 else {count}
         if not isinstance(values, Tensor) or values.ndim != 1 or len(values) not in sizes:
-            raise InputError(
-                f"{item} must be a tensor of shape ({count},), or those of one system where all are copies", item=item
-            )
+            wanted = f"({count},), or those of one system where all are copies"
+            raise InputError(f"{item} must be a tensor of shape {wanted}", item=item)
         return values.to(self.dtype).repeat(count // max(len(values), 1))
 
     def weights(self, masses: Tensor | None = None) -> Tensor:
@@ -330,11 +323,7 @@ class Batch:
     def project_velocities(self, x: Tensor, v: Tensor, *, time: float = 0.0, masses: Tensor | None = None) -> Tensor:
         """Nearest admissible velocities in the mass metric: A v = c.
 
-        Parameters
-        ----------
-        x, v : Tensor, shape (n_atoms, 3) or (copies, atoms, 3)
-        time : float
-        masses : Tensor, shape (n_atoms,) or (atoms of one system,), optional
+        Shapes and `masses` are as for `solve_positions`, the `time` is that of positions.
         """
         here, task = self._flat(x, "x"), self._task(False, time, time)
         rates = self._rates_at(time, 1)
@@ -360,15 +349,7 @@ class Batch:
     ) -> Tensor:
         """lambda of the constraint forces A^T lambda, in natural units; of least norm where rows depend on each other.
 
-        Parameters
-        ----------
-        x, v, forces : Tensor, shape (n_atoms, 3) or (copies, atoms, 3)
-        time : float
-        masses : Tensor, shape (n_atoms,) or (atoms of one system,), optional
-
-        Returns
-        -------
-        Tensor, shape (n_rows,) or (copies, rows)
+        Shapes are as for `solve_positions`; the result has shape (n_rows,) or (copies, rows).
         """
         here, speed, f = self._flat(x, "x"), self._flat(v, "v"), self._flat(forces, "forces")
         w, rates, task = self.weights(masses), self._rates_at(time, 2), self._task(False, time, time)

@@ -113,22 +113,22 @@ class Clusters:
 
     # -- positions ----------------------------------------------------------------------------------
 
-    def newton(self, of: Problem, lam: Tensor) -> tuple[Tensor, Tensor]:
-        """One step of Newton's method: multipliers, and by how much rows were off; infinite where they turned."""
-        weights, known = self.weights(of.w), self.rows_of(lam)
-        there = self.evaluate(of.at_start, None)[1]
-        value, slope = self.evaluate(of, _times(weights, self.spread(there, known)))
-        off = self.solved(self.off(value, self.rows_of(of.held)))
-        s = self.couple(slope, there, weights)
-        step = self.solve(s, [-each for each in off])
-        size = [torch.where(d > 0, o.abs(), torch.inf) for d, o in zip(self.diagonal(s), off, strict=True)]
-        return self.packed(_added(known, step), of.base), self.packed(size, of.base)
+    def newton(self, of: Problem, lam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One step of Newton's method: the next multipliers; what these ones come to.
 
-    def finish(self, of: Problem, lam: Tensor) -> tuple[Tensor, Tensor]:
-        """How far multipliers move the atoms, and by how much all rows are off there."""
-        u = _times(self.weights(of.w), self.spread(self.evaluate(of.at_start, None)[1], self.rows_of(lam)))
-        off = self.off(self.evaluate(of, u, slope=False)[0], self.rows_of(of.held))
-        return self.packed(u, of.base), self.packed([each.abs() for each in off], of.base)
+        That is how far they move the atoms, and by how much all rows are off then, infinite where one has turned.
+        """
+        weights, known, rank = self.weights(of.w), self.rows_of(lam), self.pattern.rank
+        there = self.evaluate(of.at_start, None)[1]
+        u = _times(weights, self.spread(there, known))
+        value, slope = self.evaluate(of, u)
+        off = self.off(value, self.rows_of(of.held))
+        s = self.couple(slope, there, weights)
+        step = self.solve(s, [-each for each in self.solved(off)])
+        size = self.packed(off, of.base).abs()
+        turned = self.packed([torch.where(d > 0, 0.0, torch.inf) for d in self.diagonal(s)], of.base)
+        size = size + turned if rank == len(size) else torch.cat([size[:rank] + turned, size[rank:]])
+        return self.packed(_added(known, step), of.base), self.packed(u, of.base), size
 
     def newton_adjoint(self, of: Problem, lam: Tensor, pushed: Tensor, bent: Tensor, _: Tensor) -> tuple[Tensor, ...]:
         """Derivatives at the solution `of.base`, by one solve with the transposed matrix.

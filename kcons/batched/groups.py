@@ -91,7 +91,7 @@ def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Any:
     """The equations of a pattern; of small ones compiled where that is asked for."""
     made: Clusters = Lanes(pattern) if pattern.small else Levels(pattern, device)
     if compiled and pattern.small:
-        for name in ("newton", "finish", "newton_adjoint", "tangent", "tangent_adjoint"):
+        for name in ("newton", "newton_adjoint", "tangent", "tangent_adjoint"):
             setattr(made, name, torch.compile(getattr(made, name), dynamic=True))
     return made
 
@@ -99,36 +99,17 @@ def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Any:
 class Group:
     """All clusters of one pattern in a batch.
 
-    Parameters
-    ----------
-    pattern : Pattern
-    parts : sequence of tuple
-        Kinds, with the numbers of the systems of each, and where their atoms and rows begin.
-    like : Tensor
-        Of the device and the type of number.
-    compiled : bool
-
-    Attributes
-    ----------
-    solver : Clusters
-    atoms, rows : Tensor of int
-        Of each cluster in the batch, shape (n_atoms, n) and (n_rows, n).
-    systems : Tensor of int, shape (n,)
-    flat : Tensor of int, shape (3 n_atoms, n)
-        Coordinates of the atoms.
-    worst : Tensor, shape (n_rows, n)
-        By how much rows were off at most since that was looked at, in parts of their scale.
+    `parts` are kinds, with the numbers of their systems, and where atoms and rows of these begin. What has a last axis
+    of n is by cluster: `atoms`, (n_atoms, n), their coordinates `flat`, (3 n_atoms, n), `rows`, (n_rows, n), `systems`,
+    (n,), and `worst`, (n_rows, n), by how much rows were off at most since that was looked at, in parts of their scale.
     """
 
-    def __init__(
-        self, pattern: Pattern, parts: Sequence[tuple[Kind, IntArray, IntArray, IntArray]], like: Tensor, compiled: bool
-    ) -> None:
+    def __init__(self, pattern: Pattern, parts: Sequence[tuple[Kind, IntArray]], like: Tensor, compiled: bool) -> None:
         self.pattern, self.solver = pattern, solver_of(pattern, like.device, compiled)
 
         def of_all(of: Any, dtype: Any = None) -> Tensor:
             """Numbers of clusters in all systems, the last axis by cluster; of one where real ones are all alike."""
-            tables = [np.concatenate([of(kind, *where) for where in zip(*w, strict=True)]) for kind, *w in parts]
-            whole = np.moveaxis(np.concatenate(tables), 0, -1)
+            whole = np.moveaxis(np.concatenate([of(kind, *where) for kind, some in parts for where in some]), 0, -1)
             if dtype is not None and whole.size and (whole == whole[..., :1]).all():
                 whole = whole[..., :1]
             return torch.as_tensor(np.ascontiguousarray(whole), device=like.device, dtype=dtype)
@@ -136,22 +117,21 @@ class Group:
         self.atoms = of_all(lambda kind, system, atom, row: kind.clusters.atoms + atom)
         self.rows = of_all(lambda kind, system, atom, row: kind.clusters.rows + row)
         self.systems = of_all(lambda kind, system, atom, row: np.full(len(kind.scale), system))
-        self.p, self.scale, self.offsets = (of_all(lambda kind, *_, k=k: kind[k], like.dtype) for k in (1, 2, 3))
+        self.p, self.scale, self._offsets = (of_all(lambda kind, *_, k=k: kind[k], like.dtype) for k in (1, 2, 3))
         self.flat = _flat(self.atoms)
-        moving = [a for a in range(pattern.n_atoms) if a not in pattern.fixed]
-        self.moving = None if not pattern.fixed else [3 * a + c for a in moving for c in range(3)]
-        before, first, begin = [], [], []
+        self.moving = [3 * a + c for a in range(pattern.n_atoms) if a not in pattern.fixed for c in range(3)]
+        now, before, first, begin = [], [], [], []
         for row in pattern.rows:
+            now += row.places
             before += row.atoms[:-1] if row.relative else row.atoms
             first += row.atoms[:1] * len(row.places)
             begin += [len(begin)] * len(row.places)
-        now = [atom for row in pattern.rows for atom in row.places]
         #: Coordinates of places, of the first atoms of their rows, and of the atoms before them.
-        self.now, self.first, self.before = (_flat(self.atoms[some]) for some in (now, first, before))
-        self.begin = torch.tensor(begin, device=like.device)
+        self._now, self._first, self._before = (_flat(self.atoms[some]) for some in (now, first, before))
+        self._begin = torch.tensor(begin, device=like.device)
         marks = [[(row.relative, row.whole)] for row in pattern.rows for _ in row.places]
-        self.relative, self.whole = torch.tensor(marks, device=like.device).unsqueeze(-1).unbind(2)
-        self.mixed = len({row.relative for row in pattern.rows}) > 1
+        self._relative, self._whole = torch.tensor(marks, device=like.device).unsqueeze(-1).unbind(2)
+        self._any, self._all = (of(row.relative for row in pattern.rows) for of in (any, all))
         self.worst = torch.zeros(self.rows.shape, dtype=like.dtype, device=like.device)
         self._known: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
 
@@ -162,46 +142,40 @@ class Group:
         key = id(numbers), id(values)
         if key not in self._known:
             found = values[numbers]
-            alike_all = bool((found == found[..., :1]).all())
-            self._known[key] = values, found[..., :1].contiguous() if alike_all else found
+            some = found[..., :1].contiguous()
+            self._known[key] = values, some if bool((found == some).all()) else found
         return self._known[key][1]
 
-    def places(self, x: Tensor) -> Tensor:
-        """Places of rows, shape (places, 3, n), without images."""
-        flat, n = x.reshape(-1), self.atoms.shape[1]
-        here = flat[self.now].reshape(-1, 3, n)
-        if not self.pattern.rows[0].relative and not self.mixed:
-            return here
-        first = flat[self.first].reshape(-1, 3, n)
-        return here - (self.relative * first if self.mixed else first)
+    def places(self, x: Tensor, lattice: Tensor | None, tree: Tensor | None) -> Tensor:
+        """Places of rows, shape (3 places, n), in the images that they mean.
 
-    def cells(self, x: Tensor, lattice: Tensor, tree: Tensor | None) -> Tensor:
-        """Whole cells by which places count from where they are stored, (places, 3, n).
-
-        `tree` are the cells by which atoms of whole rows are moved, shape (n_atoms, 3).
+        Parameters
+        ----------
+        x : Tensor, shape (all atoms, 3)
+        lattice : Tensor, shape (n_systems, 2, 3, 3), or None
+        tree : Tensor, shape (all atoms, 3), or None
+            Whole cells by which atoms of whole rows stand off where they are stored.
         """
         flat, n = x.reshape(-1), self.atoms.shape[1]
-        turns = -self._turns(flat[self.now] - flat[self.before], lattice)
-        sums = torch.cat([torch.zeros_like(turns[:1]), turns.cumsum(0)])
-        found = sums[1:] - sums[self.begin]
+        here = flat[self._now]
+        if self._all:
+            here = here - flat[self._first]
+        elif self._any:
+            here = here - (self._relative * flat[self._first].reshape(-1, 3, n)).reshape(here.shape)
+        if lattice is None or not self._any:
+            return here
+        cell, inverse = lattice[self.systems].unbind(1)
+        step = (flat[self._now] - flat[self._before]).reshape(-1, 3, n)
+        sums = -torch.round(torch.einsum("exn,nxy->eyn", step, inverse)).cumsum(0)
+        cells = sums - torch.cat([torch.zeros_like(sums[:1]), sums])[self._begin]
         if tree is not None:
-            cells = tree.reshape(-1)
-            apart = (cells[self.now] - cells[self.first]).reshape(-1, 3, n)
-            found = torch.where(self.whole, apart + self.offsets, found)
-        return found * self.relative
-
-    def passed(self, x: Tensor, start: Tensor, lattice: Tensor) -> Tensor:
-        """Whole cells that places have been moved by from a start, as when positions are wrapped."""
-        flat = (x - start).reshape(-1)
-        return (self._turns(flat[self.now], lattice) - self._turns(flat[self.first], lattice)) * self.relative
-
-    def _turns(self, step: Tensor, lattice: Tensor) -> Tensor:
-        inverse = lattice[self.systems, 1]
-        return torch.round(torch.einsum("exn,nxy->eyn", step.reshape(-1, 3, self.atoms.shape[1]), inverse))
+            apart = (tree.reshape(-1)[self._now] - tree.reshape(-1)[self._first]).reshape(-1, 3, n)
+            cells = torch.where(self._whole, apart + self._offsets, cells)
+        return here + torch.einsum("exn,nxy->eyn", cells * self._relative, cell).reshape(here.shape)
 
     def put(self, into: Tensor, vector: Tensor) -> None:
         """Write a vector of atoms, (3 n_atoms, n), into a tensor of all atoms; those that are fixed keep theirs."""
-        some = slice(None) if self.moving is None else self.moving
+        some = self.moving if self.pattern.fixed else slice(None)
         into.view(-1)[self.flat[some]] = vector[some]
 
 

@@ -27,7 +27,7 @@ class Lanes(Clusters):
         lane = like[0]
         return torch.stack([each.expand_as(lane) if isinstance(each, Tensor) else lane * 0 + each for each in vector])
 
-    def evaluate(self, of: Problem, u: Vector | None, slope: bool = True) -> tuple[Vector, Any]:
+    def evaluate(self, of: Problem, u: Vector | None) -> tuple[Vector, Any]:
         places, start, numbers = of.base.unbind(0), of.start.unbind(0), of.p.unbind(0)
         values, slopes = [], []
         k = used = 0
@@ -46,7 +46,7 @@ class Lanes(Clusters):
                     r.append(0.0 if of.way is None else of.way[i] if u is None else of.way[i] + u[i])
             t = 0.5 * (of.t + of.t_start) if flies else of.t
             mine, used = numbers[used : used + row.parameters], used + row.parameters
-            value, steep = row.function(r, mine, t) if slope else (row.function.value(r, mine, t), None)
+            value, steep = row.function(r, mine, t)
             values.append(value)
             slopes.append(steep)
         return values, slopes

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcons.batched.clusters import Clusters, Pattern, Problem, Vector
-from kcons.plan.clusters_alike import elimination, neighbors
+from kcons.plan.clusters_alike import elimination
 
 
 class _Level(NamedTuple):
@@ -35,14 +35,15 @@ class _Program(NamedTuple):
 
 
 def _table(entries: Iterable[Iterable[int]], width: int, device: torch.device) -> Tensor:
-    return torch.tensor([list(each) for each in entries], dtype=torch.long, device=device).reshape(-1, width).T
+    rows = [list(each) for each in entries]
+    return torch.tensor(rows, dtype=torch.long, device=device).reshape(len(rows), width).T
 
 
 def _program(pattern: Pattern, device: torch.device) -> tuple[_Program, dict[tuple[int, int], int]]:
     """Elimination of the rows that are solved for, and their entries by number, those that fill in among them."""
     moving = [tuple(a for a in row.atoms if a not in pattern.fixed) for row in pattern.rows[: pattern.rank]]
-    order = elimination(neighbors(moving), set())
-    place, later = order.rows, [[order.rows[i] for i in some] for some in order.later]
+    order = elimination(moving, set())
+    place, later = order.rows.tolist(), [order.rows[some].tolist() for some in order.later]
     pairs = [pair for here, some in zip(place, later, strict=True) for i in some for pair in ((here, i), (i, here))]
     numbers = {pair: k for k, pair in enumerate([*((k, k) for k in place), *pairs])}
     levels = []
@@ -55,9 +56,8 @@ def _program(pattern: Pattern, device: torch.device) -> tuple[_Program, dict[tup
         rows = torch.tensor(place[begin:end], device=device)
         levels.append(_Level(rows, _table(factor, 3, device), _table(product, 3, device)))
     row, column, across = _table(((i, j, numbers[j, i]) for i, j in numbers), 3, device)
-    return _Program(
-        levels, row, column, across, _table([[numbers[k, k] for k in range(len(place))]], 1, device)[0]
-    ), numbers
+    (diagonal,) = _table(([numbers[k, k]] for k in range(len(place))), 1, device)
+    return _Program(levels, row, column, across, diagonal), numbers
 
 
 class _Solution(torch.autograd.Function):
@@ -146,7 +146,7 @@ class Levels(Clusters):
     def packed(self, vector: Vector, like: Tensor) -> Tensor:
         return vector[0].expand(*vector[0].shape[:-1], like.shape[-1]).reshape(-1, like.shape[-1])
 
-    def evaluate(self, of: Problem, u: Vector | None, slope: bool = True) -> tuple[Vector, Any]:
+    def evaluate(self, of: Problem, u: Vector | None) -> tuple[Vector, Any]:
         n, zero = of.base.shape[-1], of.base.new_zeros(())
         values, slopes = [], []
         for some in self.alike:
@@ -165,12 +165,10 @@ class Levels(Clusters):
                     come = of.way.reshape(-1, 3, n)[some.atoms] + (0.0 if u is None else u[0][some.atoms])
                 r = torch.cat([r, come], 1)
             numbers, coordinates = of.p[some.parameters].unbind(1), r.reshape(len(r), -1, n).unbind(1)
-            given = coordinates, numbers, 0.5 * (of.t + of.t_start) if flies else of.t
-            value, steep = function(*given) if slope else (function.value(*given), [])
+            value, steep = function(coordinates, numbers, 0.5 * (of.t + of.t_start) if flies else of.t)
             values.append((zero + value).expand(len(r), n))
-            if slope:
-                slopes.append(torch.stack([(zero + e).expand(len(r), n) for e in steep], 1).reshape(-1, 3, n))
-        return [torch.cat(values)[self.order]], torch.cat(slopes)[self.slots] if slope else None
+            slopes.append(torch.stack([(zero + e).expand(len(r), n) for e in steep], 1).reshape(-1, 3, n))
+        return [torch.cat(values)[self.order]], torch.cat(slopes)[self.slots]
 
     def couple(self, left: Any, right: Any, weights: Vector) -> Tensor:
         entry, one, other, atom = self.products

@@ -15,24 +15,17 @@ from kcons.batched.clusters import Problem
 from kcons.batched.groups import Group
 
 #: Newton iterations after which there is no solution near, and those that are made where nobody looks.
-MAX_ITERATIONS, UNWATCHED = 30, 6
+MAX_ITERATIONS, UNWATCHED = 30, 5
+#: Roundings that a row may be off by for the iterations to end.
+ROUNDINGS = 10
 
 
 class Task(NamedTuple):
-    """What is solved for: positions or velocities, the clusters, times, and cells.
+    """What is solved for.
 
-    Attributes
-    ----------
-    of_positions, flies : bool
-        Whether it is positions, and whether rows of velocities count in these.
-    groups : sequence of Group
-    t, t_start : Tensor
-        Times of what is projected and of where directions are taken.
-    lattice : Tensor, shape (n_systems, 2, 3, 3), or None
-    tree : callable
-        Cells by which atoms of whole rows stand off where they are stored.
-    own : tuple of Tensor
-        Inverse masses and targets that do not change from call to call.
+    `of_positions` or of velocities, and whether rows of velocities count in positions as well (`flies`); times of what
+    is projected and of where directions are taken; cells, and cells by which atoms of whole rows stand off where they
+    are stored; inverse masses and targets that are the batch's `own`, which do not change from call to call.
     """
 
     of_positions: bool
@@ -46,20 +39,13 @@ class Task(NamedTuple):
 
     def problem(self, group: Group, x: Tensor, start: Tensor, held: Tensor, w: Tensor) -> Problem:
         """Of the clusters of a group, at positions x with directions of a start, which may be the same tensor."""
-        n = group.atoms.shape[1]
-        there = group.places(start)
-        here = there if x is start else group.places(x)
-        if self.lattice is not None:
-            cells = group.cells(start, self.lattice, self.tree(start))
-            cell = self.lattice[group.systems, 0]
-            there = there + torch.einsum("exn,nxy->eyn", cells, cell)
-            cells = cells - group.passed(x, start, self.lattice)
-            here = there if x is start else here + torch.einsum("exn,nxy->eyn", cells, cell)
+        there = group.places(start, self.lattice, self.tree(start))
+        here = there if x is start else group.places(x, self.lattice, self.tree(x))
         flies = self.flies and any(not row.function.holonomic for row in group.pattern.rows)
         way = (x - start).reshape(-1)[group.flat] if flies else None
         weights = group.lanes(w, group.atoms, w is self.own[0])
         wanted = group.lanes(held, group.rows, held is self.own[1])
-        return Problem(here.reshape(-1, n), there.reshape(-1, n), way, weights, wanted, group.p, self.t, self.t_start)
+        return Problem(here, there, way, weights, wanted, group.p, self.t, self.t_start)
 
 
 def _solve(group: Group, of: Problem) -> tuple[Tensor, Tensor]:
@@ -67,23 +53,18 @@ def _solve(group: Group, of: Problem) -> tuple[Tensor, Tensor]:
 
     On a processor residuals are looked at in each iteration; on a GPU that would wait for it.
     """
-    rank, eps = group.pattern.rank, torch.finfo(of.base.dtype).eps
-    watched = of.base.device.type == "cpu"
-    lam, before = of.base.new_zeros(rank, of.base.shape[-1]), torch.inf
-    count = MAX_ITERATIONS if watched else UNWATCHED
-    for iteration in range(1, count + 1):
-        lam, size = group.solver.newton(of, lam)
-        # The next error is about the square of this one.
-        if iteration < count and (not watched or float((size / group.scale[:rank]).max()) > 0.05 * eps**0.5):
-            continue
-        moved, off = group.solver.finish(of, lam)
-        off = off / group.scale
-        worst = float(off.max()) if watched else 0.0
-        if not 30 * eps < worst < 0.5 * before:
+    eps, watched = torch.finfo(of.base.dtype).eps, of.base.device.type == "cpu"
+    count, before = MAX_ITERATIONS if watched else UNWATCHED, torch.inf
+    following = of.base.new_zeros(group.pattern.rank, of.base.shape[-1])
+    for _ in range(count + 1):
+        lam = following
+        following, moved, size = group.solver.newton(of, lam)
+        worst = float((size / group.scale).max()) if watched else torch.inf
+        # Near the end an iteration that gains nothing shows what rounding leaves.
+        if not worst > ROUNDINGS * eps or eps**0.5 > worst > 0.5 * before:
             break
         before = worst
-    off[:rank] = torch.where(torch.isinf(size), size, off[:rank])
-    group.worst = torch.maximum(group.worst, off)
+    group.worst = torch.maximum(group.worst, size / group.scale)
     return lam, moved
 
 

@@ -70,22 +70,15 @@ class RowFunction(NamedTuple):
     def __call__(self, r: Sequence[Any], p: Sequence[Any], t: Any) -> tuple[Any, list[Any]]:
         """Value, and 3 width numbers of its gradient, by where the flight ends for velocity rows.
 
-        Parameters
-        ----------
-        r : sequence of tensor
-            Coordinates x, y, z by atom, and the way behind them for velocity rows.
-        p : sequence of tensor
-            Parameters.
-        t : tensor
+        `r` are coordinates x, y, z by atom, and the way behind them for velocity rows; `p` are parameters.
         """
         if self.tape is not None and len(self.tape.results) > 1:
-            found = run(self.tape, r, p, t)
-            return found[0], found[1:]
+            value, *slope = run(self.tape, r, p, t)
+            return value, slope
         like = next(each for each in r if isinstance(each, Tensor))
         r = [each if isinstance(each, Tensor) else torch.full_like(like, each) for each in r]
-        value, pull = torch.func.vjp(lambda *places: self._value(places, p, t), *r)
-        slope = list(pull(torch.ones_like(value)))
-        n = 3 * self.width
+        value, pull = torch.func.vjp(lambda *places: self.value(places, p, t), *r)
+        slope, n = list(pull(torch.ones_like(value))), 3 * self.width
         if not self.holonomic:
             slope = [0.5 * middle + way for middle, way in zip(slope[:n], slope[n:], strict=True)]
         return value, slope
@@ -93,24 +86,16 @@ class RowFunction(NamedTuple):
     def value(self, r: Sequence[Any], p: Sequence[Any], t: Any) -> Any:
         """Value alone."""
         if self.tape is not None:
-            return run(Tape(self.tape.steps, self.tape.results[:1]), r, p, t)[0]
-        return self._value(r, p, t)
-
-    def _value(self, r: Sequence[Any], p: Sequence[Any], t: Any) -> Any:
-        if self.tape is not None:
             return run(self.tape, r, p, t)[0]
-        assert self.called is not None
         places = torch.stack(torch.broadcast_tensors(*r), -1)
         flat = places.reshape(-1, places.shape[-1] // 3, 3)
-        found = torch.func.vmap(lambda each: _of_one(self, each, t))(flat)
-        return found.reshape(places.shape[:-1])
+        return torch.func.vmap(lambda each: self._of_one(each, t))(flat).reshape(places.shape[:-1])
 
-
-def _of_one(function: RowFunction, places: Tensor, t: Any) -> Any:
-    time = (t,) if function.timed else ()
-    assert function.called is not None
-    found = function.called(places[: function.width], *time)
-    return found if function.holonomic else (found * places[function.width :]).sum()
+    def _of_one(self, places: Any, t: Any) -> Any:
+        """The user's function of the places of one row, and the way behind them."""
+        assert self.called is not None
+        found = self.called(places[: self.width], *((t,) if self.timed else ()))
+        return found if self.holonomic else (found * places[self.width :]).sum()
 
 
 def row_function(item: Constraint) -> RowFunction:
@@ -122,19 +107,22 @@ def row_function(item: Constraint) -> RowFunction:
         A function of Python that is written neither with NumPy's elementary functions nor with torch.
     """
     found = function_of(item)
-    timed = bool(getattr(item, "time_dependent", False))
     if found is not None:
         tape = found.tape()
-        moves = any(("t", 0) in operands for _, operands in tape.steps) or ("t", 0) in tape.results
-        return RowFunction(tape, None, item.width, item.holonomic, moves)
-    called = _of_places(item)
+        timed = any(("t", 0) in operands for _, operands in tape.steps)
+        return RowFunction(tape, None, item.width, item.holonomic, timed)
+    function = RowFunction(None, _called(item), item.width, item.holonomic, item.time_dependent)  # type: ignore[attr-defined]
+    n = (3 if item.holonomic else 6) * item.width
+
+    def row(r: Any, p: Any, t: Any, out: Any) -> None:
+        value = function._of_one(np.array([r[k] for k in range(n)], dtype=object).reshape(-1, 3), t)
+        out[0] = value.item() if isinstance(value, np.ndarray) else value
+
     try:
-        return RowFunction(_traced(item, called, timed), None, item.width, item.holonomic, timed)
+        return function._replace(tape=record(row), called=None)
     except UnsupportedError as error:
-        function = RowFunction(None, called, item.width, item.holonomic, timed)
-        places = torch.arange(1.0, 1.0 + 3 * item.width, dtype=torch.float64).sin()
         try:
-            function([*places, *([] if item.holonomic else places)], (), torch.zeros((), dtype=torch.float64))
+            function([*torch.arange(1.0, 1.0 + n).sin()], (), torch.zeros(()))
         except Exception as other:  # whatever the function of a user raises
             raise UnsupportedError(
                 f"{item!r} cannot be run on tensors: {error}; called with tensors it raises {type(other).__name__}: "
@@ -143,22 +131,7 @@ def row_function(item: Constraint) -> RowFunction:
         return function
 
 
-def _of_places(item: Any) -> Callable[..., Any]:
-    """The user's function of the positions of one row."""
+def _called(item: Any) -> Callable[..., Any]:
     if isinstance(item, ImplicitSurface):
         return lambda r, *t: item.function(r, *t)[0]
-    return item.coefficients if isinstance(item, CustomVelocity) else item.function
-
-
-def _traced(item: Constraint, called: Callable[..., Any], timed: bool) -> Tape:
-    n = 3 * item.width
-
-    def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        places = np.array([r[k] for k in range(n)], dtype=object).reshape(-1, 3)
-        found = called(places, *((t,) if timed else ()))
-        if not item.holonomic:
-            way = np.array([r[n + k] for k in range(n)], dtype=object).reshape(-1, 3)
-            found = (np.asarray(found) * way).sum()
-        out[0] = found[()] if isinstance(found, np.ndarray) else found
-
-    return record(row)
+    return item.coefficients if isinstance(item, CustomVelocity) else item.function  # type: ignore[no-any-return]

@@ -14,22 +14,15 @@ from kcons.batched.batch import Batch
 Force = Callable[[Tensor], Tensor]
 
 
-def kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: float, **options: Any) -> Tensor:
-    """Velocities after forces have acted for a time h at positions x, on the rows: v + h M_par^+ f.
-
-    `options` are those of `Batch.project_velocities`.
-    """
-    return batch.project_velocities(x, v + h * _inverse_masses(batch, x, options) * forces, **options)
+def _kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: float, time: float, masses: Tensor | None) -> Tensor:
+    """Velocities after forces have acted for a time h, on the rows."""
+    w = batch.weights(masses).reshape(*x.shape[:-1], 1)
+    return batch.project_velocities(x, v + h * w * forces, time=time, masses=masses)
 
 
-def drift(batch: Batch, x: Tensor, v: Tensor, h: float, **options: Any) -> tuple[Tensor, Tensor]:
-    """Positions after a time h on the rows, and velocities with the impulse that has kept them there.
-
-    Velocities are not projected at the new place. `options` are those of `Batch.solve_positions`; the `time` is that of
-    the end.
-    """
-    time = options.pop("time", 0.0)
-    found = batch.solve_positions(x + h * v, x, time=time, reference_time=time - h, flight=h, **options)
+def _drift(batch: Batch, x: Tensor, v: Tensor, h: float, time: float, **held: Any) -> tuple[Tensor, Tensor]:
+    """Positions a time h later on the rows, and velocities with the impulse that has kept them there."""
+    found = batch.solve_positions(x + h * v, x, time=time + h, reference_time=time, flight=h, **held)
     return found.positions, v + found.push / h
 
 
@@ -45,7 +38,7 @@ def rattle(
     targets: Tensor | None = None,
     masses: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One step of RATTLE: order two, reversible, on the rows; differentiable in all that are tensors.
+    """One step of RATTLE: order two, reversible; differentiable in all that are tensors.
 
     Parameters
     ----------
@@ -54,9 +47,8 @@ def rattle(
         Forces at positions, of the same shape.
     x, v, forces : Tensor, shape (n_atoms, 3) or (copies, atoms, 3)
         Positions and velocities on the rows, and the forces there.
-    dt : float
-    time : float
-        At the beginning of the step.
+    dt, time : float
+        The step, and the time at its beginning.
     targets, masses : Tensor, optional
         As for `Batch.solve_positions`.
 
@@ -69,10 +61,10 @@ def rattle(
     ----------
     H. C. Andersen, J. Comput. Phys. 52, 24 (1983).
     """
-    half = 0.5 * dt * _inverse_masses(batch, x, {"masses": masses})
-    x, v = drift(batch, x, v + half * forces, dt, time=time + dt, targets=targets, masses=masses)
+    half = 0.5 * dt * batch.weights(masses).reshape(*x.shape[:-1], 1)
+    x, v = _drift(batch, x, v + half * forces, dt, time, targets=targets, masses=masses)
     forces = force(x)
-    return x, batch.project_velocities(x, v + half * forces, time=time + dt, masses=masses), forces
+    return x, _kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces
 
 
 def gbaoab(
@@ -87,38 +79,33 @@ def gbaoab(
     *,
     generator: torch.Generator | None = None,
     time: float = 0.0,
-    targets: Tensor | None = None,
-    masses: Tensor | None = None,
+    **held: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One step of Langevin dynamics on the rows, g-BAOAB with one step of positions each half.
+    """One step of Langevin dynamics, g-BAOAB; differentiable as `rattle`, which tells what else is given.
 
     Parameters
     ----------
-    batch, force, x, v, forces, dt, time, targets, masses
-        As for `rattle`.
     kT : float or Tensor
-        Temperature as an energy; of tensors one that is broadcast to velocities.
+        Temperature as an energy; a tensor is broadcast to velocities.
     friction : float
         Rate at which velocities are forgotten.
     generator : torch.Generator, optional
         Of the noise.
+    **held : Tensor
+        Targets and masses.
 
     References
     ----------
     B. Leimkuhler and C. Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
-    tangent = {"masses": masses}
-    w = _inverse_masses(batch, x, tangent)
-    v = kick(batch, x, v, forces, 0.5 * dt, time=time, **tangent)
-    x, v = drift(batch, x, v, 0.5 * dt, time=time + 0.5 * dt, targets=targets, masses=masses)
+    masses = held.get("masses")
+    v = _kick(batch, x, v, forces, 0.5 * dt, time, masses)
+    x, v = _drift(batch, x, v, 0.5 * dt, time, **held)
     kept = torch.exp(torch.as_tensor(-friction * dt, dtype=x.dtype, device=x.device))
     noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
+    w = batch.weights(masses).reshape(*x.shape[:-1], 1)
     v = kept * v + torch.sqrt((1 - kept * kept) * kT * w) * noise
-    v = batch.project_velocities(x, v, time=time + 0.5 * dt, **tangent)
-    x, v = drift(batch, x, v, 0.5 * dt, time=time + dt, targets=targets, masses=masses)
+    v = batch.project_velocities(x, v, time=time + 0.5 * dt, masses=masses)
+    x, v = _drift(batch, x, v, 0.5 * dt, time + 0.5 * dt, **held)
     forces = force(x)
-    return x, kick(batch, x, v, forces, 0.5 * dt, time=time + dt, **tangent), forces
-
-
-def _inverse_masses(batch: Batch, x: Tensor, options: dict[str, Any]) -> Tensor:
-    return batch.weights(options.get("masses")).reshape(*x.shape[:-1], 1)
+    return x, _kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 EXIT = {"kept": 0, "tolerated": 0, "violated": 1, "incomplete": 3}
 #: Options that are arguments of `check_trajectory`, by the same names.
 AS_GIVEN = (
-    *("constrain", "select", "rigid_residues", "rigid_bodies", "targets", "tolerance", "precision", "frames"),
-    *("format", "topology_format", "workers", "worst"),
+    *("constrain", "select", "targets", "tolerance", "precision", "frames", "format", "topology_format", "workers"),
 )
 
 
@@ -38,7 +37,7 @@ def _check(chosen: argparse.Namespace) -> int:
 
     if chosen.out is not None:
         report.results(chosen.out, chosen.trajectory).refuse_others()  # complain before any work
-    for name in ("rigid_bodies", "no_rigid_water", "format", "topology_format"):
+    for name in ("no_rigid_water", "format", "topology_format"):
         if chosen.forces is not None and getattr(chosen, name):
             option = name.replace("_", "-")
             raise InputError(f"--forces does not go with --{option}; leave one of them out", item="forces")
@@ -51,7 +50,6 @@ def _check(chosen: argparse.Namespace) -> int:
             chosen.trajectory,
             chosen.topology,
             rigid_water=not chosen.no_rigid_water,
-            rank=not chosen.no_rank,
             **{name: getattr(chosen, name) for name in AS_GIVEN},
         )
     except UnreadableError as error:
@@ -69,9 +67,10 @@ def _check(chosen: argparse.Namespace) -> int:
             result.remarks.append(f"no temperatures of the configurations: {reason}")
             print(f"kcons: {reason}", file=sys.stderr)
     summary, units, rows, verdict = report.page(result)
-    show(summary, units, rows, verdict)
     text = "\n".join([summary, rendered(units), rendered(rows), result.verdict])
-    say_written(_put(chosen, lambda folder: report.write(result, folder, text=text)))
+    written = _put(chosen, lambda folder: report.write(result, folder, text=text))
+    show(summary, units, rows, verdict)
+    say_written(written)
     return 2 if failed else EXIT[result.status]
 
 
@@ -80,8 +79,8 @@ def _temperatures(chosen: argparse.Namespace, result: CheckResult) -> list[str]:
 
     if result.violated:
         return ["no temperatures of the configurations: frames are off the constraints; say what the run held"]
-    options = {"constrain": chosen.constrain, "select": chosen.select, "rigid_residues": list(chosen.rigid_residues)}
-    found = trajectory_temperatures.along(chosen.trajectory, chosen.topology, chosen.forces, result.frames, **options)
+    held = {"constrain": chosen.constrain, "select": chosen.select}
+    found = trajectory_temperatures.along(chosen.trajectory, chosen.topology, chosen.forces, result.frames, **held)
     return trajectory_temperatures.sentences(found, chosen.temperature)
 
 
@@ -113,8 +112,6 @@ COMMAND = Command(
         ),
         Option("--select", "rows within this selection only (MDAnalysis' language)", default="all"),
         Option("--no-rigid-water", "do not expect water to be rigid", action="store_true"),
-        Option("--rigid-residues", "residues that are held rigid", nargs="+", default=(), metavar="NAME"),
-        Option("--rigid-bodies", "atoms that are held rigid", nargs="+", default=(), metavar="SELECTION"),
         Option(
             "--targets", "first (frame, default), mean, topology (its coordinates), or a TOML file", default="first"
         ),
@@ -122,13 +119,11 @@ COMMAND = Command(
         Option("--precision", "step of the coordinates in the file, Å, where not known", type=float),
         Option("--frames", "frames to look at (default all)", metavar="A:B:STEP"),
         Option("--workers", "processes (default 1)", type=int, default=1),
-        Option("--worst", "rows to name (default 10)", type=int, default=10),
         Option(
             "--forces",
             "also the temperatures of the configurations, by forces as for compare (amber14-all,amber14/tip3p, gfn2)",
         ),
         Option("--temperature", "with --forces: say whether the temperatures are this one", type=float, metavar="K"),
-        Option("--no-rank", "leave out rank and temperature", action="store_true"),
         Option("--out", "folder for check.json, .png and .txt (default ./check-TRAJECTORY)", type=Path),
     ),
     _check,

@@ -17,7 +17,7 @@ from kcons.errors import InputError
 #: Options that say nothing beside expensive and cheap forces.
 NOT_WITH_CHEAP_FORCES = ("size", "forces", "forcefield", "add_hydrogens")
 #: Options that results depend on, beside the system, the budget and what is said about molecules.
-SETTINGS = ("size", "seed", "quick", "dt")
+SETTINGS = ("size", "quick", "dt")
 #: Steps of a production run that are looked at, in fs.
 PRODUCTION_STEPS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
@@ -60,8 +60,7 @@ def run(chosen: argparse.Namespace) -> int:
             file.write(f"{words}\n".encode())
         with in_one_piece(folder / "compare.png") as file:
             report.figure(table).savefig(file, dpi=150, format="png")
-    show(words + "\n")
-    print(f"wrote compare.csv, .png and .txt into {folder}; the whole table is in {path}")
+    show(words + "\n", f"wrote compare.csv, .png and .txt into {folder}; the whole table is in {path}")
     return 0
 
 
@@ -75,8 +74,8 @@ def _asks_for_averages(chosen: argparse.Namespace) -> bool:
     if target is not None and not (target > 0 and isfinite(target)):
         raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
     averages = chosen.criterion == "temperature" or any(forces)
-    if target is not None and (averages or chosen.criterion == "drift"):
-        other = "--slow and --fast" if any(forces) else f"--criterion {chosen.criterion}"
+    if target is not None and averages:
+        other = "--slow and --fast" if any(forces) else "--criterion temperature"
         raise InputError(f"--target-error is an error of trajectories; leave {other} out", item="criterion")
     if not averages:
         methods.choose(chosen.methods)
@@ -87,7 +86,7 @@ def _asks_for_averages(chosen: argparse.Namespace) -> bool:
     choose_samplers(chosen.methods, any(forces))
     if any(forces):
         wrong = [name for name in NOT_WITH_CHEAP_FORCES if getattr(chosen, name)]
-        wrong += ["criterion"] if chosen.criterion in ("error", "drift") else []
+        wrong += ["criterion"] if chosen.criterion == "error" else []
         for name in wrong:
             option = f"--{name.replace('_', '-')}"
             raise InputError(f"{option} does not go with --slow and --fast; leave it out", item=name)
@@ -118,7 +117,7 @@ def _trajectories(chosen: argparse.Namespace, options: dict[str, Any]) -> tuple[
         rows = ranking.find_steps(system, table, chosen.target_error, reference, budget=budget, watcher=watcher)
         table = measure.table_of([*table.to_dict("records"), *rows], table.attrs)
     production = _production(chosen, system, budget, watcher)
-    found = ranking.rank(table, chosen.criterion or "error", chosen.target_error)
+    found = ranking.rank(table, limit=chosen.target_error)
     code = ""
     if found is not None and len(found.table):
         best = found.table.iloc[0]
@@ -133,7 +132,7 @@ def _averages(chosen: argparse.Namespace, options: dict[str, Any]) -> tuple[Any,
     with options["watcher"].piece("building the test system", 1):
         both = [argparse.Namespace(**{**vars(chosen), "forces": name}) for name in (chosen.slow, chosen.fast) if name]
         system, *cheap = [test_system(each, quick=chosen.quick) for each in both or [chosen]]
-    given: dict[str, Any] = {"cheap": cheap[0] if cheap else None, "steps": chosen.dt, "rng": chosen.seed}
+    given: dict[str, Any] = {"cheap": cheap[0] if cheap else None, "steps": chosen.dt}
     table = averages.compare_averages(system, chosen.methods, **given, **options)
     found = ranking.rank(table, "temperature")
     code = ""
@@ -192,9 +191,7 @@ def _expression(chosen: argparse.Namespace) -> str:
     """Python that makes the test system, after `from kcons.comparison import test_systems`."""
     from kcons.comparison import test_systems
 
-    said: dict[str, Any] = {"rng": chosen.seed} if chosen.seed != 1 else {}
-    said |= {"quick": True} if chosen.quick else {}
-    said |= molecules(chosen)
+    said = ({"quick": True} if chosen.quick else {}) | molecules(chosen)
     words = [f"{name}={_literal(value)}" for name, value in said.items()]
     if chosen.system not in test_systems.SYSTEMS:
         return f"test_systems.from_file({', '.join([_literal(chosen.system), *words])})"
@@ -243,9 +240,9 @@ COMMAND = Command(
         ),
         Option(
             "--criterion",
-            "what methods are ranked by: error of the trajectory (default), drift of the energy; temperature runs "
-            "thermostats instead, and looks at the temperature of the configurations",
-            choices=("error", "drift", "temperature"),
+            "what methods are ranked by: error of the trajectory (default); temperature runs thermostats instead, and "
+            "looks at the temperature of the configurations",
+            choices=("error", "temperature"),
         ),
         Option("--slow", "of a file: expensive forces, as in --forces, with --fast", metavar="FORCES"),
         Option(

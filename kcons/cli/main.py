@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Sequence
 
 from kcons import __version__
 from kcons.cli import check, compare, doctor, freeenergy, scan, systems, warmup
 from kcons.cli.parser import Parser
-from kcons.cli.terminal import Terminated, ended_in_order, forgiving_streams, warnings_in_a_line
+from kcons.cli.terminal import Terminated, drop_what_follows, ended_in_order, warnings_in_a_line
 from kcons.errors import KconsError, with_extra
 
 COMMANDS = (
@@ -27,14 +28,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     The exit status: 0; of `check`, 1 for a violation and 3 where not all could be told; of `scan` and
     `freeenergy`, 3 where some points or windows failed; 2 for an error that the user can mend; 130 when interrupted,
-    143 when terminated.
+    143 when terminated. Characters that the encoding of the output lacks become '?', and what nobody reads any more, as
+    behind `head`, is dropped.
     """
+    status = 0
+    streams = [stream for stream in (sys.stdout, sys.stderr) if isinstance(stream, io.TextIOWrapper)]
+    before = [stream.errors for stream in streams]
+    for stream in streams:
+        stream.reconfigure(errors="replace")
     try:
-        with forgiving_streams():
-            return _main(arguments)
+        status = _main(arguments)
+        for stream in streams:
+            stream.flush()
     except OSError as error:
-        print(f"kcons: the output cannot be written: {error}", file=sys.stderr)
-        return 2
+        drop_what_follows()
+        if not isinstance(error, BrokenPipeError):
+            print(f"kcons: the output cannot be written: {error}", file=sys.stderr)
+            status = 2
+    finally:
+        for stream, errors in zip(streams, before, strict=True):
+            stream.reconfigure(errors=errors)
+    return status
 
 
 def _main(arguments: Sequence[str] | None) -> int:
@@ -55,6 +69,8 @@ def _main(arguments: Sequence[str] | None) -> int:
         if not isinstance(explained, KconsError):
             raise
         said = str(explained)
+    except BrokenPipeError:
+        raise
     except (FileExistsError, NotADirectoryError) as error:
         said = f"{error.filename}: there is a file where a folder has to be; give another folder (--out)"
     except (KconsError, OSError) as error:

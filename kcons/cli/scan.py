@@ -55,8 +55,9 @@ def _scan(chosen: argparse.Namespace) -> int:
             watcher.advance(done / points)
 
         found = scan(atoms, coordinates, values, folder=folder, progress=progress, **how)
+    written = found.write(folder)
     show(found.table(), found.summary())
-    say_written(found.write(folder))
+    say_written(written)
     return INCOMPLETE if found.failed else 0
 
 

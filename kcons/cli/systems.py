@@ -26,7 +26,6 @@ SYSTEM = (
         metavar="SYSTEM",
     ),
     Option("--size", "number of molecules, bonds or particles", type=int),
-    Option("--seed", "of the initial velocities (default 1)", type=int, default=1),
     Option("--list", "list test systems and methods, and leave", action="store_true"),
     Option(
         "--constrain",
@@ -51,7 +50,6 @@ SYSTEM = (
         group=_FILES,
     ),
     Option("--select", "hold only what is within this selection of MDAnalysis", metavar="WORDS", group=_FILES),
-    Option("--rigid-residues", "residues held rigid", nargs="+", metavar="NAME", group=_FILES),
 )
 
 
@@ -73,8 +71,6 @@ def check_name(chosen: argparse.Namespace) -> None:
             f"there are {known}; or give a PDB file",
             item="system",
         )
-    if chosen.seed < 0:
-        raise InputError(f"--seed is {chosen.seed}; give a non-negative number", item="seed")
 
 
 def molecules(chosen: argparse.Namespace) -> dict[str, Any]:
@@ -87,7 +83,6 @@ def molecules(chosen: argparse.Namespace) -> dict[str, Any]:
         "coordinates": None if chosen.coordinates is None else str(chosen.coordinates),
         "forces": chosen.forces,
         "select": chosen.select,
-        "rigid_residues": chosen.rigid_residues,
     }
     return {name: value for name, value in said.items() if value is not None}
 
@@ -100,7 +95,7 @@ def test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSyste
             raise InputError("--add-hydrogens is for PDB and mmCIF files with OpenMM", item="add_hydrogens")
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", UserWarning)
-            found = test_systems.from_file(chosen.system, chosen.seed, quick=quick, **molecules(chosen))
+            found = test_systems.from_file(chosen.system, quick=quick, **molecules(chosen))
         for text in dict.fromkeys(str(w.message) for w in said if w.category is UserWarning):
             print(f"kcons: {text}", file=sys.stderr)
         return found
@@ -108,7 +103,7 @@ def test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSyste
         raise InputError("--add-hydrogens is for files; the built-in molecules have theirs", item="add_hydrogens")
     for name in sorted(test_systems.FILE_OPTIONS & set(molecules(chosen))):
         raise InputError(f"--{name.replace('_', '-')} is for files, not for built-in test systems", item=name)
-    return test_systems.build(chosen.system, chosen.size, chosen.seed, quick=quick, **molecules(chosen))
+    return test_systems.build(chosen.system, chosen.size, quick=quick, **molecules(chosen))
 
 
 def list_everything() -> int:

@@ -36,15 +36,22 @@ def console() -> Console:
     from rich.console import Console
 
     found = Console()
-    # Into a file or a pipe there is no width to fit into.
-    return found if found.is_terminal else Console(width=WIDE)
+    if not found.is_terminal:  # a file or a pipe has no width to fit into
+        found = Console(width=WIDE)
+    found.on_broken_pipe = drop_what_follows  # type: ignore[method-assign]
+    return found
 
 
 def show(*parts: RenderableType) -> None:
-    """Tables, and sentences as they are."""
+    """Tables, and sentences as they are; into a pipe that nobody reads nothing."""
     terminal = console()
     for part in parts:
         terminal.print(part, highlight=False, markup=False, soft_wrap=not hasattr(part, "columns"))
+
+
+def drop_what_follows() -> None:
+    """Send what is written to standard output from now on, and what waits to be, nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def rendered(table: RenderableType) -> str:
@@ -57,8 +64,7 @@ def rendered(table: RenderableType) -> str:
 
 
 def say_written(paths: Iterable[Path]) -> None:
-    for path in paths:
-        print(f"wrote {path}")
+    show(*(f"wrote {path}" for path in paths))
 
 
 class Terminated(KeyboardInterrupt):
@@ -96,53 +102,3 @@ def warnings_in_a_line() -> Iterator[None]:
 
         warnings.showwarning = show_one
         yield
-
-
-class _Pipe(io.FileIO):
-    """A pipe that may be closed at its other end: what is written from then on is dropped."""
-
-    gone = False
-
-    def write(self, data: Any, /) -> int:
-        try:
-            return len(data) if self.gone else super().write(data)
-        except BrokenPipeError:
-            self.gone = True
-            return len(data)
-
-
-def _forgiving(stream: Any) -> Any:
-    if stream is None:  # closed by whoever started the command
-        return open(os.devnull, "w", encoding="utf-8")
-    buffer = getattr(stream, "buffer", None)
-    if not isinstance(getattr(buffer, "raw", buffer), io.FileIO):
-        return stream  # of a program that calls the command
-    stream.flush()
-    raw = io.BufferedWriter(_Pipe(stream.fileno(), "w", closefd=False))
-    at_once = stream.line_buffering or stream.write_through
-    return io.TextIOWrapper(raw, encoding=stream.encoding, errors="replace", line_buffering=at_once)
-
-
-@contextmanager
-def forgiving_streams() -> Iterator[None]:
-    """Standard output and errors that take any character, '?' for those that their encoding lacks, and a reader that
-    goes away, such as `head`.
-
-    Raises
-    ------
-    OSError
-        What was written cannot be brought to its file, at the end.
-    """
-    before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = map(_forgiving, before)
-    streams = [new for new, old in zip((sys.stdout, sys.stderr), before, strict=True) if new is not old]
-    try:
-        yield
-    finally:
-        sys.stdout, sys.stderr = before
-        for stream in streams:
-            try:
-                stream.flush()
-            except OSError:
-                getattr(stream.buffer, "raw", stream.buffer).gone = True  # closing would try again
-                raise

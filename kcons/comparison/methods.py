@@ -211,13 +211,6 @@ def lines_on_arrays(imports: str, last: str) -> str:
     return _ON_ARRAYS.replace("$imports", imports).replace(", run", ", run" if "run(" in last else "") + last
 
 
-_BY_EXTRAPOLATION = lines_on_arrays(
-    "from kcons.steppers import Extrapolation",
-    """\
-for end in Extrapolation($step).states(system, start, until=test_system.horizon):
-    pass  # each state is the end of a step
-""",
-)
 _BY_DYNAMICS = """\
 from ase import units
 
@@ -285,12 +278,6 @@ for _name, _title, _stepper in (
     )
 
 
-def _extrapolated(system: TestSystem, tolerance: float) -> Run:
-    start = State(system.positions, system.velocities)
-    return OfStates(steppers.Extrapolation(tolerance).states(_system(system), start, system.horizon), start)
-
-
-add_method("extrapolation", _extrapolated, title="kcons Extrapolation", adaptive=True, code=_BY_EXTRAPOLATION)
 add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", kind="baseline")
 
 
@@ -467,7 +454,7 @@ def exponent(tolerance: float) -> str:
 
 def evaluations(scheme: str) -> int:
     """Force evaluations of a step of a scheme."""
-    return 1 if scheme == "leapfrog" else STEPPERS[scheme]().force_evaluations
+    return STEPPERS[scheme]().force_evaluations
 
 
 def _engine(system: TestSystem) -> OpenMMEngine:
@@ -512,15 +499,14 @@ def _in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, sy
     context = engine.context(made, integrator)
     context.setPositions(x)
     v = system.velocities * engine.speed
-    half_step = own or getattr(integrator, "scheme", "") is None
-    if half_step:
+    if own:
         # Velocities are those of half a step earlier: then the first position is the one that RATTLE reaches.
         state = context.getState(forces=True, groups=integrator.getIntegrationForceGroups())
         v = v - 0.5 * dt * engine.time * state.getForces(asNumpy=True)._value / system.masses[:, None]
     context.setVelocities(v)
     each = evaluations(given[0]) if given and isinstance(given[0], str) else 1
     units = {"length": engine.length, "speed": engine.speed}
-    return InOpenMM(context, integrator, dt, force_evaluations=each, half_step=half_step, **units)
+    return InOpenMM(context, integrator, dt, force_evaluations=each, half_step=own, **units)
 
 
 _IN_OPENMM = """\
@@ -541,7 +527,7 @@ integrator.step($steps)
 
 def _lines_in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, system: TestSystem) -> str:
     """Lines of Python that do what `_in_openmm` does."""
-    if not kind.startswith(("Projected", "Rattle", "Surface")):
+    if not kind.startswith(("Projected", "Surface")):
         lines = f"integrator = openmm.{kind}({', '.join([*map(repr, given), '$ps'])})\n"
         lines, imported = f"{lines}integrator.setConstraintTolerance({tolerance:g})", "import openmm"
     elif how == "surfaces":
@@ -607,12 +593,12 @@ for _name, _title, _own in (
     ("openmm-nose-hoover-bath", "NoseHoover, 300 K", "NoseHooverIntegrator"),
 ):
     in_openmm(_name, _title, _own, 300.0, 1.0, tolerance=DEFAULT, kind="thermostat", refuses=_kelvin)
-for _scheme in (*USUAL, "geodesic", "yoshida4", "blanes-moan6a", "leapfrog"):
+for _scheme in (*USUAL, "geodesic", "yoshida4", "blanes-moan6a"):
     _usual = _scheme in USUAL
     in_openmm(f"openmm-kcons-{_scheme}", f"+ kcons {_scheme}", "ProjectedIntegrator", _scheme, usual=_usual)
-for _t in (1e-4, DEFAULT, 1e-6, TIGHT):
-    _name = "openmm-rattle" if _t == TIGHT else f"openmm-rattle-{exponent(_t)}"
-    in_openmm(_name, f"+ kcons compiled RATTLE, {exponent(_t)}", "RattleIntegrator", tolerance=_t)
+for _t in (1e-4, DEFAULT, 1e-6):
+    _name, _title = f"openmm-kcons-rattle-{exponent(_t)}", f"+ kcons rattle, {exponent(_t)}"
+    in_openmm(_name, _title, "ProjectedIntegrator", "rattle", tolerance=_t)
 for _scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
     in_openmm(
         f"openmm-held-{_scheme}",

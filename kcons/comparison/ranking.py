@@ -21,7 +21,7 @@ from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.test_systems.potential import NO_FORCES
 from kcons.errors import InputError
 
-Criterion = Literal["error", "drift", "temperature"]
+Criterion = Literal["error", "temperature"]
 
 #: Columns of costs, and what they are called.
 COSTS = {"seconds": "processor time", "evaluations": "force evaluations"}
@@ -32,7 +32,7 @@ RESOLVED, ROUNDING = 3.0, 1e-13
 #: Errors, times and evaluations that differ by these fractions are the same, unless rounds of timing say more.
 SAME_ERROR, SAME_TIME, SAME_EVALUATIONS = 0.05, 0.05, 0.02
 #: Methods whose error is what is usually accepted, and the step of it where time is in fs.
-USUAL_METHODS = ("rattle", "openmm-kcons-rattle", "ase-kcons", "openmm-rattle", "openmm-verlet")
+USUAL_METHODS = ("rattle", "openmm-kcons-rattle", "ase-kcons", "openmm-verlet")
 USUAL_STEP = 2.0
 #: Steps are predicted for this part of the error, since the prediction may be off; one that makes less than `WASTE` of
 #: it was too short. So many runs of one method, and so many methods, are tried.
@@ -103,12 +103,12 @@ class Ranking:
     Attributes
     ----------
     table : DataFrame
-        Rows of the comparison with 'place', 'value' (error or drift), 'cost' and 'times' (of the first). Methods whose
-        costs differ by less than the scatter share a place.
+        Rows of the comparison with 'place', 'cost' and 'times' (of the first). Methods whose costs differ by less than
+        the scatter share a place.
     beyond : DataFrame
         The best row of each method that is not good enough.
     limit : float
-        The largest value that is good enough.
+        The largest error that is good enough.
     limit_is : str
         Where it comes from.
     what, unit : str
@@ -136,21 +136,18 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | Non
     ----------
     table : DataFrame
         From `kcons.comparison.compare`.
-    criterion : {'error', 'drift', 'temperature'}
-        The error of the trajectory, or the drift of its energy: its slope and twice the standard error of that; or, for
-        a table of averages, how far the temperature of the configurations is off.
+    criterion : {'error', 'temperature'}
+        The error of the trajectory, or, for a table of averages, how far the temperature of the configurations is off.
     limit : float, optional
-        The largest value that is good enough; by default what the usual method makes at its usual step, and 1 % of the
+        The largest error that is good enough; by default what the usual method makes at its usual step, and 1 % of the
         temperature.
     """
     about, cost = table.attrs, cost_that_decides(table)
     done = with_errors(table)
     least = resolution(table) if criterion == "error" else 0.0
-    value = done.slope.abs() + 2 * done.slope_error.fillna(0.0) if criterion == "drift" else done.error
-    done = done.assign(value=value.astype(float), cost=done[cost])
-    done = done[np.isfinite(done.value)]
     if not len(done):
         return None
+    done = done.assign(cost=done[cost])
     limit_is, slack = "asked for", 0.0
     if limit is None and criterion == "temperature":
         limit, limit_is = RIGHT, "two standard errors included"
@@ -159,18 +156,17 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | Non
         if limit < least:
             limit, limit_is = least, "the least that the reference can tell apart"
         slack = SAME_ERROR
-    good = done[done.value.clip(lower=least) <= limit * (1 + slack)]
+    good = done[done.error.clip(lower=least) <= limit * (1 + slack)]
     best = good.sort_values("cost").drop_duplicates("method")
-    beyond = done[~done.method.isin(good.method)].sort_values("value").drop_duplicates("method")
+    beyond = done[~done.method.isin(good.method)].sort_values("error").drop_duplicates("method")
     same = scatter(table, cost)
-    drift = f"{about.get('energy', '')}/{about['long_time']} a degree of freedom"
     return Ranking(
         table=best.assign(place=_places(list(best.cost), same), times=best.cost / best.cost.min()),
         beyond=beyond,
         limit=limit,
         limit_is=limit_is,
-        what="drift of the energy" if criterion == "drift" else about.get("what", "error"),
-        unit=drift if criterion == "drift" else about["error_unit"],
+        what=about.get("what", "error"),
+        unit=about["error_unit"],
         cost=cost,
         scatter=same,
     )
@@ -197,8 +193,8 @@ def _usual(done: pd.DataFrame, about: Mapping[str, Any]) -> tuple[float, str]:
             row = rows.iloc[min(1, len(rows) - 1)]
             if about["time"] == "fs":
                 row = rows.loc[(np.log(rows.setting.astype(float) / USUAL_STEP)).abs().idxmin()]
-            return float(row.value), f"what {row.title} makes at {shown_setting(row, about)}"
-    return float(done.value.median()), "what half of the rows make"
+            return float(row.error), f"what {row.title} makes at {shown_setting(row, about)}"
+    return float(done.error.median()), "what half of the rows make"
 
 
 def shown_setting(row: Any, about: Mapping[str, Any]) -> str:

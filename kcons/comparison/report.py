@@ -100,10 +100,10 @@ def sentence(table: pd.DataFrame, found: Ranking | None) -> str:
     if not len(found.table):
         best = found.beyond.iloc[0]
         at = shown_setting(best, about)
-        if best.value <= found.limit:
+        if best.error <= found.limit:
             return f"No method makes {limit}, which cannot be told from none: the reference is no better."
         remedy = " Longer runs (--budget) make errors smaller." if "what" in about else ""
-        return f"No method makes {limit}; the least is {best.value:.2g}, by {best.title} at {at}.{remedy}"
+        return f"No method makes {limit}; the least is {best.error:.2g}, by {best.title} at {at}.{remedy}"
     first = found.table.iloc[0]
     spent = f"the least {COSTS[found.cost]} {_per(about)}, {_spent(first.cost, found.cost)}"
     words = f"Use {first.title} at {shown_setting(first, about)}: {spent}, for {limit}"
@@ -122,7 +122,7 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
         "": [f"{p}{'=' if tie else ''}" for p, tie in zip(shown.place, tied, strict=False)] or [""] * len(shown),
         "method": [str(title)[:40] for title in shown.title],
         "at": [shown_setting(row, about) for row in shown.itertuples()],
-        found.what.split()[0]: [f"{value:.1e}" for value in shown.value],
+        found.what.split()[0]: [f"{error:.1e}" for error in shown.error],
         "cost": [_spent(cost, found.cost) for cost in shown.cost],
         "times": ["" if np.isnan(t) else f"{t:.2f}" if t < 10 else f"{t:,.0f}" for t in shown.times],
         "timed": ["once" if not rounds else f"{rounds:.0f} rounds" for rounds in shown.rounds],

@@ -44,7 +44,7 @@ def along(
     frames : sequence of int
         Numbers of the frames.
     **options
-        What `any_file.from_file` takes: constrain, select, rigid_residues, force_field, platform.
+        What `any_file.from_file` takes: constrain, select, force_field, platform.
 
     Raises
     ------

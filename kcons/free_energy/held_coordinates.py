@@ -197,6 +197,14 @@ class HeldCoordinates:
             f"<HeldCoordinates: {', '.join(self.names)}, beside {len(self._order) - len(self)} rows of their clusters>"
         )
 
+    @property
+    def seen(self) -> IntArray:
+        """All atoms that samples depend on: `atoms`, and those of the groups that torsions turn."""
+        groups = [
+            np.concatenate([turn.axis, turn.group, turn.bonds.ravel()]) for turn in self._turns if turn is not None
+        ]
+        return np.unique(np.concatenate([self.atoms, *groups])).astype(np.int64)
+
     def sample(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> Sample:
         """The coordinates at one configuration.
 

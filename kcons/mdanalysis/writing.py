@@ -427,7 +427,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
             writer.motion = _followed(writer, engine())
         forces = None
         if writer.motion is not None or with_forces:
-            forces = dynamics.applied_forces() if hasattr(dynamics, "applied_forces") else applied_forces(atoms)
+            forces = applied_forces(atoms)
         time, v = float(dynamics.get_time()), velocities_of(atoms)
         writer.write(atoms.positions, v, time=time, cell=box(), forces=forces, step=dynamics.nsteps)
 

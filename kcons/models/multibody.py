@@ -1,9 +1,9 @@
-"""Mechanical systems in any coordinates q: a full mass matrix, and constraints g(q, t) = 0.
+"""Mechanical systems in any coordinates q: a full mass matrix, and constraints g(q) = 0.
 
-M(q) q'' = f(q, q', t) + G^T lambda,  g(q, t) = 0,  G = dg/dq
+M(q) q'' = f(q, q', t) + G^T lambda,  g(q) = 0,  G = dg/dq
 
 as multibody problems and the test sets for differential-algebraic equations are published. Accelerations obey
-G q'' = b, b = -(q' d/dq + d/dt)^2 g. With N an orthonormal basis of the null space of G and a_0 any solution of
+G q'' = b, b = -(q' d/dq)^2 g. With N an orthonormal basis of the null space of G and a_0 any solution of
 G a_0 = b, they are a_0 + N y, (N^T M N) y = N^T (f - M a_0). So M need not be regular, only positive along what the
 constraints leave free, and rows may depend on each other. Corrections of positions and velocities are the smallest
 in the metric of M by the same formula, with f = 0.
@@ -25,7 +25,6 @@ from numpy.typing import ArrayLike
 from scipy.linalg import lapack
 
 from kcons.constraints.arguments import (
-    TAKES_TIME,
     FloatArray,
     IntArray,
     as_float_array,
@@ -33,10 +32,9 @@ from kcons.constraints.arguments import (
     positive,
     read_only_view,
 )
-from kcons.constraints.target import WRONG, first_derivative, first_derivative_4, second_derivative
+from kcons.constraints.target import WRONG, first_derivative_4, second_derivative
 from kcons.errors import (
     ConstraintError,
-    ContradictionError,
     ConvergenceError,
     InputError,
     NonFiniteError,
@@ -103,7 +101,7 @@ class _Place(NamedTuple):
 
 
 class Multibody:
-    """M(q) q'' = f(q, q', t) + G^T lambda, g(q, t) = 0, in any coordinates.
+    """M(q) q'' = f(q, q', t) + G^T lambda, g(q) = 0, in any coordinates.
 
     Parameters
     ----------
@@ -113,18 +111,13 @@ class Multibody:
         ``force(q, v, t) -> (n,)``, all that stands beside M q'': applied forces and the terms in the velocities
         (Coriolis, centrifugal) that come with a mass that changes with q.
     constraints : callable, optional
-        ``constraints(q) -> (m,)``, held at 0; with `time_dependent`, ``(q, t)``.
+        ``constraints(q) -> (m,)``, held at 0.
     jacobian : callable, optional
-        ``jacobian(q) -> (m, n)``, G; with `time_dependent`, ``(q, t)``. Without it g is differenced (12 digits).
+        ``jacobian(q) -> (m, n)``, G. Without it g is differenced (12 digits).
     curvature : callable, optional
-        ``curvature(q, v) -> (m,)``, v^T (d2g/dq2) v; with `time_dependent`, ``(q, v, t)`` and with
-        2 (d2g/dq dt) v + d2g/dt2 added. Without it G, or g, is differenced along v (12 digits, or 10).
-    time_dependent : bool
-        Whether constraints take the time as their last argument.
+        ``curvature(q, v) -> (m,)``, v^T (d2g/dq2) v. Without it G, or g, is differenced along v (12 digits, or 10).
     length : float
         Change of the coordinates over which g bends; differences are taken at a small part of it.
-    time_step : float
-        Step of differences in time: about 1/50 of the time over which g changes.
 
     Notes
     -----
@@ -139,19 +132,15 @@ class Multibody:
         jacobian: Callable[..., ArrayLike] | None = None,
         *,
         curvature: Callable[..., ArrayLike] | None = None,
-        time_dependent: bool = False,
         length: float = 1.0,
-        time_step: float = 0.02,
     ) -> None:
         self.force, self.constraints, self.jacobian, self.curvature = force, constraints, jacobian, curvature
-        self.time_dependent = bool(time_dependent)
-        self.length, self.time_step = positive(length, "length"), positive(time_step, "time_step")
-        last = ("t",) if time_dependent else ()
+        self.length = positive(length, "length")
         if force is None:
             raise InputError("force must be a function, not None", item="force")
         check_call("force", force, ("q", "v", "t"))
         for name, taken in (("constraints", ("q",)), ("jacobian", ("q",)), ("curvature", ("q", "v"))):
-            check_call(name, getattr(self, name), (*taken, *last), TAKES_TIME)
+            check_call(name, getattr(self, name), taken)
             if constraints is None and getattr(self, name) is not None:
                 raise InputError(f"there is a {name} without constraints; give the function g as well", item=name)
         #: Number of constraints, None until it is seen.
@@ -164,38 +153,36 @@ class Multibody:
             self.mass = np.diag(matrix) if matrix.ndim == 1 else matrix
             _check_symmetric(self.mass)
 
-    def degrees_of_freedom(self, q: ArrayLike, t: float = 0.0) -> int:
+    def degrees_of_freedom(self, q: ArrayLike) -> int:
         """n - rank G at `q`."""
-        q, _ = self._state(q, q, t)
-        return len(q) - len(self._place(q, t, None).rows)
+        q, _ = self._state(q, q)
+        return len(q) - len(self._place(q, 0.0, None).rows)
 
-    def residuals(self, q: ArrayLike, v: ArrayLike, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """g and its time derivative G v + dg/dt, shape (m,) each, in the units that g has."""
-        q, v = self._state(q, v, t)
-        return self._g(q, t), self._G(q, t) @ v - self._c(q, t)
+    def residuals(self, q: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """g and its time derivative G v, shape (m,) each, in the units that g has."""
+        q, v = self._state(q, v)
+        return self._g(q), self._G(q) @ v
 
     def motion(self, q: ArrayLike, v: ArrayLike, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Accelerations, shape (n,), and multipliers, shape (m,), at a state on the constraints."""
-        q, v = self._state(q, v, t)
+        q, v = self._state(q, v)
         return self._motion(self._place(q, t, None), v)
 
     def _motion(self, place: _Place, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         f = self._called("force", (len(v),), place.q, v, place.t)
-        a = place.solve(f, self._b(place.q, v, place.t))
+        a = place.solve(f, self._b(place.q, v))
         return a, place.multipliers(place.M @ a - f)
 
-    def project(self, q: ArrayLike, v: ArrayLike, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    def project(self, q: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """The state on the constraints near (q, v): corrections are the smallest in the metric of M.
 
         Raises
         ------
         ConvergenceError
             No positions near `q` are on the constraints.
-        ContradictionError
-            Dependent rows ask for different velocities.
         """
-        q, v = self._state(q, v, t)
-        place = self._placed(q, t, None)
+        q, v = self._state(q, v)
+        place = self._placed(q, 0.0, None)
         return place.q, self._tangent(place, v)
 
     def solve(
@@ -234,8 +221,6 @@ class Multibody:
             The start is off the constraints, or its velocities are.
         ConvergenceError
             Steps became too small, or no positions were found on the constraints; says when.
-        ContradictionError
-            As `project`.
         SingularGeometryError
             M is not positive along what the constraints leave free, or constraints become dependent on the way.
         NonFiniteError
@@ -244,7 +229,7 @@ class Multibody:
         solver, (t0, t1), wanted = check_run(
             t_span, t_eval, method, options | {"rtol": rtol, "atol": atol}, 2 * np.size(q)
         )
-        q, v = self._state(q, v, t0)
+        q, v = self._state(q, v)
         n, rank = len(q), len(self._start(q, v, t0).rows)
         latest: dict[str, Any] = {}
 
@@ -257,7 +242,7 @@ class Multibody:
             if place.t != t or not np.array_equal(place.q, q):
                 place = self._place(q, t, rank)
             f = self._called("force", (n,), q, v, t)
-            return np.concatenate([v, place.solve(f, self._b(q, v, t))])
+            return np.concatenate([v, place.solve(f, self._b(q, v))])
 
         def count(t: float, y: FloatArray) -> None:
             latest["steps"] += 1
@@ -283,7 +268,7 @@ class Multibody:
     def _place(self, q: FloatArray, t: float, rank: int | None) -> _Place:
         """Factors at `q`, with so many independent rows, by default as many as there are."""
         n = len(q)
-        M, G = self._M(q), self._G(q, t)
+        M, G = self._M(q), self._G(q)
         size = np.sqrt(np.einsum("ij,ij->i", G, G))
         size[size == 0] = 1.0
         Q, R, rows = _factors(G / size[:, None])
@@ -308,18 +293,17 @@ class Multibody:
 
     def _start(self, q: FloatArray, v: FloatArray, t: float) -> _Place:
         """The place of a start; refused where that is off the constraints."""
-        place, c = self._place(q, t, None), self._c(q, t)
+        place = self._place(q, t, None)
         gained = np.sqrt(_largest(self._motion(place, v)[0]) * self.length)
-        speed = _largest(v) + gained + np.abs(c) / place.size
         for miss, allowed, what in (
-            (self._g(q, t), max(self.length, _largest(q)) + 0 * place.size, "off"),
-            (place.G @ v - c, speed, "left by the velocities, per unit of time,"),
+            (self._g(q), max(self.length, _largest(q)), "off"),
+            (place.G @ v, _largest(v) + gained, "left by the velocities, per unit of time,"),
         ):
             off = np.abs(miss) / place.size
             if np.any(off > START * allowed):
-                row = int(np.argmax(off - START * allowed))
+                row = int(np.argmax(off))
                 raise ConstraintError(
-                    f"constraint {row} is {what} by {off[row]:.3g} at the start. Start from body.project(q, v, t), "
+                    f"constraint {row} is {what} by {off[row]:.3g} at the start. Start from body.project(q, v), "
                     "which gives the nearest state on the constraints",
                     rows=[row],
                 )
@@ -327,7 +311,7 @@ class Multibody:
 
     def _placed(self, q: FloatArray, t: float, rank: int | None) -> _Place:
         """The place on the constraints near `q`, by Newton's method down to rounding."""
-        place, g = self._place(q, t, rank), self._g(q, t)
+        place, g = self._place(q, t, rank), self._g(q)
         off = _largest(g / place.size)
         accepted = ACCEPTED * max(self.length, _largest(q))
         for _ in range(ITERATIONS):
@@ -336,7 +320,7 @@ class Multibody:
             step = place.solve(np.zeros(len(q)), -g)
             for part in PARTS if off > accepted else PARTS[:1]:
                 moved = read_only_view(place.q + part * step)
-                there = self._g(moved, t)
+                there = self._g(moved)
                 left = _largest(there / place.size)
                 if left < (1.0 - 0.5 * part) * off:
                     break
@@ -357,17 +341,8 @@ class Multibody:
 
     def _tangent(self, place: _Place, v: FloatArray) -> FloatArray:
         """The nearest velocities that stay on the constraints."""
-        c, speed = self._c(place.q, place.t), _largest(v)
         for _ in range(2):  # the second time for what rounding left
-            v = v + place.solve(np.zeros(len(v)), c - place.G @ v)
-        off = np.abs(c - place.G @ v) / place.size
-        if not np.all(off <= ACCEPTED * (speed + np.abs(c) / place.size)):
-            row = int(np.argmax(off))
-            raise ContradictionError(
-                f"at t = {place.t:.8g} dependent constraints ask for different velocities: row {row} stays off by "
-                f"{off[row]:.3g}. Remove one of them or change what it asks for",
-                rows=[row],
-            )
+            v = v - place.solve(np.zeros(len(v)), place.G @ v)
         return v
 
     # -- what the user gave: called, differenced where derivatives are missing, and checked ----------------
@@ -389,44 +364,34 @@ class Multibody:
             )
         return array
 
-    def _at(self, *arguments: Any) -> tuple[Any, ...]:
-        """What functions of the constraints take; the time, which is last, only where they depend on it."""
-        return arguments if self.time_dependent else arguments[:-1]
-
     def _M(self, q: FloatArray) -> FloatArray:
         return self.mass if isinstance(self.mass, np.ndarray) else self._called("mass", (len(q), len(q)), q)
 
-    def _g(self, q: FloatArray, t: float) -> FloatArray:
-        return self._called("constraints", None, *self._at(q, t)) if self.m else np.zeros(0)
+    def _g(self, q: FloatArray) -> FloatArray:
+        return self._called("constraints", None, q) if self.m else np.zeros(0)
 
-    def _G(self, q: FloatArray, t: float) -> FloatArray:
+    def _G(self, q: FloatArray) -> FloatArray:
         if self.m and self.jacobian is not None:
-            return self._called("jacobian", (self.m, len(q)), *self._at(q, t))
+            return self._called("jacobian", (self.m, len(q)), q)
         step = 1e-3 * self.length
 
         def along(e: FloatArray) -> FloatArray:
-            return first_derivative_4(lambda s: self._g(q + s * e, t), 0.0, step)
+            return first_derivative_4(lambda s: self._g(q + s * e), 0.0, step)
 
         return np.stack([along(e) for e in np.eye(len(q))], axis=1)
 
-    def _c(self, q: FloatArray, t: float) -> FloatArray:
-        """What G v must be, shape (m,) or ()."""
-        if not (self.m and self.time_dependent):
-            return np.zeros(())
-        return -first_derivative(lambda s: self._g(q, s), t, self.time_step)
-
-    def _b(self, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+    def _b(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """What G a must be, shape (m,)."""
         if self.m and self.curvature is not None:
-            return -self._called("curvature", None, *self._at(q, v, t))
-        speed = max(_largest(v) / self.length, 0.02 / self.time_step if self.time_dependent else 0.0)
+            return -self._called("curvature", None, q, v)
+        speed = _largest(v) / self.length
         if not self.m or speed == 0.0:
             return np.zeros(self.m or 0)
-        if self.jacobian is not None and not self.time_dependent:
-            return -first_derivative_4(lambda s: self._G(q + s * v, t) @ v, 0.0, 1e-3 / speed)
-        return -second_derivative(lambda s: self._g(q + s * v, t + s), 0.0, 0.02 / speed)
+        if self.jacobian is not None:
+            return -first_derivative_4(lambda s: self._G(q + s * v) @ v, 0.0, 1e-3 / speed)
+        return -second_derivative(lambda s: self._g(q + s * v), 0.0, 0.02 / speed)
 
-    def _state(self, q: ArrayLike, v: ArrayLike, t: float) -> tuple[FloatArray, FloatArray]:
+    def _state(self, q: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """A state as arrays, after all functions were seen to fit it."""
         found = []
         for item, given in (("q", q), ("v", v)):
@@ -439,26 +404,25 @@ class Multibody:
             if not np.isfinite(array).all():
                 raise InputError(f"{item}[{int(np.argmin(np.isfinite(array)))}] is not finite", item=item)
             found.append(read_only_view(array))
-        self._check_functions(found[0], t)
+        self._check_functions(found[0])
         return found[0], found[1]
 
-    def _check_functions(self, q: FloatArray, t: float) -> None:
+    def _check_functions(self, q: FloatArray) -> None:
         """Count the constraints; refuse derivatives that differences contradict, which would give wrong motion."""
         if callable(self.mass):
             _check_symmetric(self._M(q))
         if self.constraints is None:
             return
         self.m = None
-        self.m = len(self._called("constraints", None, *self._at(q, t)))
-        speed = self.length * (0.02 / self.time_step if self.time_dependent else 1.0)
-        along = speed * np.random.default_rng(0).normal(size=len(q))
+        self.m = len(self._called("constraints", None, q))
+        along = self.length * np.random.default_rng(0).normal(size=len(q))
         bare = copy(self)
         bare.jacobian = bare.curvature = None
-        own, found = ((body._G(q, t), -body._b(q, along, t)) for body in (self, bare))
+        own, found = ((body._G(q), -body._b(q, along)) for body in (self, bare))
         slope = _largest(found[0])
         for name, mine, differences, unit in (
             ("jacobian", own[0], found[0], 0.0),
-            ("curvature", own[1], found[1], speed**2 / self.length),
+            ("curvature", own[1], found[1], self.length),
         ):
             if getattr(self, name) is not None:
                 check_derivative(

@@ -28,12 +28,10 @@ try:
     from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
-    from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
     from kcons.openmm.integrator.schemes import SCHEMES
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
     from kcons.openmm.states import positions_of, velocities_of
-    from kcons.openmm.surfaces.landings import ExpressionSurface
     from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
     from kcons.openmm.topology import constraints_of
 except ModuleNotFoundError as error:
@@ -44,7 +42,6 @@ __all__ = [
     "CarriedConstraints",
     "CollectiveRows",
     "DeviceIntegrator",
-    "ExpressionSurface",
     "HamiltonianMonteCarlo",
     "Isokinetic",
     "IsokineticSpheres",
@@ -54,7 +51,6 @@ __all__ = [
     "NoseHooverMiddle",
     "Precision",
     "ProjectedIntegrator",
-    "RattleIntegrator",
     "Row",
     "SurfaceIntegrator",
     "constraints_of",

@@ -12,13 +12,8 @@
 - `slow_share`: the stiffness that slow forces carry
 """
 
-from kcons.thermostats.configurational_temperature import (
-    SplitTemperatures,
-    TemperatureSplit,
-    configurational_sample,
-    configurational_temperature,
-)
-from kcons.thermostats.correlated_series import Estimate, autocorrelation_time, evaluations_per_sample, mean
+from kcons.thermostats.configurational_temperature import SplitTemperatures, TemperatureSplit
+from kcons.thermostats.correlated_series import Estimate, mean
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
@@ -35,7 +30,6 @@ from kcons.thermostats.pressure import (
     CellSystem,
     ConstantPressure,
     MonteCarloBarostat,
-    PressureObserver,
     find_pieces,
     instantaneous_pressure,
 )
@@ -58,15 +52,10 @@ __all__ = [
     "LangevinRespa",
     "MonteCarloBarostat",
     "NoseHooverChain",
-    "PressureObserver",
     "SplitTemperatures",
     "TemperatureSplit",
     "Tuned",
-    "autocorrelation_time",
     "best_acceptance",
-    "configurational_sample",
-    "configurational_temperature",
-    "evaluations_per_sample",
     "exchange",
     "find_pieces",
     "freedom",

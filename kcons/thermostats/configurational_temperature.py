@@ -37,11 +37,9 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import (
     Rng,
     as_array,
-    as_float_array,
     generator_of,
     positive,
     refuse_other,
-    whole_number,
 )
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
@@ -49,9 +47,9 @@ from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.steppers import State, System
+from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.correlated_series import MIN_SAMPLES, Estimate, checked, few, spread
+from kcons.thermostats.correlated_series import MIN_SAMPLES, Estimate, few, spread
 from kcons.thermostats.freedom import UNCHANGED, atom_numbers, bodies, row_changes
 from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
@@ -76,76 +74,6 @@ def temperature(squares: FloatArray, curvatures: FloatArray) -> tuple[Estimate, 
         return Estimate(found, math.inf), said
     error, independent = spread((squares - found * curvatures) / scale)
     return Estimate(found, error), few(n, independent)
-
-
-def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Estimate:
-    """k_B T = <|grad U|^2>/<laplacian of U> from samples of both along a run.
-
-    Raises
-    ------
-    InputError
-        Fewer than 32 samples; curvatures that are all 0.
-
-    Warns
-    -----
-    UserWarning
-        Fewer than 10 independent samples; a mean curvature that is 0 within three standard errors, so that the ratio
-        has no error: it is given as infinite.
-    """
-    above, below = as_float_array(squares, "squares"), as_float_array(curvatures, "curvatures")
-    if above.shape != below.shape:
-        raise InputError(f"{above.shape} squares and {below.shape} curvatures do not go together", item="curvatures")
-    for series, name in ((above, "squares"), (below, "curvatures")):
-        checked(series, name)
-    if not below.any():
-        raise InputError("the forces do not change with the positions: they tell no temperature", item="curvatures")
-    found, doubt = temperature(above, below)
-    if doubt:
-        warnings.warn(doubt, UserWarning, stacklevel=2)
-    return found
-
-
-def configurational_sample(
-    system: System, state: State, rng: np.random.Generator, *, flight: float = 1e-4, directions: int = 1
-) -> tuple[float, float]:
-    """|grad U|^2 and an unbiased sample of the laplacian of U on the surface, in the metric M.
-
-    Two force evaluations for each direction.
-
-    Parameters
-    ----------
-    system : System
-    state : State
-    rng : numpy.random.Generator
-    flight : float
-        How long to fly along a geodesic at unit thermal energy, for a difference of the slopes of U at its ends.
-    directions : int
-        How many random directions to average over.
-
-    Raises
-    ------
-    UnsupportedError
-        Targets move, or forces depend on the velocities.
-    """
-    if system.motion.plan.driven or system.velocity_dependent:
-        raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")
-    x, time = state.positions, state.time
-    forces = system.with_forces(state).forces
-    assert forces is not None
-    square = float((forces * constrained_acceleration(system, x, forces, time)).sum())
-    total = 0.0
-    for _ in range(whole_number(directions, "directions")):
-        v = thermal_velocities(system, x, 1.0, rng, time=time)
-        ends = [_slope(system, x, v, time, h) for h in (flight, -flight)]
-        total += (ends[0] - ends[1]) / (2 * flight)
-    return square, total / directions
-
-
-def _slope(system: System, x: FloatArray, v: FloatArray, time: float, h: float) -> float:
-    """dU/ds at the end of the geodesic that starts with v."""
-    there, v = system.flown(x, v, h, time)
-    end = system.motion.project_velocities(there, v, time=time)
-    return -float((system.forces(there, end, time, 0) * end).sum())
 
 
 #: Typical move for a difference, as a share of the distance to the next atom.
@@ -295,8 +223,6 @@ class TemperatureSplit:
     displacement : float, optional
         Typical move of an atom for a difference; a thousandth of the distance to the next atom by default. Forces in
         single precision want three to ten times as much.
-    directions : int
-        Random moves a sample.
     groups : mapping of str to array_like of int, optional
         Atoms by name, whose temperatures `result` tells apart. A cluster belongs to the group of its first atom.
 
@@ -307,8 +233,8 @@ class TemperatureSplit:
 
     Notes
     -----
-    A sample costs 2 evaluations of the forces for shifts, 2 for turns and 2 for what is left, for each direction, where
-    there is such a motion, and one at the configuration itself if its forces are not given.
+    A sample costs 2 evaluations of the forces for shifts, 2 for turns and 2 for what is left, where there is such a
+    motion, and one at the configuration itself if its forces are not given. The same configuration may be added again.
     """
 
     def __init__(
@@ -317,7 +243,6 @@ class TemperatureSplit:
         *,
         rng: Rng = 0,
         displacement: float | None = None,
-        directions: int = 1,
         groups: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         refuse_other(system, System, "system", "a kcons.steppers.System")
@@ -330,7 +255,6 @@ class TemperatureSplit:
         if groups is not None and not isinstance(groups, Mapping):
             raise InputError(f"groups is {groups!r}; give a mapping of names to atoms", item="groups")
         self._system, self._displacement = system, displacement
-        self._directions = whole_number(directions, "directions")
         self._groups = {name: atom_numbers(atoms, system.n_atoms) for name, atoms in (groups or {}).items()}
         self._rng = generator_of(rng)
         self._clusters: Clusters | None = None
@@ -364,7 +288,7 @@ class TemperatureSplit:
             rest = masses * self._rest_of(x, arms, turns) ** 2
             self._rest = clusters.add_up(rest.sum(axis=1)) > RIGID
         above = self._squares(x, f, arms, turns)
-        below = np.mean([self._curvatures(x, arms, turns) for _ in range(self._directions)], axis=0)
+        below = self._curvatures(x, arms, turns)
         for kinds in (above, below):  # what is left: all less shifts and turns
             kinds[2] = np.where(self._rest, kinds[2] - kinds[0] - kinds[1], 0.0)
         self._series.append(np.stack([above, below]) @ self._member.T)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_float_array, positive
+from kcons.constraints.arguments import as_float_array
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -164,16 +164,6 @@ def spread(series: FloatArray) -> Spread:
     )
 
 
-def checked(series: FloatArray, item: str) -> FloatArray:
-    """The same series, if an error can be taken from it; `InputError` otherwise."""
-    if series.ndim != 1 or len(series) < MIN_SAMPLES:
-        raise InputError(f"{series.shape} {item} are too few for an error; give {MIN_SAMPLES} or more", item=item)
-    if not np.isfinite(series).all():
-        bad = int(np.argmin(np.isfinite(series)))
-        raise InputError(f"number {bad} of {item} is not finite; leave it out", item=item)
-    return series
-
-
 def few(n: int, independent: float) -> str | None:
     """What is to be said of an error from so few independent values; None of one that is all right."""
     if independent >= FEW_INDEPENDENT:
@@ -202,47 +192,17 @@ def mean(values: ArrayLike) -> Estimate:
     UserWarning
         Fewer than 10 independent values.
     """
-    series = checked(as_float_array(values, "values"), "values")
+    series = as_float_array(values, "values")
+    if series.ndim != 1 or len(series) < MIN_SAMPLES:
+        raise InputError(f"{series.shape} values are too few for an error; give {MIN_SAMPLES} or more", item="values")
+    if not np.isfinite(series).all():
+        bad = int(np.argmin(np.isfinite(series)))
+        raise InputError(f"number {bad} of values is not finite; leave it out", item="values")
     found = spread(series)
     doubt = few(len(series), found.independent)
     if doubt:
         warnings.warn(doubt, UserWarning, stacklevel=2)
     return Estimate(float(series.mean()), found.error)
-
-
-def autocorrelation_time(values: ArrayLike) -> float:
-    """Statistical inefficiency 1 + 2 sum rho(k) of a series, in values: so many of them are one independent sample.
-
-    The sum goes on as long as sums of two neighboring correlations are positive and fall (Geyer's initial monotone
-    sequence, Stat. Sci. 7, 473 (1992)). It is for long runs, where it is known to a few percent. The error of a mean is
-    that of `mean`, which also knows of slow parts that noise hides.
-
-    1 for a series that does not change, or whose values swing back; 32 values or more are needed.
-    """
-    series = checked(as_float_array(values, "values"), "values")
-    n = len(series)
-    off = series - series.mean()
-    power = np.fft.rfft(off, 2 * n)
-    covariance = np.fft.irfft(power * power.conj(), 2 * n)[:n]
-    if not covariance[0] > (_ROUNDING * float(np.abs(series).max())) ** 2 * n:
-        return 1.0
-    pairs = (covariance / covariance[0])[: n - n % 2].reshape(-1, 2).sum(axis=1)
-    ends = np.flatnonzero(pairs <= 0)
-    falling = np.minimum.accumulate(pairs[: ends[0] if len(ends) else len(pairs)])
-    return max(1.0, float(2 * falling.sum() - 1))
-
-
-def evaluations_per_sample(values: ArrayLike, evaluations: float) -> float:
-    """Evaluations of the (slow) forces for one independent sample of what was observed.
-
-    Parameters
-    ----------
-    values : array_like, shape (n_values,)
-        An observable along a run, after equilibration.
-    evaluations : float
-        Of the forces in question from one value to the next, for example from `ForceGroups.evaluations`.
-    """
-    return positive(evaluations, "evaluations") * autocorrelation_time(values)
 
 
 def slope(times: FloatArray, values: FloatArray) -> Estimate:

@@ -17,7 +17,7 @@ from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.program import Program, Row
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_dissipation
+from kcons.thermostats.freedom import carried, refuse_dissipation
 from kcons.thermostats.noise import fill_normal
 
 #: What the numbers of a bath begin with: the heat that has flowed in, the kinetic energy after noise, gamma and k_B T,
@@ -129,9 +129,6 @@ class Langevin(SeededBath):
         A seed, or what one is drawn from, which `seed` then tells; None takes it from the operating system.
     substeps : int
         RATTLE substeps in each of the two drifts.
-    conserve_momentum : bool
-        Friction and noise act relative to the center of mass, in the directions in which no row knows a place in
-        space; so many degrees of freedom less take part.
 
     Notes
     -----
@@ -143,20 +140,10 @@ class Langevin(SeededBath):
     Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
 
-    def __init__(
-        self,
-        thermal_energy: float,
-        friction: float,
-        rng: Rng,
-        *,
-        substeps: int = 3,
-        conserve_momentum: bool = False,
-    ) -> None:
+    def __init__(self, thermal_energy: float, friction: float, rng: Rng, *, substeps: int = 3) -> None:
         super().__init__(thermal_energy, friction, rng, substeps)
-        self.conserve_momentum = bool(conserve_momentum)
         self._in_flights = listed_and_made(_geodesic_baoab((1.0 / self.substeps,) * self.substeps))
         self._great_circles = listed_and_made(_geodesic_baoab((1.0,), exact=True))
-        self._open: tuple[System, FloatArray] | None = None
 
     def __repr__(self) -> str:
         return f"Langevin({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}, substeps={self.substeps})"
@@ -165,13 +152,6 @@ class Langevin(SeededBath):
         self.refuse_back(system, dt)
         carried(state, 1, "Langevin")
         return LangevinStep(system, system.with_forces(state), dt, self, steps)
-
-    def directions(self, system: System, x: FloatArray, time: float) -> FloatArray:
-        """Those in which no row knows a place in space."""
-        known = self._open
-        if known is None or known[0] is not system:
-            known = self._open = (system, open_directions(system.motion, x, time))
-        return known[1]
 
     def conserved_energy(self, system: System, state: State) -> float:
         """Total energy less the heat that has flowed in."""
@@ -254,7 +234,7 @@ class LangevinStep(Interpreter):
     def __init__(self, system: System, start: State, dt: float, thermostat: Langevin, steps: int) -> None:
         heat = 0.0 if start.thermostat is None else float(start.thermostat[HEAT])
         program, masses = thermostat.listed(system)[1], system.moving_masses
-        aside, seed = system.motion.plan.driven or thermostat.conserve_momentum, divmod(thermostat.seed, 2**32)
+        aside, seed = system.motion.plan.driven, divmod(thermostat.seed, 2**32)
         parts = sum(row.name == "exchange" for row in program.rows)
         head = heat, 0.0, thermostat.friction, thermostat.thermal_energy, aside, *seed, start.step + 1, 0, parts
         numbers = np.concatenate((head, masses, system.root_weights.ravel(), masses))
@@ -262,18 +242,12 @@ class LangevinStep(Interpreter):
         self.thermostat = thermostat
 
     def exchange(self, row: Row, begun: bool) -> None:
-        """What friction does not act on, velocities of targets and of the center of mass, is added to the noise."""
-        system, thermostat, dt, v = self.system, self.thermostat, row.length * self.dt, self.v
-        noise = self.numbers[MASSES + 2 * v.size :].reshape(v.shape)
+        """Velocities of targets, on which friction does not act, are added to the noise."""
+        dt, v = row.length * self.dt, self.v
         x, time = self.place(row.here), self.at(row.end)
-        kept = np.zeros_like(v)
-        if system.motion.plan.driven:
-            kept = system.motion.project_velocities(x, kept, time=time)
-        if thermostat.conserve_momentum:
-            directions = thermostat.directions(system, x, time)
-            noise -= drift_velocity(noise, system.masses, directions)
-            kept = kept + drift_velocity(v - kept, system.masses, directions)
-        noise += (1.0 - math.exp(-thermostat.friction * dt)) * kept
+        kept = self.system.motion.project_velocities(x, np.zeros_like(v), time=time)
+        noise = self.numbers[MASSES + 2 * v.size :].reshape(v.shape)
+        noise += (1.0 - math.exp(-self.thermostat.friction * dt)) * kept
         _mix(v, dt, self.numbers)
 
     def variables(self) -> FloatArray:

@@ -31,7 +31,7 @@ from kcons.errors import (
 )
 from kcons.steppers import Rattle, ReversibilityCheck, State, Stepper, System
 from kcons.steppers.stepper import DropsSystemCaches, require_stepper, stays
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, refuse_dissipation
+from kcons.thermostats.freedom import carried, refuse_dissipation
 from kcons.thermostats.langevin import noise_generator
 
 #: What `State.thermostat` holds, in this order; the last is what became of the last proposal, 0 before the first.
@@ -169,9 +169,6 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     keep : float
         The part a of the velocities that is kept, v = a v + sqrt(1 - a^2) noise. 0: all are drawn anew. Near 1, with
         few steps of a proposal: generalised Hamiltonian Monte Carlo, which is near to Langevin dynamics.
-    conserve_momentum : bool
-        Velocities are drawn relative to the center of mass, in the directions in which no row knows a place in space;
-        so many degrees of freedom less take part.
     tolerance : float
         Largest difference of a step taken back, relative as for `kcons.steppers.ReversibilityCheck`.
 
@@ -203,7 +200,6 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         *,
         stepper: Stepper | None = None,
         keep: Share = 0.0,
-        conserve_momentum: bool = False,
         tolerance: Positive = 1e-9,
     ) -> None:
         self.thermal_energy, self.keep, self.tolerance = thermal_energy, keep, tolerance
@@ -215,8 +211,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
                 f"{self.stepper!r} is not reversible and symplectic, and its proposals could not be corrected; use "
                 "Rattle, Geodesic, a Composition or a RungeKuttaNystrom stepper"
             )
-        self.conserve_momentum = bool(conserve_momentum)
-        self._known: tuple[System, ReversedSteps, FloatArray] | None = None
+        self._known: tuple[System, ReversedSteps] | None = None
 
     def __repr__(self) -> str:
         few, most = self.steps
@@ -298,7 +293,9 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
 
     def trajectory(self, system: System, state: State, dt: float, count: int) -> State:
         """The end of so many steps from `state`, each of which was taken back, or `ReversibilityError`."""
-        steps = self._found(system, state)[1]
+        if self._known is None or self._known[0] is not system:
+            self._known = system, ReversedSteps(system, self.stepper, self.tolerance)
+        steps = self._known[1]
         for _ in range(count):
             state = steps.step(system, state, dt)
         return state
@@ -329,22 +326,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         x, v = system.near_origin(state)[0], state.velocities
         noise = random.standard_normal(v.shape)
         noise *= np.sqrt((1 - self.keep**2) * self.thermal_energy * system.inverse_masses)
-        kept = self.keep * v
-        if self.conserve_momentum:
-            directions = self._found(system, state)[2]
-            noise -= drift_velocity(noise, system.masses, directions)
-            kept += (1 - self.keep) * drift_velocity(v, system.masses, directions)
-        return system.motion.project_velocities(x, kept + noise, time=state.time)
-
-    def _found(self, system: System, state: State) -> tuple[System, ReversedSteps, FloatArray]:
-        """Steps of the system that are taken back, and directions in which no row knows a place in space."""
-        known = self._known
-        if known is None or known[0] is not system:
-            directions = np.zeros((0, 3))
-            if self.conserve_momentum:
-                directions = open_directions(system.motion, state.positions, state.time)
-            known = self._known = system, ReversedSteps(system, self.stepper, self.tolerance), directions
-        return known
+        return system.motion.project_velocities(x, self.keep * v + noise, time=state.time)
 
 
 def energy_at(system: System, state: State) -> float:
@@ -533,7 +515,7 @@ def exchange(
     Raises
     ------
     InputError
-        A state without a potential energy; states of Systems of other masses or constraints.
+        A state without a potential energy; states of other numbers of atoms.
     """
     if not all(isinstance(given, Sequence | np.ndarray) for given in (states, thermal_energies)):
         raise InputError("give a sequence of states, and of as many temperatures", item="states")
@@ -556,7 +538,6 @@ def exchange(
             )
         if state.positions.shape != states[0].positions.shape:
             raise InputError(f"state {k} has another number of atoms than state 0", item="states")
-        _refuse_others(states[0], state, k)
     chances = np.log1p(-noise_generator((seed_from(rng), 0), number, EXCHANGE).random(len(states)))
     after = list(states)
     told: list[bool | None] = [None] * (len(states) - 1)
@@ -572,21 +553,6 @@ def exchange(
 def potential_of(state: State) -> float:
     """The potential energy that a state of `HamiltonianMonteCarlo` knows; NaN if it does not."""
     return math.nan if state.thermostat is None else float(state.thermostat[POTENTIAL])
-
-
-def _refuse_others(first: State, other: State, k: int) -> None:
-    """Refuse states of which one is not on the constraints of the other."""
-    systems = [s.origin[0]() if s.origin is not None and s.origin[0] is not None else None for s in (first, other)]
-    if systems[0] is None or systems[1] is None:
-        return
-    if not np.array_equal(systems[0].masses, systems[1].masses):
-        raise InputError(f"state {k} has other masses than state 0", item="states")
-    for system, state in zip(systems, (other, first), strict=True):
-        assert system is not None
-        try:
-            system.initial_state(state.positions, time=state.time)
-        except InputError as error:
-            raise InputError(f"state {k} is of other constraints than state 0: {error}", item="states") from None
 
 
 def _moved(there: State, here: State, scale: float) -> State:

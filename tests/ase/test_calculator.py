@@ -26,9 +26,9 @@ class Counting(EMT):
         super().calculate(*args, **kwargs)
 
 
-def ethanol(inner=None, **options) -> tuple[Atoms, ConstrainedCalculator]:
+def ethanol(inner=None) -> tuple[Atoms, ConstrainedCalculator]:
     atoms = molecule("CH3CH2OH")
-    calculator = ConstrainedCalculator(Counting() if inner is None else inner, ROWS, **options)
+    calculator = ConstrainedCalculator(Counting() if inner is None else inner, ROWS)
     atoms.calc = calculator
     return atoms, calculator
 
@@ -44,20 +44,6 @@ def test_on_the_constraints_forces_are_f_plus_z():
     assert np.abs(atoms.get_forces() - peer.get_forces()).max() <= 1e-14
     rows = held.engine(peer).constraint_set.jacobian(peer.positions)
     assert np.abs(rows @ (atoms.get_forces() / atoms.get_masses()[:, None]).ravel()).max() <= 1e-13
-
-
-def test_with_the_constraint_object_as_well():
-    atoms, calculator = ethanol()
-    forces = atoms.get_forces()
-    atoms.set_constraint(calculator.constraints.copy())
-    assert np.abs(atoms.get_forces() - forces).max() <= 1e-14
-
-
-def test_momenta_do_not_matter():
-    atoms, _ = ethanol()
-    forces = atoms.get_forces()
-    atoms.set_momenta(np.random.default_rng(0).normal(size=(9, 3)))
-    assert np.array_equal(atoms.get_forces(), forces)
 
 
 def test_caching():
@@ -80,11 +66,11 @@ def test_caching():
 def test_new_masses_and_settings_are_noticed():
     """Masses share out what the constraints take; ASE compares only what a calculator of free atoms reads."""
 
-    def fresh(inner, masses, project):
+    def fresh(inner, masses):
         peer = molecule("CH3CH2OH")
         peer.rattle(0.05, seed=1)
         peer.set_masses(masses)
-        peer.calc = ConstrainedCalculator(inner, held, project=project)
+        peer.calc = ConstrainedCalculator(inner, held)
         return peer.get_forces()
 
     held = Constraints(ROWS)
@@ -98,12 +84,11 @@ def test_new_masses_and_settings_are_noticed():
         (lambda: atoms.set_masses(masses), LennardJones(sigma=1.0, rc=5.0)),
         (lambda: (calculator.inner.set(sigma=1.1), calculator.inner.reset()), LennardJones(sigma=1.1, rc=5.0)),
         (lambda: setattr(calculator, "inner", LennardJones(sigma=1.2, rc=5.0)), LennardJones(sigma=1.2, rc=5.0)),
-        (lambda: setattr(calculator, "project", False), LennardJones(sigma=1.2, rc=5.0)),
     ):
         change()
         assert not np.array_equal(atoms.get_forces(), seen[-1])
         seen.append(atoms.get_forces())
-        assert np.array_equal(seen[-1], fresh(inner, masses, calculator.project))
+        assert np.array_equal(seen[-1], fresh(inner, masses))
 
 
 def test_off_the_constraints_energy_and_forces_belong_to_one_function():
@@ -121,17 +106,6 @@ def test_off_the_constraints_energy_and_forces_belong_to_one_function():
         # Exact on the constraints; of first order in the distance off them.
         slope = (energies[0] - energies[1]) / 2e-5
         assert -float(np.vdot(forces, direction)) == pytest.approx(slope, abs=1e-6 + 100 * distance)
-
-
-def test_stays_where_the_positions_are_if_asked():
-    atoms, calculator = ethanol(project=False)
-    atoms.get_forces()
-    atoms.rattle(0.02, rng=np.random.default_rng(0))
-    plain = atoms.copy()
-    plain.calc = EMT()
-    assert atoms.get_potential_energy() == plain.get_potential_energy()
-    expected = calculator.constraints.engine(atoms).project_forces(atoms.positions, plain.get_forces())
-    assert np.array_equal(atoms.get_forces(), expected)
 
 
 @pytest.mark.parametrize("optimizer", [BFGS, FIRE])

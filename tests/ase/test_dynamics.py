@@ -82,13 +82,6 @@ def test_rows_that_ase_has_no_place_for():
         ConstrainedDynamics(atoms, FS, constraints=[row], time=0.0)
 
 
-def test_its_state_cannot_be_changed():
-    state = ConstrainedDynamics(rigid()[0], FS).state
-    for array in (state.positions, state.velocities):
-        with pytest.raises(ValueError, match="read-only"):
-            array[:] = 0.0
-
-
 @pytest.mark.parametrize("beside_ours", [False, True])
 def test_ase_constraints_are_absorbed(beside_ours):
     atoms = molecule("CH3CH2OH")
@@ -112,20 +105,6 @@ def boxed() -> tuple[Atoms, Constraints]:
     atoms.set_cell([6.0, 6.5, 7.0])
     atoms.pbc = True
     return atoms, held
-
-
-@pytest.mark.parametrize("rates", [0.5, [0.2, 0.5, 0.9]], ids=["one rate", "a rate for each"])
-def test_friction_brings_to_rest_on_the_constraints(rates):
-    """And a run at rest can be saved and continued."""
-    atoms, _ = water(Field(stiffness=2.0))
-    dynamics = ConstrainedDynamics(atoms, 0.25, friction=np.asarray(rates))
-    dynamics.run(2000)
-    assert np.abs(atoms.get_velocities()).max() <= 1e-13
-    left = dynamics.motion.project_forces(atoms.positions, atoms.get_forces(apply_constraint=False))
-    assert np.abs(left).max() <= 1e-11
-    again = atoms.copy()
-    again.calc = Field(stiffness=2.0)
-    ConstrainedDynamics(again, 0.25, friction=np.asarray(rates), state=dynamics.state).run(2)
 
 
 def test_periodic_box_that_changes():
@@ -405,14 +384,11 @@ def test_times_in_errors_are_in_fs():
             dynamics.run(1)
 
 
-def test_bad_time_and_forces():
+def test_bad_time():
     atoms, _ = water()
     for time in (np.nan, "0", None):
         with pytest.raises(InputError, match=f"time is {time!r}; give a finite number"):
             ConstrainedDynamics(atoms, FS, time=time)
-    for forces in (np.zeros((2, 3)), np.full((3, 3), np.nan)):
-        with pytest.raises(InputError, match="forces"):
-            ConstrainedDynamics(atoms, FS, forces=forces)
 
 
 def test_the_step_and_the_temperature_are_named():

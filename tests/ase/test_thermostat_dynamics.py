@@ -31,7 +31,7 @@ from kcons.constraints import Distance, FixedAtoms, Plane
 from kcons.errors import InputError, KconsError, NonFiniteError, OverdeterminedError, UnsupportedError
 from kcons.motion import Motion
 from kcons.steppers import BlanesMoan4, State, System, run
-from kcons.thermostats import ForceGroups, HamiltonianMonteCarlo, IsokineticSpheres, Langevin, LangevinRespa
+from kcons.thermostats import ForceGroups, HamiltonianMonteCarlo, IsokineticSpheres, LangevinRespa
 
 FS = units.fs
 KT = 300 * units.kB
@@ -225,27 +225,14 @@ def test_the_chain_has_the_constants_of_ase():
     assert moving.thermostat_degrees_of_freedom == 18
 
 
-@pytest.mark.parametrize("kind", ["langevin", "monte carlo", "two steps"])
-def test_total_momentum_left_alone_takes_degrees_of_freedom(kind):
-    option = "conserve_momentum" if kind == "two steps" else "fixcm"
-    atoms = waters(calc=Pairs(twist=0.0), zero_momentum=True)
-    assert made(kind, atoms.copy() if kind == "two steps" else atoms).thermostat_degrees_of_freedom == 18
-    moving = made(kind, atoms, **{option: True})
-    assert moving.thermostat_degrees_of_freedom == 15
-    if kind != "two steps":
-        moving.run(100)
-        assert np.abs(atoms.get_momenta().sum(axis=0)).max() <= 1e-10
-    assert moving.get_temperature() == pytest.approx(2 * moving.get_kinetic_energy() / (15 * units.kB))
-
-
 def test_targets_that_move():
     first, rate = waters(2).get_distance(0, 3), 0.003 / FS
     pulled = {"constraints": Distance([[0, 3]], lambda t: first + rate * t)}
-    for kind in ("isokinetic", "langevin"):
-        atoms = waters(2)
-        made(kind, atoms, **pulled).run(50)
-        assert atoms.get_distance(0, 3) == pytest.approx(first + rate * 50 * FS, abs=1e-12)
-    for kind, why in (("nose-hoover", "targets move"), ("monte carlo", "move with time"), ("spheres", "that moves")):
+    atoms = waters(2)
+    made("langevin", atoms, **pulled).run(50)
+    assert atoms.get_distance(0, 3) == pytest.approx(first + rate * 50 * FS, abs=1e-12)
+    refused = {"monte carlo": "move with time", "spheres": "that moves"}
+    for kind, why in (*dict.fromkeys(("nose-hoover", "isokinetic"), "targets move").items(), *refused.items()):
         atoms = waters(2)
         before, calculator = state(atoms), atoms.calc
         with pytest.raises(UnsupportedError, match=why):
@@ -321,30 +308,6 @@ def test_isokinetic_goes_on_from_a_trajectory(tmp_path):
     for each in (again, atoms):
         made("isokinetic", each).run(10)
     assert equal(state(atoms), state(again))
-
-
-def test_isokinetic_goes_on_at_another_temperature(tmp_path):
-    moving, again = made("isokinetic", waters()), waters(momenta=False)
-    moving.run(3)
-    moving.save(tmp_path / "restart.npz")
-    hotter = made("isokinetic", again, temperature_K=600, restart=tmp_path / "restart.npz")
-    for _ in range(2):
-        assert again.get_kinetic_energy() == pytest.approx(2 * moving.atoms.get_kinetic_energy(), rel=1e-12)
-        hotter.run(3)
-    assert hotter.get_temperature() == pytest.approx(600) and hotter.nsteps == 9
-
-
-def test_a_restart_keeps_asked_constraints_of_the_dynamics(tmp_path):
-    atoms, more = waters(2), {"constraints": [Distance([[0, 3]])]}
-    moving = made("langevin", atoms, **more)
-    length = atoms.get_distance(0, 3)
-    moving.run(5)
-    moving.save(tmp_path / "a.npz")
-    moving.run(5)
-    again = waters(2, momenta=False)
-    made("langevin", again, restart=tmp_path / "a.npz", **more).run(5)
-    assert equal(state(atoms), state(again))
-    assert again.get_distance(0, 3) == pytest.approx(length, abs=1e-12)
 
 
 def test_files_that_hold_no_restart(tmp_path):
@@ -463,23 +426,14 @@ def test_another_calculator_on_the_atoms():
 BAD = [
     ("isokinetic", {"temperature_K": "hot"}, "temperature_K is .*give a positive number"),
     ("nose-hoover", {"tdamp": 0}, "tdamp is 0"),
-    ("nose-hoover", {"tchain": 0}, "length is 0"),
-    ("langevin", {"temperature_K": math.nan}, "temperature_K is .*give a positive number"),
     ("langevin", {"step": math.nan}, "the time step is"),
     ("langevin", {"step": -FS}, "noise cannot be taken back"),
     ("monte carlo", {"keep": 1.5}, "keep is 1.5"),
-    ("monte carlo", {"step": -FS}, "noise cannot be taken back"),
-    ("monte carlo", {"stepper": Langevin(0.1, 0.1, 1)}, "not reversible and symplectic"),
-    ("monte carlo", {"constraints": [], "friction": 0.1}, "friction"),
-    ("two steps", {"fast_steps": 0}, "group 'fast' takes 0 steps"),
     ("two steps", {"fast_steps": 1}, "both take 1 steps"),
-    ("two steps", {"temperature_K": 0}, "temperature_K is 0"),
     ("two steps", {"bath": "hot"}, "bath is 'hot'"),
     ("two steps", {"slow": 3}, "slow is 3; give an ASE calculator"),
     ("two steps", {"auxiliary": 2}, "auxiliary is no option with bath='langevin'"),
-    ("spheres", {"friction": 0.0}, "friction is 0.0; give a positive number"),
     ("spheres", {"spheres": "axes", "auxiliary": 0}, "radius 0"),
-    ("spheres", {"conserve_momentum": True}, "conserve_momentum is no option with bath='spheres'"),
 ]
 
 
@@ -531,18 +485,6 @@ def test_total_momentum_is_said(kind):
         moving.run(1)
     draw_velocities(atoms, 300, 1, zero_momentum=True)
     moving.run(3)
-
-
-@pytest.mark.parametrize("kind", ["isokinetic", "nose-hoover"])
-def test_bodies_that_feel_no_other_are_said_in_long_runs(kind, monkeypatch):
-    """Waters in a field that is the same for each."""
-    for module in ("isokinetic.isokinetic", "nose_hoover"):
-        monkeypatch.setattr(f"kcons.thermostats.{module}.LOOK_AT", 3)
-    moving = made(kind, waters(), momentum="free")
-    moving.run(3)
-    with pytest.warns(UserWarning, match="feels another"):
-        moving.run(1)
-    moving.run(2)
 
 
 @pytest.mark.parametrize("kind", ["isokinetic", "langevin", "nose-hoover", "two steps", "spheres"])
@@ -739,11 +681,7 @@ def test_drawn_velocities():
     assert np.array_equal(a, atoms.get_momenta())
     rows = atoms.constraints[0].engine(atoms).constraint_set.jacobian(atoms.positions)
     assert np.abs(rows @ atoms.get_velocities().ravel()).max() <= 1e-15
-    draw_velocities(atoms, 300, 2, exact=True)
-    assert 2 * atoms.get_kinetic_energy() == pytest.approx(18 * KT, rel=1e-13)
-    assert atoms.get_temperature() == pytest.approx(300, rel=1e-12)
-    draw_velocities(atoms, 300, 2, exact=True, zero_momentum=True)
-    assert 2 * atoms.get_kinetic_energy() == pytest.approx(15 * KT, rel=1e-13)
+    draw_velocities(atoms, 300, 2, zero_momentum=True)
     assert np.abs(atoms.get_momenta().sum(axis=0)).max() <= 1e-13
 
 

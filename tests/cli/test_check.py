@@ -14,7 +14,7 @@ from kcons.cli.main import main
 from kcons.mdanalysis.check import report
 
 N = 20
-OPTIONS = ["--constrain", "none", "--no-rank"]
+OPTIONS = ["--constrain", "none"]
 IMPORTED = ("kcons.cli.main", "kcons.mdanalysis.check.report", "matplotlib.backends.backend_agg", "rich.table")
 PLAIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
 
@@ -58,9 +58,9 @@ def test_kept(folder, capsys):
 
 
 def test_violated(folder, capsys):
-    assert command(folder, "bad.xtc", "--worst", "2", "--no-rank") == 1
+    assert command(folder, "bad.xtc") == 1
     page = capsys.readouterr().out
-    assert "violated by" in page and "SOL3" in page and "0.001 nm" in page and "rank" not in page
+    assert "violated by" in page and "SOL3" in page and "0.001 nm" in page
 
 
 def test_a_file_that_ends_too_early(folder, capsys):
@@ -149,7 +149,7 @@ def test_the_check_of_another_trajectory_is_not_overwritten(folder, tmp_path, mo
         path.write_bytes((folder / source).read_bytes())
         places.append(name)
     for _ in range(2):
-        status = [main(["check", name, "--topology", top, "--constrain", "none", "--no-rank"]) for name in places]
+        status = [main(["check", name, "--topology", top, "--constrain", "none"]) for name in places]
         assert status == [0, 1, 0]
     found = {path.parent.name: json.loads(path.read_text()) for path in tmp_path.glob("check*/check.json")}
     assert {name: (data["trajectory"], data["status"]) for name, data in found.items()} == {
@@ -179,7 +179,7 @@ def test_the_usual_folder_is_no_link(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "check-good").symlink_to(tmp_path / "elsewhere")
-    arguments = [str(folder / "good.xtc"), "--topology", str(folder / "t.gro"), "--constrain", "none", "--no-rank"]
+    arguments = [str(folder / "good.xtc"), "--topology", str(folder / "t.gro"), "--constrain", "none"]
     assert main(["check", *arguments]) == 0
     assert not list((tmp_path / "elsewhere").iterdir())
     assert (tmp_path / "check-good-2" / "check.json").is_file()
@@ -242,18 +242,12 @@ def test_a_full_device_is_said_and_the_files_are_there(folder):
         ("good.xtc", ["--select", "resname ABC"], "ABC"),
         ("good.xtc", ["--frames", "9:"], "no frames"),
         ("good.xtc", ["--tolerance", "-1"], "tolerance"),
-        ("good.xtc", ["--worst", "-1"], "worst"),
     ],
 )
 def test_errors_take_one_line(folder, capsys, name, more, words):
     assert command(folder, name, *more) == 2
     said = capsys.readouterr()
     assert said.err.startswith("kcons: ") and said.err.count("\n") == 1 and words in said.err
-
-
-def test_no_rows_may_be_named(folder, capsys):
-    assert command(folder, "good.xtc", "--worst", "0") == 0 and command(folder, "bad.xtc", "--worst", "0") == 1
-    assert "SOL3" in capsys.readouterr().out  # in the verdict
 
 
 def test_advice_is_of_the_command(folder, tmp_path, capsys):
@@ -288,7 +282,7 @@ def test_hydrogens_without_a_bond_are_a_gap(tmp_path, capsys):
     write(tmp_path / "cut.xyz", [water, water])
     for name, status in (("cut", 3), ("whole", 0)):
         path = str(tmp_path / f"{name}.xyz")
-        assert main(["check", path, "--topology", path, "--no-rank", "--out", str(tmp_path / name)]) == status
+        assert main(["check", path, "--topology", path, "--out", str(tmp_path / name)]) == status
         page = " ".join(capsys.readouterr().out.split())
         told = "incomplete: no bond was found for 4 hydrogens, the first of which is H (atom 8)" in page
         assert told == (name == "cut")

@@ -47,14 +47,6 @@ def test_the_folder_is_named_after_the_system_and_lines_of_python_run(tmp_path, 
     assert made["end"].positions.shape[1] == 3
 
 
-def test_the_seed_changes_the_trajectory(tmp_path):
-    errors = []
-    for seed in (1, 2):
-        assert run(*CHAIN, "--methods", "rattle", "--seed", seed, "--out", tmp_path / str(seed)) == 0
-        errors.append(read_csv(tmp_path / str(seed) / "compare.csv").error[0])
-    assert errors[0] != errors[1]
-
-
 def test_a_target_error_is_reached(tmp_path, capsys):
     words = ("--methods", "rattle,blanes-moan4", "--target-error", "1e-6", "--out", tmp_path)
     assert run("compare", "chain", "--size", 4, "--budget", 5, *words) == 0
@@ -82,7 +74,7 @@ def test_it_goes_on_from_the_rows_that_are_there(tmp_path, monkeypatch, capsys):
     assert asked == ["rattle", "suzuki4", "suzuki4"]
     assert set(read_csv(tmp_path / "compare.csv").method) == {"rattle", "suzuki4"}
     capsys.readouterr()
-    assert run(*words, "--resume", "--seed", 2) == 2
+    assert run(*words, "--resume", "--budget", 2) == 2
     assert "give another --out" in capsys.readouterr().err
     assert run(*words, "--out", tmp_path / "new", "--resume") == 2
     assert "leave --resume out" in capsys.readouterr().err

@@ -66,10 +66,9 @@ MISTAKES = [
     ("compare chain --size 0", "size is 0; give a whole number, 1 or more"),
     ("compare chain --size 3 --dt 3", "does not divide the horizon"),
     ("compare chain --size 3 --dt ,", "--dt is empty"),
-    ("compare chain --seed -1", "non-negative"),
     ("compare chain --size 3 --budget -1", "budget is -1.0; give a positive number"),
     ("compare chain --size 3 --out /dev/null/x", "/dev/null"),
-    ("compare chain --criterion drift --target-error 1e-3", "leave --criterion drift out"),
+    ("compare chain --criterion temperature --target-error 1e-3", "leave --criterion temperature out"),
     (f"plan {ALANINE} --constrain none", "none with kcons compare --forces"),
 ]
 OF_MOLECULES = [

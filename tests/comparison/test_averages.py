@@ -266,7 +266,7 @@ def test_the_command_writes_the_same_files_and_goes_on(tmp_path, monkeypatch, ca
     assert main.main([*words, "--resume"]) == 130
     assert ran == [None, ["langevin", "langevin"]]
     assert list(read_csv(folder / "compare.csv").method) == ["langevin", "langevin", "isokinetic"]
-    assert main.main([*words, "--resume", "--seed", "2"]) == 2
+    assert main.main([*words, "--resume", "--budget", "2"]) == 2
 
 
 def test_expensive_and_cheap_forces_of_a_file(tmp_path, monkeypatch, capsys):
@@ -290,8 +290,7 @@ def test_expensive_and_cheap_forces_of_a_file(tmp_path, monkeypatch, capsys):
         ("compare chain --slow gfn2 --fast lj", "--slow and --fast are for files, not for 'chain'"),
         ("compare run.pdb --slow gfn2 --fast lj --methods rattle", "there is no thermostat 'rattle'"),
         ("compare run.pdb --slow gfn2 --fast gfn2", "are both gfn2: give cheaper forces to --fast"),
-        ("compare run.pdb --slow gfn2 --fast lj --seed -1", "give a non-negative number"),
-        ("compare run.pdb --slow gfn2 --fast lj --criterion drift", "--criterion does not go with --slow and --fast"),
+        ("compare run.pdb --slow gfn2 --fast lj --criterion error", "--criterion does not go with --slow and --fast"),
         ("compare run.pdb --slow gfn2 --fast lj --add-hydrogens", "--add-hydrogens does not go with"),
         ("compare run.pdb --slow gfn2 --fast lj --size 3", "--size does not go with"),
         ("compare run.pdb --slow gfn2 --fast lj --forces emt", "--forces does not go with"),

@@ -232,7 +232,6 @@ def test_plans_of_files(ethanol, gro, tmp_path, capsys):
     cut = with_text(tmp_path / "cut.xyz", "3\n\nO 0 0 0\nH 0.96 0 0\nH 11.76 0.93 0\n")
     for words, said in (
         ([cut], "no bond was guessed for 1 hydrogens"),
-        ([gro, "--rigid-residues", "ALA", "--constrain", "none"], "rank 24"),  # ten atoms
         ([gro, "--select", "resname ALA", "--constrain", "allbonds"], "9 rows on 10 atoms"),
         ([ALANINE, "--select", "all"], "hbonds: 12 Distance"),
     ):
@@ -244,7 +243,6 @@ def test_plans_of_files(ethanol, gro, tmp_path, capsys):
     ("words", "said"),
     [
         ("alanine.gro --select=resname:ALAX", "alanine.gro.*no resname ALAX \\(did you mean ALA\\?\\)"),
-        ("alanine.gro --rigid-residues ALAX", "alanine.gro.*no residue is called ALAX \\(did you mean ALA\\?\\)"),
         ("alanine.gro --coordinates nowhere.xtc", "there is no file nowhere.xtc"),
         ("alanine.gro --coordinates ethanol.xyz", "ethanol.xyz has 9 atoms.*alanine.gro has 22"),
         ("alanine.gro --forces emt", "a plan needs no forces; leave --forces out"),
@@ -280,9 +278,6 @@ def test_system_with_a_force_field_is_the_one_of_openmm(gro):
     assert {tuple(sorted(p)) for p in system.bonds.tolist()} == {tuple(sorted(p)) for p in by_openmm.bonds.tolist()}
     x = by_openmm.positions
     assert system.potential.energy(x) == pytest.approx(by_openmm.potential.energy(x), abs=1e-9)
-    rigid = quietly(from_file, gro, rigid_residues=["ALA"])
-    assert rigid.openmm.home and rigid.openmm.system.getNumConstraints() == rigid.motion.constraint_set.n_rows
-    assert rigid.motion.rank == 3 * 10 - 6 + 7  # the residue, and the hydrogens of both caps
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,6 @@ from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6,
     BlanesMoan6a,
-    Extrapolation,
     Geodesic,
     KahanLi6,
     ReversibilityCheck,
@@ -60,7 +59,7 @@ from kcons.steppers import (
     Suzuki4,
     Yoshida4,
 )
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, configurational_sample, thermal_velocities
+from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, TemperatureSplit, thermal_velocities
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPPERS = [
@@ -248,10 +247,9 @@ SYSTEMS: dict[str, tuple[Callable[[], Built], list]] = {
     "groups": (grouped, FEW),
     "moving targets": (driven, STEPPERS),
     "friction": (lambda: molecules(*["water"] * 3, friction=0.3), STEPPERS),
-    "friction of each atom": (lambda: molecules(*GROUPS, friction=np.linspace(0.1, 0.5, 17)), FEW),
     "friction and an angle": (lambda: angled(friction=0.2), FEW),
     "friction on spheres": (lambda: on_spheres(friction=0.2), FEW),
-    "friction and moving targets": (lambda: driven(friction=np.linspace(0.1, 0.5, 5)), FEW),
+    "friction and moving targets": (lambda: driven(friction=0.3), FEW),
     "velocity-dependent": (lambda: molecules(*GROUPS, force=dragged, velocity_dependent=True), ONLY_COMPOSED),
     "velocity-dependent, an angle": (
         lambda: angled(force=dragged, velocity_dependent=True, friction=0.1),
@@ -287,14 +285,11 @@ def plain_steppers() -> Iterator[tuple[str, list[State]]]:
         for stepper in steppers:
             label = "drift, kick, drift" if type(stepper) is Splitting else repr(stepper)
             system, state = make()
-            if system.friction is not None and stepper.order > 4:
+            if system.friction and stepper.order > 4:
                 continue
             yield f"{name}: {label}", trail(system, state, stepper)
     checked = ReversibilityCheck(Rattle(), 1e-6)
     yield f"small clusters: {checked!r}", trail(*molecules(*GROUPS), checked)
-    for name, make in (("small clusters", lambda: molecules(*GROUPS)), ("moving targets", driven)):
-        system, state = make()
-        yield f"{name}: Extrapolation", list(Extrapolation(1e-9).states(system, state, state.time + 0.5))
 
 
 def balanced(x, t):
@@ -328,14 +323,13 @@ def thermostats() -> Iterator[tuple[str, list[State]]]:
         chosen = [
             Langevin(0.2, 0.5, 3),
             Langevin(0.2, 0.5, 3, substeps=1),
-            *(Isokinetic(0.2, order=order) for order in (2, 4, 6)),
-            Isokinetic(kinetic_energy=3.0),
-            Isokinetic(0.2, convention="notes", momentum="free"),
         ]
         if name != "moving targets":
+            chosen += [Isokinetic(0.2, order=order) for order in (2, 4, 6)]
+            chosen += [Isokinetic(), Isokinetic(0.2, convention="notes", momentum="free")]
             chosen += [NoseHooverChain(0.2, 2.0), NoseHooverChain(0.2, 2.0, length=2, stepper=Geodesic(3))]
         if name in ("free cluster", "far away"):
-            chosen += [Langevin(0.2, 0.5, 3, conserve_momentum=True), Isokinetic(0.2, momentum="conserved")]
+            chosen.append(Isokinetic(0.2, momentum="conserved"))
         if name in ("small clusters", "periodic"):
             chosen.append(Isokinetic(0.2, atoms=range(7)))
         for k, stepper in enumerate(chosen):
@@ -345,8 +339,9 @@ def thermostats() -> Iterator[tuple[str, list[State]]]:
         # What a strong force does to a kick that is opposed to it.
         slow = State(state.positions, 1e-3 * state.velocities, state.time)
         yield f"{name}: slow Isokinetic", trail(system, slow, Isokinetic(), 0.5)
-        sample = configurational_sample(system, state, np.random.default_rng(1), directions=3)
-        yield f"{name}: configurational sample", [State(np.array(sample), np.zeros(0))]
+        split = TemperatureSplit(system, rng=1)
+        split.add(state.positions)
+        yield f"{name}: configurational sample", [State(split._series[0], np.zeros(0))]
 
 
 def changing_cell() -> Iterator[tuple[str, list[State]]]:
@@ -433,7 +428,7 @@ def through_openmm() -> Iterator[tuple[str, list[State]]]:
 
     from kcons.openmm import Isokinetic as OfOpenMM
     from kcons.openmm import Langevin as Noise
-    from kcons.openmm import ProjectedIntegrator, RattleIntegrator, SurfaceIntegrator, hold
+    from kcons.openmm import ProjectedIntegrator, SurfaceIntegrator, hold
 
     x = np.random.default_rng(3).normal(size=(10, 3)) * 0.3
     x[6:8] *= 0.5 / np.linalg.norm(x[6:8], axis=1)[:, None]
@@ -453,23 +448,22 @@ def through_openmm() -> Iterator[tuple[str, list[State]]]:
         part = hold(system, [Angle([[3, 4, 5]]), Dihedral([[4, 5, 8, 9]])], x)
         return ProjectedIntegrator(0.001, scheme, parts=[part], ensemble=ensemble)
 
-    def around(scheme, **more):
-        return SurfaceIntegrator(0.001, scheme, surfaces=Sphere([6, 7], np.zeros(3), 0.5), n_particles=10, **more)
+    def around(system, scheme, **more):
+        return SurfaceIntegrator(0.001, scheme, surfaces=Sphere([6, 7], np.zeros(3), 0.5), system=system, **more)
 
-    schemes = ("rattle", "leapfrog", "geodesic", "yoshida4", "suzuki4", "kahan-li6")
+    schemes = ("rattle", "geodesic", "yoshida4", "suzuki4", "kahan-li6")
     schemes += ("blanes-moan4", "blanes-moan6", "blanes-moan6a", "isokinetic4", "isokinetic6")
     made = {f"ProjectedIntegrator {s}": lambda system, s=s: ProjectedIntegrator(0.001, s) for s in schemes}
-    made["RattleIntegrator"] = lambda system: RattleIntegrator(0.001)
     made["Langevin"] = lambda system: ProjectedIntegrator(0.001, ensemble=Noise(300.0, 2.0))
-    for s in ("rattle", "leapfrog", "isokinetic4"):
+    for s in ("rattle", "isokinetic4"):
         made[f"Isokinetic {s}"] = lambda system, s=s: ProjectedIntegrator(0.001, s, ensemble=OfOpenMM(300.0))
-    for s in ("rattle", "suzuki4", "leapfrog", "blanes-moan6a"):
+    for s in ("rattle", "suzuki4", "blanes-moan6a"):
         made[f"carried {s}"] = lambda system, s=s: carried(system, s)
-        made[f"spheres {s}"] = lambda system, s=s: around(s)
-    made["spheres geodesic"] = lambda system: around("geodesic")
+        made[f"spheres {s}"] = lambda system, s=s: around(system, s)
+    made["spheres geodesic"] = lambda system: around(system, "geodesic")
     made["carried Langevin"] = lambda system: carried(system, "rattle", Noise(300.0, 2.0))
     made["carried Isokinetic"] = lambda system: carried(system, "rattle", OfOpenMM(300.0))
-    made["spheres Isokinetic"] = lambda system: around("isokinetic4", ensemble=OfOpenMM(300.0))
+    made["spheres Isokinetic"] = lambda system: around(system, "isokinetic4", ensemble=OfOpenMM(300.0))
     for name, make in made.items():
         system = springy()
         integrator = make(system)

@@ -104,8 +104,8 @@ def test_one_degree_of_freedom():
     one = [Plane([0], [0, 0, 1.0]), Sphere([0], [0, 0, 0], 1.0)]
     state = State(x, np.array([[0.0, 0.7, 0.0]]))
     ring = system(one, x, [1.0], waves)
-    after = run(ring, state, 0.01, 100, stepper=Isokinetic(kinetic_energy=0.1))
-    assert ring.kinetic_energy(after.velocities) == pytest.approx(0.1, rel=1e-14)
+    after = run(ring, state, 0.01, 100, stepper=Isokinetic())
+    assert ring.kinetic_energy(after.velocities) == pytest.approx(ring.kinetic_energy(state.velocities), rel=1e-14)
     two = system(one[1:], x, [1.0], waves)
     assert 2 * two.kinetic_energy(Isokinetic(0.4).start(two, state).velocities) == pytest.approx(0.4, rel=1e-14)
 
@@ -136,17 +136,6 @@ def test_forces_whose_squares_overflow():
     light = system([], x, [1e-200, 1.0], lambda x, t: np.full_like(x, 1e200))
     with pytest.raises(NonFiniteError, match="non-finite position at step 1"):
         Isokinetic(momentum="free").step(light, State(x, v), 0.01)
-
-
-def test_targets_that_are_too_fast():
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0]])
-    fast = system([Distance([[0, 1]], lambda t: 1 + 50.0 * t)], x, [1.0, 1.0, 1.0], waves)
-    state = fast.initial_state(x, thermal_velocities(fast, x, 0.5, 0))
-    with pytest.raises(InputError, match="moving targets alone have more kinetic energy"):
-        Isokinetic(0.5).step(fast, state, 0.01)
-    later = system([Distance([[0, 1]], lambda t: 1 + 20.0 * t**2)], x, [1.0, 1.0, 1.0], waves)
-    with pytest.raises(InputError, match="than the thermostat allows at step"):
-        run(later, later.initial_state(x, thermal_velocities(later, x, 0.5, 0)), 0.01, 100, stepper=Isokinetic(0.5))
 
 
 def test_a_row_between_inside_and_outside_is_refused():

@@ -67,19 +67,6 @@ def test_order_with_all_bonds_held(scheme, truth):
         assert slope == pytest.approx(order, abs=0.15), name
 
 
-def test_leapfrog_has_order_2_in_positions(truth):
-    system, x, v = alanine()
-    errors = []
-    for dt in (1e-3, 0.5e-3, 0.25e-3):
-        integrator = ProjectedIntegrator(dt, "leapfrog", tolerance=1e-13)
-        context = started(system, integrator, x, v)
-        context.setVelocities(v - 0.5 * dt * forces_at(context) / masses_of(system)[:, None])
-        integrator.step(round(TIME / dt))
-        errors.append(np.abs(state_of(context)[0] - truth[0]).max())
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.15)
-    assert np.log2(errors[1] / errors[2]) == pytest.approx(2, abs=0.15)
-
-
 def test_far_fewer_force_evaluations_than_rattle(truth):
     """At 5e-7 nm after 48 fs, from the error of RATTLE, which falls as the square of its step."""
     rattle = np.abs(flown("rattle", 1e-3 / 16)[0] - truth[0]).max()
@@ -94,7 +81,7 @@ def test_far_fewer_force_evaluations_than_rattle(truth):
 
 @pytest.mark.parametrize(  # on the CPU, programs are run by the code of Reference
     ("scheme", "platform"),
-    [*((scheme, "Reference") for scheme in (*SCHEMES, "leapfrog")), ("rattle", "CPU"), ("leapfrog", "CPU")],
+    [*((scheme, "Reference") for scheme in SCHEMES), ("rattle", "CPU")],
 )
 def test_constraints_to_the_last_digits(scheme, platform):
     system, x, v = alanine()
@@ -104,7 +91,7 @@ def test_constraints_to_the_last_digits(scheme, platform):
         integrator.step(3)
         distance, along = residuals(system, context)
         assert distance <= 1e-12
-        assert along <= 1e-12 or scheme == "leapfrog"
+        assert along <= 1e-12
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
@@ -235,7 +222,7 @@ def test_one_force_evaluation_a_step():
         calls.append(1)
         return 50.0 * float(np.sum(x**2)), -100.0 * np.asarray(x)
 
-    for scheme in (*SCHEMES, "leapfrog"):
+    for scheme in SCHEMES:
         system, x, v = dumbbell()
         system.removeForce(0)
         system.addForce(openmm.PythonForce(bond))
@@ -244,8 +231,7 @@ def test_one_force_evaluation_a_step():
         integrator.step(2)
         calls.clear()
         integrator.step(10)
-        expected = 1 if scheme == "leapfrog" else SCHEMES[scheme]().force_evaluations
-        assert len(calls) == 10 * expected, scheme
+        assert len(calls) == 10 * SCHEMES[scheme]().force_evaluations, scheme
         del context
 
 

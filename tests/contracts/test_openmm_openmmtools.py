@@ -22,7 +22,6 @@ from kcons.openmm import (
     LangevinRespa,
     NoseHoover,
     ProjectedIntegrator,
-    RattleIntegrator,
 )
 
 with warnings.catch_warnings():
@@ -41,10 +40,7 @@ BATHS = {
     "LangevinRespa": lambda kelvin: LangevinRespa(kelvin, 5.0, {0: 1, 1: 2}),
     **ENSEMBLES,
 }
-MAKERS = {
-    **{name: lambda kelvin, of=of: ProjectedIntegrator(0.001, ensemble=of(kelvin)) for name, of in BATHS.items()},
-    "RattleIntegrator": lambda kelvin: RattleIntegrator(0.001),
-}
+MAKERS = {name: lambda kelvin, of=of: ProjectedIntegrator(0.001, ensemble=of(kelvin)) for name, of in BATHS.items()}
 
 
 def trapped():
@@ -112,7 +108,6 @@ def test_integrators_that_differ_in_more_have_contexts_of_their_own():
         ProjectedIntegrator(0.001, ensemble=Langevin(300, 1.0)),
         ProjectedIntegrator(0.001, ensemble=NoseHoover(300, 1.0)),
         ProjectedIntegrator(0.001, ensemble=NoseHoover(300, 2.0)),
-        RattleIntegrator(0.001),
     ]
     assert len({same(integrator) for integrator in made}) == len(made)
 
@@ -132,7 +127,7 @@ def test_a_move_with_a_row_that_is_held():
     assert abs(np.linalg.norm(y[0] - y[3]) - np.linalg.norm(x[0] - x[3])) < 1e-9
 
 
-@pytest.mark.parametrize("name", ["Langevin", "RattleIntegrator"])
+@pytest.mark.parametrize("name", ["Langevin", "constant energy"])
 def test_replica_exchange(name, tmp_path):
     system, x = trapped()
     kelvins = (300, 320, 345)

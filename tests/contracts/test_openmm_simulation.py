@@ -10,10 +10,9 @@ import pytest
 from openmm import app
 from openmm_systems import DATA, GPUS, PLATFORMS, PROPERTIES, alanine, residuals, state_of
 
-from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 
 MADE = {
-    "RattleIntegrator": lambda: RattleIntegrator(1e-3),
     "rattle": lambda: ProjectedIntegrator(1e-3),
     "blanes-moan4": lambda: ProjectedIntegrator(1e-3, "blanes-moan4"),
     "Langevin": lambda: ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1.0)),
@@ -21,7 +20,7 @@ MADE = {
 }
 CASES = [
     *(pytest.param(name, "Reference", id=f"{name}-Reference") for name in MADE),
-    *(pytest.param(name, "CPU", id=f"{name}-CPU") for name in ("RattleIntegrator", "Langevin")),
+    *(pytest.param(name, "CPU", id=f"{name}-CPU") for name in ("rattle", "Langevin")),
     *(
         pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=p.marks)
         for p in GPUS
@@ -61,7 +60,7 @@ def test_everything_that_a_simulation_does(name, platform, tmp_path):
     np.testing.assert_array_equal(rows[:, 0], [5, 10, 15, 20, 25])
     np.testing.assert_allclose(rows[:, 1], 1e-3 * rows[:, 0], rtol=1e-6)
     assert ((rows[:, 3] > 50) & (rows[:, 3] < 700)).all()
-    if name in ("RattleIntegrator", "rattle", "blanes-moan4"):
+    if name in ("rattle", "blanes-moan4"):
         assert np.ptp(rows[:, 2]) < 1.0
     for file in ("a.dcd", "a.xtc", "a.pdb", "a.chk", "a.xml"):
         assert (tmp_path / file).stat().st_size > 0
@@ -123,7 +122,7 @@ def test_states_pass_between_platforms(tmp_path):
     first.context.setPositions(x)
     first.context.setVelocities(v)
     first.step(15)
-    second = simulation_of(MADE["RattleIntegrator"](), "CPU")
+    second = simulation_of(MADE["rattle"](), "CPU")
     second.context.setState(first.context.getState(positions=True, velocities=True))
     assert second.currentStep == 15
     energy = [second.context.getState(energy=True)]

@@ -24,12 +24,9 @@ from kcons.errors import InputError
 from kcons.openmm import (
     CarriedConstraints,
     CollectiveRows,
-    ExpressionSurface,
-    Isokinetic,
     Langevin,
     NoseHoover,
     ProjectedIntegrator,
-    RattleIntegrator,
     Row,
     constraints_of,
     hold,
@@ -126,11 +123,6 @@ def test_surfaces():
         part.check(context)
     with pytest.raises(InputError, match="Sphere: radius is 5 K; give it in nm"):
         Sphere([0], [0, 0, 0], 5 * kelvin)
-    formula = ExpressionSurface([0, 1], "x-a", {"a": [5, 7.5] * angstrom}, length=3 * angstrom)
-    np.testing.assert_allclose(formula.parameters["a"], [0.5, 0.75])
-    assert formula.length == pytest.approx(0.3)
-    with pytest.raises(InputError, match="length is 3 K"):
-        ExpressionSurface([0], "x", length=3 * kelvin)
 
 
 def test_collective_variables_of_composite_units():
@@ -153,17 +145,15 @@ def test_collective_variables_of_composite_units():
 def test_arguments_of_integrators_and_ensembles():
     for make, words in (
         (lambda: ProjectedIntegrator(1 * kelvin), "timestep is 1 K; give it in ps"),
-        (lambda: RattleIntegrator(1 * nm), "timestep is 1 nm; give it in ps"),
+        (lambda: ProjectedIntegrator(1 * nm), "timestep is 1 nm; give it in ps"),
         (lambda: Langevin(1 * nm, 1.0), "temperature is 1 nm; give it in K"),
         (lambda: Langevin(300, 1 * nm), "friction is 1 nm; give it in 1/ps"),
-        (lambda: Isokinetic(kinetic_energy=1 * nm), r"kinetic_energy is 1 nm; give it in kJ/mol"),
         (lambda: NoseHoover(300, 1 * nm), "frequency is 1 nm; give it in 1/ps"),
         (lambda: ProjectedIntegrator("soon"), "timestep is 'soon'; give a number of ps, or a Quantity"),
         (lambda: Langevin([300], 1.0), "temperature is"),
     ):
         with pytest.raises(InputError, match=words):
             make()
-    assert Isokinetic(kinetic_energy=1 * unit.kilocalorie_per_mole).kinetic_energy == pytest.approx(4.184)
 
 
 def test_arguments_of_methods():
@@ -186,7 +176,7 @@ def test_arguments_of_methods():
 def test_positions_of_the_wrong_kind():
     for call in (
         lambda: hold(atoms(), [Distance([[0, 1]])], positions=X * kelvin),
-        lambda: surface_parts(Sphere([0], [1, 0, 0]), n_particles=4, positions=X * kelvin),
+        lambda: surface_parts(Sphere([0], [1, 0, 0]), system=atoms(), positions=X * kelvin),
         lambda: constraints_of(openmm.app.Topology(), X[:0] * kelvin),
     ):
         with pytest.raises(InputError, match=r"positions .*give it in nm"):

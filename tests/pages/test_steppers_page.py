@@ -37,7 +37,7 @@ def test_table_says_what_the_stepper_says(name):
     assert (row["velocity-dependent forces"] == "no") == refuses
     if isinstance(stepper, steppers.Splitting):
         drifts = [abs(a * w) for a in stepper.drifts for w in stepper.flight]
-        assert int(row["drifts a step"]) == len(drifts)
-        assert float(row["longest drift"]) == pytest.approx(max(drifts), rel=0.05)
+        assert int(row["flights a step"]) == len(drifts)
+        assert float(row["longest flight"]) == pytest.approx(max(drifts), rel=0.05)
     else:
-        assert row["drifts a step"] == row["longest drift"] == ""
+        assert row["flights a step"] == row["longest flight"] == ""

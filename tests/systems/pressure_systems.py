@@ -10,7 +10,8 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State
-from kcons.thermostats import autocorrelation_time, thermal_velocities
+from kcons.thermostats import thermal_velocities
+from kcons.thermostats.correlated_series import spread
 from kcons.thermostats.pressure import Barostat, CellSystem
 
 Array = NDArray[np.float64]
@@ -68,6 +69,6 @@ def cells_of(system: CellSystem, state: State, barostat: Barostat, trials: int, 
 
 
 def p_value(values: Array, distribution: stats.rv_continuous) -> float:
-    """Of a Kolmogorov-Smirnov test on every so many of correlated values."""
-    apart = int(np.ceil(autocorrelation_time(values)))
+    """Of a Kolmogorov-Smirnov test on every so many of correlated values, which are then nearly independent."""
+    apart = 2 * int(np.ceil(len(values) / spread(values).independent))
     return float(stats.kstest(values[::apart], distribution.cdf).pvalue)

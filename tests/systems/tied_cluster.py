@@ -13,7 +13,6 @@ from kcons.openmm import (
     Isokinetic,
     Langevin,
     ProjectedIntegrator,
-    RattleIntegrator,
     Row,
     SurfaceIntegrator,
     hold,
@@ -82,15 +81,11 @@ def bond(i=0, j=7):
     return force
 
 
-def rattle(strength=200.0):
-    return begun(cluster(strength, bonded=True), RattleIntegrator(0.002))
-
-
 def on_a_sphere(radius=RADIUS, strength=200.0, **options):
     system = cluster(strength)
     surface = Sphere([0], CENTER, radius)
     integrator = SurfaceIntegrator(0.002, surfaces=surface, system=system, **options)
-    return begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.surfaces[0])
+    return begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.parts[0])
 
 
 def row_at(target=0.30, strength=200.0, **options):
@@ -109,16 +104,12 @@ def carried_at(target=0.30, strength=200.0, **options):
 KINDS = {
     "constant energy": thermostatted(None),
     "suzuki4": thermostatted(None, scheme="suzuki4"),
-    "leapfrog": thermostatted(None, scheme="leapfrog"),
     "Langevin": thermostatted(Langevin(300, 1.0)),
     "Isokinetic": thermostatted(Isokinetic(300)),
     "isokinetic4": thermostatted(Isokinetic(300), scheme="isokinetic4"),
-    "RattleIntegrator": rattle,
     "sphere": on_a_sphere,
-    "sphere, compiled": lambda **given: on_a_sphere(compiled=True, **given),
     "sphere, Langevin": lambda **given: on_a_sphere(ensemble=Langevin(300, 1.0), **given),
     "collective": row_at,
-    "collective, leapfrog": lambda **given: row_at(scheme="leapfrog", **given),
     "collective, Langevin": lambda **given: row_at(ensemble=Langevin(300, 1.0), **given),
     "carried": carried_at,
     "carried, suzuki4": lambda **given: carried_at(scheme="suzuki4", **given),

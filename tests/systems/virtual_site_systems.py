@@ -9,7 +9,7 @@ import openmm
 from openmm import app
 from openmm_systems import masses_of, started, state_of
 
-from kcons.openmm import RattleIntegrator
+from kcons.openmm import ProjectedIntegrator
 
 
 def water(model, molecules=8):
@@ -67,7 +67,7 @@ def mixed_sites():
 def prepared(model):
     """A System, and a start at 300 K on its constraints."""
     system, positions = mixed_sites() if model == "mixed" else water(model)
-    context = started(system, RattleIntegrator(1e-3, tolerance=1e-12), positions)
+    context = started(system, ProjectedIntegrator(1e-3, tolerance=1e-12), positions)
     integrator = context.getIntegrator()
     context.computeVirtualSites()
     openmm.LocalEnergyMinimizer.minimize(context, 1, 200)

@@ -126,6 +126,7 @@ def test_targets_that_move_are_refused_where_they_have_no_place():
     )
     for stepper, words in (
         (NoseHooverChain(0.5, 1.0), "targets move"),
+        (Isokinetic(0.5), "targets move"),
         (IsokineticSpheres(0.5, 1.0, 3), "Distance has a target that moves"),
     ):
         with pytest.raises(UnsupportedError, match=words):
@@ -138,8 +139,8 @@ def test_targets_that_move_are_refused_where_they_have_no_place():
         (LangevinRespa(0.5, 1.0, 3), "LangevinRespa(0.5, 1.0, rng=3)"),
         (LangevinRespa(0.5, 1.0, 3, steps=TWO, slow_kicks="middle"), "slow_kicks='middle')"),
         (
-            IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres="axes", order=4),
-            "IsokineticSpheres(0.5, 1.0, rng=3, steps={'slow': 1, 'fast': 4}, spheres='axes', auxiliary=1, order=4)",
+            IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres="axes"),
+            "IsokineticSpheres(0.5, 1.0, rng=3, steps={'slow': 1, 'fast': 4}, spheres='axes', auxiliary=1)",
         ),
         (HamiltonianMonteCarlo(0.5, (2, 4), 7), "HamiltonianMonteCarlo(0.5, (2, 4), rng=7, stepper=Rattle())"),
         (Isokinetic(0.5, order=4, convention="notes"), "Isokinetic(0.5, order=4, convention='notes')"),

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from thermostat_systems import dumbbells, quartic, quartic_potential, swirling, system, waves
+from thermostat_systems import dumbbells, quartic, quartic_potential, system, waves
 
-from kcons.constraints import Distance, FixedAtoms, MovingTarget, Plane, Sphere
+from kcons.constraints import Distance, FixedAtoms, MovingTarget, Sphere
 from kcons.steppers import State, System, run
 from kcons.thermostats import Langevin, thermal_velocities
 from kcons.thermostats.langevin import noise_generator
@@ -49,24 +48,6 @@ def test_without_friction_it_is_the_plain_scheme():
     assert np.array_equal(
         one.positions, run(held, state, 0.01, 100, stepper=Langevin(0.9, 0.0, 8, substeps=4)).positions
     )
-
-
-def test_momentum_is_left_alone_where_asked():
-    held, state = started(force=swirling, potential=None)
-    state = replace(state, velocities=state.velocities + np.array([0.3, 0, 0]))
-    total = held.masses @ state.velocities
-    after = run(held, state, 0.01, 500, stepper=Langevin(0.5, 2.0, 3, conserve_momentum=True))
-    np.testing.assert_allclose(held.masses @ after.velocities, total, atol=1e-12)
-    forgotten = run(held, state, 0.01, 500, stepper=Langevin(0.5, 2.0, 3))
-    assert np.abs(held.masses @ forgotten.velocities - total).max() > 0.1
-
-
-def test_momentum_along_a_plane():
-    x = np.random.default_rng(0).standard_normal((5, 3)) * [1, 1, 0]
-    flat = system([Plane(range(5), [0, 0, 1.0])], x, np.arange(1.0, 6), swirling)
-    state = State(x, thermal_velocities(flat, x, 1.0, 5, zero_momentum=True))
-    after = run(flat, state, 0.01, 200, stepper=Langevin(0.5, 2.0, 3, conserve_momentum=True))
-    assert np.abs(flat.masses @ after.velocities).max() <= 1e-12
 
 
 def test_moving_targets_are_followed_and_friction_knows_their_speed():

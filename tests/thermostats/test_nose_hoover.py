@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +11,8 @@ import pytest
 from thermostat_systems import METHANE, TEN, dumbbells, quartic, quartic_potential, system, waves
 
 from kcons.constraints import Distance
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.steppers import Geodesic, ReversibilityCheck, State, Suzuki4, run
+from kcons.errors import ConvergenceError, InputError, NonFiniteError
+from kcons.steppers import ReversibilityCheck, State, run
 from kcons.thermostats import NoseHooverChain, thermal_velocities
 
 
@@ -121,22 +120,6 @@ def test_a_loaded_run_whose_total_momentum_is_not_zero_says_so_again():
     asked.clear()
     assert np.array_equal(NoseHooverChain(0.5, 1.0).start(held, loaded(free)).thermostat, free.thermostat)
     assert not asked
-
-
-def test_a_chain_copied_with_its_state_finds_other_degrees_of_freedom():
-    x, chain = METHANE, NoseHooverChain(0.5, 1.0)
-    held, fewer = (system([Distance(TEN[:n])], x, [12.0, 1, 1, 1, 1], waves) for n in (10, 4))
-    saved = run(held, State(x, thermal_velocities(held, x, 0.5, 1)), 0.02, 5, stepper=chain)
-    state, copied = pickle.loads(pickle.dumps((saved, chain)))
-    assert np.array_equal(copied.start(fewer, state).thermostat, [0.0] * 6 + [11.0])
-
-
-def test_another_stepper_of_order_two():
-    held, state = started()
-    a, b = (run(held, state, 0.01, 100, stepper=NoseHooverChain(0.5, 1.0, stepper=s)) for s in (None, Geodesic()))
-    assert 0 < np.abs(a.positions - b.positions).max() <= 1e-3
-    with pytest.raises(UnsupportedError, match="has order 4, the chain 2; use Rattle"):
-        NoseHooverChain(0.5, 1.0, stepper=Suzuki4())
 
 
 def test_steps_that_cannot_be():

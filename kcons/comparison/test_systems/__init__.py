@@ -36,7 +36,7 @@ __all__ = [
 #: Files that are read as molecules.
 SUFFIXES = (".pdb", ".ent", ".cif", ".pdbx", ".mmcif")
 #: What can be chosen for files that MDAnalysis reads only.
-FILE_OPTIONS = frozenset({"coordinates", "forces", "select", "rigid_residues"})
+FILE_OPTIONS = frozenset({"coordinates", "forces", "select"})
 
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
@@ -53,7 +53,7 @@ def from_file(path: Path | str, rng: Rng = 1, *, quick: bool = False, **options:
         Half the horizon.
     **options
         What `structure.from_file` takes: constrain, force_field, add_hydrogens, platform, relax; or, for
-        other files and where one of coordinates, forces, select, rigid_residues is given, what
+        other files and where one of coordinates, forces, select is given, what
         `kcons.comparison.test_systems.any_file.from_file` takes.
 
     Raises

@@ -66,7 +66,6 @@ def plan(
     coordinates: Path | str | None = None,
     constrain: str = "hbonds",
     select: str = "all",
-    rigid_residues: Sequence[str] = (),
     angles: str = "angles",
 ) -> Plan:
     """Constraints of a file.
@@ -77,7 +76,7 @@ def plan(
         A topology, or a file with both.
     coordinates : path, optional
         Coordinates or a trajectory, of which the first frame counts.
-    constrain, select, rigid_residues, angles
+    constrain, select, angles
         As for `kcons.mdanalysis.constraints_of`.
 
     Raises
@@ -102,7 +101,6 @@ def plan(
                 universe,
                 constrain,
                 select=select,
-                rigid_residues=rigid_residues,
                 angles=angles,  # type: ignore[arg-type]
             )
         except KconsError as error:
@@ -124,7 +122,6 @@ def from_file(
     coordinates: Path | str | None = None,
     constrain: str = "hbonds",
     select: str = "all",
-    rigid_residues: Sequence[str] = (),
     forces: str = "openmm",
     force_field: Sequence[str] | None = None,
     platform: str = "",
@@ -135,7 +132,7 @@ def from_file(
 
     Parameters
     ----------
-    path, coordinates, constrain, select, rigid_residues
+    path, coordinates, constrain, select
         See `plan`.
     rng : int
         Of the velocities.
@@ -160,7 +157,6 @@ def from_file(
         coordinates=coordinates,
         constrain=constrain,
         select=select,
-        rigid_residues=rigid_residues,
         angles="distances",
     )
     for note in found.notes:

@@ -1,12 +1,9 @@
 """Free energy along one coordinate from the mean forces of windows: thermodynamic integration with an error band.
 
-F(b) - F(a) is the integral of dF/dx. Two ways to it, both linear in the mean forces, so that the covariance of all
-differences is known and not only errors at points:
-
-- 'gp': a Gaussian process learned from the derivatives (`gaussian_process`). Its band has what the
-  windows do not tell between them as well, and it knows where the next window helps most.
-- 'spline': the integral of the cubic spline through the mean forces (not-a-knot; periodic over a period). Fourth order
-  in the distance of windows. Its band has the errors of the mean forces only.
+F(b) - F(a) is the integral of dF/dx. It is that of a Gaussian process learned from the derivatives
+(`gaussian_process`), linear in the mean forces, so that the covariance of all differences is known and not only errors
+at points. The band has what the windows do not tell between them as well, and the process knows where the next window
+helps most.
 """
 
 from __future__ import annotations
@@ -19,15 +16,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 
 from kcons.constraints.arguments import FloatArray, as_float_array, checked, positive, whole_number
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
 from kcons.thermostats import Estimate
-
-Method = Literal["gp", "spline"]
 
 #: Points of a profile unless they are given, and points at which a window may be proposed.
 _POINTS = 201
@@ -43,7 +37,7 @@ _SAME = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Mean forces in the order of their places; integrals by both methods."""
+    """Mean forces in the order of their places, and the process learned from them."""
 
     x: FloatArray
     f: FloatArray
@@ -69,25 +63,8 @@ class _Windows:
     def process(self, closed: bool) -> Learned:
         return self._learned_closed if closed else self.learned
 
-    def spline(self, at: FloatArray, closed: bool) -> tuple[FloatArray, FloatArray]:
-        """Integrals from the first window, and their covariance."""
-        knots, unit = self.x, np.eye(len(self.x))
-        if self.period is not None:
-            knots, unit = np.append(knots, self.end), np.vstack([unit, unit[:1]])
-        kind = "periodic" if self.period is not None else "not-a-knot"
-        integral = CubicSpline(knots, unit, bc_type=kind, extrapolate=False).antiderivative()
-        rule, whole = integral(at), integral(self.end)
-        variances = self.e**2
-        if closed:  # The most likely mean forces whose integral vanishes.
-            spread = variances if variances.any() else np.ones(len(variances))
-            gain = spread * whole / (whole @ (spread * whole))
-            rule = rule @ (np.eye(len(gain)) - np.outer(gain, whole))
-        return rule @ self.f, (rule * variances) @ rule.T
-
-    def values(self, method: Method, at: FloatArray, closed: bool) -> tuple[FloatArray, FloatArray]:
+    def values(self, at: FloatArray, closed: bool) -> tuple[FloatArray, FloatArray]:
         """Free energies up to a constant, and their covariance."""
-        if method == "spline":
-            return self.spline(at, closed)
         return self.process(closed).posterior((at[:, None], [-1]))
 
 
@@ -109,7 +86,6 @@ class Profile:
         What it was made of, in order. Mean forces are dF/dx.
     closure : Estimate or None
         Integral of dF/dx over the period, which should be 0, before the profile was closed.
-    method : {'gp', 'spline'}
     """
 
     x: FloatArray
@@ -121,14 +97,12 @@ class Profile:
     mean_forces: FloatArray
     mean_force_errors: FloatArray
     closure: Estimate | None
-    method: Method
     _known: _Windows
-    _closed: bool
     _added: Callable[[FloatArray], FloatArray] | None = None
 
     def __repr__(self) -> str:
         ends = f"{self.windows[0]:.6g} to {self.windows[-1]:.6g}"
-        return f"<Profile: {len(self.windows)} windows from {ends}, {self.method!r}>"
+        return f"<Profile: {len(self.windows)} windows from {ends}>"
 
     def __str__(self) -> str:
         """A line for each window, and how far the free energy reaches."""
@@ -141,7 +115,7 @@ class Profile:
         return "\n".join([f"{'window':>10} {'dF/dx':>11}{'':13} {'F':>10}", *rows, end])
 
     def _values(self, at: FloatArray) -> tuple[FloatArray, FloatArray]:
-        F, covariance = self._known.values(self.method, at, self._closed)
+        F, covariance = self._known.values(at, self._known.period is not None)
         return F if self._added is None else F + self._added(at), covariance
 
     def difference(self, a: float, b: float) -> Estimate:
@@ -204,34 +178,28 @@ class Profile:
         step = 1e-6 * np.ptp(self.windows)
         return (self._added(at + step) - self._added(at - step)) / (2 * step)
 
-    def next_windows(
-        self, count: int, *, between: tuple[float, float] | None = None, below: float | None = None
-    ) -> list[float]:
+    def next_windows(self, count: int, *, below: float | None = None) -> list[float]:
         """Where more windows would tell most, if they were sampled as long as those that are there.
 
         Each is put where the variance of all differences of free energy together is reduced most (Bayesian
         quadrature: Kempkes and Perez de Alba Ortiz, arXiv 2601.08783), taking those before it as done. A window has
-        the error that its neighbors suggest. Where a profile was made by a spline, a Gaussian process is learned
-        from the same windows.
+        the error that its neighbors suggest.
 
         Parameters
         ----------
         count : int
-        between : tuple of two float, optional
-            Only the difference between these two places counts; all of the profile by default.
         below : float, optional
             Only places count where the free energy is this much above its lowest value or less: rates and populations
             do not depend on the others.
         """
         known = self._known
         grid = np.linspace(known.x[0], known.end, _POINTS)
-        aims = grid if between is None else _places(between, known, "between")
-        closed = self._closed and known.period is not None
+        aims = grid
         if below is not None:
-            if not below > 0 or between is not None:
-                raise InputError(f"below is {below}; give a positive energy, and no between beside it", item="below")
+            if not below > 0:
+                raise InputError(f"below is {below}; give a positive energy", item="below")
             aims = grid[self.lower_than(below, grid)]
-        covariance = known.process(closed).posterior((aims[:, None], [-1]), (grid[:, None], [0]))[1]
+        covariance = known.process(known.period is not None).posterior((aims[:, None], [-1]), (grid[:, None], [0]))[1]
         noise = np.interp(grid, known.x, known.e**2, period=known.period)
         m = len(aims)
         # What is known exactly has a variance of rounding, from which nothing more is to be learned.
@@ -254,9 +222,7 @@ def integrate(
     f: ArrayLike,
     e: ArrayLike,
     *,
-    method: Method = "gp",
     period: float | None = None,
-    closed: bool = True,
     zero: float | None = None,
     at: ArrayLike | None = None,
 ) -> Profile:
@@ -270,12 +236,9 @@ def integrate(
         dF/dx there: the slope of the free energy, not the force against it. Windows at one place are put together.
     e : array_like, shape (n,)
         Standard errors of f; 0 where it is exact.
-    method : {'gp', 'spline'}
-        Gaussian process, or cubic spline, which does not know how far it is off between windows.
     period : float, optional
-        Of the coordinate: the profile goes once around, from the first window.
-    closed : bool
-        Whether a periodic profile is made to end where it begins. `closure` says how far it was from that.
+        Of the coordinate: the profile goes once around, from the first window, and ends where it begins; `closure` says
+        how far the mean forces were from that.
     zero : float, optional
         Where F is 0; by default where it is lowest.
     at : array_like, shape (m,), optional
@@ -285,7 +248,7 @@ def integrate(
     ------
     InputError
         Fewer than 3 windows; a NaN or infinity; a negative error; windows further apart than the period; a place
-        outside of the windows; an unknown method.
+        outside of the windows.
 
     Warns
     -----
@@ -296,7 +259,7 @@ def integrate(
     points = np.linspace(known.x[0], known.end, _POINTS) if at is None else _places(at, known, "at")
     closure = None
     if period is not None:
-        closure = difference(*known.values(method, np.array([known.x[0], known.end]), False))
+        closure = difference(*known.values(np.array([known.x[0], known.end]), False))
         if abs(closure.value) > _CLOSES * closure.error and abs(closure.value) > 1e-9 * period * np.abs(known.f).max():
             warnings.warn(
                 f"the mean force has the integral {closure.value:.4g} ± {closure.error:.2g} over the period, which "
@@ -304,15 +267,14 @@ def integrate(
                 UserWarning,
                 stacklevel=2,
             )
-    close = closed and period is not None
     if zero is None:
         inner = np.linspace(known.x[0], known.end, _POINTS)
-        zero = float(inner[np.argmin(known.values(method, inner, close)[0])])
+        zero = float(inner[np.argmin(known.values(inner, period is not None)[0])])
     places = np.append(points, _places([zero], known, "zero"))
-    F, covariance = known.values(method, places, close)
+    F, covariance = known.values(places, period is not None)
     less = covariance[:-1, :-1] - covariance[:-1, -1:] - covariance[-1:, :-1] + covariance[-1, -1]
     error = np.sqrt(np.maximum(np.diag(less), 0.0))
-    return Profile(points, F[:-1] - F[-1], error, less, zero, known.x, known.f, known.e, closure, method, known, close)
+    return Profile(points, F[:-1] - F[-1], error, less, zero, known.x, known.f, known.e, closure, known)
 
 
 def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> _Windows:
@@ -333,7 +295,7 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
             )
         place = place.min() + (place - place.min()) % period if len(place) else place
         place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place) if len(place) else place
-    # Places that differ by rounding are one: a spline through both would have any slope.
+    # Places that differ by rounding are one.
     order = np.argsort(place, kind="stable")
     new = np.diff(place[order], prepend=-np.inf) > _SAME * np.ptp(place) if len(place) else np.zeros(0, dtype=bool)
     places, which = place[order][new], np.zeros(len(place), dtype=np.int64)

@@ -41,36 +41,17 @@ class Pulled:
     ----------
     jarzynski : Estimate
         -kT ln <exp(-W/kT)> over the forward pulls.
-    cumulant : Estimate
-        <W> - var(W)/2kT: exact where works are normally distributed.
-    bias : float
-        By how much `jarzynski` is too high in the mean, to first order in 1/n (Gore, Ritort and Bustamante, Proc.
-        Natl. Acad. Sci. USA 100, 12564 (2003)).
     n_effective : float
         Forward pulls that count: (sum w)^2/sum w^2 with w = exp(-W/kT).
-    dissipated : float
-        Mean forward work less the best estimate.
-    jarzynski_backward, cumulant_backward, bias_backward, n_effective_backward
-        The same from the backward pulls, of the same difference; None without them.
     bar : Estimate or None
         From pulls both ways.
-    crossing : Estimate or None
-        Where normal distributions of the works W and -W_backward cross. None if all works of a direction are the same.
     overlap : float or None
         0 if no forward pull could have been a backward one, 1 if all could.
     """
 
     jarzynski: Estimate
-    cumulant: Estimate
-    bias: float
     n_effective: float
-    dissipated: float
-    jarzynski_backward: Estimate | None = None
-    cumulant_backward: Estimate | None = None
-    bias_backward: float | None = None
-    n_effective_backward: float | None = None
     bar: Estimate | None = None
-    crossing: Estimate | None = None
     overlap: float | None = None
 
     @property
@@ -113,9 +94,9 @@ def pull_free_energy(
     kT = positive(thermal_energy, "thermal_energy")
     ahead, generator = _works(forward, "forward", kT), generator_of(rng)
     drawn = ahead[generator.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
-    one = _one_way(ahead, drawn, kT)
+    jarzynski = Estimate(kT * float(_jarzynski(ahead)), kT * float(_jarzynski(drawn).std(ddof=1)))
+    effective = math.exp(2 * logsumexp(-ahead) - logsumexp(-2 * ahead))
     if backward is None:
-        effective = one[-1]
         if effective < FEW_INDEPENDENT:
             warnings.warn(
                 f"{effective:.1f} of {len(ahead)} pulls count in the average of exp(-W/kT), and it may be off by more "
@@ -123,9 +104,8 @@ def pull_free_energy(
                 UserWarning,
                 stacklevel=2,
             )
-        return Pulled(*one, kT * float(ahead.mean()) - one[0].value)
+        return Pulled(jarzynski, effective)
     back = _works(backward, "backward", kT)
-    drawn_back = back[generator.integers(len(back), size=(_SAMPLES, len(back)))]
     difference, error = _bar(ahead, back)
     overlap = _overlap(ahead, back, difference)
     if overlap < _OVERLAP:
@@ -144,12 +124,7 @@ def pull_free_energy(
             UserWarning,
             stacklevel=2,
         )
-    crossing = None
-    if np.ptp(ahead) and np.ptp(back):
-        sampled = _crossing(drawn, drawn_back)
-        crossing = Estimate(kT * float(_crossing(ahead[None], back[None])[0]), kT * float(np.nanstd(sampled)))
-    dissipated, bar = kT * float(ahead.mean() - difference), Estimate(kT * difference, kT * error)
-    return Pulled(*one, dissipated, *_one_way(back, drawn_back, -kT), bar, crossing, overlap)
+    return Pulled(jarzynski, effective, Estimate(kT * difference, kT * error), overlap)
 
 
 def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
@@ -234,36 +209,12 @@ def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:
     return values / positive(thermal_energy, "thermal_energy")
 
 
-def _one_way(works: FloatArray, drawn: FloatArray, unit: float) -> tuple[Estimate, Estimate, float, float]:
-    """Jarzynski's average, the second cumulant, the bias of the first, the pulls that count; in kT, or -kT backward."""
-
-    def jarzynski(w: FloatArray) -> FloatArray:
-        return np.asarray(math.log(len(works)) - logsumexp(-w, axis=-1))
-
-    def cumulant(w: FloatArray) -> FloatArray:
-        return np.asarray(w.mean(axis=-1) - 0.5 * w.var(axis=-1, ddof=1))
-
-    first, second = (
-        Estimate(unit * float(f(works)), abs(unit) * float(f(drawn).std(ddof=1))) for f in (jarzynski, cumulant)
-    )
-    effective = math.exp(2 * logsumexp(-works) - logsumexp(-2 * works))
-    # var(w)/(2 n <w>^2), w = exp(-W/kT).
-    return first, second, unit * 0.5 * (1 / effective - 1 / len(works)), effective
+def _jarzynski(works: FloatArray) -> FloatArray:
+    """-ln <exp(-w)> along the last axis."""
+    return np.asarray(math.log(works.shape[-1]) - logsumexp(-works, axis=-1))
 
 
 def _overlap(ahead: FloatArray, back: FloatArray, difference: float) -> float:
     """What MBAR's overlap matrix has off its diagonal (Klimovich et al., J. Comput.-Aided Mol. Des. 29, 397 (2015))."""
     odds = np.concatenate([ahead, -back]) - difference + math.log(len(ahead) / len(back))
     return float((expit(odds) * expit(-odds)).sum() * (1 / len(ahead) + 1 / len(back)))
-
-
-def _crossing(ahead: FloatArray, back: FloatArray) -> FloatArray:
-    """Where the normal densities of W and of -W_backward are equal, between their means; row by row."""
-    one, other = ahead.mean(axis=1), -back.mean(axis=1)
-    middle = 0.5 * (one + other)
-    one, other = one - middle, other - middle
-    v, w = ahead.var(axis=1, ddof=1), back.var(axis=1, ddof=1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # samples of one value, drawn again and again
-        a, b = 1 / v - 1 / w, one / v - other / w
-        c = one**2 / v - other**2 / w + np.log(v / w)
-        return middle + c / (b + np.copysign(np.sqrt(b**2 - a * c), b))

@@ -14,7 +14,6 @@ from ase.md.md import MolecularDynamics
 from kcons.ase import (
     ConstrainedDynamics,
     ConstrainedLangevin,
-    ConstrainedNoseHoover,
     Constraints,
     IsokineticDynamics,
     draw_velocities,
@@ -28,7 +27,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
+from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
 from kcons.motion import minimize
 from kcons.motion.motion import Motion
 from kcons.thermostats import IsokineticSpheres
@@ -219,40 +218,27 @@ class _Simulation:
         atoms.positions = x
         self._dynamics: Any = None
 
-    def hold(
-        self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
-    ) -> None:
+    def hold(self, begin: Sequence[float], end: Sequence[float], seed: int, velocities: int | None) -> None:
         settings, dt = self._settings, self._settings.timestep * units.fs
         friction = settings.friction / (1000 * units.fs)
         rows = [*self.held.others, *self.held.at(begin)]
         if velocities is not None:
-            still = thermostat != "langevin" and not self.held.knows_place
-            draw_velocities(self.atoms, settings.temperature, velocities, constraints=rows, zero_momentum=still)
+            draw_velocities(self.atoms, settings.temperature, velocities, constraints=rows)
         if tuple(begin) != tuple(end):
             rows = [*self.held.others, *self.held.towards(begin, end, settings.pull * dt)]
-        common: dict[str, Any] = {"temperature_K": settings.temperature, "constraints": rows}
-        if thermostat == "langevin":
-            self._dynamics = ConstrainedLangevin(self.atoms, dt, friction=friction, rng=seed, **common)
-        elif thermostat == "nose-hoover":
-            self._dynamics = ConstrainedNoseHoover(self.atoms, dt, tdamp=1 / friction, **common)
-        else:
-            self._dynamics = IsokineticDynamics(self.atoms, dt, **common)
+        temperature = settings.temperature
+        self._dynamics = ConstrainedLangevin(self.atoms, dt, temperature, friction, rng=seed, constraints=rows)
 
     def step(self, steps: int) -> None:
         self._dynamics.run(steps)
 
-    def run(self, steps: int, every: int, take: Callable[[], None]) -> None:
+    def run(self, steps: int, every: int, take: Callable[..., None]) -> None:
         first = self._dynamics.nsteps
         # Before the first step ASE calls it, too.
-        self._dynamics.attach(lambda: take() if self._dynamics.nsteps > first else None, interval=every)
+        self._dynamics.attach(lambda: take(*self.state()) if self._dynamics.nsteps > first else None, interval=every)
         self._dynamics.run(steps)
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         forces = self._dynamics.state.forces
         forces = applied_forces(self.atoms) if forces is None else np.array(forces)
         return self.atoms.get_positions(), np.array(velocities_of(self.atoms)), forces, self._dynamics.get_time()
-
-    @property
-    def isokinetic_degrees_of_freedom(self) -> int:
-        isokinetic = isinstance(self._dynamics, IsokineticDynamics)
-        return self._dynamics.thermostat_degrees_of_freedom if isokinetic else 0

@@ -80,7 +80,7 @@ class WindowResult:
         their difference is one error more.
     sides : dict of str to MeanForce
         From below and from above.
-    hysteresis : float
+    p_value : float
         Probability of a larger difference between the sides if both were equilibrated; NaN with one side.
     raw : ndarray, shape (d,)
         The plain mean of the multipliers, for comparison.
@@ -93,7 +93,7 @@ class WindowResult:
     force: FloatArray
     covariance: FloatArray
     sides: dict[str, MeanForce]
-    hysteresis: float
+    p_value: float
     raw: FloatArray
     seconds: float
 
@@ -198,24 +198,24 @@ class FreeEnergy:
         made = Table(title=f"mean force (kJ/mol by {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})")
         titles = [f"{name} ({_SHOWN[angle]})" for name, angle in zip(self.names, self.angles, strict=True)]
         titles += [f"dF/d {name}" for name in self.names] if len(self.names) > 1 else ["dF/dq"]
-        for title in (*titles, "raw multiplier", "independent samples", "hysteresis p"):
+        for title in (*titles, "raw multiplier", "independent samples", "p of both sides"):
             made.add_column(title, justify="right")
         for window in self.windows:
             shown = [np.degrees(q) if angle else q for q, angle in zip(window.value, self.angles, strict=True)]
-            mark = "!" if window.hysteresis < UNLIKELY else ""
+            mark = "!" if window.p_value < UNLIKELY else ""
             made.add_row(
                 *(f"{q:.4g}" for q in shown),
                 *(f"{f:.2f} ± {e:.2f}" for f, e in zip(window.force, window.error, strict=True)),
                 ", ".join(f"{raw:.2f}" for raw in window.raw),
                 f"{window.independent:.0f}",
-                "" if np.isnan(window.hysteresis) else f"{window.hysteresis:.2g}{mark}",
+                "" if np.isnan(window.p_value) else f"{window.p_value:.2g}{mark}",
             )
         return made
 
     def summary(self) -> str:
         """A sentence or two."""
         lines = [f"{len(self.windows)} windows"]
-        if doubtful := ", ".join(str(w.number) for w in self.windows if w.hysteresis < UNLIKELY):
+        if doubtful := ", ".join(str(w.number) for w in self.windows if w.p_value < UNLIKELY):
             lines.append(
                 f"runs from below and from above differ by more than chance in window {doubtful} (marked !): something "
                 "slow is not equilibrated there; sample longer, or look for the other coordinate"
@@ -239,10 +239,10 @@ class FreeEnergy:
         """What pulls gave, as plain data and in a sentence; of one coordinate with the windows between the ends."""
         best, name = pulled.best, "Jarzynski" if pulled.bar is None else "BAR"
         numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist()}
-        estimates = {key: getattr(pulled, key) for key in ("bar", "jarzynski", "jarzynski_backward")}
+        estimates = {key: getattr(pulled, key) for key in ("bar", "jarzynski")}
         numbers |= {key: [*estimate] for key, estimate in estimates.items() if estimate is not None}
-        numbers |= {"dissipated": pulled.dissipated, "overlap": pulled.overlap}
-        said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name}; {pulled.dissipated:.2g} kJ/mol lost)"
+        numbers["overlap"] = pulled.overlap
+        said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name})"
         if self._profile()[0] is not None:
             windows = self.between(float(start[0]), float(end[0]))
             if windows is None:
@@ -264,7 +264,7 @@ class FreeEnergy:
                     "mean force": w.force.tolist(),
                     "covariance": w.covariance.tolist(),
                     "raw multiplier": w.raw.tolist(),
-                    "hysteresis": w.hysteresis,
+                    "p_value": w.p_value,
                     "samples": sum(side.n for side in w.sides.values()),
                     "independent samples": w.independent,
                 }
@@ -322,7 +322,8 @@ class Windows:
         one at a time.
     settings : Settings, optional
     both_sides : bool
-        Sample each window twice, pulled there from below and from above: what the two differ by is hysteresis.
+        Sample each window twice, pulled there from below and from above: their difference shows whether it is
+        equilibrated.
     approach : float or array_like, shape (d,)
         From how far away it is pulled, in angstrom and radian.
     rng : int, numpy.random.Generator or None
@@ -417,7 +418,6 @@ class Windows:
         error: float,
         most: int,
         *,
-        between: tuple[float, float] | None = None,
         below: float | None = None,
         at_once: int = 1,
     ) -> FreeEnergy:
@@ -428,8 +428,8 @@ class Windows:
         error : float
         most : int
             Never more than so many windows.
-        between, below
-            Of `Profile.next_windows`. With `below`, errors higher up do not count.
+        below : float, optional
+            Of `Profile.next_windows`: errors higher up do not count.
         at_once : int
             How many are added before the profile is looked at again: as many as there are workers.
         """
@@ -441,7 +441,7 @@ class Windows:
                 profile = result.profile
                 if profile.error[profile.lower_than(np.inf if below is None else below)].max() <= error:
                     break
-                places = profile.next_windows(min(at_once, most - len(self._targets)), between=between, below=below)
+                places = profile.next_windows(min(at_once, most - len(self._targets)), below=below)
                 known = len(self._failed)
                 result = self._run(self._added([place] for place in places))
                 if len(self._failed) > known:

@@ -19,12 +19,13 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Held, Sampler, Settings, Thermostat, Window, digest_of
-from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
+from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
+from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, Row
 from kcons.openmm.callback_rows.callbacks import cell_of
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
 from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.collective.coordinates import formula_rows
+from kcons.openmm.device.device_integrator import choose
 from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
 from kcons.openmm.states import positions_of, velocities_of
 from kcons.openmm.topology import bonds_of
@@ -127,7 +128,9 @@ class HeldCoordinatesReporter:
         assert self._held is not None and self._set is not None
         if self._set.lattice is not None:
             self._set.with_cell(cell_of(state.getPeriodicBoxVectors()))
-        self.series.isokinetic_degrees_of_freedom = _isokinetic(simulation.integrator)
+        ensemble = getattr(simulation.integrator, "ensemble", None)
+        if isinstance(ensemble, Isokinetic):
+            self.series.isokinetic_degrees_of_freedom = ensemble.count(simulation.integrator)
         sample = self._held.sample(x, v, f, time)
         self._work += self.series.append(sample)
         pairs = [n for pair in zip(sample.value.tolist(), sample.multiplier.tolist(), strict=True) for n in pair]
@@ -252,27 +255,36 @@ class _Simulation:
     def __init__(self, sampler: OpenMMWindows, held: Held, window: Window, settings: Settings) -> None:
         self._sampler, self.held, self._settings = sampler, held, settings
         self._x, self._v = held.placed(window.start)[1], np.zeros_like(sampler.positions)
+        self._seen = held.measured(window.target).seen
         if settings.relax:
-            self.hold(window.start, window.start, "langevin", window.seed, None)
+            self.hold(window.start, window.start, window.seed, None)
             integrator: Any = self.simulation.integrator
             integrator.minimizeEnergy(self.simulation.context, _FORCE, settings.relax)
             self._x = positions_of(self.simulation.context)
 
-    def hold(
-        self, begin: Sequence[float], end: Sequence[float], thermostat: Thermostat, seed: int, velocities: int | None
-    ) -> None:
+    def hold(self, begin: Sequence[float], end: Sequence[float], seed: int, velocities: int | None) -> None:
         settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
         system = sampler.system()
         duration, wraps = max(settings.pull, 1) * dt, system.usesPeriodicBoundaryConditions()
-        rows = [
-            Row(_force_of(name, item, wraps), float(a), (float(b) - float(a)) / duration, period=item.period, name=name)
-            for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
-        ]
-        ensemble: Any = Isokinetic(settings.temperature)
-        if thermostat != "isokinetic":
-            ensemble = (Langevin if thermostat == "langevin" else NoseHoover)(settings.temperature, settings.friction)
-        part = CollectiveRows(system, rows, positions=sampler.positions)
-        integrator = ProjectedIntegrator(dt * unit.picosecond, parts=[part], ensemble=ensemble)
+        ensemble = Langevin(settings.temperature, settings.friction)
+        moves = tuple(begin) != tuple(end)
+        parts: list[Any] = self.held.towards(begin, end, duration) if moves else self.held.at(begin)
+        self._on_device = choose(None, dt, parts=parts, ensemble=ensemble)[0] is DeviceIntegrator
+        if not self._on_device:
+            rows = [
+                Row(
+                    _force_of(name, item, wraps),
+                    float(a),
+                    (float(b) - float(a)) / duration,
+                    period=item.period,
+                    name=name,
+                )
+                for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
+            ]
+            parts = [CollectiveRows(system, rows, positions=sampler.positions)]
+        integrator: Any = ProjectedIntegrator(dt * unit.picosecond, parts=parts, ensemble=ensemble)
+        if self._on_device:
+            integrator.record(self._seen)
         integrator.setRandomNumberSeed(seed % 2**31 + 1)
         platform = sampler.platform
         chosen = [] if platform is None else [openmm.Platform.getPlatformByName(platform), sampler.properties]
@@ -289,28 +301,26 @@ class _Simulation:
             integrator.applyVelocityConstraints()
         else:
             integrator.setVelocitiesToTemperature(context, settings.temperature, velocities % 2**31)
-            if thermostat != "langevin" and not self.held.knows_place:
-                # Thermostats that scale velocities never forget the total momentum.
-                masses, v = masses_of(system), velocities_of(context)
-                v[masses > 0] -= masses @ v / masses.sum()
-                context.setVelocities(v)
 
     def step(self, steps: int) -> None:
         self.simulation.step(steps)
         self._x, self._v = positions_of(self.simulation.context), velocities_of(self.simulation.context)
 
-    def run(self, steps: int, every: int, take: Callable[[], None]) -> None:
-        for _ in range(steps // every):
-            self.simulation.step(every)
-            take()
+    def run(self, steps: int, every: int, take: Callable[..., None]) -> None:
+        if not self._on_device:
+            for _ in range(steps // every):
+                self.simulation.step(every)
+                take(*self.state())
+            return
+        whole: FloatArray = np.zeros((3, *self._x.shape))
+        integrator: Any = self.simulation.integrator
+        for *seen, time in integrator.records(steps // every * every, every):
+            whole[:, self._seen] = seen
+            take(*whole, time)
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         groups = self.simulation.integrator.getIntegrationForceGroups()
         return _state(self.simulation.context.getState(positions=True, velocities=True, forces=True, groups=groups))
-
-    @property
-    def isokinetic_degrees_of_freedom(self) -> int:
-        return _isokinetic(self.simulation.integrator)
 
 
 def _state(state: openmm.State) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -319,12 +329,6 @@ def _state(state: openmm.State) -> tuple[FloatArray, FloatArray, FloatArray, flo
     for kind, array in zip((openmm.State.Positions, openmm.State.Velocities, openmm.State.Forces), arrays, strict=True):
         state._getVectorAsNumpy(kind, array)
     return arrays[0], arrays[1], arrays[2], state.getTime()._value
-
-
-def _isokinetic(integrator: Any) -> int:
-    """Degrees of freedom under an isokinetic thermostat; 0 under others."""
-    ensemble = getattr(integrator, "ensemble", None)
-    return ensemble.count(integrator) if isinstance(ensemble, Isokinetic) else 0
 
 
 def _refuse_another(topology: app.Topology, system: openmm.System) -> None:

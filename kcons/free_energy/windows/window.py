@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,8 +31,6 @@ from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Collector, Series
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.motion import Motion
-
-Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
 
 #: What the sides of a window and the directions of a pull are called.
 SIDES, DIRECTIONS = ("up", "down"), ("forward", "backward")
@@ -63,7 +61,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Settings:
-    """How every window is sampled.
+    """How every window is sampled, by Langevin dynamics.
 
     Attributes
     ----------
@@ -71,10 +69,8 @@ class Settings:
         In K.
     timestep : float
         In fs.
-    thermostat : {'langevin', 'nose-hoover', 'isokinetic'}
-        For equilibration and production; pulls have Langevin's.
     friction : float
-        In 1/ps, of Langevin dynamics; the other thermostats take its inverse as their time.
+        In 1/ps.
     relax, pull, equilibration, production : int
         Steps of relaxation where the window begins, and of each part of the run.
     every : int
@@ -83,7 +79,6 @@ class Settings:
 
     temperature: Positive = 300.0
     timestep: Positive = 1.0
-    thermostat: Thermostat = "langevin"
     friction: Positive = 5.0
     relax: FromZero = 50
     pull: FromZero = 1000
@@ -140,11 +135,10 @@ class Sampler(ABC):
     def simulation(self, held: Held, window: Window, settings: Settings) -> Any:
         """A run at the start of a window, relaxed there, and without velocities.
 
-        It has ``hold(begin, end, thermostat, seed, velocities)``, to go on with the coordinates moving from `begin` to
-        `end` in the steps of a pull, or at rest where these agree (`velocities` is the seed of new ones at the
-        temperature of the settings, or None to keep those that there are); ``step(steps)``; ``run(steps, every,
-        take)``, to call `take` after every so many steps; ``state()``: positions, velocities, forces and time; and
-        ``isokinetic_degrees_of_freedom``.
+        It has ``hold(begin, end, seed, velocities)``, to go on with the coordinates moving from `begin` to `end` in the
+        steps of a pull, or at rest where these agree (`velocities` is the seed of new ones at the temperature of the
+        settings, or None to keep those that there are); ``step(steps)``; ``run(steps, every, take)``, to call `take`
+        with the state after every so many steps; and ``state()``: positions, velocities, forces and time.
         """
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
@@ -162,10 +156,10 @@ class Sampler(ABC):
         began = time.process_time()
         run = self.simulation(self.rows(), window, settings)
         if settings.pull:
-            run.hold(window.start, window.target, "langevin", window.seed, window.seed)
+            run.hold(window.start, window.target, window.seed, window.seed)
             run.step(settings.pull)
         # New velocities: those of the pull's end have its rate.
-        run.hold(window.target, window.target, settings.thermostat, window.seed + 2, window.seed + 1)
+        run.hold(window.target, window.target, window.seed + 2, window.seed + 1)
         run.step(settings.equilibration)
         series = self._recorded(run, window, settings.production, settings.every)
         series.seconds = time.process_time() - began
@@ -174,9 +168,9 @@ class Sampler(ABC):
     def pull(self, window: Window, settings: Settings, file: Path) -> None:
         """Equilibrate at the start, pull to the target, and write the `Series` of the pull, every step of it."""
         run = self.simulation(self.rows(), window, settings)
-        run.hold(window.start, window.start, "langevin", window.seed + 2, window.seed)
+        run.hold(window.start, window.start, window.seed + 2, window.seed)
         run.step(settings.equilibration)
-        run.hold(window.start, window.target, "langevin", window.seed, None)
+        run.hold(window.start, window.target, window.seed, None)
         self._recorded(run, window, settings.pull, 1, start=True).save(file)
 
     def _recorded(self, run: Any, window: Window, steps: int, every: int, *, start: bool = False) -> Series:
@@ -186,9 +180,8 @@ class Sampler(ABC):
         collector = Collector(held, series)
         if start:
             collector.add(*run.state())
-        run.run(steps, every, lambda: collector.add(*run.state()))
+        run.run(steps, every, collector.add)
         collector.look()
-        series.isokinetic_degrees_of_freedom = run.isokinetic_degrees_of_freedom
         return series
 
 
@@ -281,11 +274,6 @@ class Held:
             item.with_target(MovingTarget(lambda t, a=a, b=b: a + (b - a) / duration * t))  # type: ignore[misc]
             for item, a, b in rows
         ]
-
-    @property
-    def knows_place(self) -> bool:
-        """Whether shifting all atoms would change a row."""
-        return not all(row.translation_invariant for row in [*self.coordinates.values(), *self.others])
 
     def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
         """The engine of a window, and the initial structure with groups turned and moved so that it is there.

@@ -1,9 +1,7 @@
 """Linear flows: exp(At), Jordan form, stability as far as double precision tells; equilibria (notes sections 1.2, 1.3).
 
-**Eigenvalues** are judged at their own scale. Variables that act on each other in one direction only make the matrix
-block triangular: its eigenvalues are those of the blocks, and small ones do not feel how large the others are. Each
-block is balanced (Parlett and Reinsch) and brought to Schur form; how far an eigenvalue may be off follows from the
-backward error of that, which is of the size of the rounding of its entries.
+**Eigenvalues** are those of the balanced matrix (Parlett and Reinsch) in Schur form; how far one may be off follows
+from the backward error of that, which is of the size of the rounding of the entries.
 
 **Jordan blocks** are not continuous in the matrix: next to any matrix lie others whose eigenvalues are all different.
 What numbers of finite precision can say is that a matrix lies within its rounding of one with the structure found.
@@ -12,8 +10,8 @@ there after their mean is a nilpotent matrix up to rounding, whose null spaces, 
 (Kublanovskaya's staircase) and chains of generalized eigenvectors.
 
 **Stability.** The notes' criterion Re lambda <= 0 (eq. 14) is completed: where Re lambda = 0, the Jordan blocks must be
-1 x 1, or the solution grows like a power of t. A real part within its error is zero only if the matrix as it is written
-says so exactly, which is decided in integers; else stability cannot be told.
+1 x 1, or the solution grows like a power of t. Whether a real part within its error is zero is decided in rational
+numbers, by SymPy: the entries are taken as they stand. Where they have errors of their own, stability cannot be told.
 
 References
 ----------
@@ -25,8 +23,6 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from fractions import Fraction
-from itertools import pairwise
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -36,7 +32,7 @@ from scipy.optimize import root
 from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints.arguments import FloatArray, Rng, as_float_array, generator_of, whole_number
-from kcons.errors import InputError
+from kcons.errors import InputError, with_extra
 from kcons.models.flows.flow import Flow
 
 ComplexArray: TypeAlias = NDArray[np.complex128]
@@ -47,7 +43,7 @@ NULL = 100.0
 STANDS_OUT = 10.0
 #: Eigenvalues that have no common structure are tried again as if known this many times better.
 CLOSER = 8.0
-#: Variables up to which it is decided in integers whether eigenvalues lie on the imaginary axis.
+#: Variables of the largest matrix whose eigenvalues on the imaginary axis are counted exactly.
 LARGEST = 24
 #: Equilibria closer than this, in parts of the size of the box, are one.
 SAME = 1e-6
@@ -94,12 +90,10 @@ class Spectrum(NamedTuple):
     values: ComplexArray
     #: How far each may be off, for all changes of the entries by their rounding and by the errors given.
     errors: FloatArray
-    #: 1/|y^H x| of the left and right eigenvectors of unit length of the balanced matrix: what multiplies its changes.
-    conditions: FloatArray
-    #: Norm of the change of its own block that was allowed for; 0 for an entry that is an eigenvalue as it stands.
-    noise: FloatArray
+    #: Norm of the change of the balanced matrix that was allowed for.
+    noise: float
     triangular: ComplexArray
-    #: S: a permutation, a scaling by powers of two, a unitary matrix.
+    #: S: a scaling by powers of two, and a unitary matrix.
     basis: ComplexArray
 
 
@@ -110,35 +104,13 @@ def spectrum(matrix: ArrayLike, error: ArrayLike = 0.0) -> Spectrum:
         raise InputError(f"errors are a number or of the shape of the matrix, {A.shape}, not {E.shape}", item="error")
     if not np.all(np.isfinite(E) & (E >= 0)):
         raise InputError("errors of entries are finite and not negative", item="error")
-    E, n = np.broadcast_to(E, A.shape), len(A)
-    order, blocks = _blocks((A != 0) | (E > 0))
-    A, E = A[np.ix_(order, order)], E[np.ix_(order, order)]
-    scaling, unitary = np.ones(n), np.eye(n, dtype=np.complex128)
-    diagonal, errors, noise = np.zeros((n, n), dtype=np.complex128), np.zeros(n), np.zeros(n)
-    for at in blocks:
-        size = at.stop - at.start
-        if size == 1:
-            diagonal[at, at], noise[at] = A[at, at], E[at, at][0]
-            errors[at] = EPSILON * np.abs(A[at, at][0]) + noise[at]
-            continue
-        # In parts of a power of two, lest norms leave the numbers.
-        unit = np.exp2(np.frexp(np.max(np.abs(A[at, at]) + E[at, at]))[1] - 1.0)
-        block, doubt = A[at, at] / unit, E[at, at] / unit
-        _, (scaling[at], _) = scipy.linalg.matrix_balance(np.abs(block) + doubt, permute=False, separate=True)
-        ratio = scaling[at] / scaling[at][:, None]
-        triangular, unitary[at, at] = _schur(block * ratio)
-        moved = size * EPSILON * np.linalg.norm(block * ratio) + np.linalg.norm(doubt * ratio)
-        own, bounds = np.diag(triangular), _bounds(triangular, float(moved))
-        # Conjugates are known equally well.
-        errors[at] = unit * np.max(np.where(own[:, None].conj() == own, bounds, 0.0), axis=1)
-        diagonal[at, at], noise[at] = unit * triangular, unit * moved
-    T = unitary.conj().T @ (A * (scaling / scaling[:, None])) @ unitary
-    for at in blocks:
-        T[at.start :, at] = 0.0
-        T[at, at] = diagonal[at, at]
-    S = np.zeros((n, n), dtype=np.complex128)
-    S[order] = scaling[:, None] * unitary
-    return Spectrum(np.diag(T).copy(), errors, _conditions(T), noise, T, S)
+    balanced, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
+    noise = len(A) * EPSILON * float(np.linalg.norm(balanced)) + float(np.linalg.norm(E * (scale / scale[:, None])))
+    T, U = _schur(balanced)
+    values, bounds = np.diag(T).copy(), _bounds(T, noise)
+    # Conjugates are known equally well.
+    errors = np.max(np.where(values[:, None].conj() == values, bounds, 0.0), axis=1)
+    return Spectrum(values, errors, noise, T, scale[:, None] * U)
 
 
 def _square(matrix: ArrayLike) -> FloatArray:
@@ -148,21 +120,6 @@ def _square(matrix: ArrayLike) -> FloatArray:
     if not np.all(np.isfinite(A)):
         raise InputError("the matrix is not finite", item="matrix")
     return A
-
-
-def _blocks(acts: NDArray[np.bool_]) -> tuple[NDArray[np.intp], list[slice]]:
-    """An order of the variables in which the matrix is block upper triangular, and its blocks.
-
-    Variables that act on each other, by whatever way round, make one block.
-    """
-    _, label = connected_components(acts, directed=True, connection="strong")
-    reach = acts | np.eye(len(acts), dtype=bool)
-    for _ in range(len(acts).bit_length()):
-        reach = (reach.astype(np.float64) @ reach) > 0
-    # Who is acted on from outside the block reaches fewer than who acts on it; members of one block reach the same.
-    order = np.lexsort((np.arange(len(acts)), label, -reach.sum(axis=1)))
-    edges = [0, *(np.flatnonzero(np.diff(label[order])) + 1).tolist(), len(acts)]
-    return order, [slice(a, b) for a, b in pairwise(edges)]
 
 
 def _schur(block: FloatArray) -> tuple[ComplexArray, ComplexArray]:
@@ -187,7 +144,7 @@ def _bounds(T: ComplexArray, noise: float) -> FloatArray:
     The smaller of two bounds: n cond_k noise (Demmel, theorem 4.5), and the one of Golub and Van Loan, theorem 7.2.3,
     which goes with a root of the noise and holds for defective matrices as well.
     """
-    n, size = len(T), max(float(np.linalg.norm(T)), noise)
+    n, size = len(T), max(float(np.linalg.norm(T)), noise) or 1.0
     departure = float(np.linalg.norm(np.triu(T, 1))) / size
     with np.errstate(over="ignore", invalid="ignore"):
         theta = noise / size * float(np.sum(departure ** np.arange(n)))
@@ -291,7 +248,7 @@ def _structures(
         return [(JordanBlocks(mean, (1,), closer == 1.0), _of_unit_length(basis))]
     # What the entries of `top` may be off by: from the Schur form, from the exchanges, and from the mean.
     noise = m * EPSILON * float(scipy.linalg.norm(np.triu(top, 1)))
-    noise += max(float(found.noise[k]) or abs(found.values[k] - mean) for k in members)
+    noise += found.noise
     stairs = _staircase(top - mean * np.eye(m), NULL * noise)
     if stairs is None:
         parts = _clusters(values, found.errors[members] / (CLOSER * closer))
@@ -393,13 +350,13 @@ class Classification(NamedTuple):
     hyperbolic: bool
     #: How far each eigenvalue may be off.
     errors: FloatArray
-    #: The condition number of each eigenvalue, of the balanced matrix; infinite or nearly so for a defective one.
-    conditions: FloatArray
+    #: What to install for an answer where there is none.
+    remark: str = ""
 
     def __str__(self) -> str:
         name = self.detail if self.detail == "saddle-focus" else f"{self.detail} {self.kind.value}".strip()
         if self.stability is Stability.UNKNOWN:
-            return f"{name} whose stability cannot be told"
+            return f"{name} whose stability cannot be told{self.remark and ': '}{self.remark}"
         return f"{self.stability.value} {name}"
 
 
@@ -414,7 +371,7 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
     matrix : array_like, shape (n, n)
     error : array_like, shape (n, n) or a number
         How far the entries may be off, beyond their rounding: of a Jacobian by differences, for example. Without any,
-        real parts of exactly zero are found, for up to 24 variables.
+        real parts of exactly zero are found, for up to 24 variables; for more than two this needs SymPy.
     """
     A, found = _square(matrix), spectrum(matrix, error)
     groups = _clusters(found.values, found.errors)
@@ -436,93 +393,42 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
         if len(blocks) == 1:
             detail = "star" if blocks[0].sizes[0] == 1 else "improper"
     stability = Stability.UNSTABLE if 1 in present else Stability.ASYMPTOTIC if present == {-1} else Stability.UNKNOWN
-    axis = on_axis(A) if stability is Stability.UNKNOWN and not np.any(error) else None
+    axis, remark = None, ""
+    if stability is Stability.UNKNOWN and not np.any(error):
+        try:
+            axis = (2, True) if len(A) == 2 and not zero and np.trace(A) == 0.0 else on_axis(A)
+        except ModuleNotFoundError as missing:
+            remark = str(with_extra(missing, "to decide in rational numbers"))
     if axis is not None and axis[0] == np.sum(signs == 0):
         stability = Stability.STABLE if axis[1] else Stability.UNSTABLE
     order = np.lexsort((-found.values.imag, -found.values.real))
-    return Classification(
-        kind,
-        stability,
-        detail,
-        found.values[order],
-        0 not in present,
-        found.errors[order],
-        found.conditions[order],
-    )
-
-
-#: Coefficients, that of the highest power first; none for the polynomial 0.
-Polynomial: TypeAlias = list[Fraction]
+    return Classification(kind, stability, detail, found.values[order], 0 not in present, found.errors[order], remark)
 
 
 def on_axis(matrix: FloatArray) -> tuple[int, bool] | None:
     """How many eigenvalues lie on the imaginary axis exactly, and whether all their Jordan blocks have size 1.
 
-    A real part of zero is no matter of accuracy: the least change of an entry makes it positive or negative. Only a
-    matrix whose numbers are meant as they stand has one, and there it can be decided, since doubles are integers times
-    a power of two. Eigenvalues on the axis are common roots of the characteristic polynomials of A and -A. None where
-    common roots lie off the axis, or of a matrix with more than `LARGEST` variables.
+    Entries count as they stand, as doubles are rational numbers. Eigenvalues on the axis are common roots of the
+    characteristic polynomials of A and -A. None where common roots lie off the axis, or with too many variables.
     """
-    n = len(matrix)
-    if n > LARGEST:
+    from sympy import QQ, Poly, Symbol
+    from sympy.polys.matrices import DomainMatrix
+
+    if len(matrix) > LARGEST:
         return None
-    entries = [[Fraction(float(v)) for v in row] for row in matrix]
-    unit = max(v.denominator for row in entries for v in row)
-    A = np.array([[int(v * unit) for v in row] for row in entries], dtype=object)
-    p, M = [Fraction(1)], 0 * A
-    for k in range(1, n + 1):  # Faddeev and Leverrier: det(l - A)
-        M = A @ M
-        M[np.diag_indices(n)] += int(p[-1])
-        p.append(Fraction(-int(np.trace(A @ M)), k))
-    common = _common(p, [c * (-1) ** k for k, c in enumerate(p)])
-    once = _divided(common, _common(common, _derivative(common)))[0]  # each of the common roots once
-    if not _all_negative(once[::2]):
+    x, shape = Symbol("x"), matrix.shape
+    A = DomainMatrix([[QQ(*float(v).as_integer_ratio()) for v in row] for row in matrix], shape, QQ)
+    p = Poly(A.charpoly(), x, domain=QQ)
+    common = p.gcd(p.compose(Poly(-x, x, domain=QQ)))
+    once = common.sqf_part()
+    squares = Poly(once.all_coeffs()[::2], x, domain=QQ)
+    if squares.degree() > 0 and squares.count_roots(None, 0) < squares.degree():
         return None
     # The least polynomial of A has simple roots on the axis if this one vanishes at A.
-    least = len(once) == len(common) or not np.any(_at(_divided(p, common)[0], A) @ _at(once, A))
-    return len(common) - 1, least
-
-
-def _at(p: Polynomial, A: NDArray[np.object_]) -> NDArray[np.object_]:
-    """A multiple of p(A), in integers."""
-    value, scale = 0 * A, math.lcm(*(c.denominator for c in p))
-    for c in p:
-        value = value @ A
-        value[np.diag_indices(len(A))] += int(c * scale)
-    return value
-
-
-def _divided(a: Polynomial, b: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Quotient and remainder."""
-    quotient, rest = [], list(a)
-    while len(rest) >= len(b):
-        factor = rest[0] / b[0]
-        quotient.append(factor)
-        rest = [r - factor * (b[k] if k < len(b) else 0) for k, r in enumerate(rest)][1:]
-    return quotient, rest[next((k for k, c in enumerate(rest) if c), len(rest)) :]
-
-
-def _common(a: Polynomial, b: Polynomial) -> Polynomial:
-    """The greatest common divisor, its leading coefficient 1."""
-    while b:
-        a, b = b, _divided(a, b)[1]
-        b = [c / abs(b[0]) for c in b]
-    return [c / a[0] for c in a]
-
-
-def _derivative(p: Polynomial) -> Polynomial:
-    return [c * (len(p) - 1 - k) for k, c in enumerate(p[:-1])]
-
-
-def _all_negative(p: Polynomial) -> bool:
-    """Whether all roots of a polynomial without double roots, and not 0 at 0, are real and negative (Sturm)."""
-    chain = [p, _derivative(p)]
-    while len(chain[-1]) > 1:
-        rest = [-c for c in _divided(chain[-2], chain[-1])[1]]
-        chain.append([c / abs(rest[0]) for c in rest])
-    far, near = [q[0] * (-1) ** (len(q) - 1) for q in chain if q], [q[-1] for q in chain if q]
-    changes = [sum((a > 0) != (b > 0) for a, b in pairwise([v for v in values if v])) for values in (far, near)]
-    return changes[0] - changes[1] == len(p) - 1
+    least, value = p.quo(common) * once, DomainMatrix.zeros(shape, QQ)
+    for c in least.all_coeffs() if once.degree() < common.degree() else ():
+        value = value * A + QQ(c.p, c.q) * DomainMatrix.eye(shape, QQ)
+    return common.degree(), value.is_zero_matrix
 
 
 # -- equilibria ---------------------------------------------------------------------------------------

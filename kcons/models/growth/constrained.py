@@ -301,12 +301,6 @@ class ConstrainedGrowth:
             )
         return best
 
-    # -- what systems of some kinds know about their motion -------------------------------------------
-
-    def past_instant(self, time: float, log_x: FloatArray) -> FloatArray:
-        """The state beyond what happens in less time than numbers can tell; the same state where nothing does."""
-        return log_x
-
     def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[float], FloatArray] | None:
         """How the motion goes on without integration, once nothing but the rows decides about it; None before.
 
@@ -403,7 +397,7 @@ def solve(
         return bound.logarithmic_velocity(Populations.from_logarithms(t, y))
 
     def placed(t: float, y: FloatArray) -> FloatArray:
-        p = Populations.from_logarithms(t, bound.past_instant(t, bound.project(t, y)))
+        p = Populations.from_logarithms(t, bound.project(t, y))
         if abs(t - span[0]) >= abs(seen["end"].time - span[0]):
             seen["end"] = p
         return p.log_x

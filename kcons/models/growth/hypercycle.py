@@ -33,9 +33,6 @@ from kcons.models.growth.rows import EntropyLaw, EntropyRow, NoProduction, Relax
 NEARNESS, SLOWNESS, STRAYING = 0.1, 0.3, 20.0
 #: Where the excess is this part of kT sum x, its direction no longer matters.
 NEGLIGIBLE_EXCESS = 1e-22
-#: Extinct is what lies below this part of the sum. Extinct species return in an instant where the variance of mu over
-#: the others, in kT^2, is below the second number; the first of them then has the third as ln x: x (ln x)^2 = 1e-13.
-EXTINCT, ALIKE, RETURNED = 1e-24, 1e-14, -37.2
 
 
 class Hypercycle(GrowthModel):
@@ -125,35 +122,6 @@ class ConstrainedHypercycle(ConstrainedGrowth):
             p = Populations.from_values(t, x)
             found[0] -= found[1] * self.model.mixture.potentials(p)[np.argmax(p.x)]
         return found
-
-    def past_instant(self, time: float, log_x: FloatArray) -> FloatArray:
-        """Bring extinct species back where entropy can be produced in no other way.
-
-        With some species extinct, the others have an equilibrium of their own, at which the entropy row fades as it
-        does at the true one. The law asks for more: lambda_2 grows like -1/(t* - t), and every ln x of an extinct
-        species returns as (t* - t)^(1/2), from -1e8 or less, in less time than the last digit of t. In that time
-        nothing else moves, and all of them keep their proportions mu_i - <mu>: they are taken to where the first of
-        them counts again.
-        """
-        row, p = self.entropy_row, Populations.from_logarithms(time, log_x)
-        total = float(np.sum(p.x))
-        extinct = p.x < EXTINCT * total
-        if row is None or not extinct.any():
-            return log_x
-        kT = self.model.mixture.kT
-        mu = row.gradient(p) / kT
-        mean = p.x @ mu / total
-        away = np.where(extinct, 0.0, mu - mean)
-        level = float(np.max(log_x[extinct])) - np.log(total)
-        # lambda_2 < 0: towards the return, not into extinction.
-        pull = row.rate(p) - kT * float(p.x @ (away * self.model.rates(p)))
-        if p.x @ away**2 >= ALIKE * total or pull >= 0 or level >= RETURNED:
-            return log_x
-        share = (RETURNED - level) / float(np.max((mu - mean)[extinct]))
-        try:
-            return self.project(time, np.where(extinct, log_x + share * (mu - mean), log_x))
-        except ConvergenceError:
-            return log_x
 
     def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[float], FloatArray] | None:
         """The slow motion from here on, once the state is on it to `tolerance`; None before.

@@ -4,12 +4,12 @@ The point on the constraints that is nearest in the mass metric moves only the a
 target wrecks the bonds around them. So where rows are far off, or the nearest point changes other bonds or angles,
 
 1. every row with a motion of its own makes it: a dihedral turns what lies beyond its bond, an angle turns what lies
-   beyond one of its legs, a bond shifts what lies beyond it, a distance between molecules shifts one of them;
+   beyond one of its legs, a bond shifts the atoms on both of its sides, a distance between molecules shifts both;
 2. where this does not do, in rings, between fixed atoms and for distances along a chain, all atoms of the molecules
    give way together, by least squares of what changes in bonds and angles;
 3. what is left, mostly rounding, is done by the search for the nearest point.
 
-Of the two sides of a bond the lighter one moves, or the one without fixed atoms.
+What has fixed atoms stays where it is. A dihedral or an angle turns the lighter of its two sides.
 """
 
 from __future__ import annotations

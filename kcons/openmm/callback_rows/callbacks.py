@@ -21,13 +21,9 @@ the engine knows the positions in OpenMM, to rounding.
 
 from __future__ import annotations
 
-import io
-import pickle
-import re
-import uuid
 import weakref
 from collections.abc import Callable
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import openmm
@@ -37,11 +33,11 @@ from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, KconsError
+from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
+from kcons.openmm.integrator.ensemble import Integrator
 from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.schemes import operations_of, stages_of
-from kcons.openmm.integrator.system_checks import ROW_NAME
+from kcons.openmm.integrator.schemes import stages_of
 from kcons.openmm.quantities import number
 from kcons.steppers.operations import Exchange
 from kcons.steppers.state import START_TOLERANCE
@@ -60,17 +56,12 @@ CARRY_SCALE = 2.0**20
 _TO_WHOLE, _FROM_WHOLE = 2.0**32, 2.0**32 - 1
 
 PHASES = ("remember", "land", "project")
-PREFIX = f"{ROW_NAME}s"
-#: Engines by their keys.
-LIVE: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
-#: Those read last, by the keys of the engines that they are copies of.
-_READ: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
 
 
 def hands_over_all() -> bool:
     """Whether callbacks are to be given the positions of all particles: a platform here may have mixed precision."""
-    platforms = range(openmm.Platform.getNumPlatforms())
-    return any("Precision" in openmm.Platform.getPlatform(k).getPropertyNames() for k in platforms)
+    platforms = map(openmm.Platform.getPlatform, range(openmm.Platform.getNumPlatforms()))
+    return any("Precision" in platform.getPropertyNames() for platform in platforms)
 
 
 class Passage:
@@ -87,22 +78,17 @@ class Passage:
     ----------
     precision : Precision
         That of the Context.
+    some : bool
+        Whether OpenMM hands over the engine's particles only; all where a platform here may have mixed precision.
     """
 
     def __init__(self, atoms: IntArray, n_particles: int) -> None:
-        self.atoms, self._n = atoms, n_particles
+        self.atoms = atoms
         self.precision = Precision("", "double")
+        self.some = len(atoms) < n_particles and not hands_over_all()
         #: Positions and corrections of all particles, where OpenMM hands over all.
-        self._all: tuple[FloatArray, FloatArray] | None = None
+        self._all = None if self.some or len(atoms) == n_particles else np.zeros((2, n_particles, 3))
         self._nothing = np.zeros((len(atoms), 3))
-        self._open = False
-
-    def open(self, state: openmm.State) -> None:
-        """At the first call: whether positions are those of all particles."""
-        if not self._open:
-            self._open = True
-            if len(self.atoms) < self._n == len(state.getPositions()):
-                self._all = np.zeros((self._n, 3)), np.zeros((self._n, 3))
 
     def take(self, state: openmm.State, out: FloatArray) -> None:
         """Positions of the engine's particles, shape (n_atoms, 3), nm."""
@@ -153,25 +139,19 @@ class Engine:
 
     def __init__(
         self,
-        key: str,
         constraints: tuple[Constraint, ...],
         positions: FloatArray,
         masses: FloatArray,
         cell: FloatArray | None,
-        degenerate: Literal["convert", "raise"],
         time: unit.Quantity | float,
     ) -> None:
-        self.key = key
         time = number(time, unit.picosecond, "time")
         held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
-        self.motion = Motion(held, positions, degenerate=degenerate, time=time)
+        self.motion = Motion(held, positions, time=time)
         self.masses, self.cell = masses, cell
-        #: What it takes to build this again; targets taken from the positions are in the set.
-        self.recipe = (held.constraints, positions, masses, cell, degenerate, time)
         self.atoms: IntArray = held.touched
-        self.whole = len(self.atoms) == len(masses)
         #: Where the carried particles are in arrays of all.
-        self._held: slice | IntArray = slice(None) if self.whole else self.atoms
+        self._held: slice | IntArray = slice(None) if len(self.atoms) == len(masses) else self.atoms
         n, local = masses.shape[0], (len(self.atoms), 3)
         #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
         self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
@@ -180,7 +160,6 @@ class Engine:
         self._x, self._read = np.zeros(local), np.zeros(local)
         #: To and from OpenMM.
         self.passage = Passage(self.atoms, n)
-        self._landed = False
         rows = self.motion.constraint_set.n_rows
         self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
         #: Whether the times of a drift matter, or its length.
@@ -189,7 +168,7 @@ class Engine:
         fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
         #: Which of the carried particles do not move.
         self._fixed = np.searchsorted(self.atoms, fixed)
-        self._integrator: Callable[[], openmm.CustomIntegrator | None] = lambda: None
+        self._integrator: Callable[[], Integrator | None] = lambda: None
         self._lean = False
         self._fractions: tuple[float, ...] = (1.0,)
         self._nodes: tuple[float, ...] = (0.0, 1.0)
@@ -207,24 +186,18 @@ class Engine:
         self._begun = False
         #: Free positions of the drift and what brings them onto the rows.
         self._landing: tuple[FloatArray, FloatArray] | None = None
-        LIVE.setdefault(key, self)
 
-    def follow(self, integrator: openmm.CustomIntegrator, lean: bool = False) -> None:
+    def follow(self, integrator: Integrator, lean: bool) -> None:
         """Take times and step sizes from this integrator; `lean` as for parts."""
         self._lean = lean
         self._push.fill(np.nan)
         self._push_before.fill(np.nan)
-        self._fractions, self._nodes, self._within = (1.0,), (0.0, 1.0), False
         self._integrator = weakref.ref(integrator)
-        self.carries_rest = not getattr(integrator, "thermostatted", False)
-        scheme = getattr(integrator, "scheme", None)
-        if scheme is not None:
-            ensemble = getattr(integrator, "ensemble", None)
-            operations = operations_of(scheme) if ensemble is None else ensemble.operations(scheme)
-            self._within = any(isinstance(operation, Exchange) for operation in operations)
-            self._fractions = tuple(stages_of(operations)[0])
-            sums = np.cumsum(self._fractions)[:-1].tolist()
-            self._nodes = (0.0, *sums, 1.0)
+        self.carries_rest = not integrator.thermostatted
+        operations = integrator.ensemble.operations(integrator.scheme)
+        self._within = any(isinstance(operation, Exchange) for operation in operations)
+        self._fractions = tuple(stages_of(operations)[0])
+        self._nodes = (0.0, *np.cumsum(self._fractions)[:-1].tolist(), 1.0)
 
     def take_precision(self, precision: Precision) -> None:
         """The Context is known. Where positions have 48 bits, what v loses on its way is less than forces know."""
@@ -288,7 +261,6 @@ class Engine:
         self._push.fill(0.0)
         change, arriving = self.passage.carried(change)
         np.add(read, arriving, out=self._x)
-        self._landed = True
         self._landing = (read.copy(), change)
         return change
 
@@ -354,7 +326,6 @@ class Engine:
 
     def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
         """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
-        self.passage.open(state)
         change = None
         try:
             if phase == "remember":
@@ -367,28 +338,17 @@ class Engine:
             self._error, change = error, None
         return (0.0 if self._error is None else 1.0), self.passage.give(change)
 
-    def rounded(self, x: FloatArray) -> bool:
-        """Whether OpenMM may have moved carried particles back into the box since the last drift: it rounds them."""
-        if self.passage.precision.name != "mixed" or not self._landed:
-            return self.passage.precision.name == "mixed"
-        off = x[self.atoms] - self._x
-        if self.cell is not None:
-            off -= np.round(off @ np.linalg.inv(self.cell)) @ self.cell
-        reach = 2.0**-22 * np.abs(x[self.atoms]).max(initial=0.0)
-        return not self.passage.same(self._x + off, self._x) and bool(np.abs(off).max(initial=0.0) <= reach)
-
     # -- afterwards -----------------------------------------------------------------------------
 
     def step_multipliers(self) -> FloatArray:
         integrator = self._integrator()
         # A drift of velocities that were not made tangent has pushed for that as well.
         whole = self._lean and integrator is not None and integrator.getGlobalVariableByName("led") != 0
-        mixed = getattr(integrator, "thermostatted", False)
         unknown = len(self._fractions) != 1 or (np.isnan(self._push_before).any() and not whole)
-        if integrator is None or mixed or unknown:
+        if integrator is None or integrator.thermostatted or unknown:
             raise InputError(
-                "multipliers of a step need two steps of a scheme with one drift, at constant energy; "
-                "multipliers(context) gives those of any state",
+                "multipliers of a step need two steps of a scheme with one drift, at constant energy and with "
+                "device=False; multipliers(context) gives those of any state",
                 item="scheme",
             )
         dt = self._made_with
@@ -399,9 +359,7 @@ class Engine:
         self._error = None
         if error is None:
             return ConvergenceError(f"step {step}: the carried rows failed without saying why", step=step)
-        cause = ""
-        if isinstance(error, ConvergenceError):
-            cause = f"{self._cause()}. "
+        cause = "time step too large, or a state off the rows. " if isinstance(error, ConvergenceError) else ""
         if isinstance(error, KconsError):
             error.args = (f"step {step}: {cause}{error}", *error.args[1:])
             error.step = step  # type: ignore[attr-defined]
@@ -409,23 +367,9 @@ class Engine:
             error.add_note(f"in step {step}, from the function of a constraint; the step was taken back")
         return cast(KconsError, error)
 
-    def _cause(self) -> str:
-        held = self.motion.constraint_set
-        time = self._times(self._stage)[0]
-        miss = np.abs(held.value(self._start, time))
-        allowed = np.maximum(1e-6 * held.scale, 4 * held.tolerance(self._start, time))
-        off = np.flatnonzero(~(miss <= allowed))
-        if not len(off):
-            return "time step too large"
-        row = int(off[np.argmax(miss[off])])
-        return (
-            f"the state before it was already off row {held.row_name(row)} by {miss[row]:.3g}; "
-            "call apply_positions(context) first"
-        )
-
 
 class Callback:
-    """The function of one PythonForce; survives pickling together with its engine."""
+    """The function of one PythonForce."""
 
     def __init__(self, engine: Engine, phase: str) -> None:
         self.engine, self.phase = engine, phase
@@ -433,52 +377,10 @@ class Callback:
     def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
         return self.engine.answer(self.phase, state)
 
-    def __reduce__(self) -> tuple[Callable[..., Callback], tuple[Any, ...]]:
-        # The first of the three brings the engine along; the others find it by its key.
-        recipe = self.engine.recipe if self.phase == PHASES[0] else None
-        return _restored, (self.engine.key, self.phase, recipe)
-
-
-def _restored(key: str, phase: str, recipe: tuple[Any, ...] | None) -> Callback:
-    """The function of a copy, whose engine has a key of its own."""
-    if recipe is not None:
-        _READ[key] = engine = Engine(uuid.uuid4().hex, *recipe)
-    elif key in _READ:
-        engine = _READ[key]
-    else:
-        raise pickle.UnpicklingError(f"the force '{force_name(PHASES[0], key)}' must be read first")
-    return Callback(engine, phase)
-
-
-class _KeyReader(pickle.Unpickler):
-    """Reads the key of a function and leaves out the rest."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        return (lambda key, *_: key) if name == _restored.__name__ else super().find_class(module, name)
-
-
-def key_of(force: openmm.Force) -> str:
-    """Of the engine that a force calls: copies of a System have the names of the first one, and engines of their own.
-
-    The force of a function that cannot be pickled is no copy.
-    """
-    try:
-        xml = openmm.XmlSerializer.serialize(force)
-    except openmm.OpenMMException:
-        return str(force.getName().split()[-1])
-    found = re.search(r' function="(\w+)"', xml)
-    assert found is not None
-    return str(_KeyReader(io.BytesIO(bytes.fromhex(found[1]))).load())
-
-
-def forces_of_rows(system: openmm.System) -> dict[str, dict[str, openmm.PythonForce]]:
-    """The forces of a System that carry rows, by phase, by the key of the engine that they call."""
-    named: dict[str, dict[str, openmm.PythonForce]] = {}
-    for force in system.getForces():
-        if isinstance(force, openmm.PythonForce) and force.getName().startswith(PREFIX):
-            phase, name = force.getName().split()[-2:]
-            named.setdefault(name, {})[phase] = force
-    return {key_of(forces[PHASES[1]]): forces for forces in named.values() if PHASES[1] in forces}
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise UnsupportedError(
+            "rows of hold belong to their System: copy the System, or write it to XML, before the call of hold"
+        )
 
 
 # -- what OpenMM gives ----------------------------------------------------------------------------
@@ -496,7 +398,3 @@ def cell_of(vectors: Any) -> FloatArray:
         else [edge.value_in_unit(unit.nanometer) for edge in vectors]
     )
     return np.array([[edge[0], edge[1], edge[2]] for edge in plain], dtype=np.float64)
-
-
-def force_name(phase: str, key: str) -> str:
-    return f"{PREFIX}: {phase} {key}"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import uuid
-import warnings
-from collections.abc import Callable, Iterable
-from typing import Any, Literal, Self
+from collections.abc import Iterable
+from typing import Self
 
 import numpy as np
 import openmm
@@ -14,35 +13,34 @@ from openmm import unit
 
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.openmm.callback_rows.callbacks import (
     CARRY_SCALE,
-    LIVE,
     LOW_SCALE,
     PHASES,
     SPEED_SCALE,
     Callback,
     Engine,
     cell_of,
-    force_name,
-    forces_of_rows,
-    hands_over_all,
 )
 from kcons.openmm.collective.coordinates import free_groups
 from kcons.openmm.integrator.part import NEAR, Part, Solver, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import groups_in, refuse_agents, require_context, virtual_sites
+from kcons.openmm.integrator.system_checks import (
+    ROW_NAME,
+    forces_of,
+    groups_in,
+    refuse_agents,
+    require_context,
+    virtual_sites,
+)
 from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
 from kcons.openmm.states import forces_at, positions_of
 from kcons.openmm.topology import bonds_of
-
-#: Rounding of positions, relative to the shortest row, that a run begins to show.
-COARSE = 1e-11
 
 
 class CarriedConstraints(Part):
@@ -62,8 +60,6 @@ class CarriedConstraints(Part):
     periodic : bool, optional
         Whether rows take minimum images; by default if the System is periodic. Turn it off for rows longer than
         half the box among molecules that are never cut.
-    degenerate : {'convert', 'raise'}
-        As for `Motion`.
     time : float
         Time of `positions` in ps, for targets that move.
 
@@ -74,12 +70,10 @@ class CarriedConstraints(Part):
 
     Notes
     -----
-    Pickling a System, or writing it to XML, takes the rows along if all of their functions can be pickled;
-    `CarriedConstraints.of` then finds them.
+    The rows belong to this System: it can be neither copied nor written to XML afterwards.
     """
 
     evaluates = lands_last = True
-    _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
 
@@ -90,65 +84,32 @@ class CarriedConstraints(Part):
         positions: unit.Quantity | ArrayLike,
         *,
         periodic: bool | None = None,
-        degenerate: Literal["convert", "raise"] = "convert",
         time: unit.Quantity | float = 0.0,
     ) -> None:
         given = tuple(accepted((constraints,) if isinstance(constraints, Constraint) else constraints))
-        if sum(c.n_rows for c in given if isinstance(c, Constraint)) == 0 and all(
-            isinstance(c, Constraint) for c in given
-        ):
+        if not any(getattr(each, "n_rows", 1) for each in given):  # ConstraintSet says what is none
             raise InputError("there are no rows to hold", item="constraints")
         masses = masses_of(system)
         x = nanometers(positions, len(masses))
         wraps = system.usesPeriodicBoundaryConditions() if periodic is None else periodic
         cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
-        engine = Engine(uuid.uuid4().hex, with_massless_atoms(given, masses), x, masses, cell, degenerate, time)
-        refuse_virtual_sites(system, engine.atoms, masses)
-        self._bind(engine, free_groups(system, len(PHASES), "rows")[-len(PHASES) :][::-1])
-
-    def _bind(self, engine: Engine, groups: list[int]) -> None:
-        self.code = 0
-        self._engine = engine
-        self._groups = dict(zip(PHASES, groups, strict=True))
-        self.groups = frozenset(groups)
-
-    @classmethod
-    def of(cls, system: openmm.System) -> CarriedConstraints:
-        """The rows that a System brings along which was read from XML or copied.
-
-        Raises
-        ------
-        InputError
-            It has none.
-        """
-        found = {key: forces for key, forces in forces_of_rows(system).items() if key in LIVE}
-        if len(found) != 1:
-            raise InputError(
-                f"the System carries {len(found) or 'no'} sets of rows of kcons; expected one", item="system"
-            )
-        ((key, forces),) = found.items()
-        if hands_over_all():
-            for force in forces.values():
-                force.setParticles([])
-        part = object.__new__(cls)
-        part._bind(LIVE[key], [forces[phase].getForceGroup() for phase in PHASES])
-        part._look_at(system)
-        return part
+        self._engine = Engine(with_massless_atoms(given, masses), x, masses, cell, time)
+        refuse_virtual_sites(system, self.atoms, masses)
+        groups = free_groups(system, len(PHASES), "rows")[-len(PHASES) :][::-1]
+        self._groups, self.groups = dict(zip(PHASES, groups, strict=True)), frozenset(groups)
+        #: How the names of its forces begin.
+        self._name = f"{ROW_NAME}s {uuid.uuid4().hex}"
 
     def add_to(self, system: openmm.System) -> None:
         """Put the forces that carry the rows into the System; before the Context is made."""
-        engine = self._engine
-        for phase in PHASES:
-            force = openmm.PythonForce(Callback(engine, phase))
-            if not (engine.whole or hands_over_all()):
-                force.setParticles(engine.atoms.tolist())
-            force.setUsesPeriodicBoundaryConditions(engine.cell is not None)
-            force.setForceGroup(self._groups[phase])
-            force.setName(force_name(phase, engine.key))
+        for phase, group in self._groups.items():
+            force = openmm.PythonForce(Callback(self._engine, phase))
+            if self._engine.passage.some:
+                force.setParticles(self.atoms.tolist())
+            force.setUsesPeriodicBoundaryConditions(self._engine.cell is not None)
+            force.setForceGroup(group)
+            force.setName(f"{self._name}: {phase}")
             system.addForce(force)
-        self._look_at(system)
-
-    def _look_at(self, system: openmm.System) -> None:
         self.alone = system.getNumConstraints() == 0
         self.sited = bool(virtual_sites(system))
 
@@ -180,7 +141,7 @@ class CarriedConstraints(Part):
 
     # -- in a context ---------------------------------------------------------------------------
 
-    def check(self, context: openmm.Context, velocities: bool = True) -> None:
+    def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up.
 
         Raises
@@ -193,10 +154,12 @@ class CarriedConstraints(Part):
         require_context(context)
         system = context.getSystem()
         self._check_system(system, Precision.of(context))
-        refuse_movers(system, self.motion.constraint_set, context.getMolecules)
-        x, v, time = self._state(context)
-        self._tell_of_rounding(x)
-        miss = self._worst(x, v if velocities else None, time)
+        held = self.motion.constraint_set
+        bound = next((repr(item) for item in held.constraints if not item.translation_invariant), None)
+        starts = zip(held.constraints, held.starts, strict=False)
+        rows = [(item.atoms, lambda k, start=start: held.row_name(start + k)) for item, start in starts]
+        refuse_agents(system, bound, rows, context.getMolecules)
+        miss = self.worst_violation(context)
         if miss is not None:
             raise InputError(
                 f"{miss}; bring them onto the rows by apply_{miss.what}(context), or correct them",
@@ -207,21 +170,18 @@ class CarriedConstraints(Part):
     def _check_system(self, system: openmm.System, precision: Precision) -> None:
         """Raise where the System is not the one that the rows were built for."""
         engine = self._engine
-        forces = forces_of_rows(system).get(engine.key, {})
-        if set(forces) != set(PHASES):
+        if not any(force.getName().startswith(self._name) for force in forces_of(system)):
             raise InputError(
-                "the System has no forces that carry these rows; call add_to(system), or hold(system, ...), before "
-                "the Context is made; those of a copy of a System are CarriedConstraints.of(copy)",
+                "the System has no forces that carry these rows; call hold(system, ...) before the Context is made",
                 item="system",
             )
-        refuse_single_precision(precision, forces[PHASES[0]])
         now = masses_of(system)
         if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
             raise InputError("masses have changed since the rows were built; build them again", item="masses")
         refuse_virtual_sites(system, engine.atoms, now)
         if self.alone and system.getNumConstraints():
             raise InputError(
-                "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
+                "the System got constraints after the rows were added to it; add the rows, by hold, last",
                 item="system",
             )
         touched = set(engine.atoms.tolist())
@@ -240,17 +200,15 @@ class CarriedConstraints(Part):
     def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:
         """sigma and A v of the constraints that were given, from the positions and velocities of the context."""
         x, v, time = self._state(context)
-        return self._worst(x, v if velocities else None, time)
-
-    def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Violation | None:
         held = self.motion.sources[0]
-        found = held.residuals(x, v, time)
+        found = held.residuals(x, v if velocities else None, time)
         near, slow = self._engine.passage.limits
         allowed = np.maximum(near * held.scale, found.allowed)
         reach = np.abs(x[held.touched]).max(initial=0.0)
         if self._slopes is None:
             self._slopes = found.norms
-        if self._engine.rounded(x):
+        if self._engine.passage.precision.name != "double" and context.getSystem().usesPeriodicBoundaryConditions():
+            # OpenMM rounds molecules to single numbers where it moves them back into the box.
             allowed += 2.0**-22 * reach * self._slopes
         miss = Violation.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
         if miss is not None or found.rates is None or found.speeds is None:
@@ -259,21 +217,6 @@ class CarriedConstraints(Part):
         # What is taken from v where it is carried together with x: all there is of a body at rest.
         lost = 4 * SPEED_SCALE * self._engine.passage.grain(reach) * self._slopes
         return Violation.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
-
-    def _tell_of_rounding(self, x: FloatArray) -> None:
-        """Warn once of coordinates so large that their rounding adds noise to the velocities."""
-        held = self.motion.constraint_set
-        if self._told or not held.n_rows:
-            return
-        reach = float(np.abs(x[held.touched]).max())
-        grain = self._engine.passage.grain(reach)
-        self._told = grain > COARSE * held.scale.min()
-        if self._told:
-            warnings.warn(
-                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; "
-                "each step turns this into velocity, and the energy wanders. Move the origin nearer",
-                stacklevel=3,
-            )
 
     def apply_positions(self, context: openmm.Context) -> None:
         """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
@@ -337,9 +280,6 @@ class CarriedConstraints(Part):
 
     def declare(self, program: Program) -> None:
         self._engine.follow(program.integrator, self.lean)
-        #: Where a step may end without a projection, the solve for positions must tell of failures itself.
-        self._early = self.lean or getattr(program.integrator, "scheme", None) is None
-        self._begins_early = getattr(getattr(program.integrator, "ensemble", None), "stays_tangent", False)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Refuse single precision; what passes through OpenMM is known now."""
@@ -350,7 +290,7 @@ class CarriedConstraints(Part):
 
     def begin(self, program: Program) -> None:
         """Where x is not where the last step ended, and velocities are projected before the first drift."""
-        if self._begins_early:
+        if program.integrator.ensemble.stays_tangent:
             self.remember(program)
 
     def _guard(self, program: Program, phase: str, words: str) -> None:
@@ -370,7 +310,7 @@ class CarriedConstraints(Part):
 
     def land(self, program: Program, h: str) -> None:
         change = f"f{self._groups['land']}"
-        if self._early:
+        if self.lean:  # where a step may end without a projection, this solve must tell of failures itself
             self._guard(program, "land", "carried rows: solve for positions")
             force, change = change, program.vector(f"change{self.code}", "what brings carried particles onto the rows")
             program.each(change, force, "from the evaluation that tells of failures")
@@ -412,8 +352,8 @@ class CarriedConstraints(Part):
 
     def __reduce__(self) -> tuple[object, ...]:
         raise UnsupportedError(
-            "rows of hold belong to their System and cannot be pickled with an integrator; pickle the System, and make "
-            "another integrator with parts=[CarriedConstraints.of(system)]"
+            "rows of hold belong to their System and cannot be pickled with an integrator; call hold and make another "
+            "integrator where it is needed"
         )
 
     def __repr__(self) -> str:
@@ -432,23 +372,10 @@ def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatAr
             raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
 
 
-def refuse_single_precision(precision: Precision, force: openmm.PythonForce | None = None) -> None:
-    """Refuse positions in single precision: those of GPUs that have no others, and those of some particles in mixed."""
+def refuse_single_precision(precision: Precision) -> None:
+    """Refuse positions in single precision."""
     if precision.name == "single":
         raise UnsupportedError(
             f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
             "Context with {'Precision': 'mixed'}, or hold the rows by CollectiveRows, which the platform computes"
         )
-    if precision.name == "mixed" and force is not None and force.getParticles():
-        raise UnsupportedError(
-            f"the forces that carry the rows were made where no GPU was, and {precision} would hand over positions "
-            "that are too coarse; read the System by CarriedConstraints.of(system) before the Context is made"
-        )
-
-
-def refuse_movers(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
-    """Refuse barostats and a CMMotionRemover that would move particles off the rows."""
-    bound = next((repr(item) for item in held.constraints if not item.translation_invariant), None)
-    starts = zip(held.constraints, held.starts, strict=False)
-    rows = [(item.atoms, lambda k, start=start: held.row_name(start + k)) for item, start in starts]
-    refuse_agents(system, bound, rows, molecules)

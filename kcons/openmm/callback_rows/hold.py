@@ -6,7 +6,6 @@ atoms with each other are solved as one, so that whole clusters of them change h
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -16,32 +15,20 @@ import openmm
 from numpy.typing import ArrayLike, NDArray
 from openmm import unit
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_movers
-from kcons.openmm.quantities import masses_of
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
 
-#: Hydrogens, also heavy ones, are lighter than this (dalton).
-_HYDROGEN = 4.5
 #: Name of the force whose bonds of no strength keep molecules together.
 TIES = "kcons molecules"
-#: Forces whose particles OpenMM counts as bonded.
-_BONDING = (openmm.HarmonicBondForce, openmm.CustomBondForce, openmm.CustomCentroidBondForce)
-
-Choice = Literal["all", "hbonds", "touched"] | Iterable[int]
 
 
-def move_constraints(
-    system: openmm.System,
-    which: Choice = "all",
-    *,
-    keep_water: bool = True,
-) -> list[Constraint]:
-    """Take constraints out of a System and return them as constraints of kcons.
+def move_constraints(system: openmm.System, *, keep_water: bool = True) -> list[Constraint]:
+    """Take the constraints out of a System and return them as constraints of kcons.
 
     Bonds of no strength are added between their atoms, so that the molecules of a Context, which barostats and the
     wrapping of positions go by, stay what they were.
@@ -50,12 +37,8 @@ def move_constraints(
     ----------
     system : openmm.System
         Changed in place, before a Context is made of it.
-    which : 'all', 'hbonds' or iterable of int
-        Clusters of constraints that share atoms are taken whole: all, those with a hydrogen (lighter than
-        4.5 dalton), or those that touch one of the given atoms.
     keep_water : bool
-        Whether rigid water stays with OpenMM, whose SETTLE is fastest there; molecules among given atoms are taken
-        all the same.
+        Whether rigid water stays with OpenMM, whose SETTLE is fastest there.
 
     Returns
     -------
@@ -65,10 +48,10 @@ def move_constraints(
     Raises
     ------
     InputError
-        Unknown choice or atoms; nothing was changed.
+        No System.
     """
     table = _table(system)
-    chosen = _chosen(system, table, which, keep_water)
+    chosen = table.all_but_water if keep_water else table.all
     rows = _as_rows(table, chosen)
     _release(system, table, chosen)
     return rows
@@ -79,10 +62,9 @@ def hold(
     constraints: Constraint | Iterable[Constraint],
     positions: unit.Quantity | ArrayLike,
     *,
-    take: Choice = "touched",
+    take: Literal["touched", "all"] = "touched",
     keep_water: bool = True,
     periodic: bool | None = None,
-    degenerate: Literal["convert", "raise"] = "convert",
     join: bool = False,
     time: unit.Quantity | float = 0.0,
 ) -> CarriedConstraints:
@@ -100,11 +82,12 @@ def hold(
         are to move over.
     positions : Quantity or array_like, shape (n_particles, 3)
         On or near the constraints; targets left at None are taken from them.
-    take : 'touched', 'all', 'hbonds' or iterable of int
-        Which clusters of the System's constraints move over besides those that a row touches.
+    take : {'touched', 'all'}
+        Which of the System's constraints move over: those that share atoms with the rows, directly or through others,
+        or all.
     keep_water
         As for `move_constraints`; water that a row touches moves over.
-    periodic, degenerate, time
+    periodic, time
         As for `CarriedConstraints`.
     join : bool
         Whether molecules that a row connects count as one from now on, for barostats and wrapping. Needed where
@@ -118,19 +101,21 @@ def hold(
     Raises
     ------
     KconsError
-        As `CarriedConstraints`; a barostat that would break a row. The System was not changed.
+        As `CarriedConstraints`. The System was not changed.
     """
     given = constraints_in(constraints, "constraints")
     table = _table(system)
     n = system.getNumParticles()
-    chosen = _chosen(system, table, () if take == "touched" else take, keep_water)
+    if take not in ("touched", "all"):
+        raise InputError(f"take is {take!r}; give 'touched' or 'all'", item="take")
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
-    chosen |= _sharing(table, touched[touched < n])
+    chosen = _sharing(table, touched[touched < n])
+    if take == "all":
+        chosen |= table.all_but_water if keep_water else table.all
     taken = _as_rows(table, chosen)
-    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, degenerate=degenerate, time=time)
+    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, time=time)
     links = [_neighbors(item.atoms) for item in given] if join else []
     joined = np.concatenate([*links, np.zeros((0, 2), np.int64)])
-    refuse_movers(system, part.motion.constraint_set, lambda: _molecules(system, joined))
     # Nothing can fail from here on.
     _release(system, table, chosen)
     _tie(system, joined)
@@ -161,11 +146,15 @@ class _Table:
         return self.clusters[self.pairs[:, 0]]
 
     @property
-    def water(self) -> NDArray[np.bool_]:
-        """Constraints of molecules that are a triangle of constraints and nothing else."""
+    def all(self) -> NDArray[np.bool_]:
+        return np.ones(len(self.pairs), dtype=bool)
+
+    @property
+    def all_but_water(self) -> NDArray[np.bool_]:
+        """All but those of molecules that are a triangle of constraints and nothing else."""
         rows = np.bincount(self.cluster, minlength=len(self.clusters))[self.cluster]
         atoms = np.bincount(self.clusters)[self.cluster]
-        return (rows == 3) & (atoms == 3)
+        return (rows != 3) | (atoms != 3)
 
 
 def _table(system: openmm.System) -> _Table:
@@ -185,26 +174,6 @@ def _table(system: openmm.System) -> _Table:
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     clusters = connected_components(links, directed=False)[1].astype(np.int64)
     return _Table(pairs, lengths, clusters)
-
-
-def _chosen(system: openmm.System, table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
-    """Which constraints to take, in whole clusters."""
-    if isinstance(which, str):
-        if which == "all":
-            chosen = np.ones(len(table.pairs), dtype=bool)
-        elif which == "hbonds":
-            masses = masses_of(system)[table.pairs]
-            with_hydrogen = ((masses > 0) & (masses < _HYDROGEN)).any(axis=1)
-            chosen = np.isin(table.cluster, table.cluster[with_hydrogen])
-        else:
-            raise InputError(f"no choice {which!r}; give 'all', 'hbonds' or the numbers of atoms", item="which")
-        return chosen & ~table.water if keep_water else chosen
-    atoms = np.asarray(list(which))
-    if atoms.size == 0:
-        return np.zeros(len(table.pairs), dtype=bool)
-    if not np.issubdtype(atoms.dtype, np.integer) or atoms.min() < 0 or atoms.max() >= len(table.clusters):
-        raise InputError(f"atoms must be integers from 0 to {len(table.clusters) - 1}", item="which")
-    return _sharing(table, atoms)
 
 
 def _sharing(table: _Table, atoms: IntArray) -> NDArray[np.bool_]:
@@ -230,38 +199,16 @@ def _tie(system: openmm.System, pairs: IntArray) -> None:
     """Make the pairs count as bonded."""
     if not len(pairs):
         return
-    n = system.getNumParticles()
-    i, j = pairs.T.astype(np.int32)  # older SciPy makes no tree of wider indices
-    links = coo_array((np.ones(len(pairs)), (i, j)), shape=(n, n))
-    tree = minimum_spanning_tree(links.tocsr()).tocoo()
     force = next((f for f in system.getForces() if f.getName() == TIES), None)
     if force is None:
         force = openmm.HarmonicBondForce()
         force.setName(TIES)
         system.addForce(force)
         force = system.getForce(system.getNumForces() - 1)
-    for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
+    for i, j in pairs.tolist():
         force.addBond(i, j, 0.0, 0.0)
 
 
 def _neighbors(atoms: IntArray) -> IntArray:
     """Pairs of atoms that follow each other in rows, shape (n, 2)."""
     return np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
-
-
-def _molecules(system: openmm.System, joined: IntArray) -> list[list[int]]:
-    """What Context.getMolecules() will say, from a Context of bonds alone."""
-    bare = openmm.System()
-    for _ in range(system.getNumParticles()):
-        bare.addParticle(1.0)
-    for k in range(system.getNumParticles()):
-        if system.isVirtualSite(k):
-            site = system.getVirtualSite(k)
-            parents = [[k, site.getParticle(m)] for m in range(site.getNumParticles())]
-            joined = np.concatenate([joined, parents])
-    _tie(bare, np.concatenate([joined, _table(system).pairs]))
-    for force in system.getForces():
-        if isinstance(force, _BONDING):
-            bare.addForce(copy.deepcopy(force))
-    context = openmm.Context(bare, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
-    return [list(atoms) for atoms in context.getMolecules()]

@@ -14,13 +14,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints import Constraint, Custom, Distance, Formula, MovingTarget
-from kcons.constraints.arguments import positive, whole_number
+from kcons.constraints.arguments import positive
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.internal import MOST_TURNED
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
-    CertificateError,
     ConstraintError,
     ConvergenceError,
     InputError,
@@ -34,8 +33,6 @@ from kcons.openmm.collective.coordinates import (
     Row,
     as_constraint,
     as_rows,
-    chosen_groups,
-    forces_in,
     found_values,
     moved_atoms,
     number,
@@ -50,6 +47,7 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
     forces_alone,
+    forces_of,
     groups_in,
     refuse_agents,
     require_context,
@@ -92,22 +90,16 @@ class CollectiveRows(GroupRows):
         term or variable of a larger one; a `kcons.constraints.Formula` is one of each of its rows.
     positions : array_like or Quantity, shape (n_particles, 3), optional
         In nm if without unit. Needed where a target is to be found.
-    box : sequence of three vectors, optional
-        Periodic box at these positions, unless it is the System's default.
     tolerance : float, optional
-        Of sigma, relative to the scale of each row: the root of the sum of squares over the rows. Left open, 1e-13,
-        or 5e-7 where the platform computes forces in single precision (CUDA, HIP and OpenCL, mixed too).
-    max_iterations : int
-        Bound of the quasi-Newton iteration.
-    meets_system : bool, optional
-        Whether the rows touch atoms constrained by the System. Found from the Forces; say True where they touch them
-        in ways that the Forces do not tell.
+        Of sigma, relative to the larger of 1 and the target: the root of the sum of squares over the rows. Left open,
+        1e-13, or 5e-7 where the platform computes forces in single precision (CUDA, HIP and OpenCL, mixed too).
+    meets_system : bool
+        Say True where the rows touch atoms that the System constrains in ways that the Forces do not tell.
 
     Raises
     ------
     InputError
-        A number that is not finite, a particle or context parameter that is not there, a target to find without
-        positions, meets_system=False where a row does.
+        A number that is not finite, a particle that is not there, a target to find without positions.
     UnsupportedError
         More rows than free force groups; rows on virtual sites. The System is unchanged then.
 
@@ -120,80 +112,54 @@ class CollectiveRows(GroupRows):
     def __init__(
         self,
         system: openmm.System,
-        rows: Row | openmm.Force | int | Formula | Sequence[Row | openmm.Force | int | Formula],
+        rows: Row | openmm.Force | Formula | Sequence[Row | openmm.Force | Formula],
         *,
         positions: object | None = None,
-        box: Sequence | None = None,
         tolerance: float | None = None,
-        max_iterations: int = 20,
-        meets_system: bool | None = None,
+        meets_system: bool = False,
     ) -> None:
         given = as_rows(rows)
         if not given:
             raise InputError("no rows to hold", item="rows")
         self.asked_tolerance = tolerance
         self.tolerance = positive(TOLERANCE if tolerance is None else tolerance, "tolerance")
-        self.max_iterations = whole_number(max_iterations, "max_iterations")
         self.n_rows = len(given)
-        forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
-        only = [f[0] if len(f) == 1 else None for f in forces]
-        self.names = tuple(_name(row, f) for row, f in zip(given, forces, strict=True))
-        self._units = [None if f is None else unit_of(f) for f in only]
-        scales = self._read_numbers(system, given, positions is not None)
-        own = [0.0 if f is None else period_of(f) for f in only]
+        forces = [row.force for row in given]
+        self.names = tuple(row.name or _name(row.force) for row in given)
+        self._units = [unit_of(force) for force in forces]
+        wanted = self._read_numbers(given, positions is not None)
         self.periods = tuple(
-            p if row.period is None else number(row.period, f"period of row {k}", self._units[k])
-            for k, (row, p) in enumerate(zip(given, own, strict=True))
+            period_of(row.force) if row.period is None else number(row.period, f"period of row {k}", self._units[k])
+            for k, row in enumerate(given)
         )
         #: The particles of each row.
-        self.atoms = tuple(tuple(sorted(moved_atoms(system, f))) for f in forces)
+        self.atoms = tuple(tuple(sorted(moved_atoms(system, force))) for force in forces)
         self._find_what_meets(system, meets_system)
-        groups = chosen_groups(system, [row.force for row in given])
-        if any(target is None for target in self._targets):
-            found = found_values(system, forces, positions, box)
-            self._targets = [f if t is None else t for t, f in zip(self._targets, found.tolist(), strict=True)]
-        put_in_groups(system, [row.force for row in given], groups)
+        if None in wanted:
+            found = found_values(system, forces, positions).tolist()
+            wanted = [f if t is None else t for t, f in zip(wanted, found, strict=True)]
+        self._targets = [float(target) for target in wanted if target is not None]
+        groups = put_in_groups(system, forces)
         self._groups, self.groups = tuple(groups), frozenset(groups)
-        self.scales = tuple(
-            (max(1.0, abs(t)) if isinstance(t, float) else 1.0) if scale is None else scale
-            for t, scale in zip(self._targets, scales, strict=True)
-        )
-        self._drives = any(isinstance(t, float) and r != 0.0 for t, r in zip(self._targets, self._rates, strict=True))
+        self.scales = tuple(max(1.0, abs(target)) for target in self._targets)
 
-    def _read_numbers(self, system: openmm.System, given: Sequence[Row], placed: bool) -> list[float | None]:
-        """Targets and rates, numbers or names of context parameters; returns the scales."""
-        self._targets, self._rates, scales = [], [], []
-        known = _context_parameters(system, [row.force for row in given])
+    def _read_numbers(self, given: Sequence[Row], placed: bool) -> list[float | None]:
+        """Rates, which are kept, and targets, None where they are to be found."""
+        self._rates, targets = [], []
         for k, (row, of) in enumerate(zip(given, self._units, strict=True)):
-            target, rate = row.target, row.rate
+            target = None if row.target is None else number(row.target, f"target of row {k}", of)
             if target is None and not placed:
                 raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
-            if isinstance(rate, str) and not isinstance(target, str):
-                raise InputError(f"row {k}: a rate with a name needs a target with a name", item="rate")
-            for name in (n for n in (target, rate) if isinstance(n, str) and n not in known):
+            if target is not None and of == unit.radian and abs(target) > MOST_TURNED:
                 raise InputError(
-                    f"{name!r} is no context parameter of the System (known: {', '.join(sorted(known)) or 'none'}); "
-                    "define it by addGlobalParameter of a Force",
+                    f"target of row {k} is {target:g}, over three turns, and in radian; give {target:g} * unit.degrees",
                     item="target",
                 )
-            if target is not None and not isinstance(target, str):
-                target = number(target, f"target of row {k}", of)
-                if of == unit.radian and abs(target) > MOST_TURNED:
-                    raise InputError(
-                        f"target of row {k} is {target:g}, over three turns, and in radian; give {target:g} * "
-                        "unit.degrees",
-                        item="target",
-                    )
-            scale = None if row.scale is None else number(row.scale, f"scale of row {k}", of)
-            if scale is not None and not scale > 0:
-                raise InputError(f"scale of row {k} is {scale}; give a positive number", item="scale")
-            rate = rate if isinstance(rate, str) else number(rate, f"rate of row {k}", of, unit.picosecond)
-            self._targets.append(target)
-            self._rates.append(rate)
-            scales.append(scale)
-        return scales
+            targets.append(target)
+            self._rates.append(number(row.rate, f"rate of row {k}", of, unit.picosecond))
+        return targets
 
-    def _find_what_meets(self, system: openmm.System, asked: bool | None) -> None:
+    def _find_what_meets(self, system: openmm.System, asked: bool) -> None:
         """Which rows touch the same bodies that the constraints of the System make, and whether they touch any."""
         for k, touched in enumerate(self.atoms):
             sites = [atom for atom in touched if system.isVirtualSite(atom)]
@@ -205,14 +171,7 @@ class CollectiveRows(GroupRows):
         self.sited = bool(virtual_sites(system))
         pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
         tied = {atom for pair in pairs for atom in pair}
-        meeting = [k for k, touched in enumerate(self.atoms) if tied.intersection(touched)]
-        if meeting and asked is False:
-            raise InputError(
-                f"row {meeting[0]} ({self.names[meeting[0]]}) touches atoms that the System constrains; leave out "
-                "meets_system=False",
-                item="meets_system",
-            )
-        self.meets_system = bool(meeting or asked)
+        self.meets_system = asked or any(tied.intersection(touched) for touched in self.atoms)
         body = _components(system.getNumParticles(), pairs if self.meets_system else [])
         bodies = [{int(body[atom]) for atom in touched} for touched in self.atoms]
         self._meet = [[bool(a & b) for b in bodies] for a in bodies]
@@ -220,16 +179,6 @@ class CollectiveRows(GroupRows):
         self._blocks = [np.flatnonzero(together == k).tolist() for k in range(int(together.max()) + 1)]
 
     # -- told by an integrator ------------------------------------------------------------------
-
-    @property
-    def driven(self) -> bool:
-        """Whether targets move."""
-        return any(rate != 0.0 for rate in self._rates)
-
-    @property
-    def steered(self) -> bool:
-        """Whether a target is a context parameter, which others may set for the step to come."""
-        return any(isinstance(target, str) for target in self._targets)
 
     def attach(self, program: Program, context: openmm.Context) -> None:
         """A tolerance that was left open becomes what Forces can tell of coordinates of this size."""
@@ -247,12 +196,10 @@ class CollectiveRows(GroupRows):
         Raises
         ------
         InputError
-            No number, no such row; a target that is a context parameter (set that); a rate for a row made without.
+            No number, no such row; a rate for a row made without.
         """
         if row not in range(self.n_rows):
             raise InputError(f"there is no row {row}; rows are numbered from 0 to {self.n_rows - 1}", item="row")
-        if isinstance(self._targets[row], str):
-            raise InputError(f"the target of row {row} is the context parameter {self._targets[row]}", item="target")
         of = self._units[row]
         value = number(target, f"target of row {row}", of)
         slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
@@ -293,19 +240,20 @@ class CollectiveRows(GroupRows):
 
     def _in_engine(self, context: openmm.Context, x: FloatArray, masses: FloatArray, plain: bool) -> list[Constraint]:
         system = context.getSystem()
-        forces = [forces_in(system, group) for group in self._groups]
-        missing = next((k for k, found in enumerate(forces) if not found), None)
-        if missing is not None:
+        in_groups = {force.getForceGroup(): force for force in forces_of(system)}
+        missing = [k for k, group in enumerate(self._groups) if group not in in_groups]
+        if missing:
             raise InputError(
-                f"row {self._named(missing)} is no part of this System; make the context from the System that the rows "
-                "were added to",
+                f"row {self._named(missing[0])} is no part of this System; make the context from the System that the "
+                "rows were added to",
                 item="context",
             )
+        forces = [in_groups[group] for group in self._groups]
         alone, values = forces_alone(system, forces, box_of(context), context.getParameters()), self.values(context)
         rows: list[Constraint] = []
         for k, (target, rate) in enumerate(zip(*self._targets_and_rates(context), strict=True)):
             atoms = np.array(self.atoms[k])
-            known = as_constraint(forces[k][0], target) if plain and len(forces[k]) == 1 else None
+            known = as_constraint(forces[k], target) if plain else None
             known = known and known.with_masses(masses[known.atoms])
             # The engine may see other images of the particles.
             if known is None or abs(known.measure(x[known.atoms], 0.0)[0] - values[k]) > SAME * max(1.0, abs(target)):
@@ -323,18 +271,11 @@ class CollectiveRows(GroupRows):
         met = np.isin(body[held.pairs[:, 0]], body[[atom for atoms in self.atoms for atom in atoms]])
         return [Distance(held.pairs[met], held.lengths[met])] if met.any() else []
 
-    def apply_positions(self, context: openmm.Context, bonds: ArrayLike | None = None) -> None:
+    def apply_positions(self, context: openmm.Context) -> None:
         """Bring the positions of the context onto the rows and the System's constraints; velocities stay as they are.
 
         Where all rows are distances, angles or dihedrals of particles or distances of centers of mass, other bonds
-        and angles stay as they are, as with `hold` (`Motion.restore_positions`).
-
-        Parameters
-        ----------
-        context : openmm.Context
-        bonds : array_like of int, shape (n, 2), optional
-            The bonds of the molecules; those of the System's forces and constraints unless given. An empty list:
-            the nearest point, whatever becomes of bonds and angles.
+        and angles stay as they are, as with `hold` (`Motion.restore_positions`); with others it is the nearest point.
 
         Raises
         ------
@@ -347,10 +288,8 @@ class CollectiveRows(GroupRows):
             if context.getSystem().getNumConstraints():
                 context.applyConstraints(context.getIntegrator().getConstraintTolerance())
             solver = self.solver_at(context, plain=True)
-            if bonds is None:
-                any_function = any(isinstance(row, Custom) for row in solver.motion.sources[0].constraints)
-                bonds = [] if any_function else bonds_of(context.getSystem(), start)
-            self.restore_by(solver, context, bonds)
+            any_function = any(isinstance(row, Custom) for row in solver.motion.sources[0].constraints)
+            self.restore_by(solver, context, [] if any_function else bonds_of(context.getSystem(), start))
         except KconsError as error:
             context.setPositions(start)
             row = getattr(error, "row", -1)
@@ -373,25 +312,12 @@ class CollectiveRows(GroupRows):
             context.applyVelocityConstraints(context.getIntegrator().getConstraintTolerance())
         super().apply_velocities(context)
 
-    def restore(self, context: openmm.Context, *, bonds: ArrayLike | None = None) -> None:
-        """`apply_positions`, then `apply_velocities`.
-
-        Raises
-        ------
-        ConvergenceError, InfeasibleError, SingularGeometryError
-            As these.
-        CertificateError
-            The rows say that they are not fulfilled afterwards.
-        """
-        self.apply_positions(context, bonds)
+    def restore(self, context: openmm.Context) -> None:
+        """`apply_positions`, then `apply_velocities`; raises what these do."""
+        self.apply_positions(context)
         self.apply_velocities(context)
-        found = self.worst_violation(context)
-        if found is not None:
-            raise CertificateError(
-                f"after restoring, the {found}", row=found.row, residual=abs(found.off), atoms=found.atoms
-            )
 
-    def check(self, context: openmm.Context, velocities: bool = True) -> None:
+    def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows.
 
         Raises
@@ -417,10 +343,10 @@ class CollectiveRows(GroupRows):
         bound = f"collective row {self._named(int(in_space[0]))}" if len(in_space) else None
         held = [(np.array([atoms]), lambda _, k=k: self._named(k)) for k, atoms in enumerate(self.atoms)]
         refuse_agents(system, bound, held, context.getMolecules)
-        found = self.worst_violation(context, velocities)
+        found = self.worst_violation(context)
         if found is not None:
             remedy = "call restore(context)"
-            moves = isinstance(self._targets[found.row], float) and self._rates[found.row] != 0.0
+            moves = self._rates[found.row] != 0.0
             holder = owner(self, context)
             if moves and found.what == "positions" and (holder is None or self._clock(holder) == 0.0):
                 remedy += (
@@ -517,20 +443,13 @@ class CollectiveRows(GroupRows):
 
     def _targets_and_rates(self, context: openmm.Context) -> tuple[FloatArray, FloatArray]:
         """What the integrator was made with or told; its variables are copies for the program."""
-        holder = owner(self, context)
-        known = {} if holder is None else holder.program.settings
-
-        def now(name: str, given: Sequence[float | str | None]) -> FloatArray:
-            found = [
-                context.getParameter(value) if isinstance(value, str) else known.get(self._of(name, k, holder), value)
-                for k, value in enumerate(given)
-            ]
-            return np.array(found, dtype=np.float64)
-
-        targets, rates = now("target", self._targets), now("rate", self._rates)
-        clock = 0.0 if holder is None else self._clock(holder)
-        moves = [isinstance(target, float) for target in self._targets]
-        return targets + np.where(moves, rates * clock, 0.0), rates
+        targets, rates, holder = self._targets, self._rates, owner(self, context)
+        if holder is None:
+            return np.array(targets), np.array(rates)
+        known = holder.program.settings
+        targets = [known.get(self._of("target", k, holder), value) for k, value in enumerate(targets)]
+        rates = [known.get(self._of("rate", k, holder), value) for k, value in enumerate(rates)]
+        return np.array(targets) + np.array(rates) * self._clock(holder), np.array(rates)
 
     # -- of an integrator, after its last step --------------------------------------------------
 
@@ -598,7 +517,7 @@ class CollectiveRows(GroupRows):
         iterations = int(integrator.getGlobalVariableByName(f"iterations{c}"))
         return ConvergenceError(
             f"step {step}: row {row} ({self.names[row]}) is off by {off[row] * self.scales[row]:.3g} after "
-            f"{iterations} iterations (tolerance {self.tolerance:.3g}){self._digits(integrator.context)}; time step "
+            f"{iterations} iterations (tolerance {self.tolerance:.3g}); time step "
             f"too large (dt = {integrator.getStepSize()}), or a start that is not on the rows: call restore(context)",
             residual=float(residual),
             tolerance=self.tolerance,
@@ -606,13 +525,6 @@ class CollectiveRows(GroupRows):
             row=row,
             step=step,
         )
-
-    def _digits(self, context: openmm.Context) -> str:
-        """What to do where the tolerance asks for more digits than Forces have."""
-        finest = self.finest(context)
-        if not self.tolerance < finest:
-            return ""
-        return f", but Forces tell no more than {finest:.0e} here in {Precision.of(context)}: leave the tolerance open"
 
     def _named(self, row: int) -> str:
         return f"{row} ({self.names[row]})"
@@ -660,33 +572,6 @@ def _components(n: int, pairs: ArrayLike) -> np.ndarray:
     return np.asarray(connected_components(links, directed=False)[1])
 
 
-def _parts_of(system: openmm.System, force: openmm.Force | int, row: int) -> list[openmm.Force]:
-    """The Forces that make one row."""
-    if isinstance(force, int):
-        return forces_in(system, force)
-    if not isinstance(force, openmm.Force):
-        raise InputError(
-            f"row {row}: {force!r} is neither a Force nor the number of a force group; kcons.openmm.hold holds "
-            "constraints of kcons",
-            item="force",
-        )
-    return [force]
-
-
-def _name(row: Row, forces: Sequence[openmm.Force]) -> str:
-    if row.name:
-        return row.name
-    if not forces:
-        return f"group {row.force}"
-    force = forces[0]
+def _name(force: openmm.Force) -> str:
     text = force.getEnergyFunction() if hasattr(force, "getEnergyFunction") else ""
     return type(force).__name__ + (f" {text}" if 0 < len(text) <= 24 else "")
-
-
-def _context_parameters(system: openmm.System, forces: Sequence[openmm.Force | int]) -> set[str]:
-    """Names of all context parameters that the Forces define."""
-    names: set[str] = set()
-    for force in (*system.getForces(), *(f for f in forces if isinstance(f, openmm.Force))):
-        if hasattr(force, "getNumGlobalParameters"):
-            names |= {force.getGlobalParameterName(k) for k in range(force.getNumGlobalParameters())}
-    return names

@@ -31,30 +31,24 @@ class Row:
 
     Parameters
     ----------
-    force : openmm.Force or int
-        A Force that is in no System yet, or one of the System, or the number of a force group of the System whose
-        Forces together are the coordinate.
-    target : float, Quantity, str or None
-        What q is held at, a Quantity in a unit of its kind; None takes the value at the initial positions. A name
-        stands for a context parameter.
-    rate : float, Quantity or str
-        Change of the target in a ps. With a number or None as target, the target is that + rate t, t the time
-        since the integrator was made, which States and checkpoints with the integrator's parameters carry to another
-        one with the same program, and to no other. With a name as target whoever sets that changes it; the rate (a
-        number or another name) then says how fast, so that velocities follow.
+    force : openmm.Force
+        A Force that is in no System yet, or one of the System.
+    target : float, Quantity or None
+        What q is held at, a Quantity in a unit of its kind; None takes the value at the initial positions.
+    rate : float or Quantity
+        Change of the target in a ps: the target is target + rate t, t the time since the integrator was made, which
+        States and checkpoints with the integrator's parameters carry to another one with the same program, and to no
+        other.
     period : float or Quantity, optional
         Period of q; differences are taken to the nearest image. Found where the coordinate is a plain dihedral.
-    scale : float or Quantity, optional
-        The tolerance is relative to this size; the larger of 1 and the target unless given.
     name : str, optional
         For messages.
     """
 
-    force: openmm.Force | int
-    target: float | unit.Quantity | str | None = None
-    rate: float | unit.Quantity | str = 0.0
+    force: openmm.Force
+    target: float | unit.Quantity | None = None
+    rate: float | unit.Quantity = 0.0
     period: float | unit.Quantity | None = None
-    scale: float | unit.Quantity | None = None
     name: str = ""
 
 
@@ -104,20 +98,28 @@ def _may_be_a_coordinate(of: unit.Unit) -> bool:
 _POWERS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "^"}
 
 
-def as_rows(given: Row | openmm.Force | int | Formula | Sequence[Row | openmm.Force | int | Formula]) -> list[Row]:
+def as_rows(given: Row | openmm.Force | Formula | Sequence[Row | openmm.Force | Formula]) -> list[Row]:
     """Whatever stands for rows, or for one, as rows; a formula is one for each of its rows.
 
     Raises
     ------
+    InputError
+        What is no row.
     UnsupportedError
         A formula, or its target, that moves with the time; one of velocities.
     """
     rows: list[Row] = []
-    for each in [given] if isinstance(given, Row | openmm.Force | int | Formula) else given:
+    for each in [given] if isinstance(given, Row | openmm.Force | Formula) else given:
         if isinstance(each, Formula):
             rows += formula_rows(each)
         else:
             rows.append(each if isinstance(each, Row) else Row(each))
+    for k, row in enumerate(rows):
+        if not isinstance(row.force, openmm.Force):
+            raise InputError(
+                f"row {k}: {row.force!r} is no Force of OpenMM; kcons.openmm.hold holds constraints of kcons",
+                item="force",
+            )
     return rows
 
 
@@ -238,18 +240,18 @@ def _united(sets: Iterable[set[int] | None]) -> set[int] | None:
     return None if None in found else set().union(*found)  # type: ignore[arg-type]
 
 
-def moved_atoms(system: openmm.System, forces: Sequence[openmm.Force]) -> set[int]:
-    """The particles whose positions determine the sum of the Forces; all where that cannot be told.
+def moved_atoms(system: openmm.System, force: openmm.Force) -> set[int]:
+    """The particles whose positions determine a Force; all where that cannot be told.
 
     Raises
     ------
     InputError
         One is not in the System.
     """
-    atoms, every = _united(map(_atoms_of, forces)), set(range(system.getNumParticles()))
+    atoms, every = _atoms_of(force), set(range(system.getNumParticles()))
     if atoms is not None and atoms - every:
         raise InputError(
-            f"{forces[0].getName()} names particle {min(atoms - every)}; the System has {len(every)} particles",
+            f"{force.getName()} names particle {min(atoms - every)}; the System has {len(every)} particles",
             item="force",
             atoms=sorted(atoms - every),
         )
@@ -343,69 +345,44 @@ def free_groups(system: openmm.System, count: int, what: str, remedy: str = "use
     return free
 
 
-def forces_in(system: openmm.System, group: int) -> list[openmm.Force]:
-    """The Forces of a System that are in a group."""
-    return [force for force in system.getForces() if force.getForceGroup() == group]
-
-
-def chosen_groups(system: openmm.System, forces: Sequence[openmm.Force | int]) -> list[int]:
-    """A force group for each row; nothing is changed.
+def put_in_groups(system: openmm.System, forces: Sequence[openmm.Force]) -> list[int]:
+    """Give each Force a group of its own, and add those that are in no System, by the name of rows; returns the groups.
 
     Raises
     ------
     InputError
-        A Force of another System, a group without Forces or named twice.
+        A Force of another System, or one that is named twice; nothing was changed.
     UnsupportedError
-        More rows than free force groups.
+        More rows than free force groups; nothing was changed.
     """
     present = {int(force.this): force for force in system.getForces()}
-    named = [force for force in forces if isinstance(force, int)]
-    identities = [int(force.this) for force in forces if isinstance(force, openmm.Force)]
+    identities = [int(force.this) for force in forces]
     settled: list[int | None] = []
-    for k, force in enumerate(forces):
+    for k, (force, identity) in enumerate(zip(forces, identities, strict=True)):
         wrong = ""
-        if isinstance(force, int):
-            if not forces_in(system, force) or named.count(force) > 1:
-                reason = "is named more than once" if forces_in(system, force) else "has no Forces"
-                wrong = f"force group {force} of the System {reason}"
-        elif identities.count(int(force.this)) > 1:
+        if identities.count(identity) > 1:
             wrong = f"this {type(force).__name__} is named more than once"
-        elif int(force.this) in present and force.getForceGroup() in named:
-            wrong = f"its Force is part of group {force.getForceGroup()}, a row too"
-        elif int(force.this) not in present and not force.thisown:
+        elif identity not in present and not force.thisown:
             wrong = f"this {type(force).__name__} belongs to another System; give a copy of it"
         if wrong:
             raise InputError(f"row {k}: {wrong}", item="force")
-        if isinstance(force, int):
-            settled.append(force)
-            continue
         group = force.getForceGroup()
-        users = [other for other in present.values() if group in groups_of(other)]
-        alone = len(users) == 1 and int(users[0].this) == int(force.this)
-        settled.append(group if alone and group != 0 else None)
-    more = (
-        "Put Forces of the System that are evaluated together into one group, or hold more rows as constraint objects"
-    )
-    free = free_groups(system, settled.count(None), f"{settled.count(None)} rows", more)
-    return [free.pop(0) if group is None else group for group in settled]
+        users = [int(other.this) for other in present.values() if group in groups_of(other)]
+        settled.append(group if users == [identity] and group != 0 else None)
+    count = settled.count(None)
+    free = free_groups(system, count, f"{count} rows", "use fewer groups for forces, or hold constraint objects")
+    groups = [free.pop(0) if group is None else group for group in settled]
+    for force, group, identity in zip(forces, groups, identities, strict=True):
+        force.setForceGroup(group)
+        if identity not in present:
+            if force.getName() == type(force).__name__:
+                force.setName(f"{ROW_NAME}: {force.getName()}")
+            system.addForce(force)
+    return groups
 
 
-def put_in_groups(system: openmm.System, forces: Sequence[openmm.Force | int], groups: Sequence[int]) -> None:
-    """Give Forces their groups, and add those that are in no System, by the name of rows."""
-    present = {int(force.this) for force in system.getForces()}
-    for force, group in zip(forces, groups, strict=True):
-        if isinstance(force, openmm.Force):
-            force.setForceGroup(group)
-            if int(force.this) not in present:
-                if force.getName() == type(force).__name__:
-                    force.setName(f"{ROW_NAME}: {force.getName()}")
-                system.addForce(force)
-
-
-def found_values(
-    system: openmm.System, rows: Sequence[Sequence[openmm.Force]], positions: object, box: Sequence | None = None
-) -> FloatArray:
-    """The energy of each row's Forces at the given positions, shape (len(rows),); evaluated apart from all else.
+def found_values(system: openmm.System, forces: Sequence[openmm.Force], positions: object) -> FloatArray:
+    """The energy of each Force at the given positions, shape (len(forces),); evaluated apart from all else.
 
     Raises
     ------
@@ -413,9 +390,9 @@ def found_values(
         Positions of the wrong shape, or at which a row is not a number.
     """
     x = nanometers(positions, system.getNumParticles())  # type: ignore[arg-type]
-    context = forces_alone(system, rows, box)
+    context = forces_alone(system, forces)
     context.setPositions(x)
-    values = np.array([energy_of(context, {group}) for group in range(len(rows))])
+    values = np.array([energy_of(context, {group}) for group in range(len(forces))])
     for k, value in enumerate(values):
         if not math.isfinite(value):
             raise InputError(f"row {k} is {value} at these positions", item="positions")

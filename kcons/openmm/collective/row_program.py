@@ -11,7 +11,6 @@ is good enough for sure is not measured: numbers are what the host of a GPU wait
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Iterable
 from typing import Any
 
@@ -29,8 +28,8 @@ from kcons.steppers.operations import Exchange
 PIVOT = 1e-10
 #: A push that is not measured leaves this part of sigma at most; what it leaves more, the next step takes away.
 _LEFT = 0.01
-#: Integrators whose programs hold rows, by the address of the object of OpenMM.
-_HOLDING: weakref.WeakValueDictionary[int, Integrator] = weakref.WeakValueDictionary()
+#: Bound of the iteration.
+_ITERATIONS = 20
 
 
 class GroupRows(Part):
@@ -54,12 +53,10 @@ class GroupRows(Part):
     periods: tuple[float, ...]
     tolerance: float
     asked_tolerance: float | None
-    max_iterations: int
     n_rows: int
     _groups: tuple[int, ...]
-    _targets: list[float | str | None]
-    _rates: list[float | str]
-    _drives: bool
+    _targets: list[float]
+    _rates: list[float]
     #: Rows whose gradients can have a product, directly or through others.
     _blocks: list[list[int]]
     _meet: list[list[bool]]
@@ -78,15 +75,16 @@ class GroupRows(Part):
 
     def _target(self, row: int) -> str:
         """Expression of the target now."""
-        target = self._targets[row]
-        if isinstance(target, str):
-            return target
         moved = f"+{self._rate(row)}*(clock{self.code}+flown{self.code})" if self._rates[row] != 0.0 else ""
         return self._of("target", row) + moved
 
     def _rate(self, row: int) -> str:
-        rate = self._rates[row]
-        return rate if isinstance(rate, str) else self._of("rate", row)
+        return self._of("rate", row)
+
+    @property
+    def driven(self) -> bool:
+        """Whether targets move."""
+        return any(self._rates)
 
     @property
     def _pushes(self) -> str:
@@ -100,12 +98,9 @@ class GroupRows(Part):
 
     def declare(self, p: Program) -> None:
         c, integrator = self.code, p.integrator
-        if isinstance(integrator, Integrator):
-            _HOLDING[int(integrator.this)] = integrator
-        scheme = getattr(integrator, "scheme", None)
-        alone = len(getattr(integrator, "parts", (self,))) == 1
-        self._leapfrog = scheme is None
-        self._single = scheme is None or len(scheme.drifts) * len(scheme.flight) == 1
+        scheme = integrator.scheme
+        alone = len(integrator.parts) == 1
+        self._single = len(scheme.drifts) * len(scheme.flight) == 1
         numbers = [
             ("push", "L: x moves by L times the row", 0.0),
             ("more", "change of L", 0.0),
@@ -124,11 +119,8 @@ class GroupRows(Part):
         ]
         for k, name in enumerate(self.names):
             p.vector(self._of("row", k), f"M_par^+ gradient of row {k}, {name}")
-            target, rate = self._targets[k], self._rates[k]
-            if isinstance(target, float):
-                p.setting(self._of("target", k), f"target of row {k}", target)
-            if isinstance(rate, float):
-                p.setting(self._of("rate", k), "change of this target in a ps", rate)
+            p.setting(self._of("target", k), f"target of row {k}", self._targets[k])
+            p.setting(self._of("rate", k), "change of this target in a ps", self._rates[k])
             for what, words, value in numbers:
                 p.number(self._of(what, k), words, value)
         for block in self._blocks:
@@ -151,7 +143,7 @@ class GroupRows(Part):
         p.number(f"state{c}", "of the iteration: 1 iterate, 2 give up, 3 push without measuring, 0 done")
         p.number(f"held{c}", "whether the rows hold")
         p.number(f"bad_sum{c}", "not a number if a multiplier is none")
-        if self._drives:
+        if self.driven:
             p.number(f"clock{c}", "time of the targets where the step began")
             p.number(f"flown{c}", "time of its drifts")
             p.number(f"began{c}", "good_steps when it began")
@@ -172,9 +164,8 @@ class GroupRows(Part):
 
     def begin(self, p: Program) -> None:
         """Gradients where x is not where the last step ended."""
-        if not self._leapfrog:
-            self._gradients(p)
-            p.let(f"known{self.code}", "0", "no projection was here")
+        self._gradients(p)
+        p.let(f"known{self.code}", "0", "no projection was here")
 
     def renew(self, p: Program) -> None:
         """Gradients after a step without `project`. Their sizes, which tell what a small pivot is, may be old."""
@@ -186,13 +177,11 @@ class GroupRows(Part):
 
     def remember(self, p: Program) -> None:
         c = self.code
-        if self._drives:  # a step that failed is not counted in good_steps, and its time is not kept
+        if self.driven:  # a step that failed is not counted in good_steps, and its time is not kept
             first, kept = "delta(stage)", f"1-delta(began{c}-good_steps)"
             p.let(f"clock{c}", f"clock{c}+{first}*({kept})*flown{c}", "the step before was kept")
             p.let(f"flown{c}", f"select({first}, 0, flown{c})", "a step begins")
             p.let(f"began{c}", "good_steps", "to see whether it is kept")
-        if self._leapfrog:  # no velocity projection has computed them
-            self._gradients(p)
         if self._start == f"start{c}":
             p.each(self._start, "x", "to start again from")
         for k in range(self.n_rows):
@@ -270,7 +259,7 @@ class GroupRows(Part):
 
     def land(self, p: Program, h: str) -> None:
         c = self.code
-        if self._drives:
+        if self.driven:
             p.let(f"flown{c}", f"flown{c}+{h}", "targets at the end of the drift")
         if self._base != "xu":
             p.each(self._base, "x", "positions as other parts leave them")
@@ -293,8 +282,6 @@ class GroupRows(Part):
         self._note_multipliers(p, h)
         if not self._single:
             self._gradients(p)
-        if self._leapfrog:
-            self._end_step(p)
 
     def _push(self, p: Program) -> None:
         if self.meets_system:
@@ -335,7 +322,7 @@ class GroupRows(Part):
         p.let(
             f"state{c}",
             f"select(delta(state{c}-1)*(1-held{c}), select(step(1e10-residual{c})"
-            f"*step({self.max_iterations - 1}-iterations{c}), {again}, 2), 0)",
+            f"*step({_ITERATIONS - 1}-iterations{c}), {again}, 2), 0)",
             "done, or once more, or give up",
         )
         for block in self._blocks:
@@ -373,9 +360,6 @@ class GroupRows(Part):
             if self.lean:  # a drift of velocities that were not made tangent pushes for that as well
                 before = f"-select(behind*looked, 0.5*dt*{end}, 0)"
             p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
-            if self._leapfrog:
-                p.let(multiplier, f"{push}/({h}*{h})", "multiplier where the drift began")
-                continue
             at = f"select(known{c}, 0.5*({end}+2*{push}/({h}*{h})), 2*{push}/({h}*{h}))"
             if self.lean:
                 at = f"select(behind, {push}/({h}*{h}), {at})"
@@ -417,7 +401,7 @@ class GroupRows(Part):
 
     def passed(self, p: Program) -> None:
         """At the end of a step without `project`."""
-        if any(rate != 0.0 for rate in self._rates):
+        if self.driven:
             self._end_step(p)
 
     def _end_step(self, p: Program) -> None:
@@ -432,7 +416,7 @@ class GroupRows(Part):
 
     def _clock(self, integrator: openmm.CustomIntegrator) -> float:
         """The time of the targets between steps; the step made last counts where it was kept."""
-        if not self._drives:
+        if not self.driven:
             return 0.0
         c, read = self.code_in(integrator), integrator.getGlobalVariableByName
         kept = read(f"began{c}") != read("good_steps")
@@ -451,12 +435,11 @@ def owner(rows: GroupRows, context: openmm.Context) -> Integrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
     require_context(context)
     integrator = context.getIntegrator()
-    compound = isinstance(integrator, openmm.CompoundIntegrator)
-    members = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())] if compound else [integrator]
-    known = [_HOLDING.get(int(one.this)) for one in members]
-    holding = [one for one in known if one is not None and rows in one.parts]
-    # Of members of a CompoundIntegrator the one that made steps last.
-    return next((one for one in holding if one.program is rows.program), next(iter(holding), None))
+    if (
+        isinstance(integrator, openmm.CompoundIntegrator) and rows.program is not None
+    ):  # the member that made steps last
+        integrator = rows.program.integrator
+    return integrator if rows in getattr(integrator, "parts", ()) else None
 
 
 def _halved(integrator: Any, scheme: Any) -> bool:
@@ -467,8 +450,8 @@ def _halved(integrator: Any, scheme: Any) -> bool:
 
 def _last_share(integrator: openmm.CustomIntegrator) -> float:
     """Length of the last drift as a fraction of the step."""
-    scheme = getattr(integrator, "scheme", None)
-    return 1.0 if scheme is None else float(scheme.drifts[-1] * scheme.flight[-1])
+    scheme = integrator.scheme
+    return float(scheme.drifts[-1] * scheme.flight[-1])
 
 
 def _sum(terms: Iterable[str]) -> str:

@@ -77,6 +77,15 @@ def refusal() -> str:
     return ""
 
 
+def reluctance() -> str:
+    """Why the plugin is not taken where nobody demands it; empty if it is."""
+    if not (accelerated() or is_built()):
+        return "the plugin is not compiled, and OpenMM has no platform for GPUs here; kcons warmup device compiles it"
+    if not (accelerated() or compiler()):
+        return "the platforms Reference and CPU need a C++ compiler, and there is none"
+    return ""
+
+
 def is_built() -> bool:
     """Whether the library of the integrator is there: in the cache, or in an installed wheel."""
     return any((path / "libKcons.so").exists() for path in places())

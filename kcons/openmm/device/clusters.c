@@ -74,7 +74,7 @@ DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, G
                 if (i == j) rows_pivot[i] = (ROW(i, 6) & 2) && fabs(up) <= ROWS_PIVOT*whole ? (mixed) 0 : 1/up;
                 else {rows_upper[e] = up; rows_lower[e] = low;}
             }
-        for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) {
+        for (int k = first+LOCAL_ID; k < rows_level[level+1]; k += LOCAL_SIZE) {
             mixed y = rows_off[k];
             for (int u = ROW(k, 5); u < ROW(k+1, 5); u++) {
                 int e = rows_earlier[u], m = ENTRY(e, 0);

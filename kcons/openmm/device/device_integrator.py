@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import ctypes
 import json
-import logging
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 from uuid import uuid4
+from xml.etree import ElementTree
 
 import numpy as np
 import openmm
 
 from kcons.constraints.arguments import whole_number
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError, UnsupportedError
 from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import molecules_of
 from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
-from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan
+from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
-from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
+from kcons.openmm.ensembles.nose_hoover_ensemble import CHAIN_ORDER, NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
@@ -33,25 +35,24 @@ from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.steps import write_step
 from kcons.openmm.states import box_of, positions_of
+from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, listed
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import chain_fractions
-
-logger = logging.getLogger("kcons.openmm")
 
 #: Ensembles whose operations kernels have.
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
 _EMPTY = b'<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
 _DOUBLES, _WHOLES = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_int)
-#: What a solve that failed leaves of a call.
-_FAILED = 1
+#: Places in what the kernel `look` tells: sum of v^2; whether a row failed, in which step, its number, its residual.
+_MOTION, _FAILED, _STEP, _ROW, _RESIDUAL = 0, 2, 3, 4, 5
 
 
 class _Given(ctypes.Structure):
     """What the plugin tells of a Context, as plugin/program_integrator.h has it."""
 
     _fields_ = (
-        *((name, ctypes.c_char_p) for name in ("description", "platform", "precision")),
+        *((name, ctypes.c_char_p) for name in ("description", "platform")),
         *((name, ctypes.c_int) for name in ("groups", "particles", "constraints")),
         ("masses", ctypes.POINTER(ctypes.c_double)),
         ("pairs", ctypes.POINTER(ctypes.c_int)),
@@ -74,12 +75,8 @@ _REFUSALS: list[Exception] = []
 
 def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
     """Why steps of this kind are not made on the device; empty if they are."""
-    if scheme is None:
-        return "the leapfrog has velocities half a step behind; use scheme='rattle'"
     if type(ensemble) not in ENSEMBLES:
         return f"{type(ensemble).__name__} has no kernels"
-    if getattr(ensemble, "atoms", None) is not None:
-        return "a thermostat on some of the particles has no kernels"
     if parts and isinstance(ensemble, LangevinRespa):
         return f"{type(ensemble).__name__} holds no parts"
     if why := rows_refusal(parts):
@@ -105,7 +102,7 @@ def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> lis
             now = ends[-1]
         elif isinstance(operation, Chain):
             assert isinstance(ensemble, NoseHoover)
-            flights = tuple(operation.fraction * f for f in chain_fractions(ensemble.chain_order, ensemble.repeats))
+            flights = tuple(operation.fraction * f for f in chain_fractions(CHAIN_ORDER, 1))
         done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
         if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
             done.append(Op("rescale"))
@@ -119,11 +116,14 @@ class DeviceProgram(Program):
     ----------
     kept : list of str
         Variables that belong to a state, in the order of the array `memory`.
+    made_under : tuple
+        `conditions` when `remembered` was asked last.
     """
 
     on_device = True
     integrator: DeviceIntegrator
     kept: list[str]
+    made_under: tuple[Any, ...] = ()
 
     def hand_over(self) -> None:
         """Describe the step to the plugin."""
@@ -133,10 +133,16 @@ class DeviceProgram(Program):
 
     def write(self, name: str, value: float) -> None:
         """Change a variable that is no setting; settings go over at the next call of `step`."""
-        if name in self.kept and self.integrator.bound:
+        if self.known(name) in self.kept and self.integrator.bound:
             values = self.integrator.read("memory")
             values[self.kept.index(name)] = value
             self.integrator.write("memory", values)
+
+    def known(self, name: str) -> str:
+        """The name of a variable, if it is one."""
+        if name not in self.numbers:
+            raise UnsupportedError(f"no variable of these steps is called {name!r}; see listing()")
+        return name
 
     def push(self) -> None:
         """Settings, where they are others than the plugin has."""
@@ -147,6 +153,7 @@ class DeviceProgram(Program):
     def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
         memory = {"memory": self.integrator.read("memory")}  # which makes the kernels if there are none yet
+        self.made_under = self.integrator.conditions(self.integrator.context)
         saved = [array.name for array in self.integrator.rows.arrays if array.saved]
         return memory | {name: self.integrator.read(name) for name in saved}
 
@@ -179,6 +186,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     rows: Any = None
     _seed = 0
     _described = ""
+    _recorded: Sequence[int] = ()
 
     def _make(self, dt: float) -> None:
         build_planner()
@@ -212,6 +220,7 @@ class DeviceIntegrator(ProjectedIntegrator):
                 "spheres": [getattr(self.ensemble, name, None) for name in ("spheres", "auxiliary")],
                 "integrator": self._key,
                 "parts": bool(self.parts),
+                "recorded": self._recorded,
             }
         )
         if description == self._described:
@@ -258,39 +267,95 @@ class DeviceIntegrator(ProjectedIntegrator):
         self._run(guard, steps, ends)
 
     def _run(self, guard: Guard, steps: int, ends: bool) -> None:
-        context = guard.context
-        first = context.getStepCount()
+        if guard.in_run and build.library().kcons_was_moved(self._address):
+            guard.begin()
+        first = guard.context.getStepCount()
         try:
-            for done in range(0, steps, self.rows.block):
-                block = min(steps - done, self.rows.block)
-                self._renew(context, block)
-                openmm.Integrator.step(self, block)
+            self._advance(guard.context, steps)
         except openmm.OpenMMException as error:
             told = self._look()
             guard.put_back()
             if told[_FAILED]:
-                raise self._unsolved(told, context.getStepCount()) from error
+                raise self._unsolved(told, guard) from error
             if "NaN" in str(error):
                 raise guard.explosion(str(error), first) from error
             raise
         if ends:
             guard.look()
 
-    def _renew(self, context: openmm.Context, steps: int) -> None:
-        """Targets and cells of the steps that follow."""
-        positions = positions_of(context) if self.rows.looks else None
-        cell = np.array(box_of(context)) if self.rows.looks else None
-        for name, values in self.rows.renew(context.getTime()._value, self._dt, steps, positions, cell).items():
-            self.write(name, values)
+    def _advance(self, context: openmm.Context, steps: int) -> None:
+        """Make steps in blocks, before each of which targets and cells are computed."""
+        rows = self.rows
+        for done in range(0, steps, rows.block):
+            block = min(steps - done, rows.block)
+            positions = positions_of(context) if rows.looks else None
+            cell = np.array(box_of(context)) if rows.looks else None
+            for name, values in rows.renew(context.getTime()._value, self._dt, block, positions, cell).items():
+                self.write(name, values)
+            openmm.Integrator.step(self, block)
 
-    def _unsolved(self, told: Sequence[float], good: int) -> KconsError:
-        error: KconsError = self.rows.failure(int(told[3]), told[4], int(told[2]))
-        error.args = (f"{error}. The Context is back at step {good}, the last that was checked", *error.args[1:])
+    def _unsolved(self, told: Sequence[float], guard: Guard) -> KconsError:
+        """The error for a row in a step that the Context is then just before.
+
+        It is at the last check. The steps from there are made again if they will be the same: if settings are, and
+        nothing acts on the System that is random. Else it stays there.
+        """
+        step, context = int(told[_STEP]), guard.context
+        error: KconsError = self.rows.failure(int(told[_ROW]), told[_RESIDUAL], step)
+        again = step - 1 - context.getStepCount()
+        if again > 0 and guard.undisturbed and not guard.moving and self.program.made_under == self.conditions(context):
+            try:
+                self._advance(context, again)
+                guard.since_check += again
+                guard.leave()
+            except openmm.OpenMMException:
+                guard.put_back()
+        if not np.isfinite(told[_RESIDUAL]):
+            return guard.explosion(f"{self.rows.set.row_name(error.row)} is not finite.", step - 1)
+        error.args = (f"{error}. The Context is at step {context.getStepCount()}", *error.args[1:])
         return error
 
+    def conditions(self, context: openmm.Context) -> tuple[Any, ...]:
+        """What a run that is made again has to have in common with the first."""
+        return self._dt, self.getConstraintTolerance(), self._described, dict(context.getParameters())
+
+    # -- records ---------------------------------------------------------------------------------
+
+    def record(self, atoms: IntArray) -> None:
+        """Choose particles of which `records` tells; before the first step of a Context."""
+        self._recorded = np.unique(atoms).tolist()
+        self.describe()
+
+    def records(self, steps: int, every: int) -> Iterator[tuple[FloatArray, FloatArray, FloatArray, float]]:
+        """Make steps, and give what was recorded on the device after each `every` of them.
+
+        It is read when the device has no more room for it: a thousand records, or 8 MB of them.
+
+        Yields
+        ------
+        x, v, f : ndarray, shape (n, 3)
+            Positions, velocities and applied forces of the particles of `record`, in ascending order.
+        time : float
+        """
+        room, n = room_for(len(self._recorded)), len(self._recorded)
+        for done in range(0, steps, room * every):
+            context = self._watch().context
+            time, since = context.getTime()._value, context.getStepCount()
+            self.write("recorded", np.array([every, since]))
+            build.library().kcons_record_every(self._address, every, since)
+            try:
+                self.step(min(steps - done, room * every))
+            finally:
+                build.library().kcons_record_every(self._address, 0, 0)
+            made = (context.getStepCount() - since) // every
+            found = self.read("records").reshape(room, n, 3, 3)
+            for k in range(made):
+                x, v, f = found[k].swapaxes(0, 1)
+                yield x, v, f, time + (k + 1) * every * self._dt
+
     def _look(self) -> list[float]:
-        told = (ctypes.c_double * 5)()
-        build.library().kcons_look(self._address, told)
+        told = (ctypes.c_double * 7)()
+        build.library().kcons_told(self._address, told)
         return list(told)
 
     def _execute(self, guard: Guard, steps: int) -> None:
@@ -302,26 +367,12 @@ class DeviceIntegrator(ProjectedIntegrator):
         """A variable of the step, see `listing`."""
         program = self.program
         if name == "motion":
-            return self._look()[0]
+            return self._look()[_MOTION]
         if name == "failed":  # a call that fails raises
             return 0.0
         if name in program.kept and self.bound:
             return float(self.read("memory")[program.kept.index(name)])
-        if name in program.settings:
-            return program.settings[name]
-        return program.numbers[name]
-
-    def setGlobalVariableByName(self, name: str, value: float) -> None:
-        """Set what belongs to a state; settings have methods of their own."""
-        if name not in self.program.kept:
-            raise UnsupportedError(
-                f"{name} cannot be set on the device: use setTemperature or setFriction, or device=False"
-            )
-        self.program.write(name, float(value))
-
-    def getNumComputations(self) -> int:
-        """None: the plugin has kernels."""
-        return 0
+        return {**program.numbers, **program.settings}[program.known(name)]
 
     def setRandomNumberSeed(self, seed: int) -> None:
         """The seed of noise, before the Context is made; 0 for one that nobody knows."""
@@ -331,14 +382,25 @@ class DeviceIntegrator(ProjectedIntegrator):
     def getRandomNumberSeed(self) -> int:
         return self._seed
 
-    @classmethod
-    def from_xml(cls, xml: str, scheme: Any = "rattle", **arguments: Any) -> DeviceIntegrator:
-        """As `ProjectedIntegrator.from_xml`."""
-        build_planner()
-        plain = openmm.XmlSerializer.deserialize(xml)
-        made = cls(plain.getStepSize(), scheme, **{"tolerance": plain.getConstraintTolerance(), **arguments})
-        openmm.Integrator.setIntegrationForceGroups(made, plain.getIntegrationForceGroups())
-        return made
+    def _has_written(self, xml: str) -> bool:
+        found = json.loads(ElementTree.fromstring(xml).attrib["description"])
+        mine = json.loads(self._described)
+        self.setRandomNumberSeed(found["seed"])
+        return all(found[name] == mine[name] for name in ("operations", "memory", "noisy", "spheres", "parts"))
+
+
+def _refuse_of_programs(name: str) -> Any:
+    def refuse(self: DeviceIntegrator, *args: Any, **options: Any) -> None:
+        raise UnsupportedError(
+            f"{name} is about the program of a CustomIntegrator, and these steps have kernels; give device=False"
+        )
+
+    return refuse
+
+
+for _name, _method in vars(openmm.CustomIntegrator).items():
+    if _name[0].islower() and getattr(DeviceIntegrator, _name) is _method and not hasattr(openmm.Integrator, _name):
+        setattr(DeviceIntegrator, _name, _refuse_of_programs(_name))
 
 
 # -- plans for a Context ------------------------------------------------------------------------------
@@ -404,6 +466,13 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     library.kcons_plan_order(made, order.ctypes.data_as(_WHOLES), order.size)
 
 
+class DeviceSurfaceIntegrator(SurfaceIntegrator, DeviceIntegrator):
+    """`SurfaceIntegrator` whose steps are kernels of a plugin."""
+
+    def _surface_parts(self, surfaces: Any, system: openmm.System | None, positions: Any) -> Sequence[Any]:
+        return listed(surfaces, positions, 2**31 if positions is None else len(positions))
+
+
 def choose(
     device: bool | None,
     timestep: Any,
@@ -411,9 +480,10 @@ def choose(
     *,
     parts: Sequence[Any] = (),
     ensemble: Ensemble | None = None,
+    classes: tuple[type[ProjectedIntegrator], type[DeviceIntegrator]] = (ProjectedIntegrator, DeviceIntegrator),
     **others: Any,
-) -> type[ProjectedIntegrator]:
-    """The class of an integrator that may run on the device: `DeviceIntegrator` if it can, see `ProjectedIntegrator`.
+) -> tuple[type[ProjectedIntegrator], str]:
+    """The class of an integrator that may run on the device, of two, see `ProjectedIntegrator`, and why it is the first.
 
     Raises
     ------
@@ -421,16 +491,18 @@ def choose(
         `device` is True, and there is no plugin or it has no kernels for this step.
     """
     why = refusal(to_scheme(scheme), parts, ConstantEnergy() if ensemble is None else ensemble) or build.refusal()
+    if not why and device is None:
+        why = build.reluctance()
     if not why:
         try:
             build.library()
-            return DeviceIntegrator
+            return classes[1], ""
         except UnsupportedError as error:
             why = str(error)
     if device:
         raise UnsupportedError(f"no steps on the device: {why}; leave out device=True for a CustomIntegrator")
-    logger.info("steps are those of a CustomIntegrator: %s", why)
-    return ProjectedIntegrator
+    return classes[0], why
 
 
 ProjectedIntegrator._on_device = staticmethod(choose)
+SurfaceIntegrator._on_device = staticmethod(partial(choose, classes=(SurfaceIntegrator, DeviceSurfaceIntegrator)))

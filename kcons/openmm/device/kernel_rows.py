@@ -11,7 +11,7 @@ import openmm
 
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.motion import Motion
 from kcons.openmm.callback_rows.callbacks import Passage, cell_of
@@ -39,10 +39,6 @@ class _Engine:
         if self.cell is None or not np.array_equal(cell, self.cell):
             self.motion.set_cell(cell)
             self.cell = cell
-
-    def rounded(self, x: FloatArray) -> bool:
-        """Whether molecules may have been moved back into the box, which rounds them."""
-        return self.passage.precision.name != "double" and self.cell is not None
 
 
 class KernelRows(CarriedConstraints):
@@ -97,6 +93,8 @@ class KernelRows(CarriedConstraints):
         """
         pairs, lengths = system_rows
         # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
+        moving = (masses[pairs] > 0).any(axis=1)  # between others OpenMM holds nothing
+        pairs, lengths = pairs[moving], lengths[moving]
         lengths = np.where(settled_rows(pairs, lengths, len(masses)), lengths.astype(np.float32), lengths)
         system_rows = pairs, lengths
         made_of = masses.tobytes(), *(np.asarray(array).tobytes() for array in system_rows)
@@ -147,11 +145,6 @@ class KernelRows(CarriedConstraints):
     def driven(self) -> bool:
         return any(item.moving or not item.holonomic for item in self.given)
 
-    @property
-    def steered(self) -> bool:
-        """Whether targets may have changed between two calls."""
-        return any(isinstance(item.target, MovingTarget) for item in self.given)
-
     def attach(self, program: Program, context: openmm.Context) -> None:
         self.bind(context)
 
@@ -166,9 +159,6 @@ class KernelRows(CarriedConstraints):
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Whatever the precision is: residuals are what it can hold."""
-
-    def _tell_of_rounding(self, x: FloatArray) -> None:
-        """Nothing: velocities come from multipliers, and not from rounded positions."""
 
     def _check_system(self, system: openmm.System, precision: Precision) -> None:
         self._engine.passage.precision = precision

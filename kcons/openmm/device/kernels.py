@@ -100,22 +100,23 @@ _COMMON = """
 /* The first failure is kept; kernels that are launched later do nothing. */
 #define FAIL(row, residual) \\
   {if (CLAIM(&failure[0], launch+1) == 0) {failure[1] = step+1; failure[2] = row; failure_residual[0] = residual;}}
-/* Four normal numbers of a particle, a step and a use within it (Philox 4x32 with 10 rounds, Box and Muller). */
-DEVICE void philox(unsigned int* c, unsigned int key0, unsigned int key1) {
+/* Four normal numbers of a particle, a step and a use within it (Philox 4x32, Box and Muller): an angle is a quarter of
+   the circle and what is left of it, from -pi/4 to pi/4, of which sine and cosine are polynomials. */
+DEVICE void gaussians(mixed* g, int particle, int step, int use, int seed) {
+  unsigned int c0 = particle, c1 = step, c2 = use, c3 = 0, key0 = seed, key1 = 0x6b636f6eu;
   for (int k = 0; k < 10; k++) {
-    mm_ulong p = (mm_ulong) 0xD2511F53u*c[0], q = (mm_ulong) 0xCD9E8D57u*c[2];
-    unsigned int first = (unsigned int) (q>>32)^c[1]^key0, third = (unsigned int) (p>>32)^c[3]^key1;
-    c[0] = first; c[1] = (unsigned int) q; c[2] = third; c[3] = (unsigned int) p;
+    mm_ulong p = (mm_ulong) 0xD2511F53u*c0, q = (mm_ulong) 0xCD9E8D57u*c2;
+    c0 = (unsigned int) (q>>32)^c1^key0; c1 = (unsigned int) q;
+    c2 = (unsigned int) (p>>32)^c3^key1; c3 = (unsigned int) p;
     key0 += 0x9E3779B9u; key1 += 0xBB67AE85u;
   }
-}
-DEVICE void gaussians(mixed* g, int particle, int step, int use, int seed) {
-  unsigned int c[4];
-  c[0] = particle; c[1] = step; c[2] = use; c[3] = 0;
-  philox(c, (unsigned int) seed, 0x6b636f6eu);
   for (int k = 0; k < 4; k += 2) {
-    float size = sqrt(-2.0f*log((c[k]+0.5f)*2.3283064e-10f)), angle = 6.2831853f*(c[k+1]*2.3283064e-10f);
-    g[k] = size*cos(angle); g[k+1] = size*sin(angle);
+    unsigned int turn = k ? c3 : c1;
+    float size = sqrt(-2.0f*log(((k ? c2 : c0)+0.5f)*2.3283064e-10f)), t = (int) (turn<<2)*3.6572952e-10f, t2 = t*t;
+    float sine = size*t*(1+t2*(-1.6666667e-1f+t2*(8.3333333e-3f-t2*1.9841270e-4f)));
+    float cosine = size*(1+t2*(-0.5f+t2*(4.1666667e-2f+t2*(-1.3888889e-3f+t2*2.4801587e-5f))));
+    if (turn>>31) cosine = -cosine;
+    g[k] = (turn>>30)&1 ? sine : cosine; g[k+1] = (turn>>30)&1 ? cosine : sine;
   }
 }
 """
@@ -295,82 +296,98 @@ def joined(operations: Sequence[Op]) -> list[Op]:
 
 # -- kernels ------------------------------------------------------------------------------------------
 
-_REDUCE = """ shared[LOCAL_ID] = acc0; shared[LOCAL_ID+WG] = acc1; shared[LOCAL_ID+2*WG] = acc2;
- shared[LOCAL_ID+3*WG] = acc3;
- SYNC_THREADS;
+_HALVES = """ SYNC_THREADS;
  for (int span = WG/2; span > 0; span /= 2) {
-  if (LOCAL_ID < span) for (int k = 0; k < 4*WG; k += WG) shared[LOCAL_ID+k] += shared[LOCAL_ID+k+span];
+  if (LOCAL_ID < span) for (int k = 0; k < COUNT*WG; k += WG) shared[LOCAL_ID+k] += shared[LOCAL_ID+k+span];
   SYNC_THREADS;
  }
 """
-_TAKE_SUMS = (
-    """ mixed sum0, sum1, sum2;
- {mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;
- for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {
-  acc0 += partial[k+BANK*MOST_GROUPS]; acc1 += partial[k+(BANK+1)*MOST_GROUPS]; acc2 += partial[k+(BANK+2)*MOST_GROUPS];
- }
-"""
-    + _REDUCE
-    + """ sum0 = shared[0]; sum1 = shared[WG]; sum2 = shared[2*WG];
- SYNC_THREADS;}
-"""
-)
+
+
+def _summed(names: Sequence[str]) -> str:
+    """Sums over a work-group of what its items have added to some numbers, to ``shared[k*WG]``."""
+    stored = "".join(f" shared[LOCAL_ID+{k}*WG] = {name};" for k, name in enumerate(names))
+    return stored + _HALVES.replace("COUNT", str(len(names)))
+
+
+def _taken(count: int, bank: int) -> str:
+    """The sums over all particles, of which each work-group has left its share, as ``sum0``, ``sum1``, ..."""
+    names = [f"acc{k}" for k in range(count)]
+    added = "".join(f"{name} += partial[k+{bank + k}*MOST_GROUPS];" for k, name in enumerate(names))
+    sums = ", ".join(f"sum{k}" for k in range(count))
+    kept = "".join(f" sum{k} = shared[{k}*WG];" for k in range(count))
+    return (
+        f" mixed {sums};\n {{mixed {' = 0, '.join(names)} = 0;\n"
+        f" for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {{{added}}}\n"
+        f"{_summed(names)}{kept}\n SYNC_THREADS;}}\n"
+    )
+
+
+def _once(code: str, *names: str) -> str:
+    """Numbers that one item computes for all of its work-group."""
+    stored = "".join(f" shared[{k}] = {name};" for k, name in enumerate(names))
+    read = "".join(f" mixed {name} = shared[{k}];" for k, name in enumerate(names))
+    return f" if (LOCAL_ID == 0) {{\n{code}{stored}}}\n SYNC_THREADS;{read}\n SYNC_THREADS;\n"
+
+
 #: The closed form of `kcons.thermostats.isokinetic.kick`, everything divided by exp(z).
-_CLOSED_FORM = """ mixed z = max((mixed) sqrt(QQ/TWICE), TINY), decay = exp(-z);
- mixed aim = WQ/sqrt(max((mixed) (WW*QQ), TINY));
+_CLOSED_FORM = """ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(-z);
+ mixed aim = sum0/sqrt(max((mixed) (sum2*sum1), TINY));
  aim = min(max(aim, (mixed) -1), (mixed) 1);
  mixed sinhc = -expm1(-2*z)/(2*z), root = -expm1(-z)/z, scale = max((mixed) (aim*z*sinhc+(1+decay*decay)/2), TINY);
- mixed keep = sqrt(TWICE/WW)*decay/scale, push = (aim*z*root*root/2+sinhc)/scale;
+ mixed keep = sqrt(P_two_k/sum2)*decay/scale, push = (aim*z*root*root/2+sinhc)/scale;
+ if (GROUP_ID == 0) {memory[M_growth] += z+log(scale); if (scale < (mixed) 1e-4f) memory[M_lost] += 1;}
 """
 #: Half a push of all links, the first of which then scales velocities, and half a push; see `kcons.openmm.NoseHoover`.
-_CHAIN = """ if (LOCAL_ID == 0) {
-  mixed link[LINKS], factor = 1, place = memory_before[M_chain_place], inertia = P_kT/(P_frequency*P_frequency);
-  const mixed parts[PARTS] = {SHARES};
-  for (int k = 0; k < LINKS; k++) link[k] = memory_before[M_link1+k];
-  for (int part = 0; part < PARTS; part++) {
-   mixed h = parts[part]*dt;
-   for (int turn = 0; turn < 2*LINKS; turn++) {
-    int k = turn < LINKS ? LINKS-1-turn : turn-LINKS;
-    if (turn == LINKS) {
-     factor *= exp(-h*link[0]); place += h*P_momenta*link[0];
-     for (int j = 1; j < LINKS; j++) place += h*link[j];
-    }
-    mixed damp = k+1 < LINKS ? exp(-h*link[k+1]/4) : (mixed) 1, push;
-    if (k == 0) push = (sum0*factor*factor-P_momenta*P_kT)/(P_momenta*inertia);
-    else push = ((k == 1 ? P_momenta : (mixed) 1)*inertia*link[k-1]*link[k-1]-P_kT)/inertia;
-    link[k] = (link[k]*damp+h*push/2)*damp;
+_CHAIN = """ mixed link[LINKS], factor = 1, place = memory_before[M_chain_place], inertia = P_kT/(P_frequency*P_frequency);
+ const mixed parts[PARTS] = {SHARES};
+ for (int k = 0; k < LINKS; k++) link[k] = memory_before[M_link1+k];
+ for (int part = 0; part < PARTS; part++) {
+  mixed h = parts[part]*dt;
+  for (int turn = 0; turn < 2*LINKS; turn++) {
+   int k = turn < LINKS ? LINKS-1-turn : turn-LINKS;
+   if (turn == LINKS) {
+    factor *= exp(-h*link[0]); place += h*P_momenta*link[0];
+    for (int j = 1; j < LINKS; j++) place += h*link[j];
    }
+   mixed damp = k+1 < LINKS ? exp(-h*link[k+1]/4) : (mixed) 1, push;
+   if (k == 0) push = (sum0*factor*factor-P_momenta*P_kT)/(P_momenta*inertia);
+   else push = ((k == 1 ? P_momenta : (mixed) 1)*inertia*link[k-1]*link[k-1]-P_kT)/inertia;
+   link[k] = (link[k]*damp+h*push/2)*damp;
   }
-  if (GROUP_ID == 0) {
-   for (int k = 0; k < LINKS; k++) memory[M_link1+k] = link[k];
-   memory[M_chain_place] = place;
-  }
-  shared[0] = factor;
  }
- SYNC_THREADS;
- mixed factor = shared[0];
- SYNC_THREADS;
+ if (GROUP_ID == 0) {
+  for (int k = 0; k < LINKS; k++) memory[M_link1+k] = link[k];
+  memory[M_chain_place] = place;
+ }
 """
 #: What the last call did: whether velocities are finite, the kinetic energy that is told, a failure.
-_LOOK = (
-    """ mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;
+_LOOK = f""" mixed acc0 = 0, acc1 = 0, acc2 = 0;
  if (GROUP_ID != 0) return;
- for (int p = LOCAL_ID; p < PARTICLES; p += LOCAL_SIZE) {
+ for (int p = LOCAL_ID; p < PARTICLES; p += LOCAL_SIZE) {{
   mixed v[3], w[1];
   GET_V(0, p)
   acc0 += v[0]*v[0]+v[1]*v[1]+v[2]*v[2];
   if (w[0] != 0) acc2 += (v[0]*v[0]+v[1]*v[1]+v[2]*v[2])/w[0];
- }
+ }}
  for (int k = LOCAL_ID; k < MOST_GROUPS; k += LOCAL_SIZE) acc1 += partial[k+6*MOST_GROUPS];
-"""
-    + _REDUCE
-    + """ if (LOCAL_ID == 0) {
+{_summed(["acc0", "acc1", "acc2"])} if (LOCAL_ID == 0) {{
   looked[0] = shared[0]; looked[1] = shared[WG]; looked[5] = failure_residual[0];
   looked[6] = shared[2*WG];
   for (int k = 0; k < 3; k++) looked[2+k] = failure[k];
+ }}
+"""
+
+#: What is kept of some particles, whose places come last in `atoms`, until the host reads it.
+_RECORD = """ if (failure[0] != 0) return;
+ GLOBAL mixed* to = records+9*COUNT*((step-recorded[1])/recorded[0]-1);
+ for (int k = GLOBAL_ID; k < COUNT; k += GLOBAL_SIZE) {
+  mixed x[3], v[3], w[1];
+  int p = atoms[FIRST+k];
+  GET_V(0, p) GET_X(0, p)
+  for (int c = 0; c < 3; c++) {to[9*k+c] = x[c]; to[9*k+3+c] = v[c]; to[9*k+6+c] = FORCES;}
  }
 """
-)
 
 
 #: What happens on the spheres of a cluster, see `kcons.thermostats.multistep.sphere_kernels`: component c of an atom is
@@ -513,7 +530,7 @@ class Kernels:
 
     def _reset(self) -> None:
         self._code = ["" for _ in self.places]
-        self._before, self._moves, self._sums, self._noted, self._used = "", False, False, False, False
+        self._before, self._moves, self._sums, self._noted, self._used = "", False, 0, False, False
 
     def _add(self, code: str, rows: str | None = None) -> None:
         """Code for each cluster; another where rows are held in it."""
@@ -537,15 +554,19 @@ class Kernels:
         self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] += {_of_dt(op.share)}*{self._force(op)}*w[a];\n")
 
     def _fly(self, op: Op) -> None:
-        for length, end in zip(op.flights, op.ends, strict=True):
-            h = _of_dt(length)
-            free = f" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
-            start = f" {{ROOM mixed h = {h};\n"
+        flights = [(length, end, 1) for length, end in zip(op.flights, op.ends, strict=True)]
+        if len(set(op.flights)) == 1:
+            flights = [(*flights[0][:2], len(flights))]
+        for length, end, count in flights:
+            h, time = _of_dt(length), f"{_time(op, end)}+flight*h"
+            loop = f" for (int flight = 0; flight < {count}; flight++)"
+            free = f"{loop} EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
+            start = f"{loop} {{ROOM mixed h = {h};\n"
             aim = " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
             moved = (
                 " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]/h;}\n }\n"
             )
-            solve = f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {_time(op, end)}, x, d, w);\n if (failure[0] == 0)\n"
+            solve = f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {time}, x, d, w);\n if (failure[0] == 0)\n"
             self._add(free, start + aim + solve + moved)
             self._moves = True
 
@@ -556,11 +577,11 @@ class Kernels:
         if self.spheres is not None:
             self._stir(op)
             return
+        damp, size = self._bath(op)
         noise = (
-            f" {{mixed y = P_friction*{_of_dt(op.share)}, damp = exp(-y), size = sqrt(-expm1(-2*y)*P_kT);\n"
-            f" EACH if (w[a] != 0) {{\n  mixed g[4], s = size*sqrt(w[a]);\n"
+            f" EACH if (w[a] != 0) {{\n  mixed g[4], s = {size}*sqrt(w[a]);\n"
             f"  gaussians(g, ORDER(AT), step+({op.begun}), {op.use}, seed[0]);\n"
-            "  for (int c = 0; c < 3; c++) v[3*a+c] = damp*v[3*a+c]+s*g[c];\n }}\n"
+            f"  for (int c = 0; c < 3; c++) v[3*a+c] = {damp}*v[3*a+c]+s*g[c];\n }}\n"
         )
         # What the drift before has left across the rows is an impulse of theirs; what noise adds is none.
         along = " SYNC velocities_NAME(ROWS_PASS CLUSTER, {}, time, x, v, w);\n"
@@ -568,16 +589,23 @@ class Kernels:
         self._add(noise)
         self._add("", along.format(0) * self.tidy)
 
+    def _bath(self, op: Op) -> tuple[str, str]:
+        """Names of what friction leaves of velocities, and of the size of noise."""
+        damp, size = f"damp{op.use}_{-op.begun}", f"size{op.use}_{-op.begun}"
+        y = f"(P_friction*{_of_dt(op.share)})"
+        self._before += _once(f" mixed {damp} = exp(-{y}), {size} = sqrt(-expm1(-2*{y})*P_kT);\n", damp, size)
+        return damp, size
+
     def _stir(self, op: Op) -> None:
         """Friction and noise on spheres, the noise along the rows; auxiliary variables have noise of their own."""
         assert self.spheres is not None
-        size = f"mixed y = P_friction*{_of_dt(op.share)}, damp = exp(-y), size = sqrt(-expm1(-2*y)*P_kT);"
+        damp, size = self._bath(op)
         draw = f"gaussians(g, ORDER(AT), step+({op.begun}), {{}}, seed[0]);"
         start = (
-            f" {{ROOM {size}\n EACH {{mixed g[4], s = sqrt(w[a]); {draw.format(op.use)}\n"
+            f" {{ROOM EACH {{mixed g[4], s = sqrt(w[a]); {draw.format(op.use)}\n"
             "  for (int c = 0; c < 3; c++) d[3*a+c] = s*g[c];}\n"
         )
-        ends = " EACH for (int c = 0; c < 3; c++) v[3*a+c] = damp*v[3*a+c]+size*d[3*a+c];\n"
+        ends = f" EACH for (int c = 0; c < 3; c++) v[3*a+c] = {damp}*v[3*a+c]+{size}*d[3*a+c];\n"
         self._add(start, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n")
         self._add(ends)
         for k, (_, freedom, first) in enumerate(self.sphere_of):
@@ -585,7 +613,7 @@ class Kernels:
             own = f"auxiliary[{first}+(ITEM)*{number}+j]"
             self._code[k] += (
                 f" if (FIRST) for (int j = 0; j < {number}; j++) {{int a = 0; mixed g[4]; "
-                f"{draw.format(f'{op.use}+1024*(j+1)')} {own} = damp*{own}+size*g[0];}}\n }}\n"
+                f"{draw.format(f'{op.use}+1024*(j+1)')} {own} = {damp}*{own}+{size}*g[0];}}\n }}\n"
             )
         self._rescale(Op("restore"))
 
@@ -603,11 +631,8 @@ class Kernels:
         )
         start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {push};\n"
         self._add(start + sums, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n{sums}")
-        self._gather()
-        named = _CLOSED_FORM.replace("WQ", "sum0").replace("QQ", "sum1").replace("WW", "sum2")
-        self._before += named.replace("TWICE", "P_two_k") + (
-            " if (GLOBAL_ID == 0) {memory[M_growth] += z+log(scale); if (scale < (mixed) 1e-4f) memory[M_lost] += 1;}\n"
-        )
+        self._gather(3)
+        self._before += _once(_CLOSED_FORM, "keep", "push")
         self._add(
             " {ROOM EACH {GET_U(a, AT) for (int c = 0; c < 3; c++) v[3*a+c] = keep*v[3*a+c]+push*d[3*a+c];}\n }\n"
         )
@@ -617,9 +642,9 @@ class Kernels:
         self._before += (
             " if (GLOBAL_ID == 0) for (int k = 0; k <= LINKS; k++) memory_before[M_link1+k] = memory[M_link1+k];\n"
         )
-        self._gather()
+        self._gather(1)
         shares = ", ".join(f"(mixed) {share!r}" for share in op.flights)
-        self._before += _CHAIN.replace("SHARES", shares).replace("PARTS", str(len(op.flights)))
+        self._before += _once(_CHAIN.replace("SHARES", shares).replace("PARTS", str(len(op.flights))), "factor")
         self._add(" EACH for (int c = 0; c < 3; c++) v[3*a+c] *= factor;\n")
 
     def _rescale(self, op: Op) -> None:
@@ -649,11 +674,11 @@ class Kernels:
     def _force(self, op: Op) -> str:
         return f"FORCE(force{list(self.groups).index(op.group)}, AT, c)"
 
-    def _gather(self) -> None:
+    def _gather(self, count: int) -> None:
         """What follows needs the sums that each cluster has added to."""
-        self._sums, bank = True, self._bank
+        self._sums, bank = count, self._bank
         self._close()
-        self._before = _TAKE_SUMS.replace("BANK", str(bank))
+        self._before = _taken(count, bank)
 
     # -- text --
 
@@ -662,14 +687,14 @@ class Kernels:
         if self._used or self._before:
             name = f"{self._name}{sum(a.verb == LAUNCH for a in self._actions)}"
             self._actions.append(Action(LAUNCH, name))
-            ends = ""
-            if self._sums or self._noted:
-                kept = [(self._bank + k, f"shared[{k}*WG]") for k in range(3) if self._sums]
-                kept += [(6, "shared[3*WG]")] * self._noted
-                stores = " ".join(f"partial[GROUP_ID+{place}*MOST_GROUPS] = {value};" for place, value in kept)
-                ends = f"{_REDUCE} if (LOCAL_ID == 0) {{{stores}}}\n"
+            ends = accumulators = ""
+            places = {f"acc{k}": self._bank + k for k in range(self._sums)} | ({"acc3": 6} if self._noted else {})
+            if places:
+                kept = enumerate(places.values())
+                stores = " ".join(f"partial[GROUP_ID+{place}*MOST_GROUPS] = shared[{k}*WG];" for k, place in kept)
+                ends = f"{_summed(list(places))} if (LOCAL_ID == 0) {{{stores}}}\n"
+                accumulators = f" mixed {' = 0, '.join(places)} = 0;\n"
                 self._bank = 3 - self._bank if self._sums else self._bank
-            accumulators = " mixed acc0 = 0, acc1 = 0, acc2 = 0, acc3 = 0;\n" if ends else ""
             self.source.append(self._header(name) + self._before + accumulators + self._clusters() + ends + "}\n")
         if action is not None:
             self._actions.append(action)
@@ -804,7 +829,8 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     kernels = Kernels(shapes, masks, **made)
     parts = divided(operations, described["noisy"])
     actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
-    order = np.concatenate(kernels.order)
+    recorded, room = described["recorded"], room_for(len(described["recorded"]))
+    order = np.concatenate([*kernels.order, np.array(recorded, dtype=np.int64)])
     arrays = standard_arrays([*parameters.values()], len(memory), seed, particles)
     arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
     if spheres is not None:
@@ -813,16 +839,27 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
         first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
         arrays.append(Array("auxiliary", "mixed", first, saved=True))
     arrays += [Array("cells", "int", np.zeros(3 * particles))] * (len(held.placed) > 0)
+    if recorded:
+        arrays += [Array("records", "mixed", np.zeros(9 * len(recorded) * room)), Array("recorded", "int", np.ones(2))]
     work_group = 1 if platform in PLAIN else held.work_group
     names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
     names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}
     names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(particles)}
     look = f"KERNEL void look(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];\n{_LOOK}}}\n"
+    if recorded:
+        forces = "+".join(f"FORCE(force{k}, p, c)" for k in range(len(masks)))
+        text = _RECORD.replace("COUNT", str(len(recorded))).replace("FIRST", str(kernels.particles))
+        look += f"KERNEL void record(ARGUMENTS) {{\n UNPACK\n{text.replace('FORCES', forces)}}}\n"
     source = preamble(platform, arrays, held.scratch, held.work_group, len(masks))
     source += "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
     items = kernels.items + kernels.crowds * work_group
     return Plan(source, arrays, actions, order, items, work_group, len(masks))  # type: ignore[arg-type]
+
+
+def room_for(particles: int) -> int:
+    """How many records of so many particles the device keeps: 8 MB of them, 1,000 at most."""
+    return min(1000, 1 + 2**20 // (9 * max(particles, 1)))
 
 
 def _of_dt(share: float) -> str:

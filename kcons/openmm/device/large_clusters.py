@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.openmm.device.c_writer import c_functions
 from kcons.openmm.device.held_rows import IN_CELLS, HeldRows, Pattern
 from kcons.openmm.device.kernels import Array
-from kcons.plan.clusters_alike import elimination, neighbors
+from kcons.plan.clusters_alike import elimination
 
 #: Numbers of a row in `rows_row`.
 _ROW = 9
@@ -31,55 +32,65 @@ class _Tables(NamedTuple):
     touch: IntArray
 
 
-def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, list[int]]:
+def _tables(pattern: Pattern, held: HeldRows) -> tuple[_Tables, IntArray]:
     """Tables of a pattern, and its rows in the order of elimination."""
-    count, n_atoms = len(pattern.rows), pattern.atoms.shape[1]
-    coupled = neighbors([row.atoms for row in pattern.rows])
-    order = elimination(coupled, {k for k, row in enumerate(pattern.rows) if row.depends})
+    count = len(pattern.rows)
+    order = elimination([row.atoms for row in pattern.rows], {k for k, r in enumerate(pattern.rows) if r.depends})
     rows = [pattern.rows[k] for k in order.rows]
-    slots = np.concatenate([[0], np.cumsum([len(row.atoms) for row in rows])])
-    place = [{a: slots[k] + i for i, a in enumerate(row.atoms)} for k, row in enumerate(rows)]
-    entry: list[list[int]] = []
-    product: list[list[int]] = []
-    numbers: dict[tuple[int, int], int] = {}
-    for i in range(count):
-        for j in [i, *order.later[i]]:
-            numbers[i, j] = len(entry)
-            entry.append([i, j, len(product), 0])
-            product += [[place[i][a], place[j][a]] for a in rows[i].atoms if a in place[j]]
-    updates: list[list[list[int]]] = [[] for _ in entry]
-    earlier: list[list[int]] = [[] for _ in rows]
-    for m in range(count):
-        for first, i in enumerate(order.later[m]):
-            earlier[i].append(numbers[m, i])
-            for j in order.later[m][first:]:
-                updates[numbers[i, j]].append([numbers[m, i], numbers[m, j], m])
-    begins = np.concatenate([[0], np.cumsum([len(each) for each in updates])])
-    places = np.concatenate([[0], np.cumsum([len(each) for each in earlier])])
+    widths = np.array([len(row.atoms) for row in rows])
+    slots = np.stack([np.concatenate([row.atoms for row in rows]), np.repeat(np.arange(count), widths)], axis=1)
+    touch = np.argsort(slots[:, 0], kind="stable")
+    # Entries row by row, the diagonal first; `key` grows.
+    lengths = np.array([1 + len(later) for later in order.later])
+    diagonal = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    entry = np.stack(
+        [np.repeat(np.arange(count), lengths), np.concatenate([[k, *later] for k, later in enumerate(order.later)])],
+        axis=1,
+    )
+    key = entry @ [count, 1]
+    product = np.concatenate([_pairs(some) for some in np.split(touch, np.flatnonzero(np.diff(slots[touch, 0])) + 1)])
+    product = product[np.argsort(slots[product, 1] @ [count, 1], kind="stable")]
+    of = np.concatenate([_pairs(later) for later in order.later]) @ [count, 1]
+    both = np.concatenate([_pairs(np.arange(b + 1, b + n)) for b, n in zip(diagonal, lengths, strict=True)])
+    update = np.column_stack([both, entry[both[:, 0], 0]])[np.argsort(of, kind="stable")]
+    aside = np.flatnonzero(entry[:, 0] < entry[:, 1])
+    earlier = aside[np.argsort(entry[aside, 1], kind="stable")]
     # In clusters where rows may depend on others any pivot may vanish: not all of them are marked in large ones.
     doubtful = bool(held.doubtful[pattern.clusters].any())
-    table = []
-    parameter = cells = 0
-    for k, row in enumerate(rows):
-        flags = row.rolls + 2 * doubtful + 4 * row.summed
-        table.append([row.function, slots[k], parameter, row.how, numbers[k, k], places[k], flags, -1, cells])
-        parameter += len(held.parameters[pattern.clusters[0, order.rows[k]]])
-        cells += 3 * len(row.atoms) if row.how == IN_CELLS else 0
-    touch = [[place[k][a] for k in range(count) if a in place[k]] for a in range(n_atoms)]
+    sizes = np.array([len(held.parameters[pattern.clusters[0, k]]) for k in order.rows])
+    cells = np.array([3 * len(row.atoms) * (row.how == IN_CELLS) for row in rows])
+    columns = [
+        np.array([row.function for row in rows]),
+        np.cumsum(widths) - widths,
+        np.cumsum(sizes) - sizes,
+        np.array([row.how for row in rows]),
+        diagonal,
+        np.searchsorted(entry[earlier, 1], np.arange(count)),
+        np.array([row.rolls + 2 * doubtful + 4 * row.summed for row in rows]),
+        np.full(count, -1),
+        np.cumsum(cells) - cells,
+    ]
     found = (
-        table,
-        [[a, k] for k, row in enumerate(rows) for a in row.atoms],
-        [[level] for level in order.levels[:-1]],
-        [[*e[:3], begins[number]] for number, e in enumerate(entry)],
+        np.stack(columns, axis=1),
+        slots,
+        order.levels[:-1],
+        np.column_stack(
+            [entry, np.searchsorted(slots[product, 1] @ [count, 1], key), np.searchsorted(np.sort(of), key)]
+        ),
         product,
-        [each for some in updates for each in some],
-        [[e] for some in earlier for e in some],
-        [[begin] for begin in np.concatenate([[0], np.cumsum([len(t) for t in touch])])[:-1]],
-        [[slot] for some in touch for slot in some],
+        update,
+        earlier,
+        np.searchsorted(slots[touch, 0], np.arange(pattern.atoms.shape[1])),
+        touch,
     )
-    widths = _ROW, 2, 1, 4, 2, 3, 1, 1, 1
-    arrays = [np.array(each, dtype=np.int64).reshape(-1, w) for each, w in zip(found, widths, strict=True)]
-    return _Tables(*arrays), order.rows
+    return _Tables(
+        *(table.astype(np.int64).reshape(len(table), math.prod(table.shape[1:])) for table in found)
+    ), order.rows
+
+
+def _pairs(some: IntArray) -> IntArray:
+    """All pairs of numbers in a list, each with itself and those after it, shape (n, 2)."""
+    return np.stack([some[side] for side in np.triu_indices(len(some))], axis=1)
 
 
 class LargeClusters:

@@ -66,30 +66,16 @@ class CountsMomenta(Ensemble):
     momentum: Momentum
     temperature: float | None
 
-    def masses(self, integrator: Integrator) -> FloatArray:
-        """Masses of the particles that it acts on; 0 for others."""
-        found: FloatArray = integrator._watch().rows.masses
-        return found
-
-    def independent(self, integrator: Integrator) -> int:
-        """Momenta of these particles that constraints leave."""
-        return integrator.independent_momenta()
-
-    def everyone(self, integrator: Integrator) -> bool:
-        """Whether it acts on all particles with a mass: total momentum may be conserved then."""
-        return np.array_equal(self.masses(integrator), integrator._watch().rows.masses)
-
     def momenta(self, integrator: Integrator) -> Momenta:
         """Which momenta are conserved."""
         guard = integrator._watch()
         if guard.momenta is None:
-            every = self.everyone(integrator)
-            guard.momenta = conserved_momenta(integrator, guard.context, self.momentum) if every else NONE
+            guard.momenta = conserved_momenta(integrator, guard.context, self.momentum)
         found: Momenta = guard.momenta
         return found
 
     def count(self, integrator: Integrator) -> int:
-        """g of an integrator: its momenta that are thermostatted and independent.
+        """g of an integrator: its momenta that are independent, less those that are conserved.
 
         Raises
         ------
@@ -98,7 +84,7 @@ class CountsMomenta(Ensemble):
         """
         guard = integrator._watch()
         if guard.thermal is None:
-            count = self.independent(integrator) - len(self.momenta(integrator).directions)
+            count = integrator.independent_momenta() - len(self.momenta(integrator).directions)
             if count < 1:
                 raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
             guard.thermal = count
@@ -123,8 +109,8 @@ class CountsMomenta(Ensemble):
                 f"{type(self).__name__} needs constant targets, and those of {moving[0]!r} move: scaled velocities "
                 "would not follow; use Langevin, or a thermostat of kcons.ase"
             )
-        masses, v = self.masses(integrator), velocities_of(context)
-        if self.everyone(integrator) and removes_center_of_mass_motion(context.getSystem()):
+        masses, v = integrator._watch().rows.masses, velocities_of(context)
+        if removes_center_of_mass_motion(context.getSystem()):
             v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
         self.ready(integrator, context, masses, v)
         momenta = self.momenta(integrator)
@@ -191,7 +177,7 @@ def _totals(
     given: openmm.Context, force: openmm.Force, x: FloatArray, fixed: list[int], turns: RigidMotions
 ) -> FloatArray:
     """Sum of one force over the particles, at a few places and as shares of its size; `turns` sees them, too."""
-    context = forces_alone(given.getSystem(), [[force]], box_of(given), given.getParameters())
+    context = forces_alone(given.getSystem(), [force], box_of(given), given.getParameters())
     rng = np.random.default_rng(0)
     size = extent(x) or 1.0
     found: list[FloatArray] = []

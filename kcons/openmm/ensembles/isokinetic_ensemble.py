@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 import openmm
-from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints.arguments import checked, positive
@@ -18,20 +16,16 @@ from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
 from kcons.openmm.integrator.ensemble import Integrator, Step
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import operations_of
-from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
-from kcons.openmm.states import energy_of, positions_of
+from kcons.openmm.quantities import GAS_CONSTANT, kelvins
+from kcons.openmm.states import energy_of
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.splitting import Composition, RungeKuttaNystrom, Splitting
-from kcons.thermostats.freedom import atom_numbers
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that
 #: is continued stays as it is, bit for bit.
 ROUNDING = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 #: Where velocities run against a strong force, s' is a small difference; below this, digits are lost.
 _CANCELS = 1e-4
-#: Particles by number, or True and False for each; None for all.
-Atoms: TypeAlias = tuple[int, ...] | tuple[bool, ...] | None
 
 
 class Isokinetic(CountsMomenta):
@@ -44,13 +38,9 @@ class Isokinetic(CountsMomenta):
     Parameters
     ----------
     temperature : Quantity or float, optional
-        In K if a float.
-    kinetic_energy : Quantity or float, optional
-        K itself, in kJ/mol if a float. With neither, K stays what it is at the first step.
+        In K if a float. Without, K stays what it is at the first step.
     convention : {'exact', 'notes'}
         2K = (g - 1) kT, or 2K = 3 n kT of the notes (eq. 111) for n particles with a mass.
-    atoms : array_like of int or bool, optional
-        Thermostat these only. No constraint may couple them to others.
     momentum : {'auto', 'conserved', 'free'}
         Whether total momentum is conserved. 'auto' looks at the kinds of forces, and computes those that may know a
         place in space.
@@ -58,7 +48,7 @@ class Isokinetic(CountsMomenta):
     Raises
     ------
     InputError
-        Temperature or energy not positive, both of them, unknown words.
+        Temperature not positive, unknown words.
 
     Warns
     -----
@@ -68,8 +58,7 @@ class Isokinetic(CountsMomenta):
 
     Notes
     -----
-    Schemes: 'rattle', 'geodesic', 'leapfrog' (order 2), 'isokinetic4' and 'isokinetic6'. Targets must rest. Of the
-    leapfrog, K at half steps is constant, and is what the Context tells as kinetic energy.
+    Schemes: 'rattle', 'geodesic' (order 2), 'isokinetic4' and 'isokinetic6'. Targets must rest.
 
     References
     ----------
@@ -79,9 +68,7 @@ class Isokinetic(CountsMomenta):
     stays_tangent = True
     adds_up = True
     temperature: float | None
-    kinetic_energy: float | None
     convention: Literal["exact", "notes"]
-    atoms: Atoms
     momentum: Momentum
 
     @checked
@@ -89,33 +76,22 @@ class Isokinetic(CountsMomenta):
         self,
         temperature: unit.Quantity | float | None = None,
         *,
-        kinetic_energy: unit.Quantity | float | None = None,
         convention: Literal["exact", "notes"] = "exact",
-        atoms: ArrayLike | None = None,
         momentum: Momentum = "auto",
     ) -> None:
-        if temperature is not None and kinetic_energy is not None:
-            raise InputError("give temperature or kinetic_energy, not both", item="temperature")
-        plain = 0.0 if kinetic_energy is None else number(kinetic_energy, unit.kilojoule_per_mole, "kinetic_energy")
         self._keep(
             temperature=None if temperature is None else positive(kelvins(temperature), "temperature"),
-            kinetic_energy=None if kinetic_energy is None else positive(plain, "kinetic_energy"),
             convention=convention,
-            atoms=None if atoms is None else tuple(np.asarray(atoms).tolist()),
             momentum=momentum,
         )
 
     def __repr__(self) -> str:
         given = [f"{self.temperature:g} K"] if self.temperature is not None else []
-        if self.kinetic_energy is not None:
-            given.append(f"K = {self.kinetic_energy:g} kJ/mol")
         if self.convention != "exact":
             given.append(f"convention={self.convention!r}")
-        if self.atoms is not None:
-            given.append(f"atoms=<{len(self.atoms)} atoms>")
         return f"Isokinetic({', '.join(given)})"
 
-    def check(self, scheme: Splitting | None) -> None:
+    def check(self, scheme: Splitting) -> None:
         """Raise `UnsupportedError` for schemes whose order is lost with kicks that are quadratic in v."""
         if isinstance(scheme, RungeKuttaNystrom) or (isinstance(scheme, Composition) and scheme.order > 2):
             raise UnsupportedError(
@@ -123,15 +99,15 @@ class Isokinetic(CountsMomenta):
                 "'isokinetic4' or 'isokinetic6'"
             )
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         """The kicks of the scheme turn velocities, which are tangent before and stay so."""
         done: list[Operation] = []
-        for operation in operations_of(scheme):
+        for operation in scheme.operations():
             if isinstance(operation, Kick):
                 done += [Project(), Turn(operation.fraction)]
             elif not (isinstance(operation, Project) and isinstance(done[-1], Turn)):
                 done.append(operation)
-        return tuple(done if scheme is None else done[isinstance(done[0], Project) :])
+        return tuple(done[isinstance(done[0], Project) :])
 
     # -- program --------------------------------------------------------------------------------
 
@@ -156,19 +132,15 @@ class Isokinetic(CountsMomenta):
             ("push", "share of q"),
         ):
             p.number(name, words)
-        if self.atoms is not None:
-            p.vector("share", "1 for thermostatted particles, 0 for others")
-        if "impulse" in p.vectors:  # of the leapfrog
-            p.kinetic_energy = "m*u*u/2; u=v-impulse"
 
     def kick(self, step: Step, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
         """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
 
         F = M_par^+ f only enters as q = h F, which is of the size of velocities.
         """
-        p, of, q = step.program, "" if self.atoms is None else "share*", f"{h}*{step.force}/m"
+        p, q = step.program, f"{h}*{step.force}/m"
         if unseen:
-            _add_up(step, of, q, f"{of}{h}*{step.force}*v")
+            _add_up(step, q, f"{h}*{step.force}*v")
         else:
             if impulse:
                 p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
@@ -177,9 +149,9 @@ class Isokinetic(CountsMomenta):
             p.each("w", "v", "velocities before the kick")
             p.each("v", q, "kick by the applied forces alone")
             step.project()
-            p.sum("wq", f"{of}m*w*v", "along the kick")
-            p.sum("ww", f"{of}m*w*w", "2K before")
-            p.sum("qq", f"{of}m*v*v", "size of the kick")
+            p.sum("wq", "m*w*v", "along the kick")
+            p.sum("ww", "m*w*w", "2K before")
+            p.sum("qq", "m*v*v", "size of the kick")
         p.let("z", "max(sqrt(qq/two_k), 1e-300)", "strength of the kick; 1e-300 keeps 0/0 away")
         p.let("aim", "min(max(wq/sqrt(max(ww*qq, 1e-300)), -1), 1)", "direction of the kick")
         p.let("decay", "exp(-z)", "all is divided by exp(z)")
@@ -192,8 +164,7 @@ class Isokinetic(CountsMomenta):
         # Drifts change the length of velocities at their order; sqrt(two_k/ww) brings it back.
         p.let("keep", "sqrt(two_k/ww)*decay/scale", "share of the velocities")
         p.let("push", "(aim*z*coshc+sinhc)/scale", "share of the kick")
-        turned, plain = (f"keep*v+(push-keep)*{q}", "v") if unseen else ("keep*w+push*v", "w+v")
-        return turned if self.atoms is None else f"select(share, {turned}, {plain})"
+        return f"keep*v+(push-keep)*{q}" if unseen else "keep*w+push*v"
 
     # -- a run ----------------------------------------------------------------------------------
 
@@ -203,14 +174,10 @@ class Isokinetic(CountsMomenta):
         Raises
         ------
         InputError
-            All velocities are zero; bad particle numbers.
+            All velocities are zero.
         OverdeterminedError
             g is 1 where a temperature is asked for, or 0.
-        UnsupportedError
-            A constraint couples thermostatted particles to others.
         """
-        if integrator.parts and integrator.scheme is None:
-            raise UnsupportedError("the isokinetic leapfrog holds constraints of the System only; use scheme='rattle'")
         found = float(masses @ np.einsum("ij,ij->i", v, v))
         if not found > 0:
             raise InputError(
@@ -219,9 +186,6 @@ class Isokinetic(CountsMomenta):
                 item="velocities",
             )
         twice = self._twice_kinetic(integrator, masses, found)
-        if self.atoms is not None:
-            share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
-            integrator.setPerDofVariableByName("share", share.tolist())
         precision = Precision.of(context).name
         integrator.program.set("two_k", twice)
         # Drifts keep the 2K of rigid bodies, and rounding is larger than what they change where it is not double.
@@ -241,77 +205,39 @@ class Isokinetic(CountsMomenta):
 
     def _twice_kinetic(self, integrator: Integrator, masses: FloatArray, found: float) -> float:
         count = self.count(integrator)
-        if self.kinetic_energy is not None:
-            return 2 * self.kinetic_energy
         if self.temperature is None:
             return found
         if self.convention == "notes":
             return 3 * int(np.sum(masses > 0)) * GAS_CONSTANT * self.temperature
         if count < 2:
             raise OverdeterminedError(
-                "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; give kinetic_energy, or "
-                "use Langevin",
+                "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; leave out the "
+                "temperature, or use Langevin",
                 rows=(),
             )
         return (count - 1) * GAS_CONSTANT * self.temperature
-
-    def masses(self, integrator: Integrator) -> FloatArray:
-        """Masses of thermostatted particles; 0 for others."""
-        masses = super().masses(integrator)
-        if self.atoms is None:
-            return masses
-        inside = np.zeros(len(masses), dtype=bool)
-        inside[atom_numbers(np.asarray(self.atoms), len(masses))] = True
-        if integrator.parts:
-            raise UnsupportedError(
-                "a thermostat on some of the particles works with constraints of the System only; leave out parts=, "
-                "or thermostat all particles"
-            )
-        rows = integrator._watch().rows
-        first, second = inside[rows.pairs].T
-        if np.any(first != second):
-            row = int(np.argmax(first != second))
-            within, other = sorted(rows.pairs[row].tolist(), key=lambda atom: not inside[atom])
-            raise UnsupportedError(
-                f"constraint {rows.numbers[row]} of the System couples the thermostatted particle {within} to {other}, "
-                "which is not; choose particles such that every constraint is wholly inside or outside"
-            )
-        return np.where(inside, masses, 0.0)
-
-    def independent(self, integrator: Integrator) -> int:
-        if self.atoms is None:
-            return super().independent(integrator)
-        masses, rows = self.masses(integrator), integrator._watch().rows
-        inside = masses[rows.pairs].any(axis=1)
-        some = replace(rows, pairs=rows.pairs[inside], lengths=rows.lengths[inside], settled=rows.settled[inside])
-        return 3 * int(np.sum(masses > 0)) - some.rank(positions_of(integrator.context))
 
     # -- what can be read -----------------------------------------------------------------------
 
     def warmth(self, integrator: Integrator) -> float:
         """2 K/(g k) times this is the temperature of the configurations."""
         count = self.count(integrator)
-        if count < 2 or not self.everyone(integrator):
-            return 1.0
-        return integrator.degrees_of_freedom() / (count - 1)
-
-    def at(self, temperature: float) -> Isokinetic:
-        return self.replaced(temperature=temperature, kinetic_energy=None)
+        return 1.0 if count < 2 else integrator.degrees_of_freedom() / (count - 1)
 
     def follow(self, integrator: Integrator) -> None:
         """Kicks scale the velocities from the next step on."""
         guard = integrator._guard
         if guard is not None and guard.alive is not None and guard.started:
-            twice = self._twice_kinetic(integrator, self.masses(integrator), 0.0)
+            twice = self._twice_kinetic(integrator, guard.rows.masses, 0.0)
             integrator.program.set("two_k", twice)
 
     def conserved_energy(self, integrator: Integrator) -> float:
-        """U + 2K int(alpha dt) in kJ/mol, conserved where all particles are thermostatted."""
+        """U + 2K int(alpha dt), conserved; kJ/mol."""
         heat = integrator.getGlobalVariableByName("two_k") * integrator.getGlobalVariableByName("growth")
         return energy_of(integrator.context, integrator.getIntegrationForceGroups()) + heat
 
 
-def _add_up(step: Step, of: str, q: str, along: str) -> None:
+def _add_up(step: Step, q: str, along: str) -> None:
     """Make v w + q, and find the lengths of a kick that is not seen, without telling w and q apart.
 
     w + q is v + h f/m made tangent; what v has across the constraints the next drift absorbs. Unless `exact`, v is not
@@ -321,10 +247,10 @@ def _add_up(step: Step, of: str, q: str, along: str) -> None:
     p = step.program
     p.let("ww", "two_k", "2K before, as drifts keep it")
     with p.when("select(behind, exact, 1) != 0", "to rounding; v may have been changed by whom ever"):
-        p.sum("ww", f"{of}m*v*v", "2K before")
+        p.sum("ww", "m*v*v", "2K before")
     p.each("v", f"v+{q}", "the applied forces act")
     step.project()
-    p.sum("wq", f"{of}m*v*v", "(w+q).M.(w+q)")
+    p.sum("wq", "m*v*v", "(w+q).M.(w+q)")
     p.sum("qq", along, "q.M.(w+q)")
     p.let("wq", "wq-qq-ww", "along the kick")
     p.let("qq", "max(qq-wq, wq^2/ww)", "size of the kick")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
     ConvergenceError,
-    InputError,
     NonFiniteError,
     ReversibilityError,
     UnsupportedError,
@@ -28,7 +26,7 @@ from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
 from kcons.openmm.states import energy_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats import Counts, best_acceptance
+from kcons.thermostats import Counts
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.monte_carlo import (
     ACCEPTED,
@@ -43,8 +41,6 @@ from kcons.thermostats.monte_carlo import (
     SQUARES,
     SUM,
     UNSOLVED,
-    DualAveraging,
-    Proposals,
     step_range,
 )
 
@@ -61,11 +57,6 @@ class ReversedDrifts(ConstantEnergy):
     to end: so the way back is that of the step from the end, whatever its kicks do across, to the place where solvers
     start.
     """
-
-    def check(self, scheme: Splitting | None) -> None:
-        """Refuse the leapfrog."""
-        if scheme is None:
-            raise UnsupportedError("the leapfrog makes no reversible steps; use 'rattle' or 'blanes-moan4'")
 
     def declare(self, program: Program) -> None:
         program.number("missed", "square of how far the worst way back has missed its start")
@@ -127,15 +118,13 @@ class HamiltonianMonteCarlo:
         The part of the velocities that a proposal keeps, from 0 to less than 1.
     tolerance : float
         Distance in nm by which a way back may miss its start; other solutions are off by a part of a bond.
-    restart : path, optional
-        Go on from what `save` wrote.
 
     Raises
     ------
     InputError
-        Temperature not positive, fewer than one step, `keep` out of range; a file of other particles.
+        Temperature not positive, fewer than one step, `keep` out of range.
     UnsupportedError
-        Another integrator, one with an ensemble, or the leapfrog; parts that move; barostats, AndersenThermostat or
+        Another integrator, one with an ensemble; parts that move; barostats, AndersenThermostat or
         CMMotionRemover in the System.
 
     Notes
@@ -153,7 +142,6 @@ class HamiltonianMonteCarlo:
         *,
         keep: Share = 0.0,
         tolerance: Positive = 1e-4,
-        restart: str | PathLike[str] | None = None,
     ) -> None:
         self.simulation = simulation if isinstance(simulation, app.Simulation) else None
         self.context: openmm.Context = getattr(simulation, "context", simulation)
@@ -168,8 +156,6 @@ class HamiltonianMonteCarlo:
         self._held = np.array([math.nan, *[0.0] * (SIZE - 1)])
         #: Proposals so far.
         self.number = 0
-        if restart is not None:
-            self.take(State.load(restart))
 
     @staticmethod
     def reversing_integrator(
@@ -197,34 +183,11 @@ class HamiltonianMonteCarlo:
 
     @property
     def state(self) -> State:
-        """Positions (nm), velocities (nm/ps), time (ps), number of proposals, and the variables of the sampler.
-
-        All that the next proposal depends on; for `take`, also of another temperature (see
-        `kcons.thermostats.exchange`).
-        """
+        """Positions (nm), velocities (nm/ps), time (ps), number of proposals, and the variables of the sampler."""
         context = self.context
         time = context.getTime().value_in_unit(unit.picosecond)
         x, v = positions_of(context), velocities_of(context)
         return State(x, v, time, None, self.number, thermostat=self._held.copy())
-
-    def take(self, state: State) -> None:
-        """Go on from a state.
-
-        Raises
-        ------
-        InputError
-            It has other particles, or is none of a HamiltonianMonteCarlo.
-        """
-        if state.positions.shape != (len(self._masses), 3):
-            raise InputError(f"the state has {len(state.positions)} particles, not {len(self._masses)}", item="state")
-        if state.thermostat is None or state.thermostat.shape != (SIZE,):
-            raise InputError("the state is none of a HamiltonianMonteCarlo", item="state")
-        self._held, self.number = state.thermostat.copy(), int(state.step)
-        self._put(state.positions, state.velocities, state.time)
-
-    def save(self, file: str | PathLike[str]) -> None:
-        """Write the state; `restart=file` goes on, to the last bit where the platform is reproducible."""
-        self.state.save(file)
 
     def step(self, proposals: int) -> None:
         """Make so many proposals.
@@ -245,40 +208,6 @@ class HamiltonianMonteCarlo:
                     positions=True, velocities=True, forces=True, energy=True, enforcePeriodicBox=asked
                 )
                 reporter.report(self.simulation, found)
-
-    @checked
-    def tune(self, wanted: float | None = None, proposals: Proposals = 80) -> float:
-        """Find the time step for a wanted share of accepted proposals, and use it from now on; returns it in ps.
-
-        The proposals that it takes are no sample, and are not counted; see `kcons.thermostats.tune`.
-
-        Raises
-        ------
-        InputError
-            A share that is not between 0 and 1, fewer than 20 proposals.
-        ConvergenceError
-            No proposal of the second half could be made, however small the step became.
-        """
-        integrator = self.integrator
-        assert integrator.scheme is not None
-        search = DualAveraging(
-            integrator.getStepSize().value_in_unit(unit.picosecond),
-            best_acceptance(integrator.scheme.order) if wanted is None else wanted,
-        )
-        begun = integrator.getStepSize()
-        try:
-            for number in range(proposals):
-                integrator.setStepSize(search.dt * unit.picosecond)
-                before = self._held[SUM]
-                self._propose(first=number == 0)
-                search.learn(float(self._held[SUM] - before))
-            search.refuse_failure()
-        except BaseException:
-            integrator.setStepSize(begun)
-            raise
-        self._held[ACCEPTED:] = 0.0
-        integrator.setStepSize(search.result * unit.picosecond)
-        return search.result
 
     # -- a proposal -----------------------------------------------------------------------------
 
@@ -403,7 +332,7 @@ def _integrator_of(context: openmm.Context) -> ProjectedIntegrator:
             f"{type(integrator).__name__} is no ProjectedIntegrator: make the Context or Simulation with "
             "HamiltonianMonteCarlo.reversing_integrator(0.009, 'blanes-moan4')"
         )
-    if integrator.scheme is None or not (integrator.scheme.reversible and integrator.scheme.symplectic):
+    if not (integrator.scheme.reversible and integrator.scheme.symplectic):
         raise UnsupportedError(f"{integrator!r} makes no reversible steps; use 'rattle' or 'blanes-moan4'")
     if not isinstance(integrator.ensemble, ConstantEnergy):
         raise UnsupportedError(f"{integrator.ensemble!r} has no energy to accept or reject by; leave out ensemble")

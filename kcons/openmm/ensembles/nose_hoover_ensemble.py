@@ -12,15 +12,16 @@ from kcons.constraints.arguments import Count, checked, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
-from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, Step, refuse_leapfrog, use
+from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, Step, use
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.openmm.states import energy_of
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import HALF, ChainOrder, chain_fractions
 
+#: Of the motion of the chain at fixed velocities.
+CHAIN_ORDER: ChainOrder = 4
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
 _FASTEST = 1.4
 
@@ -42,17 +43,13 @@ class NoseHoover(CountsMomenta):
         relaxation time, 1/frequency. At most a tenth of a step's inverse.
     length : int
         Links of the chain.
-    chain_order : {2, 4, 6}
-        Of the motion of the chain at fixed velocities.
-    repeats : int
-        In how many parts of the time it is made.
     momentum : {'auto', 'conserved', 'free'}
         As for `Isokinetic`.
 
     Raises
     ------
     InputError
-        Temperature or frequency not positive, no links, an unknown order.
+        Temperature or frequency not positive, no links.
 
     Warns
     -----
@@ -61,7 +58,7 @@ class NoseHoover(CountsMomenta):
 
     Notes
     -----
-    Schemes of order 2 but the leapfrog. Targets must rest. Single oscillators and other small systems without
+    Schemes of order 2. Targets must rest. Single oscillators and other small systems without
     collisions need not visit all states, whatever the length of the chain: use Langevin there.
 
     References
@@ -73,8 +70,6 @@ class NoseHoover(CountsMomenta):
     temperature: float
     frequency: float
     length: int
-    chain_order: ChainOrder
-    repeats: int
     momentum: Momentum
 
     @checked
@@ -84,27 +79,21 @@ class NoseHoover(CountsMomenta):
         frequency: unit.Quantity | float,
         *,
         length: Count = 3,
-        chain_order: ChainOrder = 4,
-        repeats: Count = 1,
         momentum: Momentum = "auto",
     ) -> None:
         self._keep(
             temperature=positive(kelvins(temperature), "temperature"),
             frequency=positive(_per_picosecond(frequency), "frequency"),
             length=length,
-            chain_order=chain_order,
-            repeats=repeats,
             momentum=momentum,
         )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.temperature:g} K, {self.frequency:g}/ps, length={self.length})"
 
-    def check(self, scheme: Splitting | None) -> None:
-        """Raise `UnsupportedError` for the leapfrog and for schemes of another order than 2."""
-        if scheme is None:
-            refuse_leapfrog(self)
-        elif scheme.order != 2:
+    def check(self, scheme: Splitting) -> None:
+        """Raise `UnsupportedError` for schemes of another order than 2."""
+        if scheme.order != 2:
             raise UnsupportedError(f"{scheme!r} has order {scheme.order}, the chain 2; use scheme='rattle'")
 
     def check_timestep(self, dt: float) -> None:
@@ -116,9 +105,9 @@ class NoseHoover(CountsMomenta):
                 item="frequency",
             )
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         """The chain moves before the scheme's own operations and after them."""
-        return HALF, *operations_of(scheme), HALF
+        return HALF, *scheme.operations(), HALF
 
     # -- program --------------------------------------------------------------------------------
 
@@ -138,7 +127,7 @@ class NoseHoover(CountsMomenta):
             ("chain_h", "its length"),
         ):
             p.number(name, words)
-        shares = chain_fractions(self.chain_order, self.repeats)
+        shares = chain_fractions(CHAIN_ORDER, 1)
         p.table("chain_share", (*shares, *shares), "length of part k as a fraction of the time, twice")
         if "between" in p.numbers:
             use(p, "behind")
@@ -238,7 +227,7 @@ class NoseHooverMiddle(BetweenHalves, NoseHoover):
 
     Parameters
     ----------
-    temperature, frequency, length, chain_order, repeats, momentum
+    temperature, frequency, length, momentum
         As for `NoseHoover`.
 
     Notes

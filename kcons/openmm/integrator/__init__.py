@@ -6,5 +6,5 @@
 - `part`, `precision`, `system_checks`: what else is held, what a platform can hold, and what a System holds
 - `guard`: what an integrator looks at in its Context, and the way back
 - `minimization`: minima on the constraints
-- `projected`, `rattle_integrator`: `ProjectedIntegrator` and `RattleIntegrator`
+- `projected`: `ProjectedIntegrator`
 """

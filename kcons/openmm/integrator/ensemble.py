@@ -25,7 +25,7 @@ import openmm
 from kcons.errors import UnsupportedError
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import operations_of, stages_of
+from kcons.openmm.integrator.schemes import stages_of
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Rattle, Splitting
 
@@ -72,7 +72,6 @@ VARIABLES = {
     "v_end": Variable("vector", "v at the end of the step that has this v_middle"),
     "v_next": Variable("vector", "velocities with all of (x-xu)/h"),
     "force": Variable("vector", "applied forces at x, kept within a call where OpenMM would compute them again"),
-    "impulse": Variable("vector", "change of v by the constraints in the last drift"),
 }
 
 
@@ -87,7 +86,7 @@ def use(program: Program, *names: str) -> str:
 class Integrator(openmm.CustomIntegrator):
     """What ensembles and checks may ask of an integrator; `ProjectedIntegrator` answers, and says what each is."""
 
-    scheme: Splitting | None
+    scheme: Splitting
     parts: tuple[Part, ...]
     program: Program
     row_groups: frozenset[int]
@@ -105,6 +104,10 @@ class Integrator(openmm.CustomIntegrator):
 
     @property
     def ensemble(self) -> Ensemble:
+        raise NotImplementedError
+
+    @property
+    def thermostatted(self) -> bool:
         raise NotImplementedError
 
     @property
@@ -139,15 +142,15 @@ class Ensemble:
 
     # -- what it goes with ----------------------------------------------------------------------
 
-    def check(self, scheme: Splitting | None) -> None:
+    def check(self, scheme: Splitting) -> None:
         """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
 
     def check_timestep(self, dt: float) -> None:
         """Raise `InputError` for a time step (ps) that the ensemble cannot follow."""
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         """What a step consists of. Where there is an `Exchange`, `middle` writes it."""
-        return operations_of(scheme)
+        return scheme.operations()
 
     # -- the program ----------------------------------------------------------------------------
 
@@ -274,25 +277,16 @@ class BetweenHalves(Ensemble):
 
     adds_up = True
 
-    def check(self, scheme: Splitting | None) -> None:
+    def check(self, scheme: Splitting) -> None:
         """Raise `UnsupportedError` for all schemes but 'rattle'."""
-        if scheme is None:
-            refuse_leapfrog(self)
-        elif scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,) or scheme.flight != (1.0,):
+        if scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,) or scheme.flight != (1.0,):
             raise UnsupportedError(
                 f"{type(self).__name__} splits the drift of scheme='rattle' in two; {scheme!r} has another form"
             )
 
-    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+    def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         first, second = drifts_of((0.5, 0.5))
         return (Kick(0.5), first, Exchange(1.0), second, Evaluate(), Kick(0.5), Project())
-
-
-def refuse_leapfrog(ensemble: Ensemble) -> None:
-    raise UnsupportedError(
-        f"{type(ensemble).__name__} needs velocities at the time of the positions, and those of the leapfrog are half "
-        "a step behind; use scheme='rattle'"
-    )
 
 
 class Step:
@@ -325,22 +319,22 @@ class Step:
         Name of the applied forces.
     """
 
-    def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
+    def __init__(self, program: Program, scheme: Splitting, parts: Sequence[Part], ensemble: Ensemble) -> None:
         self.program, self.scheme, self.parts, self.ensemble = program, scheme, tuple(parts), ensemble
         self.operations = ensemble.operations(scheme)
         self.drifts, self.kicks = stages_of(self.operations)
         self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
         self.one_drift = len(self.drifts) == 1 or self.halves
         self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
-        self.sited = scheme is not None and any(part.sited for part in self.parts)
+        self.sited = any(part.sited for part in self.parts)
         self.single = len(self.parts) == 1 and self.parts[0].alone and not self.sited
         verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
         self.lean = plain and bool(self.parts) and verlet and not self.sited
         #: Without parts: the kick that ends a step is made with that which begins the next.
         self.joined = ensemble.adds_up and not self.parts and verlet
-        self.lazy = self.lean or self.joined or (not self.parts and (ensemble.owes or scheme is None))
+        self.lazy = self.lean or self.joined or (not self.parts and ensemble.owes)
         self.observed = 2 if self.lean and any(hasattr(part, "mean_multipliers") for part in self.parts) else 1
-        self.kept = scheme is not None and any(part.evaluates for part in self.parts) and not self.lean
+        self.kept = any(part.evaluates for part in self.parts) and not self.lean
         self.force = "f"
         #: Whether drifts change v by impulses without the rounding errors of positions.
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
@@ -354,7 +348,6 @@ class Step:
 
     def kicked(self, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
         """The velocities after a kick, which a drift may begin with."""
-        tangent = tangent and self.scheme is not None  # the leapfrog's velocities belong to half a step before
         return self.ensemble.kick(self, h, impulse, tangent, unseen)
 
     def drift(self, h: str, u: str = "v") -> str:
@@ -369,16 +362,13 @@ class Step:
         for part in self.parts:
             part.remember(p)
         self.land(u, h)
-        if self.scheme is None:
-            p.each("impulse", f"(x-xu)/{h}", "what the constraint forces do to v")
-            return "impulse"
         return f"(x-xu)/{h}"
 
     def _filtered_flight(self, h: str) -> str:
-        """What a drift does to v lies along the gradients where it began: the rest of (x-xu)/h is rounding.
+        """The drift, with rounding kept out of v: of (x-xu)/h only what is along the gradients at its start is added.
 
-        (x-xu)/h has the rounding errors of x, divided by h. The projector where the drift began tells what of it is
-        along the constraints.
+        (x-xu)/h is the change of v by the constraint forces, plus the rounding errors of x divided by h. Constraint
+        forces act along the gradients where the drift began, so that whatever else (x-xu)/h has is rounding.
         """
         p = self.program
         use(p, "x_start", "v_next")

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 import openmm
-from numpy.typing import NDArray
 
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.certificate import MOST, SHARE
@@ -132,11 +130,6 @@ class Guard:
         assert integrator is not None
         return integrator
 
-    @property
-    def late(self) -> bool:
-        """Whether velocities are those of half a step before, and on no constraints at x."""
-        return self.integrator.scheme is None
-
     def _refuse_old_positions(self) -> None:
         """Raise where rows would be computed at old positions."""
         integrator, precision = self.integrator, self.precision
@@ -151,13 +144,13 @@ class Guard:
 
     # -- constraints of the System ---------------------------------------------------------------
 
-    def limit(self, x: FloatArray, *, wrapped: bool = False) -> FloatArray:
+    def limit(self, x: FloatArray) -> FloatArray:
         """What each relative residual may be, given the tolerance and the size of the coordinates.
 
-        `wrapped` for molecules that OpenMM has just moved back into the box: in mixed precision it rounds their
-        positions there to single numbers then, until the next step.
+        In mixed precision OpenMM rounds positions of molecules that it moves back into the box to single numbers, until
+        the next step.
         """
-        coarse = wrapped and self.precision.name == "mixed" and self.system.usesPeriodicBoundaryConditions()
+        coarse = self.precision.name == "mixed" and self.system.usesPeriodicBoundaryConditions()
         place = SINGLE if coarse else self.precision.place
         inside = width_of(self.context) if coarse else 0.0
         reach = np.maximum(np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0), inside) / self.rows.lengths
@@ -172,8 +165,6 @@ class Guard:
             return
         miss = np.abs(self.rows.stretches(x))
         limit = self.limit(x)
-        if _may_have_crossed(self.context, self.rows.pairs[:, 0], miss > limit):
-            limit = self.limit(x, wrapped=True)
         excess = miss / limit
         row = int(np.argmax(excess))
         if not excess[row] <= 1:  # also NaN
@@ -203,7 +194,7 @@ class Guard:
         if not rows.n_rows:
             return None
         allowed = (10 * tolerance + self.precision.solvers) * rows.speeds_of_one(v)
-        allowed += (self.limit(x, wrapped=True) + self.precision.speeds) * np.sqrt(np.mean(v * v))
+        allowed += (self.limit(x) + self.precision.speeds) * np.sqrt(np.mean(v * v))
         return Violation.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
 
     # -- calls ----------------------------------------------------------------------------------
@@ -215,6 +206,11 @@ class Guard:
         if context is None or self._size != _size(self.system):
             return False
         return self._left is None or self._left == (context.getStepCount(), box_of(context))
+
+    @property
+    def in_run(self) -> bool:
+        """Whether a call of `step` has ended, or failed, before this one."""
+        return self._left is not None
 
     def enter(self) -> None:
         """A call of `step` begins."""
@@ -256,10 +252,10 @@ class Guard:
             self._put_right(x)
             self._make_tangent(velocities_of(context))
             for part in integrator.parts:
-                if not self.started:
-                    part.check(context, velocities=not self.late)
-                elif not part.steered:  # a context parameter moves rows, and the next drift follows
-                    self._refuse(part.worst_violation(context, velocities=not self.late))
+                if self.started:
+                    self._refuse(part.worst_violation(context))
+                else:
+                    part.check(context)
             if not self.started:
                 warn_of_barostat(context, getattr(integrator.ensemble, "temperature", None), stacklevel=5)
                 integrator.ensemble.begin(integrator, context)
@@ -282,14 +278,15 @@ class Guard:
                 item="positions",
                 atoms=self.rows.pairs[row],
             )
-        asked = [part for part in integrator.parts if not (self.started and part.steered)]
-        misses = _misses(asked, context)
+        misses = _misses(integrator.parts, context)
         near = bool(misses) and all(found.near for found in misses)  # those that are far are refused later
         if not near and not np.any(miss > self.limit(x)):
             return
         if not near:
             self.hold_positions(integrator.getConstraintTolerance())
-            near = not misses and bool(_misses(asked, context))  # pulled off by the constraints of the System
+            near = not misses and bool(
+                _misses(integrator.parts, context)
+            )  # pulled off by the constraints of the System
         if near:
             integrator.applyConstraints(context)
         now = positions_of(context)
@@ -313,14 +310,8 @@ class Guard:
     def _make_tangent(self, v: FloatArray) -> None:
         """Project velocities that were set from outside; those of a run that is continued stay bit for bit."""
         integrator, context = self.integrator, self.context
-        if self.late:
-            # What is taken away here the first drift would take away: the leapfrog's way is the same, but the first
-            # impulse, which enters the kinetic energy, is that of a smooth motion.
-            off = not np.any(np.asarray(integrator.getPerDofVariableByName("impulse")))
-        else:
-            off = self.speed_violation(positions_of(context), v) is not None
-            off = off or any(part.worst_violation(context) is not None for part in integrator.parts)
-        if off:
+        off = self.speed_violation(positions_of(context), v) is not None
+        if off or any(part.worst_violation(context) is not None for part in integrator.parts):
             integrator.applyVelocityConstraints(context)
 
     # -- after steps ----------------------------------------------------------------------------
@@ -357,16 +348,10 @@ class Guard:
             self._go_back(error)
             raise
 
-    def count(self, steps: int, *, ends: bool = False) -> None:
+    def count(self, steps: int) -> None:
         """Count steps that were made; check where a check is due.
 
         Where the integrator may spare them, checks wait while they would take more than `SHARE` of the time.
-
-        Parameters
-        ----------
-        steps : int
-        ends : bool
-            Whether a call ends that is checked at its end.
 
         Raises
         ------
@@ -374,14 +359,12 @@ class Guard:
             The Context is put back to where it was checked last.
         """
         self.since_check += steps
-        due = 0 < self.integrator.check_every <= self.since_check
-        if not (due or ends):
+        if not 0 < self.integrator.check_every <= self.since_check:
             return
-        spare = self.integrator.spare and (not due or self._put_off < MOST)
+        spare = self.integrator.spare and self._put_off < MOST
         if spare and self._cost > SHARE * (perf_counter() - self._checked):
-            if due:
-                self._put_off += 1
-                self.since_check = 0
+            self._put_off += 1
+            self.since_check = 0
             return
         begun = perf_counter()
         try:
@@ -412,9 +395,7 @@ class Guard:
             v = np.asarray(now.getVelocities(asNumpy=True)._value)
             check_finite(x, v, step, self.rows.n_rows > 0)
             self.check_lengths(x, step)
-            misses = [] if self.late else [self.speed_violation(x, v)]
-            misses += [part.worst_violation(context, velocities=not self.late) for part in integrator.parts]
-            for miss in misses:
+            for miss in (self.speed_violation(x, v), *(part.worst_violation(context) for part in integrator.parts)):
                 self.certify(miss, f"at step {step} ")
         except (CertificateError, ConvergenceError, NonFiniteError) as error:
             error.step = step
@@ -491,26 +472,6 @@ def _size(system: openmm.System) -> tuple[int, int, int]:
 def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Violation]:
     """Rows whose positions are off, the worst of each part."""
     return [found for part in parts if (found := part.worst_violation(context, velocities=False)) is not None]
-
-
-def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.bool_]) -> bool:
-    """Whether what is off may be molecules that were just moved back into the box: few of them cross a face at a time.
-
-    Parameters
-    ----------
-    context : openmm.Context
-    first : ndarray of int, shape (n_rows,)
-        A particle of each row.
-    off : ndarray of bool, shape (n_rows,)
-        Rows that are off.
-    """
-    if not off.any():
-        return False
-    of_particle = np.zeros(context.getSystem().getNumParticles(), dtype=np.int64)
-    for number, molecule in enumerate(context.getMolecules()):
-        of_particle[list(molecule)] = number
-    molecules = of_particle[first]
-    return 2 * len(np.unique(molecules[off])) <= max(len(np.unique(molecules)), 2)
 
 
 def _smaller_step(held: bool) -> str:

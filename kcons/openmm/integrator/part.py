@@ -161,11 +161,6 @@ class Part(ABC):
         """Whether rows demand velocities that are not 0."""
         return False
 
-    @property
-    def steered(self) -> bool:
-        """Whether context parameters move targets; positions need not be on the rows after one has changed."""
-        return False
-
     # -- the program ----------------------------------------------------------------------------
 
     @abstractmethod
@@ -212,11 +207,8 @@ class Part(ABC):
     # -- in a Context ---------------------------------------------------------------------------
 
     @abstractmethod
-    def check(self, context: openmm.Context, velocities: bool = True) -> None:
-        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up.
-
-        `velocities` is False for the leapfrog, whose velocities belong to half a step before.
-        """
+    def check(self, context: openmm.Context) -> None:
+        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""
 
     @abstractmethod
     def worst_violation(self, context: openmm.Context, velocities: bool = True) -> Violation | None:

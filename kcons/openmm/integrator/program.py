@@ -90,7 +90,7 @@ class Program:
         self._words: dict[str, str] = {}
 
     @property
-    def integrator(self) -> openmm.CustomIntegrator:
+    def integrator(self) -> Any:
         integrator = self._integrator()
         assert integrator is not None
         return integrator

@@ -15,14 +15,14 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
-from kcons.errors import InputError, KconsError, MissingSettingError, UnsupportedError
+from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context
 from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import TOLERANCES, Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
+from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.steps import write_step
 from kcons.openmm.integrator.system_checks import require_context, warn_of_barostat
 from kcons.openmm.quantities import kelvins, number, relative_tolerance
@@ -77,8 +77,7 @@ class ProjectedIntegrator(Integrator):
         In ps if a float; more than 0. OpenMM refuses negative steps: to go back, turn the velocities round.
     scheme : str or Splitting
         'rattle' (velocity Verlet), 'geodesic', 'suzuki4', 'yoshida4', 'kahan-li6', 'blanes-moan4', 'blanes-moan6',
-        'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog', with velocities half a step behind as in
-        openmm.VerletIntegrator.
+        'blanes-moan6a', 'isokinetic4', 'isokinetic6', or a splitting of kcons.steppers.
     parts : sequence of Part
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float, optional
@@ -90,13 +89,13 @@ class ProjectedIntegrator(Integrator):
     ensemble : Ensemble, optional
         How velocities change between drifts; constant energy by default.
     device : bool, optional
-        Whether a compiled plugin makes the steps, see `kcons.openmm.device`: True demands it, None takes it where it
-        can be had and has this step, False is the program of a CustomIntegrator.
+        Whether a compiled plugin makes the steps, see `kcons.openmm.device`: True demands it, False is the program of a
+        CustomIntegrator. None takes the plugin if it has this step, and OpenMM has a platform for GPUs here (CUDA, HIP,
+        OpenCL) or the plugin was compiled already; `listing` says why not.
 
     Attributes
     ----------
-    scheme : Splitting or None
-        None for the leapfrog.
+    scheme : Splitting
     parts : tuple of Part
     row_groups : frozenset of int
         Force groups that carry rows, not forces.
@@ -126,13 +125,19 @@ class ProjectedIntegrator(Integrator):
     asked_tolerance: float | None = None
     _guard: Guard | None = None
     _program_type = Program
-    #: Makes integrators whose steps are made on the device; given by `kcons.openmm.device`.
-    _on_device: ClassVar[Callable[..., type[ProjectedIntegrator]]]
+    #: Chooses the class, and says why it is not that whose steps are made on the device; of `kcons.openmm.device`.
+    _on_device: ClassVar[Callable[..., tuple[type[ProjectedIntegrator], str]]]
+    #: Why steps are not made on the device, where that was asked.
+    _refused = ""
 
-    def __new__(cls, *args: Any, device: bool | None = False, **kwargs: Any) -> ProjectedIntegrator:
+    def __new__(cls, *args: Any, device: bool | None = None, **kwargs: Any) -> ProjectedIntegrator:
         """Of this class, or of the one that runs on the device."""
-        kind = cls._on_device(device, *args, **kwargs) if cls is ProjectedIntegrator and device is not False else cls
-        return object.__new__(kind)
+        kind, why = cls, ""
+        if "_on_device" in vars(cls) and device is not False:
+            kind, why = cls._on_device(device, *args, **kwargs)
+        made = object.__new__(kind)
+        made._refused = why
+        return made
 
     def __init__(
         self,
@@ -143,7 +148,7 @@ class ProjectedIntegrator(Integrator):
         tolerance: float | None = None,
         check_every: int | None = None,
         ensemble: Ensemble | None = None,
-        device: bool | None = False,
+        device: bool | None = None,
     ) -> None:
         self._make(picoseconds(timestep))
         self.asked_tolerance = None if tolerance is None else relative_tolerance(tolerance)
@@ -191,9 +196,8 @@ class ProjectedIntegrator(Integrator):
     _own_step: Callable[[Step], bool] | None = None
 
     def __repr__(self) -> str:
-        scheme = "leapfrog" if self.scheme is None else repr(self.scheme)
         held = "".join(f", {part!r}" for part in self.parts)
-        return f"<ProjectedIntegrator: {scheme}, {self._dt * 1e3:g} fs{held}>"
+        return f"<ProjectedIntegrator: {self.scheme!r}, {self._dt * 1e3:g} fs{held}>"
 
     def __str__(self) -> str:
         return f"{self!r}\n{self.listing()}"
@@ -206,7 +210,8 @@ class ProjectedIntegrator(Integrator):
         elif self.asked_tolerance is None:
             held += ", or what the precision of the Context allows"
         step = "\n".join(f"  {operation}" for operation in self.operations())
-        return f"{held}\na step of {self!r}\n{step}\n{self.program.listing()}"
+        refused = f"not on the device: {self._refused}\n" if self._refused else ""
+        return f"{held}\na step of {self!r}\n{step}\n{refused}{self.program.listing()}"
 
     def operations(self) -> tuple[Operation, ...]:
         """What a step consists of, as for steppers on arrays; `listing` adds how OpenMM computes it."""
@@ -224,17 +229,12 @@ class ProjectedIntegrator(Integrator):
             There is none.
         """
         context = None if self._guard is None else self._guard.alive
-        if context is None and (context := find_context(self._holder)) is None:
+        if context is None and (context := find_context(self)) is None:
             raise UnsupportedError(
                 "this integrator belongs to no Context: create one with it first. Where it has one that is not found, "
                 "as a member of a CompoundIntegrator, call integrator.attach(context)"
             )
         return context
-
-    @property
-    def _holder(self) -> openmm.Integrator:
-        """The integrator that the Context has."""
-        return self
 
     def attach(self, context: openmm.Context) -> None:
         """Look at this Context, and at its System anew; done by itself but for members of a CompoundIntegrator.
@@ -248,7 +248,7 @@ class ProjectedIntegrator(Integrator):
         owner = context.getIntegrator()
         compound = isinstance(owner, openmm.CompoundIntegrator)
         members = [owner.getIntegrator(k) for k in range(owner.getNumIntegrators())] if compound else []
-        if owner is not self._holder and all(int(member.this) != int(self.this) for member in members):
+        if owner is not self and all(int(member.this) != int(self.this) for member in members):
             raise InputError(
                 f"the Context was made with another integrator than {self!r}; give the Context of this one",
                 item="context",
@@ -372,7 +372,9 @@ class ProjectedIntegrator(Integrator):
                 return
             guard.since_check += done
             failure = self._failure(code, first + done + 1)
-            if "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
+            if isinstance(failure, NonFiniteError) and not np.isfinite(motion_of(context)).all():
+                guard.put_back()  # a force is seen in the step after the one whose velocities it has spoilt
+            elif "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
                 self.program.write("between", 0.0)
                 self.applyVelocityConstraints(context)
             guard.leave()
@@ -420,7 +422,7 @@ class ProjectedIntegrator(Integrator):
             self.program.write("failed", 0.0)
             raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
         for part in self.parts:
-            part.check(guard.context, velocities=not guard.late)
+            part.check(guard.context)
         guard.check()
 
     # -- states on constraints ------------------------------------------------------------------
@@ -538,12 +540,11 @@ class ProjectedIntegrator(Integrator):
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
         """As a State has it: of the velocities at x; with a bath that has noise, of those in the middle of the step.
 
-        With such a bath, and with the leapfrog, the next step computes forces anew, as after any State with energies.
+        With such a bath the next step computes forces anew, as after any State with energies.
         """
         guard = self._watch(context)
-        if self.scheme is None or self.ensemble.noisy:
-            groups = self.getIntegrationForceGroups() if self.scheme is None else 0
-            return guard.context.getState(energy=True, groups=groups).getKineticEnergy()
+        if self.ensemble.noisy:
+            return guard.context.getState(energy=True, groups=0).getKineticEnergy()
         v = velocities_of(guard.context)
         return 0.5 * float(guard.rows.masses @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
 
@@ -688,7 +689,7 @@ class ProjectedIntegrator(Integrator):
             raise UnsupportedError(
                 f"{name} is a setting of the integrator: use setTemperature, setFriction, or set_target of a part"
             )
-        super().setGlobalVariableByName(name, value)
+        self.program.write(name, float(value))
 
     def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
         """Choose the force groups that act; groups that carry rows never do.
@@ -705,7 +706,7 @@ class ProjectedIntegrator(Integrator):
         UnsupportedError
             The Context exists; it has read the groups and would ignore the change.
         """
-        if self._guard is not None or find_context(self._holder) is not None:
+        if self._guard is not None or find_context(self) is not None:
             raise UnsupportedError("the Context has read the force groups already; set them before it is created")
         if isinstance(groups, int | np.integer):
             wanted = {g for g in range(32) if (int(groups) >> g) & 1}
@@ -742,21 +743,29 @@ class ProjectedIntegrator(Integrator):
         InputError
             The file has another program.
         """
+        device = 'type="KconsProgram"' in xml
+        if device and "_on_device" in vars(cls):
+            cls = cls._on_device(True, 0.0, scheme, **arguments)[0]  # loads what the file is read by
         plain = openmm.XmlSerializer.deserialize(xml)
-        made = cls(plain.getStepSize(), scheme, **{"tolerance": plain.getConstraintTolerance(), **arguments})
-        if not isinstance(plain, openmm.CustomIntegrator) or _computations(plain) != _computations(made):
+        given = {"tolerance": plain.getConstraintTolerance(), "device": False, **arguments}
+        made = cls(plain.getStepSize(), scheme, **given)
+        if not (made._has_written(xml) if device else _computations(plain) == _computations(made)):
             raise InputError(
                 f"the file has another program than {made!r}; give the scheme, ensemble and parts it was made with",
                 item="integrator",
             )
-        made.setRandomNumberSeed(plain.getRandomNumberSeed())
+        if not device:
+            made.setRandomNumberSeed(plain.getRandomNumberSeed())
         openmm.Integrator.setIntegrationForceGroups(made, plain.getIntegrationForceGroups())
         return made
 
+    def _has_written(self, xml: str) -> bool:
+        """Whether a file of steps on the device has the step of this integrator; takes the seed of it."""
+        return False
+
     def _making(self) -> tuple[Any, ...]:
-        scheme = LEAPFROG if self.scheme is None else self.scheme
         every = None if self.spare else self.check_every
-        made_with = (self.getStepSize(), scheme, self.parts, self.asked_tolerance, every, self.ensemble)
+        made_with = (self.getStepSize(), self.scheme, self.parts, self.asked_tolerance, every, self.ensemble)
         program = self.program
         # What belongs to a state or a step a copy starts without; clocks of targets that move go by the good steps.
         left = {*program.settings, *program.idle, *program.memory, *VARIABLES} - {"good_steps"}
@@ -783,7 +792,8 @@ def _remade(
     seed: int,
 ) -> ProjectedIntegrator:
     dt, scheme, parts, tolerance, check_every, ensemble = made_with
-    made = kind(dt, scheme, parts=parts, tolerance=tolerance, check_every=check_every, ensemble=ensemble)
+    options = {"tolerance": tolerance, "check_every": check_every, "ensemble": ensemble, "device": False}
+    made = kind(dt, scheme, parts=parts, **options)
     made.setRandomNumberSeed(seed)
     openmm.Integrator.setIntegrationForceGroups(made, groups)
     for name, value in settings.items():
@@ -792,7 +802,9 @@ def _remade(
     return made
 
 
-def _computations(integrator: openmm.CustomIntegrator) -> list[tuple[Any, ...]]:
+def _computations(integrator: openmm.Integrator) -> list[tuple[Any, ...]]:
+    if not isinstance(integrator, openmm.CustomIntegrator):
+        return []
     return [tuple(integrator.getComputationStep(k)) for k in range(integrator.getNumComputations())]
 
 

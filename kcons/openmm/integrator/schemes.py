@@ -15,7 +15,7 @@ from kcons.steppers import (
     Suzuki4,
     Yoshida4,
 )
-from kcons.steppers.operations import Fly, Kick, Operation, Turn, drifts_of
+from kcons.steppers.operations import Fly, Kick, Operation, Turn
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.isokinetic.isokinetic import SCHEMES as ISOKINETIC
 
@@ -40,11 +40,10 @@ SCHEMES: dict[str, Callable[[], Splitting]] = {
     "isokinetic4": lambda: _any_flows(4),
     "isokinetic6": lambda: _any_flows(6),
 }
-LEAPFROG = "leapfrog"
 
 
-def to_scheme(scheme: str | Splitting) -> Splitting | None:
-    """The splitting of a name; None for the leapfrog.
+def to_scheme(scheme: str | Splitting) -> Splitting:
+    """The splitting of a name.
 
     Raises
     ------
@@ -53,17 +52,9 @@ def to_scheme(scheme: str | Splitting) -> Splitting | None:
     """
     if isinstance(scheme, Splitting):
         return scheme
-    if scheme == LEAPFROG:
-        return None
     if not isinstance(scheme, str) or scheme not in SCHEMES:
-        known = ", ".join((*SCHEMES, LEAPFROG))
-        raise InputError(f"no scheme {scheme!r}; known: {known}", item="scheme")
+        raise InputError(f"no scheme {scheme!r}; known: {', '.join(SCHEMES)}", item="scheme")
     return SCHEMES[scheme]()
-
-
-def operations_of(scheme: Splitting | None) -> tuple[Operation, ...]:
-    """What a step consists of at constant energy; velocities of the leapfrog belong to half a step before positions."""
-    return (Kick(1.0), *drifts_of((1.0,))) if scheme is None else scheme.operations()
 
 
 def stages_of(operations: Iterable[Operation]) -> tuple[list[float], list[float]]:

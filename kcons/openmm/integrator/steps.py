@@ -19,11 +19,6 @@ def write_step(step: Step, own: Callable[[Step], bool] | None = None) -> None:
         A kind of step of the integrator's own, which returns False where it leaves the step to the others.
     """
     p, ensemble = step.program, step.ensemble
-    if step.scheme is None:
-        # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
-        # impulse of the forces at x is added, and half that of the constraints in the drift to x.
-        p.kinetic_energy = "m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse"
-        p.memory.add(use(p, "impulse"))
     if step.lazy:
         use(p, "between")
     ensemble.declare(p)
@@ -45,25 +40,10 @@ def _kind(step: Step) -> Callable[[Step], None]:
         return _lean_step if step.lean else _guarded_step
     if step.joined:
         return _joined_step
-    if step.scheme is None:
-        return _leapfrog_step
-    return single_step if step.one_drift else _loop_step
+    return _single_step if step.one_drift else _loop_step
 
 
-def _leapfrog_step(step: Step) -> None:
-    """Velocities half a step behind positions, without parts."""
-    p = step.program
-    p.let_others_act()
-    step.kick("dt")
-    p.each("x", "x+dt*v", "move freely (drift)")
-    p.each("xu", "x", "where that leads")
-    p.hold_positions("back onto the constraints of the System")
-    with p.when("between = 0", "somebody asks for the kinetic energy"):
-        p.each("impulse", "(x-xu)/dt", "what the constraint forces do to v")
-    p.each("v", "v+(x-xu)/dt", "the constraint forces act on v as well")
-
-
-def single_step(step: Step) -> None:
+def _single_step(step: Step) -> None:
     """One drift, or two halves with a bath between them, without parts."""
     p, kicks, ensemble = step.program, step.kicks, step.ensemble
     use(p, "phase")
@@ -243,9 +223,7 @@ def _only_drift(step: Step) -> None:
     p.let("per_h", "0", "no drift yet")
     with p.when("failed = 0", "rows are independent"):
         p.let("h", "dt*drift_share(stage)", "length of the drift")
-        impulse = step.drift("h")
-        if step.scheme is None:
-            p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+        step.drift("h")
         p.let("per_h", "1/h", "the constraint forces act on v as well, with the kick that follows")
         p.let("stage", "stage+1", "what follows")
 
@@ -278,21 +256,17 @@ def _kick_after(step: Step, impulse: str = "") -> None:
 
 def _with_forces(step: Step) -> None:
     p = step.program
-    if step.scheme is None:
-        with p.when("failed = 0", "the step is good"):
-            p.let("good_steps", "good_steps+1", "count it")
-    else:
-        with p.when("failed = 0", "all solves converged"):
-            if step.one_drift:
-                step.note_middle("v+per_h*(x-xu)")
-                _kick_after(step, "per_h*(x-xu)")
-            if not step.ends_tangent:
-                step.project()
-            step.note_end()
-            step.ensemble.close(p)
-            p.let("good_steps", "good_steps+delta(failed)", "count it")
-            if step.kept:
-                p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
+    with p.when("failed = 0", "all solves converged"):
+        if step.one_drift:
+            step.note_middle("v+per_h*(x-xu)")
+            _kick_after(step, "per_h*(x-xu)")
+        if not step.ends_tangent:
+            step.project()
+        step.note_end()
+        step.ensemble.close(p)
+        p.let("good_steps", "good_steps+delta(failed)", "count it")
+        if step.kept:
+            p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
     with p.when("failed > 0", "a solve failed"):
         p.each("x", "x_last", "back to where the step began")
         p.each("v", "v_last", "back to where the step began")

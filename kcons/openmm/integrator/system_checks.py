@@ -257,17 +257,17 @@ def groups_in(integrator: openmm.Integrator) -> set[int]:
 
 def forces_alone(
     system: openmm.System,
-    rows: Sequence[Sequence[openmm.Force]],
+    forces: Sequence[openmm.Force],
     box: Sequence | None = None,
     parameters: Mapping[str, float] | None = None,
 ) -> openmm.Context:
-    """A Context of copies of some Forces alone, each row of them in the group of its number, in double precision.
+    """A Context of copies of some Forces alone, each in the group of its number, in double precision.
 
     Parameters
     ----------
     system : openmm.System
         Of its particles.
-    rows : sequence of sequences of Force
+    forces : sequence of Force
     box : sequence of three vectors, optional
         In place of the System's default.
     parameters : mapping of str to float, optional
@@ -282,14 +282,13 @@ def forces_alone(
     for k in range(system.getNumParticles()):
         alone.addParticle(system.getParticleMass(k))
     alone.setDefaultPeriodicBoxVectors(*(system.getDefaultPeriodicBoxVectors() if box is None else box))
-    for group, forces in enumerate(rows):
-        for force in forces:
-            try:
-                taken = copy.deepcopy(force)
-            except openmm.OpenMMException as error:
-                raise UnsupportedError(f"{force.getName()}: {error} Define the function in a module") from error
-            taken.setForceGroup(group)
-            alone.addForce(taken)
+    for group, force in enumerate(forces):
+        try:
+            taken = copy.deepcopy(force)
+        except openmm.OpenMMException as error:
+            raise UnsupportedError(f"{force.getName()}: {error} Define the function in a module") from error
+        taken.setForceGroup(group)
+        alone.addForce(taken)
     context = openmm.Context(alone, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
     for name in context.getParameters():
         if parameters is not None:
@@ -324,8 +323,7 @@ def refuse_forgotten_parts(system: openmm.System, row_groups: Iterable[int]) -> 
             raise InputError(
                 f"the System has a force {force.getName()!r}, which carries rows that are held, and the integrator has "
                 "no part for it: pass what hold, CollectiveRows or surface_parts returned, "
-                "ProjectedIntegrator(..., parts=[rows]). For a System that was copied or read from XML, the rows of "
-                "hold are CarriedConstraints.of(system)",
+                "ProjectedIntegrator(..., parts=[rows])",
                 item="parts",
             )
 
@@ -401,14 +399,14 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
     """
     system, platform = context.getSystem(), context.getPlatform().getName()
     sites = virtual_sites(system)
-    if not sites or integrator.scheme is None:
+    if not sites:
         return False
     late = platform in _LATE
     where = f"particle {sites[0]} is a virtual site"
     if integrator.parts and not any(part.sited for part in integrator.parts):
         raise UnsupportedError(
             f"{where}, of which {integrator.parts[0]!r} does not know; hold rows after the sites were added, by hold "
-            "or CollectiveRows, or use scheme='leapfrog'"
+            "or CollectiveRows"
         )
     if integrator.parts and late and "phase" not in integrator.program.idle:
         raise UnsupportedError(
@@ -418,8 +416,7 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
     if late and type(context.getIntegrator()) is openmm.CompoundIntegrator:
         raise UnsupportedError(
             f"{where}: {platform} places virtual sites at the end of a program only, and within a CompoundIntegrator "
-            "OpenMM runs it as a whole, with forces of sites that are one step old. Use scheme='leapfrog', or the "
-            "integrator alone"
+            "OpenMM runs it as a whole, with forces of sites that are one step old. Use the integrator alone"
         )
     return late
 

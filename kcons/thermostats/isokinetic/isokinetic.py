@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import Positive, checked
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, OverdeterminedError
+from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
@@ -46,7 +46,6 @@ ROUNDING = 1e-12
 KEPT = 1e-9
 #: Kinetic energy below which v.f/2K may overflow.
 SMALLEST = 1e-290
-_MAX_ITERATIONS = 50
 
 _S6 = (0.0792036964311957, 0.353172906049774, -0.0420650803577195)
 _S6_OTHER = (0.209515106613362, -0.143851773179818)
@@ -69,35 +68,13 @@ class _FirstTurn(Turn):
     verb = "first_turn"
 
 
-def programs(operations: Sequence[Operation]) -> tuple[Program, Program, Program]:
-    """A step compiled, with the turns in Python, and where targets move."""
+def programs(operations: Sequence[Operation]) -> tuple[Program, Program]:
+    """A step compiled, and with the turns in Python."""
     first, *others = operations
     assert isinstance(first, Turn)
     parts = _FirstTurn(first.fraction), *others
     functions = {"first_turn": closed_form.first_turn, "turn": closed_form.turn}
-    return Program(parts, functions), Program(parts), Program(parts, python=("project", "fly"))
-
-
-def split(system: System, x: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray | None, FloatArray]:
-    """v, projected, as the slowest velocities that the targets demand (None where they rest) and the rest."""
-    motion = system.motion
-    whole = motion.project_velocities(x, v, time=time)
-    if not motion.plan.driven:
-        return None, whole
-    drive = motion.project_velocities(x, np.zeros_like(v), time=time)
-    return drive, whole - drive
-
-
-def left_for(twice: float, driven: float, step: int) -> float:
-    """What moving targets leave of 2K."""
-    left = twice - driven
-    if not left > SMALLEST:
-        raise InputError(
-            f"moving targets alone have more kinetic energy than the thermostat allows at step {step}: raise the "
-            "temperature, or move them slower",
-            item="kinetic_energy",
-        )
-    return left
+    return Program(parts, functions), Program(parts)
 
 
 class ThermostattedAtoms:
@@ -137,14 +114,12 @@ class ThermostattedAtoms:
 def constrained_acceleration(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
     """M_par^+ f."""
     motion = system.motion
-    if motion.plan.driven:
-        return np.asarray(motion.project_forces(x, forces, time=time) * system.inverse_masses)
     pace = forces * system.weights
     return motion.project_velocities(x, pace, time=time, out=pace) if motion.rank else pace
 
 
 class Isokinetic(Splitting):
-    """Constant kinetic energy, with all that is held at rest or moving: order 2, 4 or 6.
+    """Constant kinetic energy on constraints at rest: order 2, 4 or 6.
 
     Kicks follow the closed form at fixed forces; drifts fly along the constraints, after which the velocities are
     brought back to the length they had. Configurations are canonical at temperature T for
@@ -155,15 +130,10 @@ class Isokinetic(Splitting):
     Symplectic it cannot be: the flow compresses phase space at the rate -(g - 1) alpha. It follows the exact motion
     backwards, with a negative time step, to the order of the scheme.
 
-    Where targets move, they and K are kept together: v is what the targets demand at least, plus the rest, which has
-    the length that is left.
-
     Parameters
     ----------
     thermal_energy : float, optional
-        k_B T in the units of energy in use.
-    kinetic_energy : float, optional
-        K itself, instead of a temperature. With neither, K stays what it is at the start.
+        k_B T in the units of energy in use; without it K stays what it is at the start.
     order : {2, 4, 6}
         1, 6 and 10 force evaluations a step.
     convention : {'exact', 'notes'}
@@ -184,7 +154,7 @@ class Isokinetic(Splitting):
     Notes
     -----
     `State.thermostat` holds 2K, the integral of alpha over time, f.M_par^+ f and g. U + 2K int(alpha) is conserved
-    where targets rest (`conserved_energy`).
+    (`conserved_energy`).
 
     References
     ----------
@@ -200,16 +170,13 @@ class Isokinetic(Splitting):
         self,
         thermal_energy: Positive | None = None,
         *,
-        kinetic_energy: Positive | None = None,
         order: Literal[2, 4, 6] = 2,
         convention: Convention = "exact",
         atoms: ArrayLike | None = None,
         momentum: Momentum = "auto",
     ) -> None:
-        if thermal_energy is not None and kinetic_energy is not None:
-            raise InputError("give thermal_energy or kinetic_energy, not both", item="thermal_energy")
         super().__init__(*SCHEMES[order])
-        self.order, self.thermal_energy, self.kinetic_energy = order, thermal_energy, kinetic_energy
+        self.order, self.thermal_energy = order, thermal_energy
         self.convention: Convention = convention
         self.atoms = None if atoms is None else np.atleast_1d(atoms)
         self.momentum: Momentum = momentum
@@ -225,8 +192,6 @@ class Isokinetic(Splitting):
 
     def __repr__(self) -> str:
         given = [f"{self.thermal_energy!r}"] if self.thermal_energy is not None else []
-        if self.kinetic_energy is not None:
-            given.append(f"kinetic_energy={self.kinetic_energy!r}")
         if self.order != 2:
             given.append(f"order={self.order}")
         if self.convention != "exact":
@@ -239,8 +204,12 @@ class Isokinetic(Splitting):
         return self._operations
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
+        """Raise `UnsupportedError` for targets that move, velocity-dependent forces, and friction besides its own."""
         refuse_dissipation(system, "closed kick; use Langevin for friction, or leave it out")
+        if system.motion.plan.driven:
+            raise UnsupportedError(
+                "targets move, or rows hold velocities, and do work that no closed kick takes out; use Langevin"
+            )
 
     # -- steps ----------------------------------------------------------------------------------
 
@@ -266,14 +235,13 @@ class Isokinetic(Splitting):
             state = replace(state, forces=None)
         share = self._share(system)
         if carried(state, 4, "Isokinetic") and self._goes_on_from(system, share, state):
-            if state.forces is None or self._left is None or state.positions is not self._left[4]:
+            if state.forces is None or self._left is None or state.positions is not self._left[3]:
                 state = self._pushed(system, share, system.with_forces(state))
             return state
         state = system.with_forces(state)
         assert state.forces is not None
-        drive, rest = split(system, state.positions, state.velocities, state.time)
-        driven = 0.0 if drive is None else share.square(drive)
-        found = share.square(rest) + driven
+        velocities = system.motion.project_velocities(state.positions, state.velocities, time=state.time)
+        found = share.square(velocities)
         if not found > SMALLEST:
             raise InputError(
                 "the isokinetic thermostat needs non-zero kinetic energy: draw velocities first "
@@ -284,13 +252,11 @@ class Isokinetic(Splitting):
         twice = self._twice_kinetic(share, free.count, found)
         turns = free.turns and self.thermal_energy is not None
         warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8)
-        velocities = rest if drive is None else drive + rest
         off = float(np.abs(velocities - state.velocities).max())
         if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:
             velocities = state.velocities
         else:
-            rest = share.scaled(rest, left_for(twice, driven, state.step))
-            velocities = rest if drive is None else drive + rest
+            velocities = share.scaled(velocities, twice)
         variables = np.array([twice, 0.0, share.push_square(system, state), free.count])
         return replace(state, velocities=velocities, thermostat=variables)
 
@@ -306,10 +272,8 @@ class Isokinetic(Splitting):
     def _goes_on_from(self, system: System, share: ThermostattedAtoms, state: State) -> bool:
         """Whether the variables of the state are those of this temperature or energy, and of these atoms and rows."""
         left = self._left
-        same = left is not None and (
-            state.thermostat is left[0] and self.thermal_energy == left[1] and self.kinetic_energy == left[2]
-        )
-        if same and state.velocities is left[3]:
+        same = left is not None and state.thermostat is left[0] and self.thermal_energy == left[1]
+        if same and left is not None and state.velocities is left[2]:
             return True  # most often, and in no time
         assert state.thermostat is not None
         twice, _, _, count = state.thermostat.tolist()
@@ -321,16 +285,14 @@ class Isokinetic(Splitting):
         return abs(share.square(state.velocities) - twice) <= KEPT * twice
 
     def _twice_kinetic(self, share: ThermostattedAtoms, count: float, found: float) -> float:
-        if self.kinetic_energy is not None:
-            return 2 * self.kinetic_energy
         if self.thermal_energy is None:
             return found
         if self.convention == "notes":
             return 3 * share.n_moving * self.thermal_energy
         if count < 2:
             raise OverdeterminedError(
-                "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; give kinetic_energy, or "
-                "use Langevin"
+                "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; leave thermal_energy out "
+                "and give velocities of the kinetic energy wanted, or use Langevin"
             )
         return (count - 1) * self.thermal_energy
 
@@ -350,25 +312,23 @@ class Isokinetic(Splitting):
         return min(steps, LOOK_AT - state.step) if state.step < LOOK_AT else steps
 
     def depends_on(self, system: System, state: State) -> Any:
-        driven = system.motion.plan.driven
-        return None if driven else (self.thermal_energy, self.kinetic_energy, state.step == LOOK_AT)
+        return self.thermal_energy, state.step == LOOK_AT
 
     def note(self, state: State) -> None:
-        asked = self.thermal_energy, self.kinetic_energy
-        self._left = state.thermostat, *asked, state.velocities, state.positions
+        self._left = state.thermostat, self.thermal_energy, state.velocities, state.positions
 
     # -- what can be read -----------------------------------------------------------------------
 
     def friction(self, system: System, state: State) -> float:
-        """alpha = v.f/(2K) at the state (notes, eq. 113); where targets move, without the part that they demand."""
+        """alpha = v.f/(2K) at the state (notes, eq. 113)."""
         state = self.start(system, state)
         assert state.forces is not None
         share = self._share(system)
-        rest = split(system, state.positions, state.velocities, state.time)[1]
-        return float(closed_form.raw_sums(rest, state.forces, system.weights, share.masses)[0]) / share.square(rest)
+        v = system.motion.project_velocities(state.positions, state.velocities, time=state.time)
+        return float(closed_form.raw_sums(v, state.forces, system.weights, share.masses)[0]) / share.square(v)
 
     def conserved_energy(self, system: System, state: State) -> float:
-        """U + 2K int(alpha dt), which the exact motion conserves where targets rest and all atoms are thermostatted.
+        """U + 2K int(alpha dt), which the exact motion conserves where all atoms are thermostatted.
 
         Needs `System.potential`.
         """
@@ -379,7 +339,7 @@ class Isokinetic(Splitting):
 
 
 class IsokineticStep(Interpreter):
-    """Steps on their way; velocities are drive + v, the drive None where targets rest."""
+    """Steps on their way."""
 
     def __init__(
         self,
@@ -387,35 +347,17 @@ class IsokineticStep(Interpreter):
         share: ThermostattedAtoms,
         start: State,
         dt: float,
-        made: tuple[Program, Program, Program],
+        made: tuple[Program, Program],
         steps: int,
     ) -> None:
         assert start.thermostat is not None
-        driven = system.motion.plan.driven
-        program = made[2 if driven else 1 if system.packed is None else 0]
+        program = made[1 if system.packed is None else 0]
         masses = share.masses.ravel()
         numbers = np.concatenate((start.thermostat, masses, masses))
         super().__init__(system, start, dt, program, steps, numbers)
         self.share = share
-        self.drive: FloatArray | None = None
         #: How long v must be, squared.
         self.left = float(start.thermostat[TWICE])
-        if driven:
-            self.drive, self.v[:] = split(system, self.x, self.v, self.time)
-            assert self.drive is not None
-            self.left = left_for(self.left, share.square(self.drive), self.number)
-
-    # -- verbs ----------------------------------------------------------------------------------
-
-    def fly(self, row: Row, begun: bool) -> None:
-        if self.drive is not None:
-            self._driven_flight(row)
-            return
-        super().fly(row, begun)
-
-    def project(self, row: Row, begun: bool) -> None:
-        if self.drive is None:
-            super().project(row, begun)
 
     def first_turn(self, row: Row, begun: bool) -> None:
         """With forces as they are: the drift takes out what they would do across the constraints."""
@@ -449,51 +391,5 @@ class IsokineticStep(Interpreter):
         self.numbers[SQUARE] = square
         self.numbers[INTEGRAL] += growth
 
-    def end(self, here: int) -> State:
-        if self.drive is not None:
-            self.v = self.drive + self.v
-        return super().end(here)
-
     def variables(self) -> FloatArray:
         return self.numbers[:SIZE].copy()
-
-    # -- moving targets ------------------------------------------------------------------------
-
-    def _driven_flight(self, row: Row) -> None:
-        """Moving targets do work: u is scaled by one factor before and after the flight, that which keeps K.
-
-        So it is symmetric, of order 2 (Hairer, BIT 40, 726 (2000)).
-        """
-        system, share, x, h = self.system, self.share, self.place(row.here), self.length(row)
-        assert self.drive is not None
-        then, now = self.at(row.begin), self.at(row.end)
-        out, log_factor, last = self.place(row.there), 0.0, math.inf
-        for _ in range(_MAX_ITERATIONS):
-            v = self.drive + self._times(math.exp(log_factor), self.v)
-            np.add(x, h * v, out=out)
-            system.motion.project_positions(
-                out, x, time=now, reference_time=then, velocities=v, dt=h, flight=h, out=out
-            )
-            check_finite(out, "position", self.number)
-            drive, u = split(system, out, v, now)
-            assert drive is not None
-            left = left_for(float(self.numbers[TWICE]), share.square(drive), self.number)
-            u = self._times(math.exp(log_factor), u)
-            miss = 0.5 * math.log(left / share.square(u))
-            if abs(miss) <= 1e-15 or (abs(miss) < 1e-12 and abs(miss) >= last):
-                break
-            last = abs(miss)
-            log_factor += 0.5 * miss
-        else:
-            raise ConvergenceError(
-                "kinetic energy and moving targets cannot be kept together; time step too large",
-                residual=last,
-                tolerance=1e-12,
-                iterations=_MAX_ITERATIONS,
-            )
-        self.drive, self.left = drive, left
-        self.v[:] = u
-        self.numbers[INTEGRAL] -= 2 * log_factor
-
-    def _times(self, factor: float, u: FloatArray) -> FloatArray:
-        return u * factor if self.share.others is None else np.where(self.share.others, u, u * factor)

@@ -1,9 +1,9 @@
 """Several time steps on constraints: forces in groups, the operations of a step, Langevin dynamics made of them.
 
 The slowest group kicks at the ends of the step, and between its kicks the next one makes its steps, and so on
-(Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1990 (1992)). The innermost group moves the atoms, by a symmetric
-scheme of order 2 or 4, with the heat bath in its middle. The same chain of operations may begin half a step later, so
-that slow forces kick in the middle of a step, and states are those halfway between two kicks.
+(Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1990 (1992)). The innermost group moves the atoms, with the heat bath
+in the middle of its steps. The same chain of operations may begin half a step later, so that slow forces kick in the
+middle of a step, and states are those halfway between two kicks.
 """
 
 from __future__ import annotations
@@ -24,15 +24,13 @@ from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.steppers.program import Row
-from kcons.steppers.splitting import SUZUKI_4
 from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import carried
-from kcons.thermostats.isokinetic.isokinetic import SCHEMES
 from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
 
 ForceFunction = Callable[[FloatArray, float], ArrayLike]
 
-#: Difference of the forces of a state from the sum of those of its groups, relative to these, that is their rounding.
+#: Forces of a state that differ from the sum of its groups by at most this fraction are taken for the same.
 SAME = 1e-12
 
 
@@ -76,28 +74,19 @@ class ForceGroups:
         self.evaluations = dict.fromkeys(self.groups, 0)
 
     @classmethod
-    def difference(
-        cls, cheap: ForceFunction, expensive: ForceFunction, *, fast: str = "fast", slow: str = "slow"
-    ) -> ForceGroups:
-        """`cheap` forces as the fast group, `expensive` less `cheap` ones as the slow group: `expensive` in all.
-
-        Parameters
-        ----------
-        cheap, expensive : callable
-            Of the same atoms.
-        fast, slow : str
-            Names of the groups.
+    def difference(cls, cheap: ForceFunction, expensive: ForceFunction) -> ForceGroups:
+        """`cheap` forces as the group 'fast', `expensive` less `cheap` ones as 'slow': `expensive` in all.
 
         Raises
         ------
         InputError
-            Both are the same function, or both groups have one name.
+            Both are the same function.
         """
         if cheap == expensive:
-            raise InputError("cheap and expensive forces are the same function; nothing is left to be slow", item=slow)
-        if fast == slow:
-            raise InputError(f"fast and slow forces are both called {fast!r}; give them two names", item="slow")
-        return cls({fast: cheap, slow: _difference(cheap, expensive)})
+            raise InputError(
+                "cheap and expensive forces are the same function; nothing is left to be slow", item="slow"
+            )
+        return cls({"fast": cheap, "slow": _difference(cheap, expensive)})
 
     def __repr__(self) -> str:
         return f"ForceGroups({', '.join(self.groups)})"
@@ -254,7 +243,6 @@ def _number_of(names: tuple[str, ...]) -> float:
 
 #: Where the slowest forces kick: half at each end of the step, or once in its middle.
 SlowKicks = Literal["ends", "middle"]
-InnerOrder = Literal[2, 4]
 
 
 @dataclass(frozen=True)
@@ -323,7 +311,6 @@ def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
 
 def nested(
     levels: tuple[Level, ...],
-    order: int,
     flight: tuple[float, ...],
     *,
     turns: bool = False,
@@ -334,8 +321,8 @@ def nested(
 
     Parameters
     ----------
-    levels, order
-        The groups, and the order of the innermost scheme.
+    levels
+        The groups.
     flight : tuple of float
         What each drift is made of, as fractions that add up to 1.
     turns : bool
@@ -345,22 +332,34 @@ def nested(
     middle : bool
         The slowest group kicks once, in the middle.
     """
-    kicks, drifts, _ = SCHEMES[order]
-    inner, odd = levels[-1].steps, len(drifts) % 2 == 1
-    halves = [d for k, d in enumerate(drifts) for d in ([d / 2] * 2 if odd and k == len(drifts) // 2 else [d])]
-    flights = iter(drifts_of([d / inner for _ in range(inner) for d in halves], flight, exact=exact))
+    inner = levels[-1].steps
+    flights = iter(drifts_of([0.5 / inner] * (2 * inner), flight, exact=exact))
     if middle:
         group, count = levels[0].group, levels[1].steps
         done: list[Operation] = []
         for number in range(count):
             if 2 * number == count:
                 done += [Evaluate(group), (Turn if turns else Kick)(1.0, group)]
-            done += _level(levels, 1, kicks, drifts, flights, turns)
+            done += _level(levels, 1, flights, turns)
     else:
-        done = list(_level(levels, 0, kicks, drifts, flights, turns))
+        done = list(_level(levels, 0, flights, turns))
     if not turns:
         done.append(Project())
     return tuple(done)
+
+
+def _level(levels: tuple[Level, ...], at: int, flights: Iterator[Fly], turns: bool) -> Iterator[Operation]:
+    """A step of one group, with those of the faster ones in it."""
+    group, length = levels[at].group, 1.0 / levels[at].steps
+    kick = (Turn if turns else Kick)(0.5 * length, group)
+    settled = (Project(),) if turns else ()
+    yield kick
+    if at + 1 < len(levels):
+        for _ in range(levels[at + 1].steps // levels[at].steps):
+            yield from _level(levels, at + 1, flights, turns)
+    else:
+        yield from (next(flights), *settled, Exchange(length), next(flights), *settled)
+    yield from (Evaluate(group), kick)
 
 
 class Nesting:
@@ -376,68 +375,26 @@ class Nesting:
         A step, and one whose flights are great circles.
     evaluations : int
         Of forces in a step, those of all groups.
-    words : list of str
-        Steps, and what else is not as by default, as arguments.
+    words : tuple of str
+        Steps, and where slow forces kick, as arguments where these are not the defaults.
     """
 
     @checked
     def __init__(
         self,
         steps: Mapping[str, int] | None,
-        order: InnerOrder,
         substeps: int,
         slow_kicks: SlowKicks,
         turns: bool = False,
     ) -> None:
         levels = levels_of(steps)
-        flight = (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
         self.names = tuple(level.group for level in levels)
         self.middle = middle_of(levels, slow_kicks)
-        self.in_flights = nested(levels, order, flight, turns=turns, middle=self.middle)
-        self.on_circles = nested(levels, order, (1.0,), turns=turns, exact=True, middle=self.middle)
+        self.in_flights = nested(levels, (1.0 / substeps,) * substeps, turns=turns, middle=self.middle)
+        self.on_circles = nested(levels, (1.0,), turns=turns, exact=True, middle=self.middle)
         self.evaluations = sum(isinstance(operation, Evaluate) for operation in self.in_flights)
         counts = {level.group: level.steps for level in levels}
-        self.words = ["" if steps is None else f", steps={counts}", "" if order == 2 else f", order={order}"]
-        self.words[1] += ", slow_kicks='middle'" if self.middle else ""
-
-
-def _level(
-    levels: tuple[Level, ...],
-    at: int,
-    kicks: tuple[float, ...],
-    drifts: tuple[float, ...],
-    flights: Iterator[Fly],
-    turns: bool,
-) -> Iterator[Operation]:
-    """A step of one group, with those of the faster ones in it."""
-
-    def drift() -> Iterator[Operation]:
-        yield next(flights)
-        if turns:
-            yield Project()
-
-    push = Turn if turns else Kick
-    group, length = levels[at].group, 1.0 / levels[at].steps
-    if at + 1 < len(levels):
-        yield push(0.5 * length, group)
-        for _ in range(levels[at + 1].steps // levels[at].steps):
-            yield from _level(levels, at + 1, kicks, drifts, flights, turns)
-        yield Evaluate(group)
-        yield push(0.5 * length, group)
-        return
-    center = len(drifts) // 2
-    odd = len(drifts) % 2 == 1
-    for k, fraction in enumerate(kicks):
-        if not odd and k == center:
-            yield from (push(0.5 * fraction * length, group), Exchange(length), push(0.5 * fraction * length, group))
-        else:
-            yield push(fraction * length, group)
-        if k < len(drifts):
-            yield from drift()
-            if odd and k == center:
-                yield Exchange(length)
-                yield from drift()
-            yield Evaluate(group)
+        self.words = "" if steps is None else f", steps={counts}", ", slow_kicks='middle'" if self.middle else ""
 
 
 class LangevinRespa(Langevin):
@@ -460,12 +417,8 @@ class LangevinRespa(Langevin):
     steps : mapping of str to int, optional
         Steps of each group of forces in one step, ``{"slow": 1, "medium": 4, "fast": 12}``; each divides the next. The
         System has the forces, as `ForceGroups`. Without it all forces are one group.
-    order : {2, 4}
-        Of the innermost scheme, with 1 or 6 evaluations of its forces a step. The whole is of order 2.
     substeps : int
-        RATTLE substeps in each drift, for order 2.
-    conserve_momentum : bool
-        See `Langevin`.
+        RATTLE substeps in each drift.
     slow_kicks : {'ends', 'middle'}
         Where the slowest forces kick: half at each end of the step, or once in its middle. States halfway between two
         slow kicks are nearer to the canonical distribution than those at the kicks; they know no slow forces, so that
@@ -493,14 +446,11 @@ class LangevinRespa(Langevin):
         rng: Rng,
         *,
         steps: Mapping[str, int] | None = None,
-        order: InnerOrder = 2,
         substeps: int = 3,
-        conserve_momentum: bool = False,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
-        super().__init__(thermal_energy, friction, rng, substeps=substeps, conserve_momentum=conserve_momentum)
-        self.nesting = Nesting(steps, order, self.substeps, slow_kicks)
-        self.inner_order = order
+        super().__init__(thermal_energy, friction, rng, substeps=substeps)
+        self.nesting = Nesting(steps, self.substeps, slow_kicks)
         both = self.nesting.in_flights, self.nesting.on_circles
         self._in_flights, self._great_circles = (listed_and_made(each, self.nesting.names) for each in both)
         self.force_evaluations = self.nesting.evaluations

@@ -33,7 +33,7 @@ from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import MARK, placed_rows
 from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
-from kcons.thermostats.multistep.respa import GroupedForces, InnerOrder, Nesting, SlowKicks, group_names
+from kcons.thermostats.multistep.respa import GroupedForces, Nesting, SlowKicks, group_names
 
 Spheres = Literal["split", "axes", "cluster", "global"]
 
@@ -196,10 +196,8 @@ class IsokineticSpheres(SeededBath):
         has one sphere in the first three.
     auxiliary : int
         L, auxiliary variables on each sphere; many of them are Langevin dynamics.
-    order : {2, 4}
-        Of the innermost scheme.
     substeps : int
-        RATTLE substeps in each drift, for order 2.
+        RATTLE substeps in each drift.
     slow_kicks : {'ends', 'middle'}
         As for `LangevinRespa`.
 
@@ -230,15 +228,13 @@ class IsokineticSpheres(SeededBath):
         steps: Mapping[str, int] | None = None,
         spheres: Spheres = "split",
         auxiliary: FromZero = 1,
-        order: InnerOrder = 2,
         substeps: int = 3,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(thermal_energy, friction, rng, substeps)
         self.spheres: Spheres = spheres
         self.auxiliary = auxiliary
-        self.inner_order = order
-        self.nesting = Nesting(steps, order, self.substeps, slow_kicks, turns=True)
+        self.nesting = Nesting(steps, self.substeps, slow_kicks, turns=True)
         both = self.nesting.in_flights, self.nesting.on_circles
         self._in_flights, self._great_circles = (_listed_and_made(each, self.nesting.names) for each in both)
         self.force_evaluations = self.nesting.evaluations

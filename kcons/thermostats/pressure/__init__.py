@@ -10,7 +10,7 @@
 from kcons.thermostats.pressure.barostat import Barostat, CellRescaling, MonteCarloBarostat, require_barostat
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.constant_pressure import ConstantPressure
-from kcons.thermostats.pressure.measured import PressureObserver, constraint_virial, instantaneous_pressure
+from kcons.thermostats.pressure.measured import constraint_virial, instantaneous_pressure
 from kcons.thermostats.pressure.pieces import BarostatBodies, find_pieces
 
 __all__ = [
@@ -20,7 +20,6 @@ __all__ = [
     "CellSystem",
     "ConstantPressure",
     "MonteCarloBarostat",
-    "PressureObserver",
     "constraint_virial",
     "find_pieces",
     "instantaneous_pressure",

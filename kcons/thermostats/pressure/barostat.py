@@ -36,7 +36,6 @@ from kcons.thermostats.pressure.pieces import (
     find_pieces,
     lattice_of,
     require_periodic,
-    work_of_shapes,
 )
 
 Kind = Literal["isotropic", "semi-isotropic", "anisotropic", "flexible", "lateral", "normal"]
@@ -535,8 +534,8 @@ def energy_by_strain(system: CellSystem, pieces: BarostatBodies, place: Place) -
     against the forces, and is taken out again.
     """
     assert place.forces is not None and place.stress is not None
-    own = pieces.label, pieces.weight, pieces.open, *pieces.tree
-    return place.volume * place.stress + work_of_shapes(place.positions, place.forces, *own, lattice_of(system))
+    shapes = pieces.work_of_shapes(place.positions, place.forces, lattice_of(system))
+    return place.volume * place.stress + shapes
 
 
 def _log_normal(e: FloatArray, mean: FloatArray, wide: FloatArray) -> float:

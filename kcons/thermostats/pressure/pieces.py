@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import check_pairs
-from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import follow_parents, spanning_tree
 from kcons.constraints.target import FloatArray
@@ -80,14 +79,21 @@ class BarostatBodies:
 
         `UnsupportedError` where what stays in its place is stored across a face of the cell that moves.
         """
-        d = np.empty_like(x)
-        atom = displacements(x, self.label, self.weight, self.open, *self.tree, lattice, change, d)
-        if atom >= 0:
+        y = self.whole(x, lattice)
+        images = np.rint((y - x) @ lattice[1]) @ (lattice[0] @ change)
+        torn = (images != 0.0) & ~self.open[self.label]
+        if torn.any():
             raise UnsupportedError(
-                f"atom {atom} is held in its place across a face of the cell that the barostat moves: the constraint "
-                "would mean another place. Store what is held with its neighbors on the same side"
+                f"atom {np.argmax(torn.any(axis=1))} is held in its place across a face of the cell that the barostat "
+                "moves: the constraint would mean another place. Store what is held with its neighbors on the same side"
             )
-        return d
+        return (self.open * (self.centers(y) @ change))[self.label] - images
+
+    def work_of_shapes(self, x: FloatArray, forces: FloatArray, lattice: FloatArray) -> FloatArray:
+        """Sum of (r_i - R) (x) f_i over atoms, R the center of their piece or zero where it stays, shape (3, 3)."""
+        y = self.whole(x, lattice)
+        carried = (self.centers(y)[:, :, None] * self.open[:, None, :])[self.label]
+        return np.asarray(np.einsum("ijk,ik->jk", y[:, :, None] - carried, forces))
 
 
 def find_pieces(
@@ -211,60 +217,3 @@ def require_periodic(system: CellSystem, axes: NDArray[np.bool_], kind: str) -> 
             f"{slab}make the cell periodic there",
             item="kind",
         )
-
-
-# -- compiled, since every trial of a barostat asks for both ----------------------------------------
-
-
-@njit(cache=True, nogil=True)
-def displacements(x, label, weight, opened, atoms, parents, lattice, change, d):  # type: ignore[no-untyped-def]
-    """`BarostatBodies.moved`, written to d; atoms and parents are the tree.
-
-    Returns an atom that stays in its place along an axis in which its image moves; -1 without one.
-    """
-    y = x.copy()
-    follow_parents(y, atoms, parents, lattice)
-    moved = np.zeros((len(opened), 3))
-    for i in range(len(x)):
-        for k in range(3):
-            moved[label[i], k] += weight[i] * y[i, k]
-    for p in range(len(opened)):
-        a, b, c = moved[p, 0], moved[p, 1], moved[p, 2]
-        for k in range(3):
-            moved[p, k] = a * change[0, k] + b * change[1, k] + c * change[2, k] if opened[p, k] else 0.0
-    cell, inverse, torn = lattice[0], lattice[1], -1
-    for i in range(len(x)):
-        p = label[i]
-        for k in range(3):
-            d[i, k] = moved[p, k]
-        u, v, w = y[i, 0] - x[i, 0], y[i, 1] - x[i, 1], y[i, 2] - x[i, 2]
-        if u == 0.0 and v == 0.0 and w == 0.0:
-            continue
-        for m in range(3):
-            cells = np.rint(u * inverse[0, m] + v * inverse[1, m] + w * inverse[2, m])
-            if cells == 0.0:
-                continue
-            for k in range(3):
-                image = cells * (cell[m, 0] * change[0, k] + cell[m, 1] * change[1, k] + cell[m, 2] * change[2, k])
-                if image != 0.0 and not opened[p, k] and torn < 0:
-                    torn = i
-                d[i, k] -= image
-    return torn
-
-
-@njit(cache=True, nogil=True)
-def work_of_shapes(x, f, label, weight, opened, atoms, parents, lattice):  # type: ignore[no-untyped-def]
-    """Sum of (r_i - R) (x) f_i over atoms, R the center of their piece or zero where it stays, shape (3, 3)."""
-    y = x.copy()
-    follow_parents(y, atoms, parents, lattice)
-    centers = np.zeros((len(opened), 3))
-    for i in range(len(x)):
-        for k in range(3):
-            centers[label[i], k] += weight[i] * y[i, k]
-    work = np.zeros((3, 3))
-    for i in range(len(x)):
-        p = label[i]
-        for j in range(3):
-            for k in range(3):
-                work[j, k] += (y[i, j] - centers[p, j] if opened[p, k] else y[i, j]) * f[i, k]
-    return work

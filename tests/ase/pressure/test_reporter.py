@@ -48,26 +48,22 @@ def test_molecular_pressure_by_stress_and_by_differences():
     assert np.array_equal(atoms.cell.array, before)
 
 
-def test_a_reporter_changes_no_run(tmp_path):
+def test_a_reporter_changes_no_run():
     runs = []
     for watched in (False, True):
         atoms, _ = dumbbells(20, side=30.0)
         barostat = MonteCarloBarostat(20 * units.kB * TEMPERATURE / 30**3, every=2, width=0.2)
         dynamics = ConstrainedLangevin(atoms, 2 * FS, TEMPERATURE, 0.01 / FS, rng=1, barostat=barostat)
-        file = tmp_path / "pressure.txt"
         if watched:
-            reporter = PressureReporter(dynamics, file, virial="difference", temperature_K=TEMPERATURE)
+            reporter = PressureReporter(dynamics, virial="difference", temperature_K=TEMPERATURE)
             dynamics.attach(reporter, interval=1)
         dynamics.run(9)
         runs.append((atoms.cell.array.copy(), atoms.get_positions(), atoms.get_momenta()))
     for one, other in zip(*runs, strict=True):
         assert np.array_equal(one, other)
-    lines = file.read_text().splitlines()
-    assert len(lines) == 11
-    time, volume, bar = (float(v) for v in lines[-1].split())
-    assert time == pytest.approx(18.0)
-    assert volume == pytest.approx(atoms.get_volume(), rel=1e-6)
-    assert bar == pytest.approx(20 * units.kB * TEMPERATURE / atoms.get_volume() / units.bar, rel=1e-4)
+    assert len(reporter.values) == 10 and reporter.volumes[-1] == pytest.approx(atoms.get_volume())
+    expected = 20 * units.kB * TEMPERATURE / atoms.get_volume()
+    assert np.trace(reporter.values[-1]) / 3 == pytest.approx(expected, rel=1e-4)
     assert len(np.unique(reporter.volumes)) > 1
 
 
@@ -102,11 +98,9 @@ def test_what_is_no_way_to_the_pressure():
         PressureReporter(None, virial="atomic", temperature_K=300)
 
 
-def test_dynamics_of_ase_are_refused(tmp_path):
-    """Before a file is opened."""
+def test_dynamics_of_ase_are_refused():
     with pytest.raises(InputError, match=r"dynamics is <ase\.md\.verlet.*; give a dynamics object of kcons\.ase"):
-        PressureReporter(VelocityVerlet(copper(), FS), tmp_path / "pressure.txt")
-    assert not list(tmp_path.iterdir())
+        PressureReporter(VelocityVerlet(copper(), FS))
 
 
 @pytest.mark.parametrize("virial", ["molecular", "difference"])

@@ -4,7 +4,7 @@ MUTANTS = {
     "ase/dynamics.py": [
         (
             'step == self.nsteps« and np.array_equal(self.atoms.arrays["momenta"], self._momenta)→»',
-            "test_logger.py::test_a_thermostat_that_leaves_total_momentum_alone",
+            "test_logger.py::test_with_noise_the_log_is_of_the_middle_of_the_step",
         ),
         (
             "«replace(state.copied(), forces=None, origin=None→state.copied(»)",
@@ -76,8 +76,8 @@ MUTANTS = {
     ],
     "ase/logger.py": [
         (
-            '«dyn.applied_forces() if hasattr(dyn, "motion") else →»applied_forces(atoms)',
-            "test_logger.py::test_a_rod_against_friction",
+            "row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)",
+            "test_logger.py::test_multipliers_by_name",
         ),
     ],
     "thermostats/pressure/measured.py": [

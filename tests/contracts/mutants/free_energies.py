@@ -95,7 +95,7 @@ MUTANTS = {
     ],
     "free_energy/profiles/profile.py": [
         ("F=self.F «+ shift[:-1] -→- shift[:-1] +» shift[-1]", "test_profile.py::test_jacobians"),
-        ("«rule = rule @ (np.eye(len(gain)) - np.outer(gain, whole))→pass»", "test_profile.py::test_a_period_closes"),
+        ("return «self._learned_closed if closed else →»self.learned", "test_profile.py::test_a_period_closes"),
     ],
     "free_energy/profiles/mean_force_surface.py": [
         (
@@ -104,12 +104,8 @@ MUTANTS = {
         ),
     ],
     "free_energy/profiles/pulls.py": [
-        ("(1 / effective« - 1 / len(works)→»)", "test_pulls.py::test_bias_of_the_exponential_average"),
-        ("_one_way(back, drawn_back, «-→»kT)", "test_pulls.py::test_directions_are_alike"),
-        (
-            "other**2 / w« + np.log(v / w)→»",
-            "test_pulls.py::test_distributions_of_different_width_cross_between_their_means",
-        ),
+        ("np.asarray(«math.log(works.shape[-1]) →»- logsumexp(-works", "test_pulls.py::test_a_spring_that_is_dragged"),
+        ("ahead, «-back→back»]) - difference", "test_pulls.py::test_works_of_no_spread"),
     ],
     "constraints/constraint_set.py": [
         (

@@ -38,10 +38,11 @@ MUTANTS = {
     ],
     "models/flows/linear.py": [
         (
-            "«size * EPSILON * np.linalg.norm(block * ratio)→0.0»",
+            "noise = «len(A) * EPSILON * float(np.linalg.norm(balanced))→0.0»",
             "test_linear.py::test_errors_hold_and_are_not_much_too_large",
         ),
         ("np.all(real > «off→0»)", "test_linear.py::test_what_is_said_is_so"),
+        ("«p.quo(common) * →»once", "test_linear.py::test_eigenvalues_on_the_axis_are_counted_in_integers"),
         (
             "certain = «closer == 1.0 and →»kept",
             "test_linear.py::test_neighbors_that_rounding_joins_are_told_as_uncertain",
@@ -70,7 +71,6 @@ MUTANTS = {
             "for _ in range(«ITERATIONS→1»):",
             "test_multibody.py::test_a_start_off_the_constraints_is_refused_and_can_be_mended",
         ),
-        ("self._g(q + s * v, t« + s→»), 0.0", "test_multibody.py::test_constraints_that_move"),
     ],
     "models/integration.py": [
         ("        «told.clear()→pass»\n", "test_multibody.py::test_what_ends_a_run_is_told_not_what_was_got_over"),

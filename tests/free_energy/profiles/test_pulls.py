@@ -21,7 +21,7 @@ def normal(rng, n, spread, m=0):
     return rng.normal(F + lost, spread, n), rng.normal(-F + lost, spread, m or n)
 
 
-NAMES = ("jarzynski", "cumulant", "jarzynski_backward", "cumulant_backward", "bar", "crossing")
+NAMES = ("jarzynski", "bar")
 
 
 @cache
@@ -44,20 +44,11 @@ def test_pulls_both_ways_are_better_than_one():
     spread = {name: np.std([getattr(each, name).value for each in found]) for name in ("jarzynski", "bar")}
     assert spread["bar"] < 0.7 * spread["jarzynski"]
     assert found[0].best is found[0].bar
-    assert np.mean([each.dissipated for each in found]) == pytest.approx(2 * KT, rel=0.1)
 
 
-def test_bias_of_the_exponential_average():
-    """To first order in 1/n, in the mean over many sets of few pulls."""
-    rng = np.random.default_rng(3)
-    works = rng.normal(F + KT / 2, KT, (4000, 20))
-    seen = np.mean([-KT * np.log(np.mean(np.exp(-w / KT))) for w in works]) - F
-    exact = KT * (np.e - 1) / (2 * 20)  # var(w)/(2 n <w>^2) of a log-normal w
-    assert seen == pytest.approx(exact, rel=0.15)
-    said = np.mean([pull_free_energy(w, -w, thermal_energy=KT).bias for w in works[:150]])
-    assert said == pytest.approx(exact, rel=0.35)  # itself too low with few pulls: the tail is not in all sets
+def test_pulls_that_count():
+    """Of normal works of variance kT^2 one in e."""
     many = pull_free_energy(F + KT / 2 + KT * norm.ppf((np.arange(4000) + 0.5) / 4000), thermal_energy=KT)
-    assert many.bias * 4000 == pytest.approx(exact * 20, rel=0.1)
     assert many.n_effective == pytest.approx(4000 / np.e, rel=0.1)
 
 
@@ -65,21 +56,7 @@ def test_directions_are_alike():
     """Backward pulls taken for forward ones give the difference with the other sign."""
     one, other = normal(np.random.default_rng(4), 300, KT, 250)
     here, there = pull_free_energy(one, other, thermal_energy=KT), pull_free_energy(other, one, thermal_energy=KT)
-    for name in ("bar", "crossing"):
-        assert getattr(here, name).value == pytest.approx(-getattr(there, name).value, abs=1e-6)
-    assert here.jarzynski_backward.value == pytest.approx(-there.jarzynski.value)
-    assert here.cumulant_backward.value == pytest.approx(-there.cumulant.value)
-    assert here.bias_backward == pytest.approx(-there.bias)
-    assert here.n_effective_backward == there.n_effective
-
-
-def test_distributions_of_different_width_cross_between_their_means():
-    rng = np.random.default_rng(5)
-    found = pull_free_energy(rng.normal(3.0, 2.0, 20000), rng.normal(-1.0, 1.0, 20000), thermal_energy=1.0)
-    w = found.crossing.value
-    assert 1.0 < w < 3.0
-    densities = [np.exp(-((w - m) ** 2) / (2 * s**2)) / s for m, s in ((3.0, 2.0), (1.0, 1.0))]
-    assert densities[0] == pytest.approx(densities[1], rel=0.05)
+    assert here.bar.value == pytest.approx(-there.bar.value, abs=1e-6) and here.overlap == pytest.approx(there.overlap)
 
 
 def dragged(rng, pulls, speed, steps=400, time=4.0):
@@ -107,7 +84,7 @@ def test_a_spring_that_is_dragged():
     assert works[:, -1].mean() == pytest.approx(mean, abs=4 * np.sqrt(2 * mean / 4000))
     assert works[:, -1].var() == pytest.approx(2 * mean, rel=0.1)
     found = pull_free_energy(works[:, -1], thermal_energy=1.0)
-    assert abs(found.jarzynski.off(0.0)) < 3.5 and abs(found.cumulant.off(0.0)) < 3.5
+    assert abs(found.jarzynski.off(0.0)) < 3.5
     profile, errors = work_profile(works[:, ::80], thermal_energy=1.0)
     assert profile[0] == errors[0] == 0.0
     assert np.abs(profile[1:] / errors[1:]).max() < 3.5
@@ -120,9 +97,9 @@ def test_slow_works_are_the_integral_of_the_mean_force():
     works = work_along(x, np.tile(3 * x**2, (6, 1)))
     assert works[:, -1] == pytest.approx(np.full(6, 7.0), abs=1e-4)
     found = pull_free_energy(works[:, -1], -works[:, -1], thermal_energy=KT)
-    for name in ("jarzynski", "cumulant", "jarzynski_backward", "bar"):
+    for name in ("jarzynski", "bar"):
         assert getattr(found, name).value == pytest.approx(7.0, abs=1e-4), name
-    assert found.crossing is None and found.overlap == pytest.approx(1.0)
+    assert found.overlap == pytest.approx(1.0)
     assert work_along(x, 3 * x**2)[-1] == works[0, -1]
 
 
@@ -138,7 +115,7 @@ def test_works_of_no_spread():
     """Pulls of what nothing resists: the difference is the work. Works that contradict each other have none."""
     same = pull_free_energy(np.full(6, 2.0), np.full(7, -2.0), thermal_energy=0.5)
     assert same.bar.value == pytest.approx(2.0) and same.bar.error == 0
-    assert same.overlap == pytest.approx(1.0) and same.dissipated == pytest.approx(0.0, abs=1e-12)
+    assert same.overlap == pytest.approx(1.0)
     with pytest.raises(InputError, match="the same each way, and 1 kT are lost"):
         pull_free_energy(np.full(6, 2.0), np.full(6, -1.0), thermal_energy=1.0)
 

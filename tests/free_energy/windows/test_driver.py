@@ -59,7 +59,7 @@ def test_windows_and_their_profile(tmp_path):
         assert set(window.sides) == {"up", "down"}
         assert abs(window.force[0] - slope(window.value[0])) < 4 * window.error[0] < 2
         assert window.error[0] == pytest.approx(2 / np.sqrt(128), rel=0.5)
-    assert min(w.hysteresis for w in result.windows) > 1e-3
+    assert min(w.p_value for w in result.windows) > 1e-3
     at = np.linspace(-np.pi, np.pi, 5)
     exact = 3 * np.cos(2 * at) + 2 * np.cos(at)
     found = np.interp(at, result.profile.x, result.profile.F)
@@ -84,7 +84,7 @@ def test_one_failed_window_does_not_stop_the_others_and_is_tried_again(tmp_path)
     )
     assert len(result.windows) == 7 and "converge" in (tmp_path / "out/window-0002-up.failed.txt").read_text()
     third = next(w for w in result.windows if w.number == 2)
-    assert list(third.sides) == ["down"] and np.isnan(third.hysteresis)
+    assert list(third.sides) == ["down"] and np.isnan(third.p_value)
     _, again = run(tmp_path)
     assert again.failed == {} and len(again.windows) == 8 and len(diary(tmp_path)) == 19
     assert not list((tmp_path / "out").glob("*.failed.txt"))
@@ -106,9 +106,9 @@ def test_without_a_pull_windows_begin_where_they_end(tmp_path):
     assert [(job.start, job.target) for job in windows._jobs(0)] == [((0.5,), (0.5,))] * 2
 
 
-def test_hysteresis_is_seen(tmp_path):
+def test_sides_that_disagree_are_seen(tmp_path):
     _, result = run(tmp_path, shift=1.5)
-    assert max(w.hysteresis for w in result.windows) < 1e-4
+    assert max(w.p_value for w in result.windows) < 1e-4
 
 
 def test_windows_are_added_where_they_help(tmp_path):

@@ -33,7 +33,7 @@ def of_two_sides(apart):
 
 def test_sides_that_differ_by_more_than_chance_widen_the_error():
     by_chance, hardly = of_two_sides([0.4, 0.1]), of_two_sides([1.0, 0.1])
-    assert by_chance.hysteresis > 0.01 > hardly.hysteresis
+    assert by_chance.p_value > 0.01 > hardly.p_value
     np.testing.assert_allclose(by_chance.covariance, 0.0125 * np.eye(2))
     np.testing.assert_allclose(hardly.covariance, 0.0125 * np.eye(2) + [[0.25, 0.025], [0.025, 0.0025]])
 
@@ -122,7 +122,7 @@ def test_table_and_sentences(sampled):
     said = sampled.summary()
     assert said.startswith("8 windows") and "window-0001-up failed: RuntimeError" in said
     assert "from the lowest to the highest point" in said
-    low = min(w.hysteresis for w in sampled.windows if w.number != 1)
+    low = min(w.p_value for w in sampled.windows if w.number != 1)
     assert ("(marked !)" in said) == (low < 0.01) == ("!" in text)
 
 

@@ -38,7 +38,6 @@ constrain = "hbonds"
 [sampling]
 temperature = 310
 timestep = 0.5
-thermostat = "nose-hoover"
 both_sides = false
 rng = 4
 
@@ -67,7 +66,7 @@ def read(folder, text=INPUT):
 def test_an_input_for_ase(folder):
     found = read(folder)
     assert isinstance(found.sampler, AseWindows) and found.sampler.names == ("turn",)
-    assert found.settings.temperature == 310 and found.settings.thermostat == "nose-hoover"
+    assert found.settings.temperature == 310
     assert found.settings.production == 20000
     np.testing.assert_allclose(found.targets[:, 0], np.radians(np.arange(-180, 180, 30)))
     assert found.options == {"both_sides": False, "rng": 4} and found.improve == {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 
 import numpy as np
 import openmm
@@ -12,7 +13,8 @@ from openmm_systems import DATA
 
 from kcons.constraints import Angle, Dihedral, Distance, DistanceDifference, Formula
 from kcons.errors import InputError, SingularGeometryError, UnsupportedError
-from kcons.free_energy import OpenMMWindows, Series, Settings, Window
+from kcons.free_energy import OpenMMWindows, Series, Settings, Window, mean_force
+from kcons.openmm.device import build
 
 PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
 PHI, PSI = Dihedral([[4, 6, 8, 14]]), Dihedral([[6, 8, 14, 16]])
@@ -28,12 +30,11 @@ def sampler(coordinates, of=None):
 
 
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")
-@pytest.mark.parametrize("thermostat", ["langevin", "nose-hoover", "isokinetic"])
-def test_two_torsions_far_from_the_structure(tmp_path, thermostat):
+def test_two_torsions_far_from_the_structure(tmp_path):
     windows = pickle.loads(pickle.dumps(sampler({"phi": PHI, "psi": PSI})))
     assert windows.begin()[0] == pytest.approx([np.pi, np.pi], abs=1e-3)
     steps = {"relax": 5, "pull": 20, "equilibration": 20, "production": 320, "every": 10}
-    settings = Settings(timestep=2.0, thermostat=thermostat, **steps)
+    settings = Settings(timestep=2.0, **steps)
     windows.sample(Window(0, "up", (-1.2, 1.9), (-1.1, 2.0), 7), settings, tmp_path / "window.npz")
     series = Series.load(tmp_path / "window.npz")
     assert len(series) == 32 and series.off.max() < 1e-10
@@ -41,8 +42,27 @@ def test_two_torsions_far_from_the_structure(tmp_path, thermostat):
     assert np.abs(series.multiplier).max() > 1
     assert np.isfinite(series.turned).all() and series.turned.std() < series.multiplier.std() / 2
     assert series.seconds > 0
-    # 66 less 12 bonds, 2 torsions and the total momentum.
-    assert series.isokinetic_degrees_of_freedom == (49 if thermostat == "isokinetic" else 0)
+
+
+@pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
+def test_windows_on_the_device_are_those_of_the_program(tmp_path, monkeypatch):
+    """A hundred steps, the states recorded on the device: multipliers, weights and what belongs to them."""
+    settings = Settings(
+        timestep=1.0, thermostat="isokinetic", relax=0, pull=10, equilibration=10, production=80, every=8
+    )
+    found = []
+    for why in ("", "there is no compiler"):
+        monkeypatch.setattr(build, "reluctance", lambda why=why: why)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # few samples
+            window = Window(0, "up", (3.0, 3.1), (3.05, 3.1), 7)
+            sampler({"phi": PHI, "psi": PSI}).sample(window, settings, tmp_path / "window.npz")
+        found.append(Series.load(tmp_path / "window.npz"))
+    for name in ("value", "multiplier", "kinetic", "log_det_z", "gradient", "turned", "mean_kinetic", "time"):
+        one, other = (getattr(series, name) for series in found)
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max(), err_msg=name)
+    forces = [mean_force(series, 2.494).force for series in found]
+    np.testing.assert_allclose(forces[0], forces[1], rtol=1e-9)
 
 
 def test_a_torsion_over_atoms_that_are_not_bonded():

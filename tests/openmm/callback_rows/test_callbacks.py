@@ -35,13 +35,13 @@ class Messenger:
         self.passage, self.taken = passage, np.zeros((3, 3))
 
     def __call__(self, state):
-        self.passage.open(state)
         self.passage.take(state, self.taken)
         return 0.0, self.passage.give(self.passage.carried(CHANGE)[0])
 
 
-def sent(platform, some):
+def sent(platform, some, monkeypatch):
     """Where particles are after the change, and what the messenger has seen."""
+    monkeypatch.setattr("kcons.openmm.callback_rows.callbacks.hands_over_all", lambda: not some)
     system = openmm.System()
     for _ in X:
         system.addParticle(1.0)
@@ -61,8 +61,8 @@ def sent(platform, some):
 
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU", *(p for p in GPUS if "single" not in str(p.id))])
-def test_what_arrives_is_known(platform):
-    there, messenger = sent(platform, some=False)
+def test_what_arrives_is_known(platform, monkeypatch):
+    there, messenger = sent(platform, False, monkeypatch)
     passage = messenger.passage
     rounding = 2 * passage.precision.place * np.abs(X).max()
     assert np.abs(messenger.taken - X[ATOMS]).max() <= rounding
@@ -77,9 +77,9 @@ def test_what_arrives_is_known(platform):
 
 
 @pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
-def test_of_some_particles_mixed_precision_hands_over_single_numbers(platform):
+def test_of_some_particles_mixed_precision_hands_over_single_numbers(platform, monkeypatch):
     """Why the positions of all are asked for."""
-    _, messenger = sent(platform, some=True)
+    _, messenger = sent(platform, True, monkeypatch)
     np.testing.assert_array_equal(messenger.taken, X[ATOMS].astype(np.float32))
 
 
@@ -154,6 +154,7 @@ def test_callbacks_keep_no_memory():
 
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])
+@pytest.mark.usefixtures("without_device")
 def test_a_step_too_large_is_taken_back(platform):
     part = hold(system := free([1.0, 1.0]), Distance([[0, 1]]), [[-0.5, 0, 0], [0.5, 0, 0]])
     integrator = ProjectedIntegrator(0.1 * unit.picosecond, parts=[part])
@@ -192,45 +193,14 @@ def test_states_off_the_rows_are_refused_and_put_right():
 # -- copies -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda s: openmm.XmlSerializer.deserialize(_xml(s))])
-def test_rows_travel_with_the_system(copied):
-    part, integrator, context = peptide()
-    x, v = state_of(context)
-    system = copied(context.getSystem())
-    other = CarriedConstraints.of(system)
-    assert other.motion is not part.motion
-    again = context_of(system, ProjectedIntegrator(0.001, parts=[other]))
-    again.setPositions(x)
-    again.setVelocities(v)
-    other.check(again)
-    integrator.step(20)
-    again.getIntegrator().step(20)
-    assert np.array_equal(state_of(again)[0], state_of(context)[0])
-
-
-def _xml(system):
-    return openmm.XmlSerializer.serialize(system)
-
-
-def test_rows_with_functions_that_cannot_be_pickled_stay():
-    part = hold(system := free([1.0]), Custom([0], lambda r: r[0, 2], _up), [[0, 0, 0]])
-    with pytest.raises(openmm.OpenMMException, match="could not be pickled"):
-        openmm.XmlSerializer.serialize(system)
-    assert part.rank() == 1
-
-
-def test_copies_of_a_system_have_engines_of_their_own():
-    """All that `of` found was the engine of the copy made last: targets moved with a time of another Context."""
-    system, part, x = driven()
-    first = copy.deepcopy(system)
-    others = [system, first, copy.deepcopy(first), openmm.XmlSerializer.clone(system)]
-    parts = [CarriedConstraints.of(other) for other in others]
-    assert parts[0].motion is part.motion
-    assert len({id(each.motion) for each in parts}) == 4
-    for other, each in zip(others, parts, strict=True):
-        integrator, context = begun(other, each, x)
-        integrator.step(7)
-        assert off_target(context) < 1e-12
+def test_rows_belong_to_their_system():
+    """Copies of the System, and pickles of the integrator, are refused; without the part, so is the integrator."""
+    system, part, _ = driven()
+    for copied in (copy.deepcopy, openmm.XmlSerializer.serialize):
+        with pytest.raises(openmm.OpenMMException, match="could not be pickled"):
+            copied(system)
+    with pytest.raises(UnsupportedError, match="belong to their System"):
+        pickle.dumps(ProjectedIntegrator(0.01, parts=[part]))
 
 
 def test_copies_of_an_integrator_take_turns_with_the_rows_of_the_system():
@@ -246,17 +216,6 @@ def test_copies_of_an_integrator_take_turns_with_the_rows_of_the_system():
         for one, place in ((other, again), (integrator, context)):
             one.step(5)
             assert off_target(place) < 1e-12
-
-
-def test_rows_are_no_others_in_a_copy_of_the_system():
-    system, part, x = driven()
-    integrator = ProjectedIntegrator(0.01, parts=[part])
-    copied = context_of(copy.deepcopy(system), integrator)
-    copied.setPositions(x)
-    with pytest.raises(InputError, match=r"CarriedConstraints\.of\(copy\)"):
-        integrator.step(1)
-    with pytest.raises(UnsupportedError, match="pickle the System"):
-        pickle.dumps(integrator)
 
 
 # -- what a System must be like -----------------------------------------------------------------------
@@ -289,7 +248,7 @@ def _later(system):
     ("made", "error", "words"),
     [
         (_shares, UnsupportedError, r"constraint 0 .* atoms 1 and 2.*hold\(system"),
-        (_not_added, InputError, "add_to"),
+        (_not_added, InputError, "no forces that carry"),
         (_lighter, InputError, "masses have changed"),
         (_later, InputError, "got constraints after"),
     ],
@@ -338,12 +297,3 @@ def test_gpus_must_carry_positions_of_more_than_single_numbers():
         refuse_single_precision(Precision("CUDA", precision))
     with pytest.raises(UnsupportedError, match=r"CUDA, single precision hands .*'mixed'.* or hold the rows by Coll"):
         refuse_single_precision(Precision("CUDA", "single"))
-    some = openmm.PythonForce(_up)
-    some.setParticles([0])
-    with pytest.raises(UnsupportedError, match=r"CUDA, mixed precision would hand over.*CarriedConstraints\.of"):
-        refuse_single_precision(Precision("CUDA", "mixed"), some)
-
-
-def test_a_system_without_rows_is_said_so():
-    with pytest.raises(InputError, match="no sets of rows"):
-        CarriedConstraints.of(free([1.0]))

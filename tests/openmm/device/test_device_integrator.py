@@ -37,7 +37,7 @@ STEPS = {
     "blanes-moan6": ("blanes-moan6", None),
     "Isokinetic": ("rattle", Isokinetic()),
     "isokinetic4": ("isokinetic4", Isokinetic(300.0)),
-    "NoseHoover": ("rattle", NoseHoover(300.0, 10.0, length=4, repeats=2)),
+    "NoseHoover": ("rattle", NoseHoover(300.0, 10.0, length=4)),
     "NoseHooverMiddle": ("rattle", NoseHooverMiddle(300.0, 10.0)),
     "friction": ("rattle", Langevin(0.0, 5.0)),
     "several steps": ("rattle", LangevinRespa(0.0, 2.0, {0: 1, 1: 4})),
@@ -356,6 +356,105 @@ def test_rows_without_solution_are_told_and_taken_back(platform):
     integrator.step(3)  # a failure leaves nothing behind
 
 
+@pytest.mark.parametrize("platform", ["Reference", *GPUS])
+def test_a_failure_leaves_the_state_before_the_step(platform):
+    """Also where the last check was many steps ago, and not where settings have changed since."""
+    x, v = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.4, 0, 0]]), np.zeros((3, 3))
+    system, _, _ = dumbbell()
+    system.addParticle(1.0)
+    kick = openmm.CustomCompoundBondForce(3, "-select(step(x3-0.5), 3e6, 1)*(y1-y2)")
+    kick.addBond([0, 1, 2], [])
+    system.addForce(kick)
+    v[2, 0] = 1.0
+    tolerance = 1e-5 if "single" in platform else None
+
+    def begun():
+        return ProjectedIntegrator(0.001, device=True, check_every=1000, tolerance=tolerance)
+
+    context = started(system, integrator := begun(), x, v, platform)
+    integrator.step(60)
+    with pytest.raises(ConvergenceError, match=r"step (\d+).* The Context is at step \d+") as told:
+        integrator.step(100)
+    step = told.value.step
+    assert 90 < step < 120 and context.getStepCount() == step - 1
+    assert context.getTime()._value == pytest.approx(0.001 * (step - 1))
+    other = started(system, again := begun(), x, v, platform)
+    again.step(step - 1)
+    assert difference(context, other) < (1e-4 if "single" in platform else 1e-9)
+    integrator.check()
+    context.setVelocities(v)  # a new start, and the state to come back to
+    context.setPositions(x)
+    integrator.step(50)
+    integrator.setStepSize(0.002)
+    with pytest.raises(ConvergenceError, match=f"The Context is at step {step - 1}"):
+        integrator.step(100)
+    np.testing.assert_allclose(state_of(context)[0], x, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("ensemble", [None, Langevin(300.0, 1.0), Isokinetic(300.0)], ids=str)
+def test_records_are_the_states_after_steps(platform, ensemble):
+    system, x, v = waters()
+    made = [ProjectedIntegrator(0.001, ensemble=ensemble, device=True) for _ in range(2)]
+    for integrator in made:
+        integrator.setRandomNumberSeed(7)
+    atoms = [0, 4, 11]
+    made[0].record(np.array(atoms[::-1]))
+    contexts = [started(system, integrator, x, v, platform) for integrator in made]
+    near = {"single": 1e-3, "mixed": 1e-5}.get(platform.partition(" ")[2], 1e-9)
+    for integrator in made:
+        integrator.step(3)
+    for *found, time in made[0].records(12, 4):
+        made[1].step(4)
+        state = contexts[1].getState(positions=True, velocities=True, forces=True)
+        assert time == pytest.approx(state.getTime()._value)
+        forces = np.array(state.getForces(asNumpy=True)._value)
+        scales = 1, 10, 1e5
+        for mine, its, scale in zip(found, (*state_of(contexts[1]), forces), scales, strict=True):
+            np.testing.assert_allclose(mine, its[atoms], rtol=0, atol=near * scale)
+    assert [context.getStepCount() for context in contexts] == [15, 15]
+
+
+def test_positions_that_others_have_moved_are_looked_at():
+    system, x, v = dumbbell()
+    context = started(system, integrator := ProjectedIntegrator(0.001, device=True), x, v)
+    integrator.step(2)
+    context.setPositions(x * np.array([1.0 + 1e-4, 1, 1]))
+    integrator.step(1)  # put right, with a note in the log
+    context.setPositions(x * 1.2)
+    with pytest.raises(InputError, match="is off by .* at the start"):
+        integrator.step(1)
+
+
+def test_which_steps_are_made_on_the_device(monkeypatch):
+    """Where nobody says: on machines with a GPU, and where the plugin was compiled."""
+    build.library()
+    assert type(ProjectedIntegrator(0.001)) is DeviceIntegrator
+    monkeypatch.setattr(build, "accelerated", list)
+    assert type(ProjectedIntegrator(0.001)) is DeviceIntegrator
+    monkeypatch.setattr(build, "is_built", lambda: False)
+    integrator = ProjectedIntegrator(0.001)
+    assert type(integrator) is type(copy.copy(integrator)) is ProjectedIntegrator
+    assert "not on the device: the plugin is not compiled" in integrator.listing()
+    monkeypatch.setattr(build, "accelerated", lambda: ["CUDA"])
+    assert type(ProjectedIntegrator(0.001)) is DeviceIntegrator
+    monkeypatch.undo()
+    with pytest.raises(UnsupportedError, match="getNumPerDofVariables is about the program .* device=False"):
+        ProjectedIntegrator(0.001).getNumPerDofVariables()
+
+
+def test_files_say_which_kind_of_integrator_they_have():
+    written = {
+        device: openmm.XmlSerializer.serialize(ProjectedIntegrator(0.001, device=device)) for device in (True, False)
+    }
+    for device, text in written.items():
+        again = ProjectedIntegrator.from_xml(text)
+        assert type(again) is (DeviceIntegrator if device else ProjectedIntegrator)
+        for other in ({"scheme": "suzuki4"}, {"ensemble": Langevin(300.0, 1.0)}):
+            with pytest.raises(InputError, match="another program"):
+                ProjectedIntegrator.from_xml(text, **other)
+
+
 def test_explosions_are_told():
     system, x, v = waters()
     integrator = ProjectedIntegrator(0.2 * openmm.unit.picosecond, device=True, tolerance=1e-6)
@@ -366,15 +465,10 @@ def test_explosions_are_told():
 
 
 def test_what_the_device_has_not_is_refused_or_left_to_the_custom_integrator(monkeypatch):
-    for made in (
-        {"scheme": "leapfrog"},
-        {"ensemble": Isokinetic(300.0, atoms=[0, 1])},
-    ):
-        with pytest.raises(UnsupportedError, match="device"):
-            ProjectedIntegrator(0.001, device=True, **made)
-        assert type(ProjectedIntegrator(0.001, device=None, **made)) is ProjectedIntegrator
+    with pytest.raises(UnsupportedError, match="ReversedDrifts has no kernels"):
+        HamiltonianMonteCarlo.reversing_integrator(0.001, device=True)
+    assert type(HamiltonianMonteCarlo.reversing_integrator(0.001, device=None)) is ProjectedIntegrator
     assert type(ProjectedIntegrator(0.001, device=False)) is ProjectedIntegrator
-    assert issubclass(HamiltonianMonteCarlo, object)
     monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
     with pytest.raises(UnsupportedError, match="no C\\+\\+ compiler"):
         ProjectedIntegrator(0.001, device=True)

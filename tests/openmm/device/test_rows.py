@@ -189,12 +189,14 @@ def test_clusters_that_look_alike_share_their_code():
 
 
 def test_levels_have_rows_that_share_no_entry():
-    """A path of 1,023 rows halves from level to level, and rows that depend on others come last."""
-    n = 1023
-    neighbors = [{k for k in (i - 1, i + 1) if 0 <= k < n} for i in range(n)]
-    order = elimination(neighbors, {17, 400})
-    assert len(order.levels) - 1 <= 14
-    assert set(order.rows[-2:]) == {17, 400}
+    """A path of 1,023 rows halves from level to level, a sheet by lines across it; all pairs have no cut."""
+    path = elimination([(i, i + 1) for i in range(1023)], set())
+    assert len(path.levels) - 1 == 10
+    sheet = [(i, j) for i in range(400) for j in (i + 1, i + 20) if j < 400 and (j - i == 20 or j % 20)]
+    assert len(elimination(sheet, set()).levels) - 1 <= 130
+    order = elimination([(i, j) for i in range(5) for j in range(i)], {2, 7})
+    assert set(order.rows[-2:]) == {2, 7}  # rows that depend on others come last
+    order = elimination([*sheet, (400, 401), (401, 402)], set())
     level = np.repeat(np.arange(len(order.levels) - 1), np.diff(order.levels))
     assert all(level[later] > level[k] for k, others in enumerate(order.later) for later in others)
 

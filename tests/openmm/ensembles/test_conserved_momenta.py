@@ -8,10 +8,9 @@ import pytest
 from ensemble_runs import run, tied
 from openmm_systems import dumbbell, loose_alanine, masses_of, started
 
-from kcons.constraints import Cylinder, Ellipsoid, Sphere
+from kcons.constraints import Cylinder, Ellipsoid, Formula, Sphere
 from kcons.openmm import (
     CollectiveRows,
-    ExpressionSurface,
     Isokinetic,
     NoseHoover,
     NoseHooverMiddle,
@@ -85,7 +84,7 @@ def between_two(system, x):
 SPHERE = Sphere(FOUR, [0, 0, 0], 0.6)
 CYLINDER = Cylinder(FOUR, [0.1, 0, 0], [0, 0, 1.0], 0.5)
 FLAT = Ellipsoid(FOUR, [0, 0, 0], [0.6, 0.6, 0.4])
-BALL = ExpressionSurface(FOUR, "x^2+y^2+z^2-0.36")
+BALL = Formula("x1**2+y1**2+z1**2-0.36", FOUR)
 LOPSIDED = "30*(x-0.1)^2+40*y^2+20*(z+0.3)^2+9*x*y*z"
 
 

@@ -26,7 +26,7 @@ from openmm_systems import (
 from kcons import ConstraintSet, Motion, State
 from kcons import System as CoreSystem
 from kcons.constraints import Distance
-from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
+from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import Isokinetic as CoreIsokinetic
@@ -113,6 +113,7 @@ def waters():
     return system, x, v - masses_of(system) @ v / masses_of(system).sum()
 
 
+@pytest.mark.usefixtures("without_device")
 def test_rigid_bodies_take_two_sums_and_make_the_same_motion():
     """Drifts keep the 2K of rigid bodies: what a sum would find is known before."""
     integrator = in_calls_of_any_length(lambda: Isokinetic(300.0), waters)
@@ -122,6 +123,7 @@ def test_rigid_bodies_take_two_sums_and_make_the_same_motion():
     )
 
 
+@pytest.mark.usefixtures("without_device")
 def test_half_a_kick_is_not_owed_after_a_failure():
     """A NaN within a call: the state of the last check, and the next step begins there with half a kick."""
     system, x, v = alanine()
@@ -230,6 +232,7 @@ def test_of_velocities_set_between_calls_only_the_direction_counts(platform):
 
 
 @pytest.mark.parametrize("remover", [False, True])
+@pytest.mark.usefixtures("without_device")
 def test_a_run_does_not_go_on_from_rest(remover):
     """There is no direction to scale: the Context goes back to where it was checked last."""
     system, x, v = dumbbell()
@@ -262,6 +265,7 @@ def unlike(dt):
     return np.abs(ends[1] - ends[0]).max(), off
 
 
+@pytest.mark.usefixtures("without_device")
 def test_two_sums_do_where_velocities_are_not_read():
     """What drifts change of K, of third order here, does not add up, and moves nothing in second order."""
     coarse, off = unlike(2e-3)
@@ -304,56 +308,3 @@ def test_gpus_wait_for_two_sums_a_step(platform):
 
 
 # -- isokinetic: with what is held -------------------------------------------------------------------
-
-
-def test_leapfrog_keeps_the_kinetic_energy_of_half_steps():
-    system, x, v = alanine()
-    integrator = ProjectedIntegrator(1e-3, "leapfrog", ensemble=Isokinetic(300.0))
-    context = started(system, integrator, x, v)
-    for _ in range(5):
-        integrator.step(10)
-        found = context.getState(energy=True).getKineticEnergy().value_in_unit(unit.kilojoule_per_mole)
-        assert abs(2 * found / (41 * GAS_CONSTANT * 300) - 1) <= 1e-13
-
-
-def test_a_part_of_the_particles():
-    system, x, v = water_box()[0], water_box()[1], np.random.default_rng(0).normal(size=(81, 3))
-    chosen = np.arange(12)
-    ensemble = Isokinetic(300.0, atoms=chosen)
-    integrator = ProjectedIntegrator(5e-4, ensemble=ensemble)
-    context = run(system, integrator, x, 0.3 * v, 30)
-    masses, u = masses_of(system), state_of(context)[1]
-    assert ensemble.count(integrator) == 24
-    wanted = 23 * GAS_CONSTANT * 300
-    assert abs(masses[:12] @ np.sum(u[:12] ** 2, axis=1) / wanted - 1) <= 1e-13
-    # The others move by Newton's equations: the same first step as without a thermostat.
-    plain = ProjectedIntegrator(5e-4)
-    start = started(system, plain, x, 0.3 * v)
-    plain.step(1)
-    again = ProjectedIntegrator(5e-4, ensemble=Isokinetic(atoms=chosen))
-    both = run(system, again, x, 0.3 * v, 1)
-    np.testing.assert_allclose(state_of(both)[0][12:], state_of(start)[0][12:], atol=1e-13)
-    assert np.abs(state_of(both)[0][:12] - state_of(start)[0][:12]).max() > 1e-9
-    with pytest.raises(UnsupportedError, match="couples"):
-        run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300, atoms=[0, 1])), x, v, 1)
-
-
-@pytest.mark.parametrize("ghost", [False, True])
-def test_all_particles_by_number_are_all(ghost):
-    """Momentum that is conserved is not counted, and the motion is that without atoms=; numbers of ghosts may lack."""
-    system, x, v = alanine()
-    named = range(len(x))
-    if ghost:
-        system.addParticle(0.0)
-        force = next(force for force in system.getForces() if isinstance(force, openmm.NonbondedForce))
-        force.addParticle(0.0, 1.0, 0.0)
-        x, v = np.vstack([x, [[3.0, 3.0, 3.0]]]), np.vstack([v, np.zeros((1, 3))])
-    v = v + 0.1 * (masses_of(system) > 0)[:, None]  # the remover takes that away
-    ends = []
-    for given in ({"atoms": named}, {}):
-        bath = Isokinetic(300.0, **given)
-        context = run(system, integrator := ProjectedIntegrator(1e-3, ensemble=bath), x, v, 10)
-        assert bath.count(integrator) == 42
-        assert integrator.computeSystemTemperature().value_in_unit(unit.kelvin) == pytest.approx(300, rel=1e-12)
-        ends.append(state_of(context))
-    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-10)

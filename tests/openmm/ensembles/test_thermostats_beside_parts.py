@@ -20,6 +20,7 @@ WITHOUT_NOISE = [name for name, make in ENSEMBLES.items() if not make(300).noisy
 
 
 @pytest.mark.parametrize("bath", WITHOUT_NOISE)
+@pytest.mark.usefixtures("without_device")
 def test_rows_that_are_carried_move_as_those_of_the_system(bath):
     """The same bonds held by OpenMM and by kcons: one trajectory of atoms and bath, although others move x."""
     system, x, v = loose_alanine()

@@ -17,7 +17,6 @@ from tied_cluster import (
     KINDS,
     MASSES,
     X,
-    begun,
     bond,
     carried_at,
     cluster,
@@ -35,13 +34,10 @@ from kcons.openmm import (
     Langevin,
     NoseHooverMiddle,
     ProjectedIntegrator,
-    RattleIntegrator,
     Row,
     hold,
 )
-from kcons.openmm.integrator.schemes import SCHEMES
 from kcons.openmm.quantities import GAS_CONSTANT
-from kcons.steppers import Geodesic
 from kcons.steppers.splitting import Splitting
 
 #: The trap of `cluster` is round.
@@ -53,15 +49,16 @@ PAIRS = {
     for held, make in (("sphere", on_a_sphere), ("collective", row_at), ("carried", carried_at))
     for name, chosen in {
         "Isokinetic": {"ensemble": Isokinetic(300)},
-        "isokinetic4": {"ensemble": Isokinetic(300), "scheme": "isokinetic4"},
         "NoseHooverMiddle": {"ensemble": NoseHooverMiddle(300, 5.0)},
-        "blanes-moan4": {"scheme": "blanes-moan4"},
+        "suzuki4": {"scheme": "suzuki4"},
     }.items()
+    if (held, name) != ("collective", "suzuki4")  # whose program takes OpenMM ten seconds
 }
 
 
-@pytest.mark.parametrize("kind", KINDS | PAIRS)
-@pytest.mark.parametrize("way", ["State", "checkpoint"])
+@pytest.mark.parametrize(
+    ("kind", "way"), [*((kind, "State") for kind in KINDS), *((kind, "checkpoint") for kind in KINDS | PAIRS)]
+)
 def test_a_run_goes_on_bit_for_bit(kind, way):
     """In another Context with an integrator of the same settings, and again in its own; noise aside."""
     if "Langevin" in kind and way != "checkpoint":
@@ -153,9 +150,9 @@ def test_a_temperature_that_is_refused_changes_nothing():
     field.addParticle(system.addParticle(20.0), [])
     system.addForce(field)
     part = hold(system, [Plane([0], [0, 1, 0], 0.0), Plane([0], [0, 0, 1], 0.0)], np.zeros((1, 3)))
-    bath = Isokinetic(kinetic_energy=2.0)
+    bath = Isokinetic()
     integrator = ProjectedIntegrator(0.002, parts=[part], ensemble=bath)
-    context = started(system, integrator, np.zeros((1, 3)), np.array([[0.1, 0, 0]]))
+    context = started(system, integrator, np.zeros((1, 3)), np.array([[np.sqrt(0.2), 0, 0]]))
     integrator.step(1)
     with pytest.raises(OverdeterminedError, match="g - 1 = 0"):
         integrator.setTemperature(300)
@@ -193,6 +190,7 @@ def test_set_target_outlives_a_state():
     assert copy.copy(made.integrator).program.settings == made.integrator.program.settings
 
 
+@pytest.mark.usefixtures("without_device")
 def test_a_setting_has_a_method_of_its_own():
     """Written by its number, as programs do that copy all variables, it has its value again in the next step."""
     made = thermostatted(Langevin(300, 1.0))()
@@ -206,26 +204,7 @@ def test_a_setting_has_a_method_of_its_own():
     assert integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "RattleIntegrator"])
-def test_variables_of_a_copy_leave_a_run_as_it_is(kind):
-    ran, fresh = KINDS[kind](), KINDS[kind]()
-    for one in (ran, fresh) if "Langevin" in kind else ():
-        one.integrator.setFriction(0)
-    ran.run(5)
-    given = copy.deepcopy(ran.integrator)
-    for k in range(given.getNumGlobalVariables()):
-        ran.integrator.setGlobalVariable(k, given.getGlobalVariable(k))
-    fresh.run(5)
-    ran.run(5)
-    fresh.run(5)
-    np.testing.assert_allclose(state_of(ran.context), state_of(fresh.context), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("make", "more"),
-    # A particle on a sphere is damped least.
-    [(row_at, 5000), (carried_at, 5000), (on_a_sphere, 16000), (lambda **given: thermostatted(**given)(), 5000)],
-)
+@pytest.mark.parametrize(("make", "more"), [(row_at, 5000), (lambda **given: thermostatted(**given)(), 5000)])
 def test_zero_kelvin_brings_to_rest(make, more):
     """Friction without noise: all energy goes, the certificate holds with velocities of rounding alone."""
     made = make(ensemble=Langevin(0, 6.0))  # as the field damps fastest
@@ -258,7 +237,7 @@ def test_ensembles_are_values():
     with pytest.raises(AttributeError):
         one.integrator.ensemble = shared
     assert Langevin(300, 1.0) == shared != Langevin(300, 2.0)
-    assert len({Langevin(300, 1.0), shared, Isokinetic(300, atoms=[1, 2]), Isokinetic(300, atoms=[1, 2])}) == 2
+    assert len({Langevin(300, 1.0), shared, Isokinetic(300), Isokinetic(300)}) == 2
 
 
 def test_what_an_ensemble_lacks():
@@ -300,7 +279,7 @@ def test_a_tolerance_that_was_left_open_stays_so_where_it_is_copied():
     assert ProjectedIntegrator(0.002, tolerance=1e-10).asked_tolerance == 1e-10
 
 
-@pytest.mark.parametrize("make", [ProjectedIntegrator, RattleIntegrator, HamiltonianMonteCarlo.reversing_integrator])
+@pytest.mark.parametrize("make", [ProjectedIntegrator, HamiltonianMonteCarlo.reversing_integrator])
 @pytest.mark.parametrize("step", [4, 0.0201, 2.0])
 def test_a_long_time_step_without_a_unit_is_asked_about(make, step):
     with pytest.warns(UserWarning, match=f"the time step is {step:g} ps, that is .* fs: is it meant in fs") as seen:
@@ -324,7 +303,7 @@ copies = pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, lambda i: pic
 def test_copies_have_the_settings_of_now(kind, how):
     made = KINDS[kind]()
     if kind.startswith("carried") and how not in (copy.copy, copy.deepcopy):
-        with pytest.raises(UnsupportedError, match="pickle the System"):
+        with pytest.raises(UnsupportedError, match="belong to their System"):
             how(made.integrator)
         return
     if "Langevin" in kind:
@@ -334,16 +313,15 @@ def test_copies_have_the_settings_of_now(kind, how):
         made.part.set_target(made.integrator, 0, 0.31)
     again = how(made.integrator)
     assert type(again) is type(made.integrator)
-    if kind != "RattleIntegrator":
-        assert again.program.settings == made.integrator.program.settings
-        assert again.ensemble == made.integrator.ensemble
-        for name, value in again.program.settings.items():
-            assert again.getGlobalVariableByName(name) == value
+    assert again.program.settings == made.integrator.program.settings
+    assert again.ensemble == made.integrator.ensemble
+    for name, value in again.program.settings.items():
+        assert again.getGlobalVariableByName(name) == value
     assert again.getStepSize() == made.integrator.getStepSize()
 
 
 @copies
-@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6", "leapfrog"])
+@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6"])
 def test_copies_make_the_same_steps(scheme, how):
     system, x, v = loose_alanine()
     integrator = ProjectedIntegrator(1e-3, scheme, parts=[holding()], tolerance=1e-11, check_every=17)
@@ -378,8 +356,9 @@ def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context(how):
     np.testing.assert_allclose(state_of(contexts[1]), state_of(made.context), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("scheme", [*SCHEMES, "leapfrog", Geodesic(3), Splitting((0.3, 0.4, 0.3), (0.5, 0.5))], ids=str)
+@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6", Splitting((0.3, 0.4, 0.3), (0.5, 0.5))], ids=str)
 @pytest.mark.parametrize("parts", [False, True])
+@pytest.mark.usefixtures("without_device")
 def test_xml_has_the_bare_program(scheme, parts):
     """What reads it makes the same steps; `from_xml` takes what no file contains."""
     system, x, v = loose_alanine()
@@ -413,7 +392,7 @@ def test_xml_has_the_bare_program(scheme, parts):
     np.testing.assert_allclose(state_of(contexts[0]), state_of(contexts[2]), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [name for name in KINDS if "carried" not in name])
+@pytest.mark.parametrize("kind", ["constant energy", "Isokinetic", "Langevin", "sphere", "collective"])
 def test_the_bare_program_makes_the_same_steps(kind):
     """Of an integrator that has run, with all that it was made with, and without Python."""
     made, again = KINDS[kind](), KINDS[kind]()
@@ -427,10 +406,10 @@ def test_the_bare_program_makes_the_same_steps(kind):
     context.setVelocities(state_of(made.context)[1])
     bare.step(6)
     made.run(6)
-    within = 1e-9 if "leapfrog" not in kind else 1e-6
-    np.testing.assert_allclose(state_of(context), state_of(made.context), rtol=0, atol=within)
+    np.testing.assert_allclose(state_of(context), state_of(made.context), rtol=0, atol=1e-9)
 
 
+@pytest.mark.usefixtures("without_device")
 def test_files_of_something_else_are_refused():
     for other in (openmm.VerletIntegrator(1e-3), openmm.CustomIntegrator(1e-3)):
         with pytest.raises(InputError, match="another program"):
@@ -442,14 +421,3 @@ def test_files_of_something_else_are_refused():
     others = CollectiveRows(cluster(), [Row(bond(), 0.35)])
     again = ProjectedIntegrator.from_xml(text, parts=[others], ensemble=None)
     assert again.getGlobalVariableByName("target1_0") == 0.35
-
-
-def test_a_checkpoint_of_the_same_program_begins_with_its_settings():
-    made, other = (
-        begun(cluster(bonded=True), RattleIntegrator(0.002)),
-        begun(cluster(bonded=True), RattleIntegrator(1e-3)),
-    )
-    made.run(5)
-    other.context.loadCheckpoint(made.context.createCheckpoint())
-    other.run(5)
-    assert other.context.getTime()._value == pytest.approx(0.015)

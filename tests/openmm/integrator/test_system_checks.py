@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import openmm
 import pytest
-from openmm import app, unit
 from openmm_systems import (
     PLATFORMS,
     context_of,
     dumbbell,
     started,
-    state_of,
-    total_energy,
     water_box,
 )
 
@@ -26,50 +21,6 @@ platforms = pytest.mark.parametrize("platform", PLATFORMS)
 
 
 # -- what cannot be propagated ----------------------------------------------------------------------
-
-
-def tip4p(molecules=12):
-    """Four-site water: the fourth site is virtual and carries the charge."""
-    box = app.Modeller(app.Topology(), [])
-    field = app.ForceField("amber14/tip4pew.xml")
-    box.addSolvent(field, model="tip4pew", boxSize=openmm.Vec3(1.9, 1.9, 1.9))
-    box.delete(list(box.topology.residues())[molecules:])
-    return field.createSystem(box.topology, removeCMMotion=False), box.positions
-
-
-@pytest.fixture(scope="module")
-def water_with_sites():
-    system, positions = tip4p()
-    integrator = openmm.VerletIntegrator(1e-3)
-    integrator.setConstraintTolerance(1e-10)
-    context = started(system, integrator, positions)
-    openmm.LocalEnergyMinimizer.minimize(context, 100, 30)
-    context.applyConstraints(1e-10)
-    context.setVelocitiesToTemperature(300, 1)
-    integrator.step(20)
-    return system, *state_of(context)
-
-
-@platforms
-def test_leapfrog_with_virtual_sites_is_verlet_integrator(water_with_sites, platform):
-    system, x, v = water_with_sites
-    ours, theirs = ProjectedIntegrator(1e-3, "leapfrog", tolerance=1e-10), openmm.VerletIntegrator(1e-3)
-    theirs.setConstraintTolerance(1e-10)
-    a, b = (started(system, integrator, x, v, platform) for integrator in (ours, theirs))
-    energies = []
-    for _ in range(20):
-        ours.step(2)
-        theirs.step(2)
-        energies.append([total_energy(a), total_energy(b)])
-    # The CPU platform computes forces in single precision.
-    assert np.abs(state_of(a)[0] - state_of(b)[0]).max() < (1e-9 if platform == "Reference" else 1e-6)
-    mine, verlet = np.ptp(np.array(energies)[1:], axis=0)
-    # VerletIntegrator finds the impulse of the constraints at x, ours is that of the drift to x.
-    assert mine < 4 * verlet
-    assert ours.degrees_of_freedom() == 6 * system.getNumParticles() // 4
-    kinetic = b.getState(energy=True).getKineticEnergy()
-    temperature = 2 * kinetic / (ours.degrees_of_freedom() * unit.MOLAR_GAS_CONSTANT_R)
-    assert ours.computeSystemTemperature() / temperature == pytest.approx(1, abs=0.01)
 
 
 def test_rows_of_a_system():
@@ -92,15 +43,6 @@ def test_rows_of_a_system():
     assert rows.name(9) == "constraint 9 of the System (particles 5 and 9, 0.2 nm)"
     x = np.random.default_rng(0).normal(size=(13, 3))
     assert rows.rank(x) == 10
-
-
-def test_rows_of_a_system_without_constraints():
-    system, x, v = dumbbell()
-    system.removeConstraint(0)
-    rows = SystemRows.of(system)
-    assert rows.n_rows == 0
-    assert rows.rank(x) == 0
-    assert rows.stretches(x).shape == rows.speeds(x, v).shape == (0,)
 
 
 def test_residuals_by_hand():
@@ -208,7 +150,9 @@ BAROSTATS = {
 }
 
 
-@pytest.mark.parametrize(("one", "two"), list(itertools.combinations_with_replacement(BAROSTATS, 2)))
+@pytest.mark.parametrize(
+    ("one", "two"), [("isotropic", "isotropic"), ("isotropic", "membrane"), ("anisotropic", "flexible")]
+)
 def test_two_barostats_are_refused(one, two):
     system, x = water_box(8)
     for name in (one, two):

@@ -6,15 +6,12 @@ import pytest
 from openmm_systems import context_of, dumbbell, masses_of, started, state_of, water_box
 
 from kcons.errors import InputError
-from kcons.openmm import ProjectedIntegrator, RattleIntegrator
-
-KINDS = {"projected": lambda: ProjectedIntegrator(0.001), "rattle": lambda: RattleIntegrator(0.001)}
+from kcons.openmm import ProjectedIntegrator
 
 
-@pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
-def test_velocities_of_a_temperature_are_tangent(make):
+def test_velocities_of_a_temperature_are_tangent():
     system, x = water_box()[:2]
-    integrator = make()
+    integrator = ProjectedIntegrator(0.001)
     context = context_of(system, integrator)
     context.setPositions(x)
     integrator.applyConstraints(context)
@@ -34,27 +31,25 @@ def test_velocities_of_a_temperature_are_tangent(make):
     assert np.array_equal(state_of(context)[1], v)
 
 
-@pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
-def test_degrees_of_freedom_are_counted_by_rank(make):
+def test_degrees_of_freedom_are_counted_by_rank():
     """Five particles by all ten distances, nine of them independent: six, and three less with a motion remover."""
     system, x = openmm.System(), 0.1 * np.random.default_rng(1).normal(size=(5, 3))
     for i in range(5):
         system.addParticle(12.0)
         for j in range(i):
             system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
-    integrator = make()
+    integrator = ProjectedIntegrator(0.001)
     context = context_of(system, integrator)
     context.setPositions(x)
     assert integrator.degrees_of_freedom(context) == integrator.independent_momenta(context) == 6
     other = openmm.XmlSerializer.clone(system)
     other.addForce(openmm.CMMotionRemover())
-    integrator = make()
+    integrator = ProjectedIntegrator(0.001)
     context = context_of(other, integrator)
     context.setPositions(x)
     assert integrator.degrees_of_freedom(context) == 3 and integrator.independent_momenta(context) == 6
 
 
-@pytest.mark.parametrize("kind", [ProjectedIntegrator, RattleIntegrator])
 @pytest.mark.parametrize(
     ("call", "given"),
     [
@@ -69,10 +64,10 @@ def test_degrees_of_freedom_are_counted_by_rank(make):
         ("applyVelocityConstraints", {"tolerance": "small"}),
     ],
 )
-def test_what_is_no_number_for_it_is_refused(kind, call, given):
+def test_what_is_no_number_for_it_is_refused(call, given):
     """Velocities of a negative temperature were no numbers."""
     system, x, v = dumbbell()
-    integrator = kind(1e-3)
+    integrator = ProjectedIntegrator(1e-3)
     context = started(system, integrator, x, v)
     with pytest.raises(InputError):
         getattr(integrator, call)(context=context, **given)

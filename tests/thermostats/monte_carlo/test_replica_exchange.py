@@ -5,13 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from monte_carlo_systems import trap, trap_potential, trimer
-from thermostat_systems import system
 
-from kcons.constraints import Distance
-from kcons.errors import InputError
-from kcons.steppers import State, run
+from kcons.steppers import run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, exchange
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.monte_carlo import EXCHANGE, POTENTIAL
@@ -62,38 +58,3 @@ def test_a_run_of_exchanges_keeps_each_temperature():
     assert 0.3 < np.mean(made) < 0.99
     mean, spread = np.mean(kinetic, axis=0), np.std(kinetic, axis=0) / math.sqrt(250)
     assert (np.abs(mean - 3.5 * np.array(LADDER)) < 3.5 * spread).all()
-
-
-def test_bad_input():
-    _, states = ladder(1)
-    bare = State(states[0].positions, states[0].velocities)
-    two = State(np.zeros((2, 3)), np.zeros((2, 3)), thermostat=states[0].thermostat)
-    for given, temperatures, number, words in (
-        (states, LADDER[:2], 0, "3 states and 2 temperatures"),
-        (states[:1], LADDER[:1], 0, "1 states"),
-        (states, [0.3, 0.4, 0.0], 0, "thermal_energies is 0.0"),
-        ([bare, *states[1:]], LADDER, 0, "state 0 does not know its potential energy"),
-        ([states[0], two, states[2]], LADDER, 0, "state 1 has another number of atoms"),
-        (states, LADDER, -1, "number is -1"),
-        (states, LADDER, 2**64, "number is 18446744073709551616"),
-    ):
-        with pytest.raises(InputError, match=words):
-            exchange(given, temperatures, 1, number)
-
-
-@pytest.mark.parametrize("other", ["masses", "constraints"])
-def test_states_of_other_systems(other):
-    held, states = ladder(1)
-    masses = held.masses * (2 if other == "masses" else 1)
-    rods = Distance([[0, 1], [1, 2]]) if other == "masses" else Distance([[0, 1]], 1.3)
-    x = states[1].positions
-    apart = system([rods], x, masses, trap, trap_potential)
-    changed = run(apart, apart.initial_state(x, project=True), 0.3, 1, stepper=HamiltonianMonteCarlo(0.45, 3, 1))
-    for given in ([states[0], changed, states[2]], [changed, states[1], states[2]]):
-        with pytest.raises(InputError, match=f"state 1 .*other {other} than state 0"):
-            exchange(given, LADDER, 1, 0)
-    # Another System of the same masses and constraints is as good.
-    same, start = trimer(trap, trap_potential)
-    again = run(same, start, 0.3, 1, stepper=HamiltonianMonteCarlo(0.45, 3, 1, keep=0.2))
-    after, _ = exchange([states[0], again, states[2]], LADDER, 1, 0)
-    assert np.isfinite(run(held, after[0], 0.3, 1, stepper=HamiltonianMonteCarlo(0.3, 3, 0, keep=0.2)).positions).all()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from monte_carlo_systems import KT, trap, trap_potential, trimer
 from thermostat_systems import dumbbells
 
-from kcons.errors import ConvergenceError, InputError
+from kcons.errors import ConvergenceError
 from kcons.steppers import Rattle, System, run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, best_acceptance, tune
 from kcons.thermostats.monte_carlo import DualAveraging
@@ -51,13 +50,6 @@ def test_a_step_is_found_and_stays():
     assert abs(Counts.of(after).acceptance - 0.8) < 0.13
     again = tune(held, state, 0.02, sampler, wanted=0.8, proposals=100)
     assert again.dt == found.dt
-
-
-def test_bad_input():
-    held, state = trimer(trap, trap_potential)
-    sampler = HamiltonianMonteCarlo(KT, 2, 3)
-    with pytest.raises(InputError, match="variables of another thermostat, not of HamiltonianMonteCarlo"):
-        tune(held, replace(state, thermostat=np.zeros(1)), 0.1, sampler)
 
 
 def test_where_nothing_succeeds():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from thermostat_systems import METHANE, TEN, dumbbells, molecules, quartic, quartic_potential, springs, system, waves
 
-from kcons.constraints import CenterOfMass, Distance, FixedAtoms, LinearRelation, LinearVelocity, Plane, Sphere
-from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.constraints import CenterOfMass, Distance, FixedAtoms, LinearRelation, Plane, Sphere
+from kcons.errors import InputError, OverdeterminedError
 from kcons.steppers import State, System, run
 from kcons.thermostats import (
     ForceGroups,
@@ -21,7 +21,7 @@ from kcons.thermostats import (
     thermal_velocities,
 )
 from kcons.thermostats.multistep import sphere_kernels as kernels
-from kcons.thermostats.multistep.spheres import SphereLayout, refuse_driven
+from kcons.thermostats.multistep.spheres import SphereLayout
 
 TWO = {"slow": 1, "fast": 4}
 KINDS = ["split", "axes", "cluster", "global"]
@@ -47,11 +47,10 @@ def lengths(stepper, held, state):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("order", [2, 4])
-def test_spheres_and_constraints_are_kept(kind, order):
+def test_spheres_and_constraints_are_kept(kind):
     held, state = molecules("triangles", 4, ions=1)
     split = grouped(held.motion)
-    stepper = IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres=kind, order=order, auxiliary=2)
+    stepper = IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres=kind, auxiliary=2)
     end = run(split, state, 0.2, 25, stepper=stepper)
     has, wanted = lengths(stepper, split, end)
     np.testing.assert_allclose(has, wanted, rtol=1e-13)
@@ -87,18 +86,6 @@ def test_without_noise_it_is_of_order_two(kind):
     assert slopes == pytest.approx([2, 2], abs=0.3)
 
 
-def test_an_inner_scheme_of_order_four_errs_less():
-    held, x = dumbbells(2)
-    state = held.initial_state(x, 0.7 * np.random.default_rng(1).normal(size=x.shape), project=True)
-    made = lambda order: IsokineticSpheres(0.5, 1e-32, 3, spheres="global", order=order)  # noqa: E731
-    known = run(held, state, 1 / 64, 64, stepper=made(4))
-    errors = [
-        [np.abs(run(held, state, 1 / n, n, stepper=made(order)).positions - known.positions).max() for n in (4, 8)]
-        for order in (2, 4)
-    ]
-    assert errors[1][0] <= 0.02 * errors[0][0] and errors[1][1] <= 0.005 * errors[0][1]
-
-
 def test_many_auxiliary_variables_are_langevin_dynamics():
     """Kinetic energy is then that of Maxwell and Boltzmann, and no energy is bounded."""
     held, x = dumbbells(40, force=None)
@@ -122,25 +109,6 @@ def test_great_circles_are_flown_exactly():
     end = run(held, held.initial_state(x), 0.3, 20, stepper=stepper)
     assert np.abs(held.motion.constraint_set.value(end.positions)).max() <= 1e-14
     assert "along great circles" in stepper.listing(held)
-    has, wanted = lengths(stepper, held, end)
-    np.testing.assert_allclose(has, wanted, rtol=1e-13)
-
-
-def test_another_temperature_from_now_on():
-    held, x = dumbbells(2)
-    stepper = IsokineticSpheres(0.5, 1.0, 3, auxiliary=0)
-    state = run(held, State(x, thermal_velocities(held, x, 0.5, 4)), 0.05, 3, stepper=stepper)
-    twice = held.kinetic_energy(state.velocities)
-    stepper.thermal_energy = 1.0
-    state = run(held, state, 0.05, 3, stepper=stepper)
-    assert held.kinetic_energy(state.velocities) == pytest.approx(2 * twice, rel=1e-12)
-
-
-@pytest.mark.parametrize("auxiliary", [0, 1])
-def test_from_rest(auxiliary):
-    held, x = dumbbells(3)
-    stepper = IsokineticSpheres(0.5, 1.0, 3, auxiliary=auxiliary)
-    end = run(held, State(x, np.zeros_like(x)), 0.05, 2, stepper=stepper)
     has, wanted = lengths(stepper, held, end)
     np.testing.assert_allclose(has, wanted, rtol=1e-13)
 
@@ -265,12 +233,3 @@ def test_radii_and_the_sphere_without_one():
     axes = SphereLayout.of(held, X, "axes")
     with pytest.raises(InputError, match="9 spheres of one degree of freedom and no auxiliary"):
         axes.squares(0.5, 0)
-
-
-def test_driven_rows_are_refused():
-    held = system([Distance([[0, 1]], lambda t: 1 + 0.1 * t)], X, MASSES)
-    with pytest.raises(UnsupportedError, match="Distance has a target that moves"):
-        SphereLayout.of(held, X, "split")
-    rolling = system([LinearVelocity([0], [[1.0, 0, 0]])], X, MASSES)
-    with pytest.raises(UnsupportedError, match="LinearVelocity holds velocities"):
-        refuse_driven(rolling)

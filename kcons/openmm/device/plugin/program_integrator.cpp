@@ -42,9 +42,6 @@ Plan ProgramIntegrator::planned(bool whole) const {
         pairs.insert(pairs.end(), {i, j});
         lengths.push_back(length);
     }
-    string precision = "double";
-    for (auto& name : platform.getPropertyNames())
-        if (name == "Precision") precision = platform.getPropertyValue(context->getOwner(), name);
     vector<Vec3> positions, box(3);
     if (whole) {
         context->getPositions(positions);
@@ -52,7 +49,7 @@ Plan ProgramIntegrator::planned(bool whole) const {
         if (!system.usesPeriodicBoundaryConditions()) box.assign(3, Vec3());
     }
     Plan plan;
-    Given given = {description.c_str(), platform.getName().c_str(), precision.c_str(), getIntegrationForceGroups(),
+    Given given = {description.c_str(), platform.getName().c_str(), getIntegrationForceGroups(),
                    (int) masses.size(), (int) lengths.size(), masses.data(), pairs.data(), lengths.data(),
                    whole ? &positions[0][0] : nullptr, &box[0][0], whole ? context->getTime() : 0};
     if (!planner(&plan, &given)) throw OpenMMException(failure);
@@ -68,7 +65,7 @@ StepKernel& ProgramIntegrator::kernel() const {
 }
 void ProgramIntegrator::step(int steps) {
     StepKernel& k = kernel();
-    look = Look();
+    told.assign(7, 0);
     try {
         k.execute(*context, *this, steps);
     } catch (...) {
@@ -77,14 +74,12 @@ void ProgramIntegrator::step(int steps) {
         if (k.read("failure")[0] == 0) throw;
         k.lookBack();                              // it came of a failure, which is told
     }
-    vector<double> told = k.read("looked");    // the only wait of a call
-    look = {told[0], told[5], told[6], (int) told[2], (int) told[3], (int) told[4]};
-    if (look.failed) {
+    moved = false;                             // by barostats, which keep to the constraints
+    told = k.read("looked");                   // the only wait of a call
+    if (told[2] != 0) {
         k.write("failure", {0, 0, 0});
         k.valid = false;
-        ostringstream text;
-        text << "kcons: row " << look.row << " could not be solved at step " << look.step << ", residual " << look.residual;
-        throw OpenMMException(text.str());
+        throw OpenMMException("kcons: row "+to_string((int) told[4])+" could not be solved at step "+to_string((int) told[3]));
     }
     middleKinetic = noisy && steps > 0 ? told[1]/2 : -1;
     endKinetic = told[6]/2;
@@ -92,6 +87,7 @@ void ProgramIntegrator::step(int steps) {
 void ProgramIntegrator::stateChanged(State::DataType changed) {
     if (context == nullptr) return;
     if (changed != State::Velocities) handle.getAs<StepKernel>().valid = false;
+    moved = moved || changed == State::Positions || changed == State::Velocities;
 }
 double ProgramIntegrator::computeKineticEnergy() {
     if (middleKinetic < 0) return handle.getAs<StepKernel>().kineticEnergy();
@@ -180,6 +176,7 @@ void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int step
     const Vec3 before[] = {numbers.box[0], numbers.box[1], numbers.box[2]};
     c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
     for (int k = 0; k < 3; k++) if (numbers.box[k] != before[k]) valid = false;
+    bool ended = true;                         // whether velocities are those of the end of a step
     for (int k = 0; k < steps; k++) {
         if (c.updateContextState()) {          // barostats have moved positions
             valid = false;
@@ -193,10 +190,13 @@ void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int step
             for (auto& action : plan.parts[1])
                 if (action.verb == Verb::Evaluate && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
         }
-        run(c, k == 0 || integrator.whole ? 0 : 1);
+        run(c, ended ? 0 : 1);
         c.setTime(numbers.time+numbers.dt);
         c.setStepCount(c.getStepCount()+1);
-        if (k == steps-1 || integrator.whole) run(c, 2);
+        bool recorded = integrator.every > 0 && (c.getStepCount()-integrator.since) % integrator.every == 0;
+        ended = k == steps-1 || integrator.whole || recorded;
+        if (ended) run(c, 2);
+        if (recorded) launch("record");
     }
     lookBack();
 }
@@ -250,6 +250,11 @@ void kcons_describe(void* integrator, const char* description, int noisy) {
     own(integrator).noisy = noisy;
 }
 void kcons_set_whole(void* integrator, int whole) { own(integrator).whole = whole; }
+void kcons_record_every(void* integrator, int steps, int since) {
+    own(integrator).every = steps;
+    own(integrator).since = since;
+}
+int kcons_was_moved(void* integrator) { return own(integrator).moved; }
 int kcons_is_bound(void* integrator) { return own(integrator).bound(); }
 int kcons_read(void* integrator, const char* name, double* out, int room) try {
     auto values = own(integrator).read(name);
@@ -260,11 +265,7 @@ int kcons_write(void* integrator, const char* name, const double* values, int n)
     own(integrator).write(name, vector<double>(values, values+n));
     return n;
 } catch (exception& e) { failure = e.what(); return -1; }
-void kcons_look(void* integrator, double* out) {
-    const Look& l = own(integrator).look;
-    double told[] = {l.squares, (double) l.failed, (double) l.step, (double) l.row, l.residual};
-    memcpy(out, told, sizeof(told));
-}
+void kcons_told(void* integrator, double* out) { memcpy(out, own(integrator).told.data(), 7*sizeof(double)); }
 void kcons_plan_source(Plan* plan, const char* source, const char* library, int items, int workGroup, int slots) {
     plan->source = source; plan->library = library;
     plan->items = items; plan->workGroup = workGroup; plan->slots = slots;

@@ -41,7 +41,7 @@ struct Plan {
 
 // Python's part in the making: fills the plan, or returns 0. Without positions only the clusters are asked for.
 struct Given {
-    const char *description, *platform, *precision;
+    const char *description, *platform;
     int groups, particles, constraints;
     const double* masses;
     const int* pairs;
@@ -50,12 +50,6 @@ struct Given {
 };
 typedef int (*Planner)(Plan* plan, const Given* given);
 
-// Of a step that failed: what the kernels have told.
-struct Look {
-    double squares = 0, residual = 0, twice = 0;   // twice: the kinetic energy
-    int failed = 0, step = 0, row = 0;
-};
-
 class StepKernel;
 
 class ProgramIntegrator : public OpenMM::Integrator {
@@ -63,11 +57,13 @@ public:
     std::string description;       // what Python makes the plan of
     bool whole = true;             // whether others look at velocities between steps, which must then end
     bool noisy = false;            // whether the kinetic energy is that of the middle of the last step
+    int every = 0, since = 0;      // steps from one record to the next, 0 for none, and the step that they count from
+    bool moved = false;            // whether others have set positions or velocities since the last step
     void step(int steps) override;
     std::vector<double> read(const std::string& name) const;
     void write(const std::string& name, const std::vector<double>& values);
     bool bound() const { return context != nullptr; }
-    Look look;
+    std::vector<double> told;      // by the kernel `look`, at the end of the last call
 protected:
     void initialize(OpenMM::ContextImpl& c) override;
     void cleanup() override;

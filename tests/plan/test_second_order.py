@@ -23,7 +23,7 @@ from kcons.constraints import (
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import SingularGeometryError
 from kcons.motion import Motion
-from kcons.plan.second_order.conversion import without_second_order_rows
+from kcons.plan.second_order import LocalRows, unsolvable, without_second_order_rows
 
 TETRAHEDRON = 0.63 * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 METHANE = np.vstack([np.zeros((1, 3)), TETRAHEDRON])
@@ -144,7 +144,7 @@ def test_regular_and_merely_dependent_rows_are_left_alone(case: str) -> None:
     x = np.array(shape, dtype=float)
     given = ConstraintSet(rows, x, np.ones(len(x)))
     assert rank_of(given, x) == rank
-    assert without_second_order_rows(given, x, 0.0, convert=False) is given
+    assert without_second_order_rows(given, x, 0.0) is given
 
 
 def test_boat_of_cyclohexane_is_left_alone() -> None:
@@ -159,7 +159,7 @@ def test_boat_of_cyclohexane_is_left_alone() -> None:
         boat = boat - (np.linalg.pinv(held.jacobian(boat).toarray(), rcond=1e-6) @ held.value(boat)).reshape(-1, 3)
     assert np.abs(held.value(boat)).max() < 1e-15
     assert rank_of(held, boat) == 11
-    assert without_second_order_rows(held, boat, 0.0, convert=False) is held
+    assert without_second_order_rows(held, boat, 0.0) is held
 
 
 @pytest.mark.parametrize("degrees", [179.0, 179.9, 179.99])
@@ -167,7 +167,7 @@ def test_nearly_collinear_triatomic_is_left_alone(degrees: float) -> None:
     a = np.radians(degrees)
     x = turned([[1, 0, 0], [0, 0, 0], [np.cos(a), np.sin(a), 0]])
     held = ConstraintSet(Distance(pairs_of(3)), x, np.ones(3))
-    assert without_second_order_rows(held, x, 0.0, convert=False) is held
+    assert without_second_order_rows(held, x, 0.0) is held
 
 
 def test_smallest_singular_value_at_179_9_degrees() -> None:
@@ -181,45 +181,31 @@ def test_smallest_singular_value_at_179_9_degrees() -> None:
 # -- refusals ---------------------------------------------------------------------------------------------
 
 
-def refuse(rows: Constraint | Sequence[Constraint], x: Array, *, convert: bool = True) -> SingularGeometryError:
+def refuse(rows: Constraint | Sequence[Constraint], x: Array) -> SingularGeometryError:
     given = ConstraintSet(rows, x, np.ones(len(x)))
     before = x.copy()
     with pytest.raises(SingularGeometryError) as caught:
-        without_second_order_rows(given, x, 0.0, convert=convert)
+        without_second_order_rows(given, x, 0.0)
     np.testing.assert_array_equal(x, before)
     return caught.value
 
 
-def test_sentence_for_a_linear_group() -> None:
-    error = refuse(Distance(pairs_of(3)), turned(CO2), convert=False)
+def test_targets_that_fit_no_flat_geometry_are_refused() -> None:
+    """With the degrees of freedom, and what to hold instead."""
+    error = refuse(Distance(pairs_of(3), [1.16, 2.31, 1.16]), turned(CO2))
     assert str(error).startswith(
         "constraint set singular at this geometry: 7 linearized degrees of freedom but the rigid body has 5"
     )
     assert "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead" in str(error)
     assert error.rows == (0, 1, 2) and error.atoms == (0, 1, 2)
-
-
-@pytest.mark.parametrize(("n", "linearized"), [(4, 7), (6, 9)])
-def test_sentence_for_a_planar_group(n: int, linearized: int) -> None:
-    error = refuse(Distance(pairs_of(n)), turned(ring(n)), convert=False)
-    assert f"{linearized} linearized degrees of freedom but the rigid body has 6" in str(error)
-    assert "hold three distances and" in str(error) and "LinearRelation" in str(error)
-
-
-def test_motion_refuses_on_request() -> None:
-    x = turned(CO2)
-    with pytest.raises(SingularGeometryError, match="7 linearized degrees of freedom"):
-        Motion(ConstraintSet(Distance(pairs_of(3)), x, np.ones(3)), x, degenerate="raise")
-
-
-def test_targets_that_fit_no_flat_geometry_are_refused() -> None:
-    error = refuse(Distance(pairs_of(3), [1.16, 2.31, 1.16]), turned(CO2))
     assert "targets do not fit a linear group" in str(error)
-    x = ring(6)
-    lengths = ConstraintSet(Distance(pairs_of(6)), x, np.ones(6)).target()
-    lengths[3] *= 1 + 1e-4
-    error = refuse(Distance(pairs_of(6), lengths), x)
-    assert "targets do not fit a planar group" in str(error)
+    for n, linearized in ((4, 7), (6, 9)):
+        x = ring(n)
+        lengths = ConstraintSet(Distance(pairs_of(n)), x, np.ones(n)).target()
+        lengths[3] *= 1 + 1e-4
+        error = refuse(Distance(pairs_of(n), lengths), turned(x))
+        assert f"{linearized} linearized degrees of freedom but the rigid body has 6" in str(error)
+        assert "hold three distances and" in str(error) and "targets do not fit a planar group" in str(error)
 
 
 def test_moving_target_in_a_flat_group_is_refused() -> None:
@@ -281,7 +267,7 @@ def test_large_regular_network_is_left_alone() -> None:
     ]
     x += 0.05 * np.random.default_rng(0).standard_normal(x.shape)
     held = ConstraintSet(Distance(np.concatenate(links)), x, np.ones(len(x)))
-    assert without_second_order_rows(held, x, 0.0, convert=False) is held
+    assert without_second_order_rows(held, x, 0.0) is held
 
 
 def test_many_molecules_are_found_one_by_one() -> None:
@@ -368,3 +354,168 @@ def test_hinged_plates_that_lock_each_other_are_refused():
     ring = [p for p in pairs if max(p) < 5]
     motion = Motion(ConstraintSet(Distance(ring), x[:5], np.ones(5)), x[:5])
     assert motion.degrees_of_freedom == 6
+
+
+# -- what the converted rows do ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "case", ["CO2 by 3", "OCS by 3", "hexagon by 15", "formate by 6", "benzene by 66", "two squares with a common edge"]
+)
+def test_all_distances_hold_over_2000_steps(case: str) -> None:
+    """RATTLE steps by hand with forces in all directions; every original distance to 1e-14."""
+    shape, pairs, _, _ = CONVERTED[case]
+    x = turned(shape) * 1.0
+    x -= x.mean(axis=0)
+    masses = np.random.default_rng(5).uniform(1.0, 16.0, len(x))
+    given = ConstraintSet(Distance(pairs), x, masses)
+    motion = Motion(given, x)
+    rng = np.random.default_rng(6)
+    pull = rng.standard_normal((len(x), 3))
+    m = masses[:, None]
+    dt, worst = 0.02, 0.0
+    v = motion.project_velocities(x, 0.3 * rng.standard_normal(x.shape))
+    lengths = given.target()
+
+    def force(x: Array) -> Array:
+        return pull - 0.5 * x
+
+    for _ in range(2000):
+        v += 0.5 * dt * force(x) / m
+        x = motion.project_positions(x + dt * v, x, velocities=v, dt=dt)
+        v += 0.5 * dt * force(x) / m
+        v = motion.project_velocities(x, v)
+        worst = max(worst, float(np.max(np.abs(given.value(x)) / lengths)))
+    assert worst <= 1e-14
+
+
+def test_out_of_plane_force_turns_the_ring_as_a_rigid_body() -> None:
+    """Accelerations of the converted hexagon are those of Euler's rigid body, to rounding."""
+    rng = np.random.default_rng(2)
+    x = turned(ring(6))
+    masses = rng.uniform(1, 20, 6)
+    motion = Motion(ConstraintSet(Distance(pairs_of(6)), x, masses), x)
+    f = rng.standard_normal((6, 3))
+    f[2] += 3.0
+    a = motion.acceleration(x, np.zeros_like(x), f)
+    m = masses[:, None]
+    center = (m * x).sum(axis=0) / masses.sum()
+    d = x - center
+    inertia = np.sum(
+        masses[:, None, None]
+        * (np.einsum("ij,ij->i", d, d)[:, None, None] * np.eye(3) - d[:, :, None] * d[:, None, :]),
+        axis=0,
+    )
+    expected = f.sum(axis=0) / masses.sum() + np.cross(np.linalg.solve(inertia, np.cross(d, f).sum(axis=0)), d)
+    np.testing.assert_allclose(a, expected, atol=1e-13 * np.abs(expected).max())
+
+
+def test_targets_of_base_distances_are_kept_to_the_last_bit() -> None:
+    lengths = np.array([1.1600000000000001, 2.3299999999999996, 1.17])
+    held = converted(Distance(pairs_of(3), lengths), turned([[0, 0, 0], [1.16, 0, 0], [2.33, 0, 0]]))
+    assert held.target()[0] == lengths[1]
+
+
+def test_weights_follow_the_targets_and_not_a_stretched_start() -> None:
+    bent = CO2 + np.array([[0, 0, 0], [0, 0.02, 0], [0, 0, 0]])
+    for shape, proper in ((1.2 * CO2, CO2), (bent, CO2), (1.2 * ring(6), ring(6))):
+        x, pairs = turned(shape), pairs_of(len(shape))
+        lengths = ConstraintSet(Distance(pairs), proper, np.ones(len(x))).target()
+        given = ConstraintSet(Distance(pairs, lengths), x, np.ones(len(x)))
+        motion = Motion(given, x)
+        restored = motion.restore_positions(x)
+        assert motion.rank == 3 * len(x) - (5 if len(x) == 3 else 6)
+        assert np.max(np.abs(given.value(restored)) / lengths) < 1e-14
+
+
+@pytest.mark.parametrize("noise", [1e-7, 1e-4, 1e-3])
+def test_puckered_start_with_planar_targets_is_held_as_planar(noise: float) -> None:
+    x0 = turned(ring(6))
+    lengths = ConstraintSet(Distance(pairs_of(6)), x0, np.ones(6)).target()
+    x = x0 + noise * np.random.default_rng(4).standard_normal(x0.shape)
+    given = ConstraintSet(Distance(pairs_of(6), lengths), x, np.ones(6))
+    motion = Motion(given, x)
+    assert motion.rank == motion.constraint_set.n_rows == 12
+    restored = motion.restore_positions(x)
+    assert np.max(np.abs(given.value(restored)) / lengths) < 1e-14
+
+
+def test_many_puckered_rings_are_all_found() -> None:
+    """More of them than regular blocks are sampled; noise of 1e-3 on planar targets."""
+    rng = np.random.default_rng(0)
+    flat = np.vstack([turned(ring(4), seed=k) + 20 * rng.standard_normal(3) for k in range(150)])
+    pairs = np.vstack([np.array(pairs_of(4)) + 4 * k for k in range(150)])
+    lengths = ConstraintSet(Distance(pairs), flat, np.ones(600)).target()
+    held = converted(Distance(pairs, lengths), flat + 1e-3 * rng.standard_normal(flat.shape))
+    assert counts(held) == (450, 450)
+
+
+def test_group_across_a_periodic_boundary() -> None:
+    x = np.mod(ring(6) + np.array([3.0, 0.2, 9.9]), 10.0)
+    held = converted(Distance(pairs_of(6)), x, cell=[10.0, 10.0, 10.0])
+    assert counts(held) == (3, 9)
+    assert np.abs(held.value(x)).max() < 1e-14
+
+
+def test_only_the_rows_of_the_flat_group_change() -> None:
+    """A rigid water and a flexible tail beside and on the ring stay as they were."""
+    water = np.array([[5.0, 5, 5], [5.96, 5, 5], [4.76, 5.93, 5]])
+    x = np.vstack([ring(6), [[2.9, 0, 0.3], [3.3, 1.4, 0.1]], water])
+    rows = [Distance([(0, 6), (6, 7), *pairs_of(6)]), Distance([(8, 9), (8, 10), (9, 10)])]
+    held = converted(rows, x)
+    assert [(c.family, c.n_rows) for c in held.constraints] == [
+        ("Distance", 2),
+        ("Distance", 3),
+        ("Distance", 3),
+        ("LinearRelation", 9),
+    ]
+    assert held.constraints[0].atoms.tolist() == [[0, 6], [6, 7]]
+    assert rank_of(held, x) == held.n_rows == 17
+
+
+def test_fixed_atoms_become_bases() -> None:
+    x = ring(6)
+    held = converted([Distance(pairs_of(6)), FixedAtoms([2])], x)
+    motion = Motion(held, x)
+    assert motion.degrees_of_freedom == 3
+    relation = held.constraints[-1]
+    assert relation.family == "LinearRelation" and (relation.atoms[:, 1:] == 2).any(axis=1).all()
+
+
+# -- one block ----------------------------------------------------------------------------------------------
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+ALL = [[i, j] for i in range(4) for j in range(i)]
+
+
+def local(x, rows):
+    held = ConstraintSet(rows, x, np.ones(len(x)))
+    return LocalRows(held, np.arange(held.n_rows), x, 0.0)
+
+
+def test_a_row_without_gradient_that_bends_is_unsolvable():
+    """sigma = y^2/2 where A = 0; with A = (1, 0) there is always an acceleration along x."""
+    bent = lambda v: v[:, 1:] ** 2  # noqa: E731
+    assert unsolvable(np.zeros((1, 1, 2)), bent, np.ones(1)).tolist() == [True]
+    assert unsolvable(np.array([[[1.0, 0.0]]]), bent, np.ones(1)).tolist() == [False]
+    # Dependent rows that bend alike: any acceleration does for both, or for none.
+    twice = np.array([[[1.0, 0.0], [1.0, 0.0]]])
+    assert unsolvable(twice, lambda v: np.repeat(v[:, 1:] ** 2, 2, axis=1), np.ones(1)).tolist() == [False]
+    assert unsolvable(twice, lambda v: v[:, 1:] ** 2 * [1.0, 2.0], np.ones(1)).tolist() == [True]
+
+
+@pytest.mark.parametrize(("x", "singular", "rank"), [(TETRAHEDRON, False, 6), (SQUARE, True, 5)])
+def test_all_distances_of_four_atoms(x, singular, rank):
+    rows = local(x, Distance(ALL))
+    assert rows.singular(rows.x) is singular and rows.rank(rows.x) == rank
+    assert len(rows.stressed(rows.x)) == (6 if singular else 0)
+    # Without a diagonal the square may fold: its five rows are independent.
+    assert not rows.singular(rows.x, np.array([0, 1, 2, 3, 5]))
+
+
+def test_pairs_that_keep_their_distance_nearby():
+    """Two triangles that share a side, flat as a square: only the pair across may come nearer."""
+    rows = local(SQUARE, Distance([[0, 1], [1, 2], [0, 2], [2, 3], [0, 3]]))
+    rigid, rank = rows.rigid_pairs()
+    assert rank == 5
+    assert sorted(map(tuple, np.argwhere(~rigid).tolist())) == [(1, 3), (3, 1)]
