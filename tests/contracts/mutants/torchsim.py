@@ -1,6 +1,8 @@
 """TorchSim: slices, drifts, noise, degrees of freedom; they need torch."""
 
-STATES, DYNAMICS, REFUSALS = ("torchsim/test_" + name + ".py::test_" for name in ("states", "dynamics", "refusals"))
+STATES, DYNAMICS, REFUSALS = (
+    "torchsim/test_torchsim_" + name + ".py::test_" for name in ("states", "dynamics", "refusals")
+)
 
 MUTANTS = {
     "torchsim/constraints_object.py": [
