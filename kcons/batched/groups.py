@@ -120,7 +120,10 @@ class Group:
         self.p, self.scale, self._offsets = (of_all(lambda kind, *_, k=k: kind[k], like.dtype) for k in (1, 2, 3))
         self.flat = _flat(self.atoms)
         self.moving = [3 * a + c for a in range(pattern.n_atoms) if a not in pattern.fixed for c in range(3)]
-        now, before, first, begin = [], [], [], []
+        now: list[int] = []
+        before: list[int] = []
+        first: list[int] = []
+        begin: list[int] = []
         for row in pattern.rows:
             now += row.places
             before += row.atoms[:-1] if row.relative else row.atoms

@@ -48,7 +48,8 @@ def _program(pattern: Pattern, device: torch.device) -> tuple[_Program, dict[tup
     numbers = {pair: k for k, pair in enumerate([*((k, k) for k in place), *pairs])}
     levels = []
     for begin, end in zip(order.levels[:-1], order.levels[1:], strict=True):
-        factor, product = [], []
+        factor: list[tuple[int, int, int]] = []
+        product: list[tuple[int, int, int]] = []
         for here, some in zip(place[begin:end], later[begin:end], strict=True):
             for there in some:
                 product += [(len(factor), numbers[here, j], numbers[there, j]) for j in some]
@@ -117,7 +118,7 @@ class Levels(Clusters):
             slots.append(range(slot, slot := slot + len(row.atoms)))
         self.alike = []
         for some in alike.values():
-            tables = [[t[k] for k in some] for t in (places, parameters)]
+            tables: list[Any] = [[t[k] for k in some] for t in (places, parameters)]
             tables += [[rows[k].atoms for k in some], [rows[k].places for k in some]]
             self.alike.append(_Alike(rows[some[0]], *(_table(t, len(t[0]), device).T for t in tables)))
         order = [k for some in alike.values() for k in some]
