@@ -12,7 +12,6 @@ from torch_sim.constraints import Constraint, SystemConstraint
 from torch_sim.integrators import MDState
 
 from kcons.batched import Batch
-from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 
@@ -31,15 +30,7 @@ _CELL = "cells are not relaxed with held rows; relax positions alone, or the cel
 class Constraints(SystemConstraint):
     """Everything that is held on a state, made by `kcons.torchsim.hold`: an engine for each system that has rows.
 
-    TorchSim takes it along where states are sliced, split, joined and moved. Its optimizers end on the constraints; its
-    integrators are refused.
-
-    Parameters
-    ----------
-    motions : sequence of Motion
-        Engines; equal systems may share one.
-    system_idx : torch.Tensor of int, shape (len(motions),)
-        The systems that they belong to.
+    Optimizers of TorchSim end on the constraints; its integrators and cell filters are refused.
     """
 
     def __init__(self, motions: Sequence[Motion], system_idx: torch.Tensor) -> None:
@@ -47,34 +38,24 @@ class Constraints(SystemConstraint):
         self.motions = tuple(motions)
         self._made: tuple[torch.Tensor, Batch, torch.Tensor | None] | None = None
 
-    # -- the engine -----------------------------------------------------------------------------
-
     def batch(self, state: SimState) -> tuple[Batch, torch.Tensor | None]:
-        """The engine for all systems of a state, and its atoms, None if these are all.
-
-        Raises
-        ------
-        InputError
-            The state has other atoms, masses or cells than the rows were made for.
-        """
+        """The engine for all systems of a state, and its atoms, None if these are all of the state."""
         # TorchSim sets another system_idx where it reorders systems.
         if self._made is None or self._made[0] is not self.system_idx or self._made[1].dtype != state.dtype:
             self.check_fits(state)
             motions = [self.motions[k] for k in torch.argsort(self.system_idx).tolist()]
-            batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=1)
             part = torch.isin(state.system_idx, self.system_idx)
+            batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=1)
             self._made = self.system_idx, batch, None if bool(part.all()) else part.nonzero().ravel()
         return self._made[1:]
 
     def check_fits(self, state: SimState) -> None:
         """Refuse a state with other atoms, masses or cells than the rows were made for."""
-        starts, masses, cells = starts_of(state), array_of(state.masses), array_of(state.row_vector_cell)
+        masses, cells = state.masses.split(state.n_atoms_per_system.tolist()), state.row_vector_cell
         for motion, k in zip(self.motions, self.system_idx.tolist(), strict=True):
-            part, lattice = masses[starts[k] : starts[k + 1]], motion.lattice
-            wrong = ""
-            if part.shape != motion.masses.shape or not np.allclose(part, motion.masses, rtol=SAME, atol=0.0):
-                wrong = "atoms or masses"
-            elif lattice is not None and np.abs(cells[k] - lattice[0]).max() > SAME * np.abs(lattice[0]).max():
+            part, lattice = array_of(masses[k]), motion.lattice
+            wrong = "" if part.shape == motion.masses.shape and np.allclose(part, motion.masses, SAME) else "masses"
+            if lattice is not None and np.abs(array_of(cells[k]) - lattice[0]).max() > SAME * np.abs(lattice[0]).max():
                 wrong = "a cell"
             if wrong:
                 raise InputError(
@@ -82,30 +63,20 @@ class Constraints(SystemConstraint):
                     item="state",
                 )
 
-    def move(self, state: SimState, new: torch.Tensor) -> tuple[Any, Any]:
-        """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction.
-
-        Raises
-        ------
-        ConvergenceError
-            There is no solution near enough; system and row are named.
-        """
+    def move(self, state: SimState, new: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction."""
         batch, atoms = self.batch(state)
         if atoms is None:
             return batch.solve_positions(new, state.positions)[:2]
-        solved = batch.solve_positions(new[atoms], state.positions[atoms])
-        push = torch.zeros_like(new).index_copy(0, atoms, solved.push)
-        return new.index_copy(0, atoms, solved.positions), push
+        positions, push, _ = batch.solve_positions(new[atoms], state.positions[atoms])
+        return new.index_copy(0, atoms, positions), torch.zeros_like(new).index_copy(0, atoms, push)
 
     def tangent(self, state: SimState, velocities: torch.Tensor) -> torch.Tensor:
         """The part of velocities that stays on the constraints."""
         batch, atoms = self.batch(state)
         if atoms is None:
             return batch.project_velocities(state.positions, velocities)
-        part = batch.project_velocities(state.positions[atoms], velocities[atoms])
-        return velocities.index_copy(0, atoms, part)
-
-    # -- what TorchSim calls --------------------------------------------------------------------
+        return velocities.index_copy(0, atoms, batch.project_velocities(state.positions[atoms], velocities[atoms]))
 
     def get_removed_dof(self, state: SimState) -> torch.Tensor:
         """The rank of the rows of each system, which may be less than their number."""
@@ -115,7 +86,7 @@ class Constraints(SystemConstraint):
     def adjust_positions(self, state: SimState, new_positions: torch.Tensor) -> None:
         """Bring positions that an optimizer asks for onto the constraints, in place."""
         if isinstance(state, MDState):
-            self.adjust_momenta(state, state.momenta)
+            raise UnsupportedError(_OWN)
         new_positions.copy_(self.move(state, new_positions)[0])
 
     def adjust_momenta(self, state: SimState, momenta: torch.Tensor) -> None:
@@ -131,13 +102,12 @@ class Constraints(SystemConstraint):
         """Refuse cell filters, which do not know the stress of held rows."""
         raise UnsupportedError(_CELL)
 
-    # -- slices, joins, copies ------------------------------------------------------------------
+    # TorchSim puts systems into the order that was asked for after `select_constraint`.
 
     def select_constraint(self, atom_mask: torch.Tensor, system_mask: torch.Tensor) -> Constraints | None:
-        """What is held of the systems that stay, numbered in ascending order; TorchSim then reorders."""
+        """What is held of the systems that stay."""
         kept = system_mask[self.system_idx].nonzero().ravel()
-        number = torch.cumsum(system_mask, 0) - 1
-        return self._part(kept, number[self.system_idx[kept]])
+        return self._part(kept, (torch.cumsum(system_mask, 0) - 1)[self.system_idx[kept]])
 
     def select_sub_constraint(self, atom_idx: torch.Tensor, sys_idx: int) -> Constraints | None:
         """What is held of one system."""
@@ -163,7 +133,6 @@ class Constraints(SystemConstraint):
         return Constraints(self.motions, self.system_idx.to(device=device))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Constraints:
-        """Rows never change: a copy shares the engines."""
         return Constraints(self.motions, self.system_idx.clone())
 
     def __repr__(self) -> str:
@@ -172,30 +141,18 @@ class Constraints(SystemConstraint):
 
 
 def constraints_of(state: SimState) -> Constraints:
-    """The one object of kcons on a state.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    UnsupportedError
-        Another constraint is beside it.
-    """
+    """The one object of kcons on a state; refuses a state without, and other constraints beside it."""
     own = next((item for item in state.constraints if isinstance(item, Constraints)), None)
     if own is None:
         raise InputError("nothing is held on this state; call kcons.torchsim.hold(state, ...) before", item="state")
-    for item in state.constraints:
-        if item is not own:
-            raise UnsupportedError(
-                f"{type(item).__name__} is beside the constraints of kcons, and each would undo the work of the other; "
-                "leave it out"
-            )
+    refuse_others([item for item in state.constraints if item is not own])
     return own
 
 
-def starts_of(state: SimState) -> IntArray:
-    """The first atom of each system, and the number of all atoms, shape (n_systems + 1,)."""
-    return np.concatenate([[0], np.cumsum(state.n_atoms_per_system.cpu().numpy())]).astype(np.int64)
+def refuse_others(constraints: Sequence[Constraint]) -> None:
+    """Refuse constraints of TorchSim, which would undo the work of those of kcons."""
+    for item in constraints:
+        raise UnsupportedError(f"{type(item).__name__} would undo the work of the constraints of kcons; leave it out")
 
 
 def array_of(values: torch.Tensor) -> Any:

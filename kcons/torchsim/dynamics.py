@@ -14,33 +14,23 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch_sim import SimState, calc_kinetic_energy
 from torch_sim.integrators import INTEGRATOR_KWARG_UNITS, IntegratorKwargUnits, MDState
-from torch_sim.integrators.md import NoseHooverChain, construct_nose_hoover_chain
+from torch_sim.integrators.md import InverseTimeArg, NoseHooverChain, TimeArg, construct_nose_hoover_chain
 from torch_sim.models.interface import ModelInterface
-from torch_sim.units import MetalUnits
+from torch_sim.units import unit_factor_from_annotation
 
 from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.torchsim.constraints_object import Constraints, constraints_of
 
 __all__ = ["Integrator", "NoseHooverState", "langevin", "nose_hoover", "nve"]
 
-#: Periods of the first thermostat of a chain in time steps, where none is given; as in TorchSim.
-PERIODS = 10.0
-#: Friction times time step where no friction is given; as in TorchSim.
-FRICTION = 0.01
+#: Without other settings, as in TorchSim: tau over time step, and friction times time step.
+PERIODS, FRICTION = 10.0, 0.01
 
 State = TypeVar("State", bound=MDState)
 
 
 class Integrator(NamedTuple):
-    """What `torch_sim.integrate` takes as its integrator.
-
-    Attributes
-    ----------
-    init : callable
-        ``init(state, model, kT=..., **settings)`` gives the state that steps go on from.
-    step : callable
-        ``step(state, model, dt=..., kT=..., **settings)`` makes one time step of it.
-    """
+    """What `torch_sim.integrate` takes: ``init(state, model, kT=...)``, then ``step(state, model, dt=..., kT=...)``."""
 
     init: Callable[..., Any]
     step: Callable[..., Any]
@@ -53,10 +43,8 @@ class NoseHooverState(MDState):
     Attributes
     ----------
     chain_positions, chain_momenta : torch.Tensor, shape (n_systems, chain_length)
-    tau : torch.Tensor, shape (n_systems,)
-        Period of the first thermostat.
-    target_kT : torch.Tensor, shape (n_systems,)
-        Thermal energy of the last step.
+    tau, target_kT : torch.Tensor, shape (n_systems,)
+        Period of the first thermostat, and the thermal energy of the last step.
     """
 
     chain_positions: torch.Tensor
@@ -64,7 +52,7 @@ class NoseHooverState(MDState):
     tau: torch.Tensor
     target_kT: torch.Tensor
 
-    _system_attributes = MDState._system_attributes | {"chain_positions", "chain_momenta", "tau", "target_kT"}
+    _system_attributes = {*MDState._system_attributes, "chain_positions", "chain_momenta", "tau", "target_kT"}
 
     def get_number_of_degrees_of_freedom(self) -> torch.Tensor:
         """3n less the rank, less 3 where no row knows a place in space: the center of mass then stays at rest."""
@@ -77,11 +65,8 @@ class NoseHooverState(MDState):
         masses = (self.target_kT * self.tau**2)[:, None].repeat(1, self.chain_positions.shape[1])
         masses[:, 0] *= freedom
         kinetic = calc_kinetic_energy(masses=self.masses, momenta=self.momenta, system_idx=self.system_idx)
-        # The functions of TorchSim write into the momenta.
+        # Functions of TorchSim write into the momenta.
         return NoseHooverChain(self.chain_positions, self.chain_momenta.clone(), masses, self.tau, kinetic, freedom)
-
-
-# -- starts ---------------------------------------------------------------------------------------
 
 
 def _start(state: SimState, model: ModelInterface, kT: Any, at_rest: bool) -> MDState:
@@ -122,11 +107,8 @@ def _each(state: SimState, value: Any, atoms: bool = False) -> torch.Tensor:
     return numbers[state.system_idx, None] if atoms else numbers.clone()
 
 
-# -- parts of a step ------------------------------------------------------------------------------
-
-
 def _whole(step: Callable[..., State]) -> Callable[..., State]:
-    """A step that fails leaves the state as it was; what is not finite is told as such."""
+    """A step that fails leaves the state as it was; forces that are not finite are told as such."""
 
     @functools.wraps(step)
     def made(state: State, model: ModelInterface, **settings: Any) -> State:
@@ -134,23 +116,34 @@ def _whole(step: Callable[..., State]) -> Callable[..., State]:
         try:
             return step(state, model, **settings)
         except BaseException as error:
-            forces = state.forces
+            bad = (~torch.isfinite(state.forces).all(dim=1)).nonzero().ravel()
             state.__dict__.clear()
             state.__dict__.update(before)
-            bad = (~torch.isfinite(forces).all(dim=1)).nonzero().ravel()
-            if isinstance(error, ConvergenceError) and len(bad):
-                atom, system = int(bad[0]), int(state.system_idx[bad[0]])
-                raise NonFiniteError(
-                    f"force of atom {atom} (in system {system}) is not finite: look at what the model returned; "
-                    "the state is as before the step",
-                    item="force",
-                    atom=atom,
-                ) from error
-            if isinstance(error, ConvergenceError):
+            if not isinstance(error, ConvergenceError):
+                raise
+            if not len(bad):
                 error.add_note("In TorchSim: take a smaller timestep; the state is as before the step")
-            raise
+                raise
+            atom, system = int(bad[0]), int(state.system_idx[bad[0]])
+            raise NonFiniteError(
+                f"force of atom {atom} (in system {system}) is not finite: look at what the model returned; the state "
+                "is as before the step",
+                item="force",
+                atom=atom,
+            ) from error
 
     return made
+
+
+def _project(state: MDState, held: Constraints) -> None:
+    masses = state.masses[:, None]
+    state.momenta = masses * held.tangent(state, state.momenta / masses)
+
+
+def _kick(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
+    """Let forces act for `dt`; those between atoms whose distance is held may be any."""
+    state.momenta = state.momenta + dt * state.forces
+    _project(state, held)
 
 
 def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
@@ -161,61 +154,38 @@ def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
     state.momenta = state.momenta + masses * push / dt
 
 
-def _kick(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
-    """Let forces act for `dt`; those between atoms whose distance is held may be any."""
-    state.momenta = state.momenta + dt * state.forces
-    _project(state, held)
-
-
-def _project(state: MDState, held: Constraints) -> None:
-    masses = state.masses[:, None]
-    state.momenta = masses * held.tangent(state, state.momenta / masses)
-
-
 def _evaluate(state: MDState, model: ModelInterface) -> None:
     output = model(state)
     state.energy, state.forces = output["energy"], output["forces"]
     state.store_model_extras(output)
 
 
-def _rattle(state: MDState, model: ModelInterface, dt: Any) -> None:
-    """Velocity Verlet on constraints."""
+def _nve_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any) -> MDState:
+    return _start(state, model, kT, at_rest=True)
+
+
+def _rattle(state: State, model: ModelInterface, dt: Any) -> State:
     held, dt = constraints_of(state), _each(state, dt, atoms=True)
     _kick(state, held, dt / 2)
     _drift(state, held, dt)
     _evaluate(state, model)
     _kick(state, held, dt / 2)
-
-
-# -- constant energy ------------------------------------------------------------------------------
-
-
-def _nve_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any) -> MDState:
-    """Momenta at `kT` on the constraints, without that of the center of mass; those of the state if it has some."""
-    return _start(state, model, kT, at_rest=True)
-
-
-@_whole
-def _nve_step(state: MDState, model: ModelInterface, *, dt: Any, **_: Any) -> MDState:
-    """A step of RATTLE."""
-    _rattle(state, model, dt)
     return state
 
 
-# -- Langevin dynamics ----------------------------------------------------------------------------
+@_whole
+def _nve_step(state: State, model: ModelInterface, *, dt: Any, **_: Any) -> State:
+    return _rattle(state, model, dt)
 
 
 def _langevin_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any) -> MDState:
-    """Momenta at `kT` on the constraints; those of the state if it has some."""
     return _start(state, model, kT, at_rest=False)
 
 
 @_whole
 def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, gamma: Any = None) -> MDState:
-    """Kick, half a drift, friction and noise, half a drift: g-BAOAB between its kicks."""
     held, dt = constraints_of(state), _each(state, dt, atoms=True)
-    friction = FRICTION / dt if gamma is None else _each(state, gamma, atoms=True)
-    keep = torch.exp(-friction * dt)
+    keep = torch.exp(torch.full_like(dt, -FRICTION) if gamma is None else -_each(state, gamma, atoms=True) * dt)
     _kick(state, held, dt)
     _drift(state, held, dt / 2)
     noise = torch.randn(state.momenta.shape, device=state.device, dtype=state.dtype, generator=state.rng)
@@ -228,38 +198,29 @@ def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, g
     return state
 
 
-# -- Nosé-Hoover chains ---------------------------------------------------------------------------
-
-
 def _nose_hoover_init(
-    state: SimState, model: ModelInterface, *, kT: Any, dt: Any, tau: Any = None, chain_length: int = 3, **_: Any
+    state: SimState, model: ModelInterface, *, kT: Any, dt: Any, tau: Any = None, chain_length: int = 3
 ) -> NoseHooverState:
-    """Momenta at `kT`, as for constant energy, and chains at rest."""
     made = _start(state, model, kT, at_rest=True)
     rest = torch.zeros((state.n_systems, chain_length), dtype=state.dtype, device=state.device)
-    return NoseHooverState.from_state(
-        made,
-        chain_positions=rest,
-        chain_momenta=rest.clone(),
-        tau=_each(state, PERIODS * dt if tau is None else tau),
-        target_kT=_each(state, kT),
-    )
+    period = _each(state, PERIODS * dt if tau is None else tau)
+    chain = {"chain_positions": rest, "chain_momenta": rest.clone(), "tau": period, "target_kT": _each(state, kT)}
+    return NoseHooverState.from_state(made, **chain)
 
 
 @_whole
-def _nose_hoover_step(state: NoseHooverState, model: ModelInterface, *, dt: Any, kT: Any, **_: Any) -> NoseHooverState:
-    """Half a step of the chains, a step of RATTLE, half a step of the chains."""
+def _nose_hoover_step(state: NoseHooverState, model: ModelInterface, *, dt: Any, kT: Any) -> NoseHooverState:
     state.target_kT = _each(state, kT)
     half_step = construct_nose_hoover_chain(dt, state.chain_positions.shape[1], 3, 3, state.tau).half_step
     for first in (True, False):
         momenta, chain = half_step(state.momenta, state.chain, state.target_kT, state.system_idx)
         state.momenta, state.chain_positions, state.chain_momenta = momenta, chain.positions, chain.momenta
         if first:
-            _rattle(state, model, dt)
+            state = _rattle(state, model, dt)
     return state
 
 
-#: Constant energy by RATTLE (velocity Verlet on constraints).
+#: Constant energy by RATTLE. Momenta are drawn without that of the center of mass.
 nve = Integrator(_nve_init, _nve_step)
 #: Langevin dynamics by geodesic BAOAB, with ``gamma`` as in TorchSim. Momenta are those before the kick, which have the
 #: right temperature.
@@ -267,6 +228,7 @@ langevin = Integrator(_langevin_init, _langevin_step)
 #: Nosé-Hoover chains around RATTLE; ``tau`` and ``chain_length`` in ``init_kwargs``, as in TorchSim.
 nose_hoover = Integrator(_nose_hoover_init, _nose_hoover_step)
 
-# `torch_sim.integrate` converts settings of the integrators that it has listed: per ps and ps, as for its own.
-INTEGRATOR_KWARG_UNITS[langevin] = {"gamma": IntegratorKwargUnits((("step", 1 / MetalUnits.time),))}  # type: ignore[index]
-INTEGRATOR_KWARG_UNITS[nose_hoover] = {"tau": IntegratorKwargUnits((("init", float(MetalUnits.time)),))}  # type: ignore[index]
+# `torch_sim.integrate` converts settings of the integrators that are listed: from 1/ps and ps, as for its own.
+for pair, name, call, unit in ((langevin, "gamma", "step", InverseTimeArg), (nose_hoover, "tau", "init", TimeArg)):
+    factors = ((call, unit_factor_from_annotation(unit)),)
+    INTEGRATOR_KWARG_UNITS.update({pair: {name: IntegratorKwargUnits(factors)}})  # type: ignore[dict-item]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from itertools import pairwise
-from typing import Any, Literal, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -13,18 +12,17 @@ from torch_sim import SimState
 from torch_sim.constraints import FixAtoms
 from torch_sim.integrators import MDState
 
-from kcons.batched import BatchReport
 from kcons.constraints import Constraint, FixedAtoms
 from kcons.constraints.arguments import check_pairs
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
+from kcons.motion.report import Report
 from kcons.topology.holding import Holding, Options
 from kcons.topology.rows_by_name import rows_of
 from kcons.topology.topology import Snapshot, Topology, require_kind, selected_numbers, sorted_pairs
-from kcons.torchsim.constraints_object import Constraints, array_of, constraints_of, starts_of
+from kcons.torchsim.constraints_object import Constraints, array_of, constraints_of, refuse_others
 
 __all__ = ["hold", "report"]
 
@@ -44,7 +42,6 @@ def hold(
     *,
     bonds: Any = None,
     project: bool = False,
-    degenerate: Literal["convert", "raise"] = "convert",
     **options: Unpack[Options],
 ) -> Constraints:
     """Hold the same constraints in each system of a TorchSim state from now on, checked at once.
@@ -63,8 +60,6 @@ def hold(
         Bonds of a system; without them all are guessed from distances.
     project : bool
         Whether to move atoms that are off explicit targets onto them instead of raising.
-    degenerate : {'convert', 'raise'}
-        What to do about rows that are singular to first order, see `kcons.Motion`.
     **options
         rigid_water, water_geometry, rigid_bodies, select, ...: see `kcons.topology.Holding`.
 
@@ -82,7 +77,6 @@ def hold(
         Targets that move with time, constraints on velocities, other constraints of TorchSim.
     """
     require_kind(state, SimState, "state", "a torch_sim.SimState")
-    fixed = _fixed_atoms(state)
     given = [constraints] if isinstance(constraints, str | Constraint) else list(constraints)
     objects = [item for item in given if not isinstance(item, str)]
     for item in objects:
@@ -90,52 +84,52 @@ def hold(
         if item.moving or not item.holonomic:
             what = "moves with time" if item.holonomic else "constrains velocities"
             raise UnsupportedError(f"{item!r} {what}, and TorchSim tells no time; use kcons.steppers")
+    words = [word.strip().lower() for text in given if isinstance(text, str) for word in text.split(",")]
+    kinds = [word for word in words if word != "water"] or ["none"]
+    if len(kinds) > 1:
+        raise InputError(f"{kinds[0]} and {kinds[1]} are two names of bonds; give one of them", item="constraints")
     if bonds is None:
         options.setdefault("guess_bonds", True)  # a state has none
-    holding = _holding([item for item in given if isinstance(item, str)], options)
-    if holding is None and not objects and not any(map(len, fixed)):
+    holding = Holding(kinds[0], **options) if words else None
+    marked = _fixed_atoms(state)
+    if holding is None and not objects and not marked.any():
         raise InputError("nothing is to be held; give names or constraints", item="constraints")
-    known: dict[tuple[Any, ...], tuple[Motion, FloatArray]] = {}
-    motions, positions = [], []
-    for k, pinned in enumerate(fixed):
-        snapshot = _snapshot(state, k, bonds)
-        cell = None if snapshot.cell is None else snapshot.cell.tobytes()
-        parts = snapshot.positions, snapshot.topology.masses, snapshot.topology.elements, pinned
+    known: dict[tuple[bytes, ...], tuple[Motion, FloatArray]] = {}
+    found = []
+    ends = torch.cumsum(state.n_atoms_per_system, 0).tolist()
+    for k, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
+        snapshot, fixed = _snapshot(state, k, slice(start, end), bonds), np.flatnonzero(marked[start:end])
+        cell = np.zeros(0) if snapshot.cell is None else snapshot.cell
+        parts = cell, snapshot.positions, snapshot.topology.masses, snapshot.topology.elements, fixed
         # Copies of one system share its engine.
-        key = (cell, *(part.tobytes() for part in parts))
+        key = tuple(part.tobytes() for part in parts)
         if key not in known:
             try:
-                numbers = partial(selected_numbers, n=snapshot.topology.n_atoms)
+                numbers = partial(selected_numbers, n=end - start)
                 rows = [] if holding is None else list(rows_of(snapshot, holding, numbers, "pass bonds= of all atoms"))
-                rows += [*objects, *([FixedAtoms(pinned)] if len(pinned) else [])]
-                known[key] = _bound(rows, snapshot, project, degenerate, state.dtype)
+                rows += [*objects, *([FixedAtoms(fixed)] if len(fixed) else [])]
+                known[key] = _bound(rows, snapshot, project, torch.finfo(state.dtype).eps)
             except KconsError as error:
                 error.add_note(f"In system {k} of the state, whose atoms are numbered from 0")
                 raise
-        motions.append(known[key][0])
-        positions.append(known[key][1])
-    held = Constraints(motions, torch.arange(len(motions), device=state.device))
+        found.append(known[key])
     if project:
-        state.positions = torch.as_tensor(np.concatenate(positions), dtype=state.dtype, device=state.device)
+        moved = np.concatenate([x for _, x in found])
+        state.positions = torch.as_tensor(moved, dtype=state.dtype, device=state.device)
+    held = Constraints([motion for motion, _ in found], torch.arange(len(found), device=state.device))
     state.constraints = [held]
     return held
 
 
-def report(state: SimState) -> BatchReport:
-    """How well a state keeps what is held: residuals of positions, and of momenta where there are any, by system.
-
-    Raises
-    ------
-    InputError
-        Nothing is held on the state.
-    """
+def report(state: SimState) -> list[Report]:
+    """What the engine of each held system reports: residuals of positions, and of momenta where there are any, rank."""
     batch, atoms = constraints_of(state).batch(state)
     part = slice(None) if atoms is None else atoms
     return batch.report(state.positions[part], state.velocities[part] if isinstance(state, MDState) else None)
 
 
-def _fixed_atoms(state: SimState) -> list[IntArray]:
-    """Atoms that TorchSim's FixAtoms holds, of each system numbered from 0; refuses other constraints."""
+def _fixed_atoms(state: SimState) -> Any:
+    """Atoms that TorchSim's FixAtoms holds, as a mask; refuses other constraints."""
     marked = np.zeros(state.n_atoms, dtype=bool)
     for item in state.constraints:
         if isinstance(item, Constraints):
@@ -144,57 +138,37 @@ def _fixed_atoms(state: SimState) -> list[IntArray]:
                 item="state",
             )
         if not isinstance(item, FixAtoms):
-            raise UnsupportedError(f"{type(item).__name__} would undo the work of kcons' constraints; leave it out")
+            refuse_others([item])
         marked[item.atom_idx.cpu().numpy()] = True
-    return [np.flatnonzero(marked[start:end]) for start, end in pairwise(starts_of(state))]
+    return marked
 
 
-def _holding(named: Iterable[str], options: Any) -> Holding | None:
-    """What names mean; None without any."""
-    words = [word.strip().lower() for text in named for word in text.split(",")]
-    kinds = [word for word in words if word != "water"]
-    if len(kinds) > 1:
-        raise InputError(f"{kinds[0]} and {kinds[1]} are two names of bonds; give one of them", item="constraints")
-    return Holding(kinds[0] if kinds else "none", **options) if words else None
-
-
-def _snapshot(state: SimState, system: int, bonds: Any) -> Snapshot:
+def _snapshot(state: SimState, system: int, atoms: slice, bonds: Any) -> Snapshot:
     """Topology and positions of one system in double precision."""
-    start, end = starts_of(state)[system : system + 2].tolist()
-    n, none = end - start, np.array([""])
-    symbols = np.array(SYMBOLS.split())[state.atomic_numbers[start:end].cpu().numpy()]
-    elements = np.where(symbols == "X", "", symbols)
+    symbols = np.array(SYMBOLS.split())[state.atomic_numbers[atoms].cpu().numpy()]
+    elements, n, none = np.where(symbols == "X", "", symbols), len(symbols), np.array([""])
     pairs = sorted_pairs(np.zeros((0, 2), np.int64) if bonds is None else check_pairs(bonds, n))
-    masses = array_of(state.masses[start:end])
-    topology = Topology(
-        symbols, elements, masses, np.zeros(n, np.int64), none, np.array(["1"]), none, pairs, residues_known=False
-    )
-    pbc = state.pbc.cpu().numpy()
+    masses, pbc = array_of(state.masses[atoms]), state.pbc.cpu().numpy()
+    topology = Topology(symbols, elements, masses, np.zeros(n, np.int64), none, none, none, pairs, residues_known=False)
     cell = array_of(state.row_vector_cell[system]) if pbc.any() else None
-    return Snapshot(topology, array_of(state.positions[start:end]), 1.0, cell, pbc, host="TorchSim state")
+    return Snapshot(topology, array_of(state.positions[atoms]), 1.0, cell, pbc, host="TorchSim state")
 
 
-def _bound(
-    rows: Sequence[Constraint],
-    snapshot: Snapshot,
-    project: bool,
-    degenerate: Literal["convert", "raise"],
-    dtype: torch.dtype,
-) -> tuple[Motion, FloatArray]:
+def _bound(rows: Sequence[Constraint], snapshot: Snapshot, project: bool, eps: float) -> tuple[Motion, FloatArray]:
     """The engine for one system, and its positions on the rows."""
     x = snapshot.positions
     held = ConstraintSet(rows, x, snapshot.topology.masses, cell=snapshot.cell, pbc=snapshot.pbc.tolist())
-    motion = Motion(held, x, degenerate=degenerate)
-    found = held.residuals(x)
-    rounding = torch.finfo(dtype).eps / torch.finfo(torch.float64).eps
-    excess = np.abs(found.sigma) / np.maximum(START_TOLERANCE * held.scale, rounding * found.allowed)
-    row = int(np.argmax(excess))
+    motion = Motion(held, x)
     if project:
         return motion, motion.restore_positions(x)
-    if excess[row] <= 1:
-        return motion, x
-    raise InputError(
-        f"positions are off {held.row_name(row)} by {abs(found.sigma[row]):.6g}; pass project=True to bring them there",
-        item="positions",
-        atoms=held.row_atoms(row),
-    )
+    found = held.residuals(x)
+    excess = np.abs(found.sigma) / np.maximum(START_TOLERANCE * held.scale, eps / np.finfo(float).eps * found.allowed)
+    row = int(np.argmax(excess))
+    if excess[row] > 1:
+        raise InputError(
+            f"positions are off {held.row_name(row)} by {abs(found.sigma[row]):.6g}; pass project=True to bring them "
+            "there",
+            item="positions",
+            atoms=held.row_atoms(row),
+        )
+    return motion, x

@@ -12,7 +12,7 @@ import torch_sim as ts
 from torch_models import Butanes, Drops, K, butane, drop, state_of
 
 from kcons.constraints import Distance, LinearVelocity
-from kcons.errors import InputError, SingularGeometryError, UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.torchsim import hold, nve, report
 
 
@@ -133,13 +133,10 @@ def test_a_state_that_has_become_another_is_refused(change, says):
         nve.init(state, Drops(), kT=300 * K)
 
 
-def test_degenerate_rows_are_converted_or_refused():
+def test_rows_that_are_singular_are_converted():
     """Three distances of atoms in a line are singular at second order."""
     line = state_of([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]], [8, 6, 8], [16.0, 12.0, 16.0])
-    rows = Distance([[0, 1], [1, 2], [0, 2]])
-    with pytest.raises(SingularGeometryError):
-        hold(line, rows, degenerate="raise")
-    hold(line, rows)
+    hold(line, Distance([[0, 1], [1, 2], [0, 2]]))
     assert line.get_number_of_degrees_of_freedom().tolist() == [5]
 
 

@@ -9,7 +9,7 @@ import torch_sim as ts
 from torch_models import Butanes, Drops, butane, drop, off, state_of
 
 from kcons.constraints import Dihedral, Distance, FixedAtoms
-from kcons.torchsim import Constraints, hold, langevin, nose_hoover, nve
+from kcons.torchsim import Constraints, hold, langevin, nose_hoover, nve, report
 
 SIZES = (5, 2, 3)
 
@@ -34,6 +34,7 @@ def test_slices_take_the_right_rows_along():
         part = state[order]
         assert [motion.n_atoms for motion in in_order(part)] == [3 * SIZES[k] for k in order]
         assert off(part).max() < 1e-12
+        assert [found.rank for found in report(part)] == [3 * SIZES[k] for k in order]
 
 
 def in_order(state):
