@@ -100,7 +100,9 @@ class Batch:
         self._numbers: dict[Motion, list[int]] = {}
         for number, each in enumerate(self.systems):
             self._numbers.setdefault(each, []).append(number)
-        self.system_idx = self._whole(np.repeat(np.arange(self.n_systems), np.diff(self.atom_starts)))
+        self.system_idx = torch.as_tensor(
+            np.repeat(np.arange(self.n_systems), np.diff(self.atom_starts)), device=self.device
+        )
         self.masses = self._joined(lambda each: each.masses)
         self.targets = self._joined(lambda each: each.constraint_set.target(0.0))
         self.ranks = self._joined(lambda each: [each.rank], torch.int64)
@@ -122,9 +124,6 @@ class Batch:
         self._set_lattices()
         self._groups = self._grouped(True)
 
-    def _whole(self, numbers: IntArray) -> Tensor:
-        return torch.as_tensor(numbers, device=self.device)
-
     def _joined(self, of: Any, dtype: torch.dtype | None = None) -> Tensor:
         """Numbers of each system, one after another."""
         known = {each: of(each) for each in self._numbers}
@@ -134,7 +133,7 @@ class Batch:
     def _placed(self, starts: IntArray, of: Any) -> Tensor:
         """Numbers of atoms or rows of all systems."""
         some = [np.asarray(of(each), dtype=np.int64) + start for each, start in zip(self.systems, starts, strict=False)]
-        return self._whole(np.concatenate(some))
+        return torch.as_tensor(np.concatenate(some), device=self.device)
 
     def _inverse(self, masses: Tensor) -> Tensor:
         return torch.where(self._free, 1.0 / torch.where(self._free, masses, 1.0), 0.0)

@@ -59,16 +59,8 @@ class Pattern(NamedTuple):
 class Problem(NamedTuple):
     """What clusters of one pattern are given; the last axis is by cluster, or 1 where all are alike.
 
-    Attributes
-    ----------
-    base, start : Tensor, shape (3 places, n)
-        Places of rows, and those whose gradients give the directions.
-    way : Tensor, shape (3 n_atoms, n), or None
-        How far atoms have come from the start, where rows of velocities count.
-    w, held, p : Tensor, shape (n_atoms, n), (n_rows, n), (n_parameters, n)
-        Inverse masses, what rows are held at, and parameters.
-    t, t_start : Tensor
-        Times.
+    Places of rows and those where directions are taken (`start`), (3 places, n), and how far atoms have come from there
+    where rows of velocities count (`way`), (3 n_atoms, n); inverse masses `w`, what rows are `held` at, parameters `p`.
     """
 
     base: Tensor
