@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -86,7 +86,7 @@ def _kinds(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
     return found
 
 
-@cache
+@lru_cache(512)
 def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Any:
     """The equations of a pattern; of small ones compiled where that is asked for."""
     made: Clusters = Lanes(pattern) if pattern.small else Levels(pattern, device)
