@@ -41,15 +41,15 @@ def tree() -> tuple[Motion, np.ndarray]:
 
 
 def medians(call: Callable[[], Any], device: str, repeats: int = 9) -> float:
-    """Seconds."""
-    found = []
-    for _ in range(repeats):
-        begun = time.perf_counter()
+    """Seconds, of one thread on a processor."""
+
+    def done() -> None:
         call()
         if device != "cpu":
             torch.cuda.synchronize()
-        found.append(time.perf_counter() - begun)
-    return float(np.median(found))
+
+    clock = time.process_time if device == "cpu" else time.perf_counter
+    return float(np.median(harness.in_turn({"": done}, repeats, clock)[""]))
 
 
 def launches(call: Callable[[], Any], device: str) -> int:
@@ -158,6 +158,7 @@ def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
 def main() -> None:
     parser = harness.options(__doc__, "batched")
     parser.add_argument("--device", default="cpu", help="cpu (default), or cuda")
+    parser.set_defaults(torch=torch.__version__)
     harness.main("batched", parser, pieces, tables)
 
 

@@ -100,7 +100,9 @@ class Batch:
         self._numbers: dict[Motion, list[int]] = {}
         for number, each in enumerate(self.systems):
             self._numbers.setdefault(each, []).append(number)
-        self.system_idx = self._whole(np.repeat(np.arange(self.n_systems), np.diff(self.atom_starts)))
+        self.system_idx = torch.as_tensor(
+            np.repeat(np.arange(self.n_systems), np.diff(self.atom_starts)), device=self.device
+        )
         self.masses = self._joined(lambda each: each.masses)
         self.targets = self._joined(lambda each: each.constraint_set.target(0.0))
         self.ranks = self._joined(lambda each: [each.rank], torch.int64)
@@ -122,9 +124,6 @@ class Batch:
         self._set_lattices()
         self._groups = self._grouped(True)
 
-    def _whole(self, numbers: IntArray) -> Tensor:
-        return torch.as_tensor(numbers, device=self.device)
-
     def _joined(self, of: Any, dtype: torch.dtype | None = None) -> Tensor:
         """Numbers of each system, one after another."""
         known = {each: of(each) for each in self._numbers}
@@ -134,7 +133,7 @@ class Batch:
     def _placed(self, starts: IntArray, of: Any) -> Tensor:
         """Numbers of atoms or rows of all systems."""
         some = [np.asarray(of(each), dtype=np.int64) + start for each, start in zip(self.systems, starts, strict=False)]
-        return self._whole(np.concatenate(some))
+        return torch.as_tensor(np.concatenate(some), device=self.device)
 
     def _inverse(self, masses: Tensor) -> Tensor:
         return torch.where(self._free, 1.0 / torch.where(self._free, masses, 1.0), 0.0)
@@ -216,7 +215,7 @@ class Batch:
             wanted = f"a tensor of shape ({self.n_atoms}, 3) or (copies, atoms, 3)"
             raise InputError(f"{item} must be {wanted}, not {shape}", item=item)
         if x.dtype != self.dtype or x.device.type != self.device.type:
-            here = f"{self.dtype} on {self.device}; use Batch.to"
+            here = f"{self.dtype} on {self.device}; convert it"
             raise InputError(f"{item}: {x.dtype} on {x.device}, but this batch is {here}", item=item)
         return x.reshape(-1, 3)
 
@@ -405,35 +404,25 @@ class Batch:
 
     def report(self, x: Tensor, v: Tensor | None = None, *, time: float = 0.0) -> list[Report]:
         """What each system's engine reports of its positions, and velocities: residuals, rank, kinds of clusters."""
-        parts = [None if y is None else self._flat(y, "x or v").detach().cpu().double().numpy() for y in (x, v)]
+        both = (x, x) if v is None else (x, v)
+        here, speed = (self._flat(each, "x or v").detach().cpu().double().numpy() for each in both)
         found = []
         for k, motion in enumerate(self.systems):
             some, before = slice(*self.atom_starts[k : k + 2]), motion.lattice
             if before is not None and self._lattice is not None:
                 motion.set_cell(self._lattice[k, 0].cpu().double().numpy(), before[1].any(axis=0).tolist())
-            here, speed = (None if part is None else part[some] for part in parts)
-            assert here is not None
-            found.append(motion.report(here, speed, time, condition=False))
+            found.append(motion.report(here[some], None if v is None else speed[some], time, condition=False))
             if before is not None:
                 motion.set_cell(before[0], before[1].any(axis=0).tolist())
         return found
 
-    # -- other batches --------------------------------------------------------------------------------
-
     def select(self, systems: Sequence[int]) -> Batch:
         """A batch of some of the systems, in this order, in their cells."""
         numbers = np.arange(self.n_systems)[list(systems)].tolist()
-        return self._again(numbers, self.device, self.dtype)
-
-    def to(self, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> Batch:
-        """The same batch on another device, or with another type of number."""
-        return self._again(list(range(self.n_systems)), device or self.device, dtype or self.dtype)
-
-    def _again(self, numbers: list[int], device: Any, dtype: torch.dtype) -> Batch:
-        options = {"compiled": self.compiled, "check_every": self.check_every}
-        made = Batch([self.systems[k] for k in numbers], device=device, dtype=dtype, **options)
+        some = [self.systems[k] for k in numbers]
+        made = Batch(some, device=self.device, dtype=self.dtype, compiled=self.compiled, check_every=self.check_every)
         if self._lattice is not None and made._lattice is not None:
-            made._lattice = self._lattice[numbers].to(made.device, dtype)
+            made._lattice = self._lattice[numbers]
         return made
 
     def __repr__(self) -> str:

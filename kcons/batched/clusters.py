@@ -59,16 +59,8 @@ class Pattern(NamedTuple):
 class Problem(NamedTuple):
     """What clusters of one pattern are given; the last axis is by cluster, or 1 where all are alike.
 
-    Attributes
-    ----------
-    base, start : Tensor, shape (3 places, n)
-        Places of rows, and those whose gradients give the directions.
-    way : Tensor, shape (3 n_atoms, n), or None
-        How far atoms have come from the start, where rows of velocities count.
-    w, held, p : Tensor, shape (n_atoms, n), (n_rows, n), (n_parameters, n)
-        Inverse masses, what rows are held at, and parameters.
-    t, t_start : Tensor
-        Times.
+    Places of rows and those where directions are taken (`start`), (3 places, n), and how far atoms have come from there
+    where rows of velocities count (`way`), (3 n_atoms, n); inverse masses `w`, what rows are `held` at, parameters `p`.
     """
 
     base: Tensor
@@ -88,11 +80,10 @@ class Problem(NamedTuple):
 class Clusters:
     """Equations of the clusters of one pattern.
 
-    Vectors of rows have shape (rank, n) or (n_rows, n), those of atoms (3 n_atoms, n). What depends on whether numbers
-    have tensors of their own: `rows_of`, `atoms_of` and `weights` make lists of such vectors and of inverse masses, and
-    `packed` tensors of lists; `evaluate` gives values and gradients A with atoms moved; `couple` A W B^T of the rows
-    that are solved for, `solve` and `diagonal` are of such matrices; `spread` gives A^T lambda, `contract` A v,
-    `solved` those of all rows that are solved for, and `off` value less target.
+    Vectors of rows have shape (rank, n) or (n_rows, n), those of atoms (3 n_atoms, n). `rows_of`, `atoms_of` and
+    `weights` make lists of vectors and of inverse masses, `packed` tensors of lists. `evaluate` gives values and
+    gradients A with atoms moved, `couple` A W B^T of the rows that are solved for, `spread` A^T lambda, `contract` A v,
+    `solved` the rows that are solved for, and `off` value less target.
     """
 
     rows_of: Any
@@ -133,15 +124,8 @@ class Clusters:
     def newton_adjoint(self, of: Problem, lam: Tensor, pushed: Tensor, bent: Tensor, _: Tensor) -> tuple[Tensor, ...]:
         """Derivatives at the solution `of.base`, by one solve with the transposed matrix.
 
-        Parameters
-        ----------
-        pushed, bent : Tensor
-            Derivatives by how far atoms were moved, and by multipliers.
-
-        Returns
-        -------
-        tuple of Tensor
-            By positions, by positions of the start, by targets, and by inverse masses.
+        By positions, by those of the start, by targets and by inverse masses; of derivatives by how far atoms are
+        `pushed` and by multipliers (`bent`).
         """
         there, slope = self.evaluate(of.at_start, None)[1], self.evaluate(of, None)[1]
         s = self.couple(slope, there, self.weights(of.w))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -86,7 +86,7 @@ def _kinds(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
     return found
 
 
-@cache
+@lru_cache(512)
 def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Any:
     """The equations of a pattern; of small ones compiled where that is asked for."""
     made: Clusters = Lanes(pattern) if pattern.small else Levels(pattern, device)
@@ -120,7 +120,10 @@ class Group:
         self.p, self.scale, self._offsets = (of_all(lambda kind, *_, k=k: kind[k], like.dtype) for k in (1, 2, 3))
         self.flat = _flat(self.atoms)
         self.moving = [3 * a + c for a in range(pattern.n_atoms) if a not in pattern.fixed for c in range(3)]
-        now, before, first, begin = [], [], [], []
+        now: list[int] = []
+        before: list[int] = []
+        first: list[int] = []
+        begin: list[int] = []
         for row in pattern.rows:
             now += row.places
             before += row.atoms[:-1] if row.relative else row.atoms

@@ -13,10 +13,9 @@ from kcons.plan.clusters_alike import elimination
 
 
 class _Level(NamedTuple):
-    """Rows that are eliminated at once.
+    """Rows that are eliminated at once; their factors, and products of these with what is beside the pivots.
 
-    `factor` has of each factor its entry, the row eliminated and the later row; `product` of each product the factor,
-    the entry beside the pivot, and the entry it is taken from.
+    A factor has its entry, the row and a later row; a product the factor, the entry beside, and that it is taken from.
     """
 
     rows: Tensor
@@ -25,7 +24,7 @@ class _Level(NamedTuple):
 
 
 class _Program(NamedTuple):
-    """What elimination does: levels; entries by row and column, the entry across the diagonal, and those on it."""
+    """Levels; of entries row, column, and the entry across the diagonal; entries on the diagonal."""
 
     levels: list[_Level]
     row: Tensor
@@ -48,7 +47,8 @@ def _program(pattern: Pattern, device: torch.device) -> tuple[_Program, dict[tup
     numbers = {pair: k for k, pair in enumerate([*((k, k) for k in place), *pairs])}
     levels = []
     for begin, end in zip(order.levels[:-1], order.levels[1:], strict=True):
-        factor, product = [], []
+        factor: list[tuple[int, int, int]] = []
+        product: list[tuple[int, int, int]] = []
         for here, some in zip(place[begin:end], later[begin:end], strict=True):
             for there in some:
                 product += [(len(factor), numbers[here, j], numbers[there, j]) for j in some]
@@ -90,16 +90,6 @@ class _Solution(torch.autograd.Function):
         return -a[ctx.program.row] * y[ctx.program.column], a, None
 
 
-class _Alike(NamedTuple):
-    """Rows of one function: the first of them; places and parameters of each, its atoms, and atoms of its places."""
-
-    row: Any
-    places: Tensor
-    parameters: Tensor
-    atoms: Tensor
-    taken: Tensor
-
-
 class Levels(Clusters):
     """See `Clusters`; gradients have shape (atoms in rows, 3, n), matrices (entries, n)."""
 
@@ -108,18 +98,19 @@ class Levels(Clusters):
         self.program, numbers = _program(pattern, device)
         rows = pattern.rows
         alike: dict[Any, list[int]] = {}
-        places, parameters, slots = [], [], []
-        place = number = slot = 0
+        columns: list[list[Any]] = [[], [], [], [row.atoms for row in rows], [row.places for row in rows]]
+        ends = [0, 0, 0]
         for k, row in enumerate(rows):
             alike.setdefault((row.function, row.relative), []).append(k)
-            places.append(range(place, place := place + len(row.places)))
-            parameters.append(range(number, number := number + row.parameters))
-            slots.append(range(slot, slot := slot + len(row.atoms)))
-        self.alike = []
-        for some in alike.values():
-            tables = [[t[k] for k in some] for t in (places, parameters)]
-            tables += [[rows[k].atoms for k in some], [rows[k].places for k in some]]
-            self.alike.append(_Alike(rows[some[0]], *(_table(t, len(t[0]), device).T for t in tables)))
+            for c, size in enumerate((len(row.atoms), len(row.places), row.parameters)):
+                columns[c].append(range(ends[c], ends[c] + size))
+                ends[c] += size
+        slots = columns[0]
+        #: Of rows of one function the first, and of each its places, parameters, atoms, and atoms of places.
+        self.alike = [
+            (rows[some[0]], *(_table([c[k] for k in some], len(c[some[0]]), device).T for c in columns[1:]))
+            for some in alike.values()
+        ]
         order = [k for some in alike.values() for k in some]
         self.order = torch.tensor(order, device=device).argsort()
         self.slots = torch.tensor([i for k in order for i in slots[k]], device=device).argsort()
@@ -149,22 +140,22 @@ class Levels(Clusters):
     def evaluate(self, of: Problem, u: Vector | None) -> tuple[Vector, Any]:
         n, zero = of.base.shape[-1], of.base.new_zeros(())
         values, slopes = [], []
-        for some in self.alike:
-            row, function = some.row, some.row.function
+        for row, places, parameters, atoms, taken in self.alike:
+            function = row.function
             flies = of.way is not None and not function.holonomic
-            r = of.base.reshape(-1, 3, n)[some.places]
+            r = of.base.reshape(-1, 3, n)[places]
             if u is not None:
-                r = r + (u[0][some.taken] - u[0][some.atoms[:, :1]] if row.relative else u[0][some.taken])
+                r = r + (u[0][taken] - u[0][atoms[:, :1]] if row.relative else u[0][taken])
             if flies:
-                r = 0.5 * (r + of.start.reshape(-1, 3, n)[some.places])
+                r = 0.5 * (r + of.start.reshape(-1, 3, n)[places])
             if row.relative:
                 r = torch.cat([torch.zeros_like(r[:, :1]), r], 1)
             if not function.holonomic:
                 come = torch.zeros_like(r)
                 if of.way is not None:
-                    come = of.way.reshape(-1, 3, n)[some.atoms] + (0.0 if u is None else u[0][some.atoms])
+                    come = of.way.reshape(-1, 3, n)[atoms] + (0.0 if u is None else u[0][atoms])
                 r = torch.cat([r, come], 1)
-            numbers, coordinates = of.p[some.parameters].unbind(1), r.reshape(len(r), -1, n).unbind(1)
+            numbers, coordinates = of.p[parameters].unbind(1), r.reshape(len(r), -1, n).unbind(1)
             value, steep = function(coordinates, numbers, 0.5 * (of.t + of.t_start) if flies else of.t)
             values.append((zero + value).expand(len(r), n))
             slopes.append(torch.stack([(zero + e).expand(len(r), n) for e in steep], 1).reshape(-1, 3, n))

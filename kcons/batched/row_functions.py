@@ -50,15 +50,9 @@ def run(tape: Tape, r: Sequence[Any], p: Sequence[Any], t: Any) -> list[Any]:
 class RowFunction(NamedTuple):
     """What rows are computed by, equal for rows that are computed alike.
 
-    Attributes
-    ----------
-    tape : Tape or None
-        Value and gradient of a declaration; the value alone of a function of NumPy.
-    called : callable or None
-        A function of torch, of positions of shape (width, 3) and, where it is `timed`, the time.
-    width : int
-    holonomic, timed : bool
-        Whether it is a function of positions alone (else of the middle of a flight and of the way); of the time.
+    `tape` has value and gradient of a declaration, and the value alone of a function of NumPy; `called` is a function
+    of torch, of positions of shape (width, 3) and, where it is `timed`, the time. What is not `holonomic` is a function
+    of the middle of a flight and of the way.
     """
 
     tape: Tape | None

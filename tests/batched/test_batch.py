@@ -87,7 +87,6 @@ def test_single_precision_is_two_units_in_the_last_place():
     assert (lengths - wanted).abs().max() <= 2 * 2.0**-17
     v = batch.project_velocities(x, y)
     assert batch.report(x, v)[0].velocity_residual < 1e-5 * float(y.abs().max())
-    assert batch.to(dtype=torch.float64).dtype == torch.float64
 
 
 def test_systems_are_selected_with_their_cells():
@@ -118,7 +117,7 @@ def test_what_is_refused():
     batch, x = Batch(water(), copies=2), torch.as_tensor(np.concatenate([WATER, WATER]))
     with pytest.raises(InputError, match=r"x_new must be a tensor of shape \(6, 3\)"):
         batch.project_positions(x[:3], x)
-    with pytest.raises(InputError, match=r"x_reference: torch.float32 on cpu.*Batch.to"):
+    with pytest.raises(InputError, match=r"x_reference: torch.float32 on cpu.*convert it"):
         batch.project_positions(x, x.float())
     with pytest.raises(InputError, match=r"targets must be a tensor of shape \(6,\)"):
         batch.project_positions(x, x, targets=torch.ones(4, dtype=torch.float64))
@@ -149,7 +148,7 @@ def test_functions_of_users_are_traced_or_refused():
     wanted = Batch(Motion(ConstraintSet(Distance([0, 1]), x.numpy(), MASSES), x.numpy())).project_positions(y, x)
     for function in (lambda r: np.linalg.norm(r[0] - r[1]), norm):
         assert (pair(function).project_positions(y, x) - wanted).abs().max() < 1e-14
-    with pytest.raises(UnsupportedError, match=r"cannot be run on tensors.*a branch.*as a Formula"):
+    with pytest.raises(UnsupportedError, match=r"cannot be run on tensors.*the function greater.*as a Formula"):
         pair(lambda r: float(r[0, 0] + r[1, 1]) if r[0, 0] > -9 else 1.0)
 
 

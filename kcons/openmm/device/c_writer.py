@@ -91,9 +91,9 @@ def openmm_expression(function: Function) -> str:
         text = re.sub(old, new, text)
     text = re.sub(r"r\[(\d)\]", lambda place: "xyz"[int(place[1])], text)
     if wrong := re.search(r"\bt\b|rint|copysign", text):
-        name = getattr(function.row, "__qualname__", function.row)
+        what = getattr(function.row, "__qualname__", function.row)
         raise UnsupportedError(
-            f"{name} has {wrong[0]!r} in it, which expressions of OpenMM do not have; leave it to the host "
+            f"{what} has {wrong[0]!r} in it, which expressions of OpenMM do not have; leave it to the host "
             "(kcons.openmm.hold)"
         )
     return text

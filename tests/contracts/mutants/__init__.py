@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mutants import (
     ase_dynamics,
+    batched,
     device,
     files,
     free_energies,
@@ -21,7 +22,19 @@ from mutants import (
 )
 
 TESTS = Path(__file__).resolve().parents[2]
-MODULES = (solvers, openmm_programs, models, steppers, files, studies, free_energies, ase_dynamics, device, torchsim)
+MODULES = (
+    solvers,
+    openmm_programs,
+    models,
+    steppers,
+    files,
+    studies,
+    free_energies,
+    ase_dynamics,
+    device,
+    torchsim,
+    batched,
+)
 
 
 def both(text: str) -> tuple[str, str]:
