@@ -84,6 +84,13 @@ def without_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(build, "reluctance", lambda: "there is no C++ compiler")
 
 
+@pytest.fixture(autouse=True)
+def custom_integrators(request: pytest.FixtureRequest) -> None:
+    """Whether the plugin for OpenMM was compiled on this machine makes no difference but to tests of the device."""
+    if "kcons.openmm.device.build" in sys.modules and "device" not in f"{request.path.parent.name} {request.path.name}":
+        request.getfixturevalue("without_device")
+
+
 def pytest_runtest_setup() -> None:
     # The Fourier transforms of OpenMM's OpenCL (VkFFT) leave the process in the C locale, in which texts are ASCII.
     locale.setlocale(locale.LC_ALL, LOCALE)

@@ -57,7 +57,7 @@ COLUMNS = {
     "engine": "whose loop and forces: arrays, ASE or OpenMM",
     "adaptive": "whether the setting is a relative tolerance",
     "setting": "time step in the unit of time that is shown, or tolerance",
-    "status": "ok; baseline (nothing held); thermostat (no error); partial (stopped for the budget); failed; not run",
+    "status": "ok; baseline (nothing held); partial (stopped for the budget); failed; not run",
     "note": "why",
     "steps": "steps made",
     "error": "root-mean-square distance an atom from the reference at the horizon",
@@ -394,8 +394,6 @@ class _Log:
             return {"status": "failed", "note": "positions are not finite"}
         sigma, tangency = self.system.residuals(x, v, run.time)
         found: dict[str, Any] = {"sigma": sigma, "tangency": tangency}
-        if not method.follows:
-            return {**found, "status": "thermostat" if status == "ok" else status}
         if status == "ok":
             found["error"] = self.system.deviation(x, reference.positions)
         return {**found, **self.energy_slope()}

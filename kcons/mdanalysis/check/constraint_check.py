@@ -17,7 +17,6 @@ from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -73,9 +72,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
     target_error : float or ndarray, shape (n_atoms,)
         Rounding of the targets, in angstrom a coordinate, of each atom or of all; for 'given' targets that were
         measured in another file.
-    removed : int, optional
-        Degrees of freedom that the engine took away besides: 3 where it stops the center of mass. Found from the
-        total momentum by default.
     rank : bool
         Whether to find the rank, which takes longer than the frames of a short trajectory.
     worst : int
@@ -109,7 +105,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         tolerance: float = 1e-4,
         precision: float | None = None,
         target_error: float | FloatArray = 0.0,
-        removed: int | None = None,
         rank: bool = True,
         worst: int = 10,
         names: tuple[str, str] | None = None,
@@ -135,8 +130,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             raise InputError(
                 f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
             )
-        if removed is not None:
-            removed = whole_number(removed, "removed", 0)
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         described = topology_of(universe)
@@ -155,7 +148,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         self._path = str(getattr(reader, "filename", None) or "")
         names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         remarks = [f"no temperature: {reason}"] if reason else []
-        self.asked = Asked(names, labels, mode, text, removed, int(worst), remarks + _remarks_on(reader))
+        self.asked = Asked(names, labels, mode, text, int(worst), remarks + _remarks_on(reader))
         self._given, self._tolerance, self._wants_rank = given, float(tolerance), rank
         self._target_error = np.broadcast_to(errors, n_atoms)
         self._precision = precision_of_reader(reader, precision)

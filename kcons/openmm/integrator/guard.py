@@ -284,9 +284,7 @@ class Guard:
             return
         if not near:
             self.hold_positions(integrator.getConstraintTolerance())
-            near = not misses and bool(
-                _misses(integrator.parts, context)
-            )  # pulled off by the constraints of the System
+            near = not misses and bool(_misses(integrator.parts, context))  # the System pulled them off
         if near:
             integrator.applyConstraints(context)
         now = positions_of(context)

@@ -181,10 +181,6 @@ class SurfaceRows(Part):
         refuse_system(context.getSystem(), self.atoms)
         require_context(context)
         x, v = motion_of(context)
-        first = 0
-        for item in self.given:
-            item.check(x[item.atoms], 0.0, first)
-            first += item.n_rows
         miss = self._worst(x, v if velocities else None)
         if miss is None:
             return
@@ -204,6 +200,10 @@ class SurfaceRows(Part):
         return self._worst(x, v if velocities else None)
 
     def _worst(self, x: FloatArray, v: FloatArray | None) -> Violation | None:
+        first = 0
+        for item in self.given:
+            item.check(x[item.atoms], 0.0, first)
+            first += item.n_rows
         allowed = START_TOLERANCE * np.maximum(1.0, np.abs(x[self.atoms]).max(axis=1))
         near = NEAR * np.concatenate([_length(item) for item in self.given])
         miss = Violation.worst("positions", self.distances(x), allowed, self.row_name, self._atoms_of, near)

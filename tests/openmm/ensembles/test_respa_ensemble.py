@@ -45,7 +45,6 @@ def trapped(n=4, constraints=0):
     return system, 0.1 * rng.normal(size=(n, 3)), 0.3 * rng.normal(size=(n, 3))
 
 
-@pytest.mark.usefixtures("without_device")
 @pytest.mark.parametrize("slow_kicks", ["ends", "middle"])
 @pytest.mark.parametrize("steps", [TWO, {0: 1, 2: 2, 1: 4}], ids=["two groups", "three groups"])
 @pytest.mark.usefixtures("without_device")

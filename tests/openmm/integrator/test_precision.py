@@ -335,7 +335,6 @@ def test_dependent_rows_are_found_in_any_precision(platform):
 
 
 @less_than_double
-@pytest.mark.usefixtures("without_device")
 def test_rows_of_constraint_objects_need_more_than_single_numbers(platform):
     precision = Precision(*platform.split())
     system, x, v = free_alanine()
@@ -365,7 +364,6 @@ def test_rows_of_constraint_objects_need_more_than_single_numbers(platform):
         if "single" not in p.id and ("double" in p.id) == (name == "suzuki4")
     ],
 )
-@pytest.mark.usefixtures("without_device")
 def test_constraint_objects_are_held_in_mixed_precision(some, kind, platform):
     """Bonds, angles and a dihedral at 2 fs to what single numbers leave of a correction, 1e-9; doubles to rounding."""
     precision = Precision(*platform.split())
@@ -393,7 +391,6 @@ def test_constraint_objects_are_held_in_mixed_precision(some, kind, platform):
         if "single" not in p.id
     ],
 )
-@pytest.mark.usefixtures("without_device")
 def test_carried_molecules_that_cross_a_face_of_the_box_are_no_failure(periodic, platform, caplog):
     """As those of OpenMM: rounded to single numbers at the face, held to 1e-9 nm again one step later."""
     precision = Precision(*platform.split())
@@ -414,7 +411,7 @@ def test_some_particles_or_all_are_the_same_motion(monkeypatch):
     """What callbacks are given does not change a bit of what is computed."""
     ends = []
     for every in (False, True):
-        monkeypatch.setattr("kcons.openmm.callback_rows.callbacks.hands_over_all", lambda every=every: every)
+        monkeypatch.setattr("kcons.openmm.callback_rows.carried_constraints.hands_over_all", lambda every=every: every)
         system, x, v = free_alanine()
         integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
         context = started(system, integrator, x, v)
@@ -471,7 +468,6 @@ def test_rows_beside_constraints_of_the_system(kind, options, platform):
 
 @mixed
 @pytest.mark.parametrize("kind, ensemble", [("carried", Langevin(300, 1)), ("free", None), ("free", Langevin(300, 1))])
-@pytest.mark.usefixtures("without_device")
 def test_rows_that_would_see_old_positions_are_refused(kind, ensemble, platform):
     system, x, v, part = beside_water(kind)
     integrator = ProjectedIntegrator(1e-3, parts=[part], ensemble=ensemble)

@@ -19,7 +19,7 @@ from surface_cases import (
     worst,
 )
 
-from kcons.constraints import Formula, Sphere
+from kcons.constraints import Formula, Sphere, Torus
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import (
     Isokinetic,
@@ -65,6 +65,17 @@ def test_a_step_without_landing_is_told_in_every_ensemble():
     context.setPositions(POSITIONS)
     context.setVelocities(100 * VELOCITIES)
     with pytest.raises(ConvergenceError, match=r"step 1: .*Sphere\(0\)"):
+        integrator.step(1)
+
+
+def test_a_landing_where_the_surface_looks_the_other_way_is_none():
+    """From the inner equator of a torus to the one across."""
+    system = system_of([1.0], "320*x", 0)
+    torus = Torus([0], [0, 0, 0], [0, 0, 1], 1.0, 0.2)
+    integrator = SurfaceIntegrator(0.1 * unit.picosecond, surfaces=torus, system=system, device=False)
+    context = started(system, integrator, [[0.8, 0, 0]], [[0, 0, 0]])
+    integrator.check()
+    with pytest.raises(ConvergenceError, match="finds no position"):
         integrator.step(1)
 
 
