@@ -34,6 +34,7 @@ import result_tables  # noqa: E402
 MADE_BY = {
     "hard_cases": "hard_cases",
     "openmm_device": "openmm_device",
+    "openmm_surfaces": "openmm_surfaces",
     "precision": "solvers_alone",
     "scaling": "solvers_alone",
     "stability": "stability",

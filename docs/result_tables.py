@@ -585,29 +585,6 @@ def openmm_platforms(data: Data) -> Tables:
     }
 
 
-def openmm_surfaces(data: Data) -> Tables:
-    schemes: dict[str, dict[int, float]] = {}
-    for row in data["precision"]:
-        schemes.setdefault(row["scheme"], {})[row["evaluations"]] = row["error"]
-    counts = sorted({n for found in schemes.values() for n in found})
-    return {
-        "speed": frame(
-            data["speed"],
-            surfaces=lambda r: r["kind"] + (", compiled" if r["compiled"] else ""),
-            scheme=lambda r: r["scheme"],
-            cutoff=lambda r: f"{r['cutoff_nm']:g} nm",
-            Verlet=lambda r: f"{r['verlet_us']:.0f} µs",
-            held=lambda r: f"{r['ours_us']:.0f} µs",
-            speed=lambda r: fixed(r["ratio"]),
-        ),
-        "precision": frame(
-            schemes.items(),
-            scheme=lambda r: r[0],
-            **{f"{n}_forces": (lambda r, n=n: small(r[1].get(n), 0)) for n in counts},
-        ),
-    }
-
-
 def openmm_thermostats(data: Data) -> Tables:
     parts = data["measurements"]
     sampling = [{"name": n, **row} for n, rows in parts["sampling"]["sampling"].items() for row in rows]
@@ -701,7 +678,7 @@ TABLES: Mapping[str, Callable[[Data], Tables]] = {
         ase_dynamics, butane, certificate, constant_pressure, engine_speed, error_budget, free_energy, high_order,
         killed_runs, long_runs, long_steps, long_steps_xtb, monte_carlo, more_free_energies, openmm, openmm_barostats,
         openmm_compare, openmm_constraints, openmm_four_femtoseconds, openmm_heavy_hydrogens, openmm_platforms,
-        openmm_surfaces, openmm_thermostats, random_cells, scans, solvated_peptide, step_length, thermostat_cost,
+        openmm_thermostats, random_cells, scans, solvated_peptide, step_length, thermostat_cost,
         thermostats,
     )
 } | {"openmm_mixed_drift": openmm_platforms}  # fmt: skip

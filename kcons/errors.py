@@ -171,15 +171,16 @@ class ConvergenceError(KconsError, RuntimeError):
         Its atoms.
     cluster : int
         Number of the cluster, -1 if unknown.
+    copy : int
+        Number of the system in a batch, -1 elsewhere.
     step : int or None
         Step number, where a stepper knows it.
-    singular : bool
-        A held dihedral has come to where it is undefined: a smaller time step does not help.
     positions : ndarray, shape (n_atoms, 3), or None
         The best place found by a search for a minimum.
     """
 
     positions: Any = None
+    copy: int = -1
 
     def __init__(
         self,
@@ -192,10 +193,8 @@ class ConvergenceError(KconsError, RuntimeError):
         atoms: Iterable[int] = (),
         cluster: int = -1,
         step: int | None = None,
-        singular: bool = False,
     ) -> None:
         super().__init__(message)
-        self.singular = singular
         self.residual = residual
         self.tolerance = tolerance
         self.iterations = iterations
@@ -259,6 +258,8 @@ EXTRAS = {
     "tblite": "xtb",
     "sympy": "formulas",
     "pymbar": "free-energy",
+    "torch": "torch",
+    "torch_sim": "torchsim",
 }
 
 

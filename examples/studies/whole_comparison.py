@@ -91,9 +91,8 @@ class Part:
     quick: bool = True
 
 
-FEW = ("extrapolation",)
 LONG = ("ase-internals",)
-LARGE = (*FEW, "ase-bonds", "ase-internals", "openmm-verlet-", "openmm-kcons-rattle-", "openmm-held", "dop853")
+LARGE = ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-kcons-rattle-", "openmm-held", "dop853")
 CCMA = (
     "ase-bonds",
     "ase-internals",
@@ -102,7 +101,7 @@ CCMA = (
     "openmm-nose",
     "openmm-kcons-",
 )
-WATER = (*FEW, "ase-internals", "dop853", "openmm-middle", "openmm-nose", "kahan-li6", "openmm-kcons-kahan-li6")
+WATER = ("ase-internals", "dop853", "openmm-middle", "openmm-nose", "kahan-li6", "openmm-kcons-kahan-li6")
 
 
 def _molecule(system: str, text: str, constrain: str, **more: Any) -> Part:
@@ -120,7 +119,7 @@ PARTS: dict[str, Part] = {
     "dumbbells": Part("Two colliding dumbbells", "dumbbells"),
     "ethanol": Part("Ethanol, GFN2-xTB", "ethanol", needs="tblite", budget=20),
     "water-216": Part("Water, 216 molecules", "water", 216, budget=20, quick=False),
-    "water-900": Part("Water, 900 molecules", "water", 900, without=(*LONG, *FEW), budget=20, quick=False),
+    "water-900": Part("Water, 900 molecules", "water", 900, without=LONG, budget=20, quick=False),
     "water-5000": Part(
         "Water, 5000 molecules", "water", 5000, steps=(4.0, 2.0, 1.0), pace=2.0, without=WATER, quick=False
     ),
@@ -141,10 +140,8 @@ PARTS: dict[str, Part] = {
         quick=False,
     ),
     **{f"alanine-{c}": _molecule("alanine", "Alanine dipeptide", c) for c in ("hbonds", "allbonds", "hangles")},
-    **{f"dhfr-{c}": _molecule("dhfr", "DHFR", c, without=FEW, quick=False) for c in ("hbonds", "allbonds")},
-    "dhfr-hangles": _molecule(
-        "dhfr", "DHFR", "hangles", steps=(2.0, 1.0), without=(*FEW, *CCMA), budget=75, quick=False
-    ),
+    **{f"dhfr-{c}": _molecule("dhfr", "DHFR", c, quick=False) for c in ("hbonds", "allbonds")},
+    "dhfr-hangles": _molecule("dhfr", "DHFR", "hangles", steps=(2.0, 1.0), without=CCMA, budget=75, quick=False),
 }
 
 
@@ -162,7 +159,7 @@ def rows(key: str, quick: bool) -> Iterator[dict[str, Any]]:
     names = [
         method.name
         for method in METHODS.values()
-        if method.follows
+        if method.holds
         and (method.usual or (method.engine == "arrays" and not quick))
         and not method.name.startswith(part.without or ("-",))
         and (method.engine != "OpenMM" or method.refuses(system) is None)

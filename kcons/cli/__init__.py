@@ -1,6 +1,6 @@
 """The command `kcons`.
 
-- `terminal`, `progress`: what is written to the terminal
+- `terminal`: what is written to the terminal
 - `parser`: the table of options of a command, and what is said of names that are not known
 - `systems`: the test system or file that a command is asked for, and `kcons plan`
 - `check`, `compare`, `doctor`, `freeenergy`, `scan`, `warmup`: the commands of these names

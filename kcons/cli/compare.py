@@ -25,8 +25,8 @@ PRODUCTION_STEPS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 def run(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return list_everything()
-    from kcons.cli.progress import Bars
     from kcons.comparison import report
+    from kcons.comparison.progress import Watcher
     from kcons.steppers.files import ResultFolder, in_one_piece
 
     temperature = _asks_for_averages(chosen)  # complain before any work
@@ -44,7 +44,7 @@ def run(chosen: argparse.Namespace) -> int:
         table.attrs["asked"] = asked
         report.write_csv(path, table)
 
-    with results.taken(), Bars() as watcher:
+    with results.taken(), Watcher(shown=True) as watcher:
         if done is None:  # what an earlier run left is not what --resume is to go on from
             for name in files:
                 (folder / name).unlink(missing_ok=True)

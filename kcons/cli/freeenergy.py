@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def _free_energy(chosen: argparse.Namespace) -> int:
     from dataclasses import replace
 
-    from kcons.cli.progress import Bars
+    from kcons.comparison.progress import Watcher
     from kcons.free_energy import Windows, read_input
     from kcons.steppers.files import in_one_piece, text
 
@@ -38,11 +38,11 @@ def _free_energy(chosen: argparse.Namespace) -> int:
     # A folder belongs to settings, and pulls are slower than the way to a window.
     slow = replace(given.settings, pull=given.pull_steps)
     pulls = Windows(given.sampler, folder / "pulls", slow, **how) if given.pulls else None
-    with windows.taken(), Bars() as watcher, given.executor() as executor:
+    watcher = Watcher(shown=True)
+    with windows.taken(), watcher, watcher.piece("windows", 1.0), given.executor() as executor:
 
         def progress(done: int, total: int, seconds: float) -> None:
-            each = seconds / (total - done) if done < total else 0.0
-            watcher.overall("windows", done * each, total * each)
+            watcher.advance(done / total)
 
         for each in filter(None, (windows, pulls)):
             each.executor, each.progress = executor, progress

@@ -44,12 +44,12 @@ def _scan(chosen: argparse.Namespace) -> int:
     atoms.calc = _calculator(chosen.calculator, chosen.settings)
     held += getattr(atoms.calc, "held", [])
 
-    from kcons.cli.progress import Bars
+    from kcons.comparison.progress import Watcher
     from kcons.free_energy import scan
 
     how = {"held": held, "fmax": chosen.fmax, "both_ways": not chosen.one_way}
     folder: Path = chosen.out or Path(f"scan-{chosen.structure.stem}")
-    with Bars() as watcher, watcher.piece("relaxed scan", 1.0):
+    with Watcher(shown=True) as watcher, watcher.piece("relaxed scan", 1.0):
 
         def progress(done: int, points: int, line: str) -> None:
             watcher.advance(done / points)

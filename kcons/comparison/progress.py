@@ -1,34 +1,53 @@
-"""Progress of long work, for whoever wants to show it, and times in words."""
+"""Progress of long work, shown or not, and times in words."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any, Self
 
 
 class Watcher:
-    """Receives progress. This one shows nothing; that of the command line shows progress bars."""
+    """Is told of progress, and shows it if `shown`: a bar for the piece in hand; without a terminal a line for each."""
 
-    def begin(self, what: str, total: float) -> None:
-        """A piece of work of `total` units starts."""
+    def __init__(self, shown: bool = False) -> None:
+        self._bars: Any = None
+        self._task: Any = None
+        if shown:
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    def advance(self, done: float) -> None:
-        """So much of it is done."""
+            columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+            self._bars = Progress(*columns, console=Console(stderr=True), transient=True)
 
-    def end(self) -> None:
-        """It is over."""
+    def __enter__(self) -> Self:
+        if self._bars is not None:
+            self._bars.start()
+        return self
 
-    def overall(self, what: str, done: float, total: float) -> None:
-        """A part of a longer run starts; `done` of the `total` expected seconds of the run have passed."""
+    def __exit__(self, *_: object) -> None:
+        if self._bars is not None:
+            self._bars.stop()
 
     @contextmanager
     def piece(self, what: str, total: float) -> Iterator[None]:
         """A piece of work of `total` units, which is over at the end of the block."""
-        self.begin(what, total)
+        if self._bars is not None:
+            if not self._bars.console.is_terminal:
+                print(what, file=sys.stderr, flush=True)
+            self._task = self._bars.add_task(what, total=total)
         try:
             yield
         finally:
-            self.end()
+            if self._task is not None:
+                self._bars.remove_task(self._task)
+                self._task = None
+
+    def advance(self, done: float) -> None:
+        """So much of the piece in hand is done."""
+        if self._task is not None:
+            self._bars.update(self._task, completed=done)
 
 
 def duration(seconds: float) -> str:

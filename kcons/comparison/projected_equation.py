@@ -39,7 +39,7 @@ class ProjectedEquation:
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for friction and forces that depend on the velocities."""
-        if system.friction is not None or system.velocity_dependent:
+        if system.friction or system.velocity_dependent:
             raise UnsupportedError(f"{self!r} is made for forces of positions alone; use Rattle")
 
     def step(self, system: System, state: State, dt: float) -> State:

@@ -7,7 +7,7 @@ processor has results of its own in the same folder, and several processes may u
   written to either, in ``$NUMBA_CACHE_DIR``. Without any of these they are kept for one process only.
 - The machine code of a kernel is the same in the process that compiles it and in those that load it (`_Library`), so
   results are the same to the last bit.
-- What is kept has a digest. A damaged file counts as missing, and that is logged once.
+- A damaged file counts as missing.
 - A kernel is compiled anew when its own source has changed or that of any kernel it may call: Numba by itself looks at
   its own file only, and what was kept would call others as they were.
 - All of this holds for what `njit` and `cfunc` of this module make, which all kernels of kcons are.
@@ -27,13 +27,11 @@ import hashlib
 import inspect
 import logging
 import os
-import pickle
 import re
 import shutil
 import tempfile
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -145,77 +143,31 @@ def kernel_sources(path: Path) -> tuple[frozenset[Path], str]:
 
 # -- what is kept on disk ---------------------------------------------------------------------------
 
-#: First bytes of what Numba itself writes: an earlier version of kcons left it.
-_PICKLE = b"\x80"
-
-
-def keep(path: Path, content: bytes) -> None:
-    """Write a file at once, for other processes; its first line, a comment of Python, is the digest of the rest."""
-    unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-    try:
-        unfinished.write_bytes(_headed(content))
-        os.replace(unfinished, path)
-    except OSError:
-        unfinished.unlink(missing_ok=True)
-        raise
-
-
-def kept(path: Path) -> bytes | None:
-    """What `keep` wrote to a file; None if there is no such file, or if it is damaged, which is logged."""
-    try:
-        text = path.read_bytes()
-    except OSError:
-        return None
-    content = text.partition(b"\n")[2]
-    if text == _headed(content):
-        return content
-    if not text.startswith(_PICKLE):
-        _say_once(f"compiled code in {path.parent} is damaged ({path.name}); it is made anew", path.parent)
-    return None
-
-
-def _headed(content: bytes) -> bytes:
-    return b"# " + hashlib.sha256(content).hexdigest().encode() + b"\n" + content
-
-
-_said: set[Path] = set()
-
-
-def _say_once(text: str, folder: Path) -> None:
-    if folder not in _said:
-        _said.add(folder)
-        logger.warning(text)
-
 
 class _Files(caching.IndexDataCacheFile):  # type: ignore[misc]
-    """Numba's index and data of a kernel, written by `keep`; what is damaged, or of other sources, is not there."""
-
-    def __init__(self, folder: str, name: str, stamp: object) -> None:
-        super().__init__(folder, name, stamp)
-        self._made_of = hashlib.sha256(repr((numba.__version__, stamp)).encode()).digest()
+    """Numba's index and data of a kernel; what is damaged is not there."""
 
     def load(self, key: Any) -> Any:
-        found = super().load(key)
-        # Two processes that write an index at once may give a number twice.
-        return found[1] if found is not None and found[0] == key else None
+        try:
+            found = super().load(key)
+        except Exception:  # pickle raises whatever the bytes lead to
+            return None
+        # Two processes that write an index at once may give a number twice, and the index is written before the data.
+        return found[1] if found is not None and found[0] == (self._source_stamp, key) else None
 
     def save(self, key: Any, data: Any) -> None:
-        super().save(key, (key, data))
+        super().save(key, ((self._source_stamp, key), data))
 
     def _load_index(self) -> Any:
-        content = kept(Path(self._index_path)) or b""
-        made_of, overloads = content[:32], content[32:]
-        return pickle.loads(overloads) if made_of == self._made_of else {}
+        try:
+            return super()._load_index()
+        except Exception:
+            return {}
 
-    def _save_index(self, overloads: Any) -> None:
-        keep(Path(self._index_path), self._made_of + self._dump(overloads))
 
-    def _load_data(self, name: str) -> Any:
-        content = kept(Path(self._data_path(name)))
-        return None if content is None else pickle.loads(content)
-
-    def _save_data(self, name: str, data: Any) -> None:
-        keep(Path(self._data_path(name)), self._dump(data))
+@functools.cache
+def _say_once(folder: str, error: str) -> None:
+    logger.warning(f"compiled code cannot be kept in {folder}, and is made anew by each process: {error}")
 
 
 class _KernelCache(caching.FunctionCache):  # type: ignore[misc]
@@ -234,8 +186,7 @@ class _KernelCache(caching.FunctionCache):  # type: ignore[misc]
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            folder = Path(self._cache_path)
-            _say_once(f"compiled code cannot be kept in {folder}, and is made anew by each process: {error}", folder)
+            _say_once(self._cache_path, str(error))
 
 
 # -- kernels ----------------------------------------------------------------------------------------
@@ -283,8 +234,8 @@ class _Compiler(compiler.Compiler):  # type: ignore[misc]
 def njit(function: Any = None, /, *, cache: bool = False, **options: Any) -> Any:
     """`numba.njit` for kernels of kcons.
 
-    Its machine code is the same whether it was compiled or loaded, what is kept of it has a digest, and it is compiled
-    anew when any of its sources changes.
+    Its machine code is the same whether it was compiled or loaded, and it is compiled anew when any of its sources
+    changes.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ _NAMES = {
     "windows.openmm_windows": ("HeldCoordinatesReporter", "OpenMMWindows"),
     "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
     "windows.input_file": ("InputFile", "read_input"),
-    "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
+    "averages": ("Mean", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
     "profiles.plots": ("plot_profile",),

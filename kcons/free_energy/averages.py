@@ -2,18 +2,15 @@
 
 The mean force of a window is a ratio, sum w f/sum w. To first order its fluctuation is that of the mean of the series
 u = w (f - mean)/<w>, whose neighbors depend on each other: a mean of n values has g times the variance of independent
-ones, g being the statistical inefficiency (from `kcons.thermostats.correlated_series`, as all errors of means). Where
-equilibration ends is where most independent samples are left (Chodera, J. Chem. Theory Comput. 12, 1799 (2016)).
+ones, g being the statistical inefficiency (from `kcons.thermostats.correlated_series`, as all errors of means).
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import warnings
 from dataclasses import dataclass
 from types import ModuleType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,8 +22,6 @@ from kcons.thermostats.correlated_series import FEW_INDEPENDENT, spread
 
 #: Fewest values that an error is taken from.
 MIN_SAMPLES = 16
-#: Places from which on a run is tried as equilibrated.
-_ORIGINS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +42,6 @@ class Mean:
         more than 1. Fewer where few blocks make up the spread, as of heavy tails.
     inefficiency : ndarray, shape (d,)
         Samples for each independent one; less than 1 of values that swing back.
-    start : int
-        First sample used: what is before it was taken for equilibration.
     """
 
     value: FloatArray
@@ -57,7 +50,6 @@ class Mean:
     n: int
     n_effective: float
     inefficiency: FloatArray
-    start: int = 0
 
 
 def pymbar() -> ModuleType:
@@ -75,8 +67,7 @@ def pymbar() -> ModuleType:
         import pymbar
     except ModuleNotFoundError:
         raise UnsupportedError(
-            "the end of equilibration and BAR are left to pymbar, which is not installed: "
-            "python -m pip install 'kcons[free-energy]'"
+            "BAR is left to pymbar, which is not installed: python -m pip install 'kcons[free-energy]'"
         ) from None
     finally:
         logging.disable(loud)
@@ -92,13 +83,7 @@ def finite(values: ArrayLike, item: str, row: str = "sample") -> FloatArray:
     return array
 
 
-def weighted_mean(
-    values: ArrayLike,
-    weights: ArrayLike | None = None,
-    *,
-    log_weights: ArrayLike | None = None,
-    equilibration: bool = False,
-) -> Mean:
+def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
     """Mean of correlated samples, sum w f/sum w, with its error.
 
     Parameters
@@ -107,28 +92,18 @@ def weighted_mean(
         In the order in which they were taken.
     weights : array_like, shape (n,), optional
         Equal by default. A common factor does not matter.
-    log_weights : array_like, shape (n,), optional
-        In place of `weights`, where these would overflow.
-    equilibration : bool
-        Leave out the beginning as far as that leaves more independent samples.
 
     Raises
     ------
     InputError
         Fewer than 16 samples; a NaN or infinity; a negative weight, or none that is positive.
-    UnsupportedError
-        `equilibration`, and pymbar is not installed.
 
     Warns
     -----
     UserWarning
         Fewer than 10 independent samples; a quantity that never changes, whose error is then 0.
     """
-    series, factors = _checked(values, weights, log_weights)
-    _refuse_one_sample(factors)
-    start = _equilibrated(_linearized(series, factors)) if equilibration else 0
-    series, factors = series[start:], factors[start:]
-    _refuse_one_sample(factors)
+    series, factors = _checked(values, weights)
     n = len(series)
     fluctuation = _linearized(series, factors)
     counted = series[factors > 0]
@@ -160,27 +135,11 @@ def weighted_mean(
             UserWarning,
             stacklevel=2,
         )
-    return Mean(_mean(series, factors), covariance, np.sqrt(np.diag(covariance)), n, effective, inefficiency, start)
+    return Mean(_mean(series, factors), covariance, np.sqrt(np.diag(covariance)), n, effective, inefficiency)
 
 
-class Agreement(NamedTuple):
-    """Whether two means are of the same quantities.
-
-    Attributes
-    ----------
-    chi_square : float
-    degrees_of_freedom : int
-    p_value : float
-        Probability of a difference as large as this by chance.
-    """
-
-    chi_square: float
-    degrees_of_freedom: int
-    p_value: float
-
-
-def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_covariance: ArrayLike) -> Agreement:
-    """Chi square of the difference of two means: hysteresis between windows reached from one side and the other.
+def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_covariance: ArrayLike) -> float:
+    """Probability of a difference of two means as large as theirs, by chi square, if they are of the same quantities.
 
     Held windows share no configurations, and so have no overlap that could be looked at: where a window has forgotten
     how it was made, its mean force is the same from both sides.
@@ -209,15 +168,13 @@ def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_cov
     parts = directions.T @ away
     parts[np.abs(parts) <= 1e-9 * np.abs(np.concatenate(arrays, axis=None)).max()] = 0.0
     if parts[~known].any():
-        return Agreement(math.inf, d, 0.0)
+        return 0.0
     square = float((parts[known] ** 2 / sizes[known]).sum())
     count = int(known.sum())
-    return Agreement(square, count, float(chi2.sf(square, count)) if count else 1.0)
+    return float(chi2.sf(square, count)) if count else 1.0
 
 
-def _checked(
-    values: ArrayLike, weights: ArrayLike | None, log_weights: ArrayLike | None
-) -> tuple[FloatArray, FloatArray]:
+def _checked(values: ArrayLike, weights: ArrayLike | None) -> tuple[FloatArray, FloatArray]:
     """Values (n, d) and weights (n,) whose mean is about 1."""
     series = finite(values, "values")
     series = series[:, None] if series.ndim == 1 else series
@@ -226,27 +183,18 @@ def _checked(
             f"values of shape {series.shape} are too few for an error; give (n, d) with n of {MIN_SAMPLES} or more",
             item="values",
         )
-    if weights is not None and log_weights is not None:
-        raise InputError("both weights and log_weights are given; give one of them", item="log_weights")
-    item = "weights" if log_weights is None else "log_weights"
-    given = weights if log_weights is None else log_weights
-    factors = np.zeros(len(series)) if given is None else finite(given, item)
+    factors = np.ones(len(series)) if weights is None else finite(weights, "weights")
     if factors.shape != (len(series),):
-        raise InputError(f"{item} must have shape {(len(series),)}, not {factors.shape}", item=item)
-    if given is None or item == "log_weights":
-        factors = np.exp(factors - factors.max())
+        raise InputError(f"weights must have shape {(len(series),)}, not {factors.shape}", item="weights")
     if (factors < 0).any() or not factors.any():
         raise InputError("weights must not be negative, and one of them must be positive", item="weights")
     factors = factors / factors.max()
-    return series, factors / factors.mean()
-
-
-def _refuse_one_sample(factors: FloatArray) -> None:
     if factors.sum() <= (1 + 1e-12) * factors.max():
         raise InputError(
             f"sample {int(np.argmax(factors))} has all of the weight, and one sample has no error; sample longer",
             item="weights",
         )
+    return series, factors / factors.mean()
 
 
 def _mean(series: FloatArray, factors: FloatArray) -> FloatArray:
@@ -256,10 +204,3 @@ def _mean(series: FloatArray, factors: FloatArray) -> FloatArray:
 def _linearized(series: FloatArray, factors: FloatArray) -> FloatArray:
     """What the ratio sum w f/sum w fluctuates by, sample by sample: its mean is 0."""
     return factors[:, None] * (series - _mean(series, factors)) / factors.mean()
-
-
-def _equilibrated(series: FloatArray) -> int:
-    """The latest place at which one of the columns is found to be equilibrated; at least `MIN_SAMPLES` samples stay."""
-    detect = pymbar().timeseries.detect_equilibration
-    skip = max(1, len(series) // _ORIGINS)
-    return min(max(int(detect(u, nskip=skip)[0]) for u in series.T), len(series) - MIN_SAMPLES)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kcons.constraints.arguments import positive, refuse_other, whole_number
+from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.averages import weighted_mean
@@ -86,7 +86,7 @@ def local_mean_force(series: Series, kT: float) -> FloatArray:
     return thermal_multipliers(series, kT) + kT * series.gradient
 
 
-def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
+def mean_force(series: Series, kT: float) -> MeanForce:
     """dF/dq = <w (lambda + kT G)>/<w>, w = (det Z)^(-1/2), G half the gradient of ln det Z along each coordinate.
 
     Where the series has `turned` as well, whose weighted mean is the same, the mixture of both that fluctuates least is
@@ -98,8 +98,6 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
         Of coordinates at rest, with velocities of temperature kT.
     kT : float
         Temperature times Boltzmann's constant, in the energy of the series.
-    discard : int
-        Samples of equilibration at the beginning.
 
     References
     ----------
@@ -107,30 +105,27 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
     (2000), for several; the page on free energies has the derivation with other constraints.
     """
     refuse_other(series, Series, "series", "a kcons.free_energy.Series")
-    if not 0 <= whole_number(discard, "discard", 0) < len(series):
-        raise InputError(f"{discard} of {len(series)} samples are to be discarded; keep some", item="discard")
-    kept = series[discard:]
-    value = kept.value
-    moved = nearest_image(value - value[0], kept.periods)
+    value = series.value
+    moved = nearest_image(value - value[0], series.periods)
     allowed = 1e-5 * np.maximum(np.abs(value[0]), 1.0)
     if not np.all(np.isfinite(moved)):
-        name = kept.names[int(np.argmin(np.isfinite(moved).all(axis=0)))]
+        name = series.names[int(np.argmin(np.isfinite(moved).all(axis=0)))]
         raise InputError(f"values of {name} are not finite; leave these samples out", item=name)
     if np.any(np.abs(moved) > allowed):
-        name = kept.names[int(np.argmax((np.abs(moved) > allowed).any(axis=0)))]
+        name = series.names[int(np.argmax((np.abs(moved) > allowed).any(axis=0)))]
         raise InputError(
             f"{name} moved by {np.abs(moved).max():.3g} during the samples; a mean force belongs to coordinates at "
             "rest (the work of moving ones is Series.work)",
             item=name,
         )
-    mean = weighted_mean(_quietest(kept, local_mean_force(kept, kT)), kept.weights)
+    mean = weighted_mean(_quietest(series, local_mean_force(series, kT)), series.weights)
     return MeanForce(
-        kept.names,
+        series.names,
         value[0] + moved.mean(axis=0),
         mean.value,
         mean.covariance,
-        kept.multiplier.mean(axis=0),
-        len(kept),
+        series.multiplier.mean(axis=0),
+        len(series),
         mean.n_effective,
     )
 

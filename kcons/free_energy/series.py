@@ -103,18 +103,7 @@ class Series:
         part._samples = self._samples[samples]
         return part
 
-    def of(self, name: str) -> FloatArray:
-        """The multipliers of one coordinate, shape (n,)."""
-        if name not in self.names:
-            raise InputError(f"there is no coordinate {name!r}; there are {', '.join(self.names)}", item="name")
-        return self.multiplier[:, self.names.index(name)]
-
     time, value, multiplier, kinetic, log_det_z, gradient, off, turned, mean_kinetic = map(_column, Sample._fields)
-
-    @property
-    def multipliers(self) -> dict[str, float]:
-        """Those of the last sample, by name."""
-        return dict(zip(self.names, self._samples[-1].multiplier.tolist(), strict=True)) if self._samples else {}
 
     @property
     def weights(self) -> FloatArray:

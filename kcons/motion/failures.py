@@ -6,15 +6,11 @@ import numpy as np
 
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsError, SingularGeometryError
 from kcons.plan.plan import Plan
 from kcons.solvers.cluster_solver import ClusterSolver, Outcome, Request
 from kcons.solvers.tolerances import ROUNDING
-
-#: Equal parts of a displacement, one after another, that tell one that is too long from one that nothing can follow.
-PARTS = 16
 
 
 class Failures:
@@ -76,27 +72,24 @@ class Failures:
         )
 
     def positions(self, request: Request, outcome: Outcome, solver: ClusterSolver) -> KconsError:
-        """The error for a position projection without solution; `request` as it was given to `solver`."""
+        """The error for a position projection without solution."""
         row = global_row(outcome, solver)
         if row < 0:
             return ConvergenceError("the position projection did not converge", residual=outcome.residual)
         name, atoms = self._label(row)
-        straight = self._becomes_straight(request, solver, np.flatnonzero(self._plan.labels == self._plan.labels[row]))
+        straight = self._straightened(
+            request.reference, request.changed, np.flatnonzero(self._plan.labels == self._plan.labels[row])
+        )
         return ConvergenceError(
             f"no positions near the given ones fulfil row {name}: relative residual {outcome.residual:.3g} after "
-            f"{outcome.iterations} iterations. "
-            + (
-                straight
-                or "The displacement is too large for this geometry; use a smaller time step (or optimizer step), or "
-                "restore_positions for a start that is far off"
-            ),
+            f"{outcome.iterations} iterations. The displacement is too large for this geometry; use a smaller time "
+            f"step (or optimizer step), or restore_positions for a start that is far off{straight}",
             residual=outcome.residual,
             tolerance=ROUNDING,
             iterations=outcome.iterations,
             row=row,
             atoms=atoms,
             cluster=int(self._plan.labels[row]),
-            singular=bool(straight),
         )
 
     def tangents(self, x: FloatArray, y: FloatArray, outcome: Outcome, solver: ClusterSolver, what: str) -> KconsError:
@@ -147,23 +140,6 @@ class Failures:
 
     # -- dihedrals that lose their meaning ------------------------------------------------------------------
 
-    def _becomes_straight(self, request: Request, solver: ClusterSolver, rows: IntArray) -> str:
-        """What to say where a held dihedral among `rows` becomes straight, with any time step; '' if none does."""
-        here, ahead = request.reference, request.changed
-        if not self._straightened(here, ahead, rows):
-            return ""
-        # As a free flight in small steps: where these pass, the dihedral is not the cause.
-        start, step = request.reference_time, minimum_image(ahead - here, request.lattice) / PARTS
-        for part in range(1, PARTS + 1):
-            time = start + part / PARTS * (request.time - start)
-            wanted = None if request.wanted is None else self._rows.target(time)
-            ahead = here + step
-            small = Request(ahead, here, wanted, request.lattice, time, start, moved=request.moved)
-            if not solver.positions(small).converged:
-                return self._straightened(here, ahead, rows)
-            here, step = ahead, ahead - here
-        return ""
-
     def _straightened(self, before: FloatArray, after: FloatArray, rows: IntArray) -> str:
         """What to say of three atoms of a held dihedral that pass through one line from `before` to `after`, or ''."""
         least, found = np.inf, ""
@@ -178,9 +154,9 @@ class Failures:
                 if side @ _beside(then[first], then[first + 1]) <= 0.0 and bend < least:
                     least, three = bend, ", ".join(str(a) for a in self._named(item.atoms[k][first : first + 3]))
                     found = (
-                        f"Atoms {three} of row {self._label(row)[0]} come onto one line, {np.degrees(bend):.2g} "
-                        "degrees away, where a dihedral angle is undefined: the motion cannot go through it with any "
-                        "time step. Hold their angle too, or leave this dihedral free"
+                        f". Atoms {three} of row {self._label(row)[0]} come onto one line, {np.degrees(bend):.2g} "
+                        "degrees away, where a dihedral angle is undefined; if the motion goes through it, no time "
+                        "step helps: hold their angle too, or leave this dihedral free"
                     )
         return found
 

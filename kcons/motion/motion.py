@@ -10,7 +10,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from math import isfinite
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,8 +27,7 @@ from kcons.motion.restoring.nearest_point import LEFT_OVER, FarStart
 from kcons.motion.solver_sequence import IterationBudget, SolverSequence
 from kcons.plan.independent_blocks import fixed_atoms
 from kcons.plan.plan import Plan, make_plan
-from kcons.plan.second_order.conversion import without_second_order_rows
-from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody
+from kcons.plan.second_order import MISFIT, FlatBody, without_second_order_rows
 
 
 class Motion:
@@ -40,10 +38,9 @@ class Motion:
     constraint_set : ConstraintSet
         What is held.
     positions : array_like, shape (n_atoms, 3)
-        Positions on (or near) the surface; rank and shapes of clusters are found there.
-    degenerate : {'convert', 'raise'}
-        What to do with rows that are singular only at second order (a collinear or planar group held by
-        all its distances): replace them by linear rows that hold the same, or refuse.
+        Positions on (or near) the surface; rank and shapes of clusters are found there. Rows that are singular only at
+        second order there (a collinear or planar group held by all its distances) are replaced by linear rows that
+        hold the same.
     time : float
         Time of `positions`, for targets that move.
 
@@ -61,7 +58,7 @@ class Motion:
     Raises
     ------
     SingularGeometryError
-        Second-order-singular rows that cannot be converted, or with ``degenerate='raise'``.
+        Second-order-singular rows that cannot be converted.
     ContradictionError
         Rows among fixed atoms only that are not fulfilled.
 
@@ -76,14 +73,13 @@ class Motion:
         constraint_set: ConstraintSet,
         positions: ArrayLike,
         *,
-        degenerate: Literal["convert", "raise"] = "convert",
         time: Finite = 0.0,
     ) -> None:
         refuse_other(constraint_set, ConstraintSet, "constraint_set", "a kcons.ConstraintSet")
         self._shape = (constraint_set.n_atoms, 3)
         x = as_array(positions, self._shape, "positions")
         self._given = constraint_set
-        self.constraint_set = without_second_order_rows(constraint_set, x, time, convert=degenerate == "convert")
+        self.constraint_set = without_second_order_rows(constraint_set, x, time)
         self.n_atoms = constraint_set.n_atoms
         self.masses = constraint_set.masses
         touched = self.constraint_set.touched

@@ -10,10 +10,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError
 from kcons.motion.failures import Failures, global_row
 from kcons.plan.plan import Plan
-from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Outcome, Request, resume
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.sparse.distances import sparse_distances
 from kcons.solvers.tolerances import MANY_ITERATIONS
 
 #: Largest cluster, in rows, that dense damped Newton rescues.
@@ -45,11 +43,11 @@ class IterationBudget:
 
 
 class DampedFallback:
-    """Solvers with step control for single clusters whose own solver has none; made when first needed."""
+    """Damped Newton for single clusters on which their own solver did not converge; made when first needed."""
 
     def __init__(self, rows: ConstraintSet, plan: Plan, failures: Failures) -> None:
         self._rows, self._plan, self._failures = rows, plan, failures
-        self._made: dict[int, ClusterSolver | None] = {}
+        self._made: dict[int, GeneralClusters | None] = {}
         #: Set during restorations, which try many projections and may do without some of them.
         self.budget: IterationBudget | None = None
 
@@ -103,8 +101,8 @@ class DampedFallback:
                 return outcome._replace(iterations=outcome.iterations + found.iterations)
         return outcome
 
-    def _solver(self, row: int) -> ClusterSolver | None:
-        """A solver with step control for the cluster of `row`; None if its own solver has that already."""
+    def _solver(self, row: int) -> GeneralClusters | None:
+        """A solver with step control for the cluster of `row`; None if it is too large for dense algebra."""
         plan = self._plan
         label = int(plan.labels[row])
         if label not in self._made:
@@ -113,8 +111,6 @@ class DampedFallback:
             if len(rows) <= RESCUE_ROWS:
                 labels = np.zeros(len(rows), dtype=np.int64)
                 self._made[label] = GeneralClusters(self._rows, rows, labels, plan.inverse_masses)
-            elif any(isinstance(solver, Chains) and row in solver.rows for solver in plan.solvers):
-                self._made[label] = sparse_distances(self._rows, rows, plan.inverse_masses)
         return self._made[label]
 
 

@@ -32,7 +32,6 @@ try:
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
     from kcons.openmm.states import positions_of, velocities_of
-    from kcons.openmm.surfaces.landings import ExpressionSurface
     from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
     from kcons.openmm.topology import constraints_of
 except ModuleNotFoundError as error:
@@ -43,7 +42,6 @@ __all__ = [
     "CarriedConstraints",
     "CollectiveRows",
     "DeviceIntegrator",
-    "ExpressionSurface",
     "HamiltonianMonteCarlo",
     "Isokinetic",
     "IsokineticSpheres",

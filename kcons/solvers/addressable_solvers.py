@@ -4,7 +4,7 @@ A kernel that is called from Python pays for each array that it is given, and on
 compiled for each of their combinations. Here a solver's functions are compiled for the solver itself, and for nobody
 else again. They are alike for all of them; `kind` says which minimum image the lattice needs (`kernels.lattices`):
 
-``_positions(careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers)``
+``_positions(alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers)``
     solves the SHAKE condition; ``_tangents(alone, x, y, wanted, ...)`` makes y tangent at x. Both return what an
     `Outcome` holds. An empty `wanted` stands for the targets found at set-up, and for no motion of the surface.
 ``_apply(x, factor, tables)``
@@ -45,7 +45,7 @@ NO_NUMBERS = np.zeros(0)
 _NUMBERS, _POINTS, _LATTICE = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 _ALIKE = _NUMBERS, _LATTICE, types.int64, _NUMBERS, _NUMBERS
 _FOUND = types.Tuple((types.boolean, types.float64, types.int64, types.int64))
-_POSITIONS = _FOUND(types.boolean, types.boolean, _POINTS, _POINTS, _POINTS, types.float64, *_ALIKE)
+_POSITIONS = _FOUND(types.boolean, _POINTS, _POINTS, _POINTS, types.float64, *_ALIKE)
 _TANGENTS = _FOUND(types.boolean, _POINTS, _POINTS, *_ALIKE)
 _APPLY = types.none(_POINTS, types.float64, _NUMBERS)
 _UNDO = types.none(_POINTS, types.boolean, types.boolean, _NUMBERS)
@@ -95,8 +95,6 @@ class AddressableSolver(ABC):
     kernels: Kernels
     tables: FloatArray
     numbers: FloatArray
-    #: Ways of solving for positions, one after the other until one arrives.
-    ways: tuple[bool, ...] = (False,)
     _solution: FloatArray
     #: Whether rows take whole cells off positions.
     _moved = False
@@ -130,14 +128,10 @@ class AddressableSolver(ABC):
         self.numbers[:3] = time, reference_time, flight
         if velocities is None:
             velocities, inv_dt = x, 0.0
-        for careful in self.ways:
-            found = self.kernels[0](
-                careful, True, x, reference, velocities, inv_dt, wanted, self._cell, self._kind, self.tables,
-                self.numbers,
-            )  # fmt: skip
-            self.refuse()
-            if found[0]:
-                break
+        found = self.kernels[0](
+            True, x, reference, velocities, inv_dt, wanted, self._cell, self._kind, self.tables, self.numbers
+        )
+        self.refuse()
         if found[0] and multipliers is not None:
             multipliers[:] = self._multipliers()
         return Outcome(*found)
@@ -278,7 +272,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
     for k in range(0, words.size, WORDS):
         mine, numbers = _arrays(words, k)
         alike = x, x_ref, v, inv_dt, none, lattice, kind, mine, numbers
-        found, _, iterations, _ = _call_positions(words[k], (False, False, *alike))
+        found, _, iterations, _ = _call_positions(words[k], (False, *alike))
         if not found:
             for j in range(0, k, WORDS):
                 if words[j + 3] != 0:
@@ -296,7 +290,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
                 _call_apply(words[k + 2], (v, inv_dt, mine))
             if words[k + 4] == 0 or again == MAX_ROUNDS or _call_resolved(words[k + 4], (x, lattice, kind, mine)):
                 break
-            found, _, iterations, _ = _call_positions(words[k], (False, False, *alike))
+            found, _, iterations, _ = _call_positions(words[k], (False, *alike))
             if not found:
                 break
             most = max(most, iterations)

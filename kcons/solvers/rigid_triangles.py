@@ -221,7 +221,7 @@ def project_triangles(tangent, points, references, velocities, inverse_dt, given
 
 
 @njit(cache=True, nogil=True)
-def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
+def _positions(alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
     """This and the next two as `kcons.solvers.addressable_solvers` says."""
     sides = wanted if wanted.size else table_array(tables, integers(tables), _SIDES)
     return project_triangles(None, x, x_ref, v, inv_dt, sides, lattice, kind, none_of(tables), tables)

@@ -168,9 +168,9 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
+    alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
 ):
-    """As `kcons.solvers.addressable_solvers` says; all is careful here."""
+    """As `kcons.solvers.addressable_solvers` says; steps that gain nothing are halved."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, masses, base = table_array(u, h, 0), table_array(u, h, 1), table_array(t, h, 2), table_array(t, h, 3)
     state, scale = table_array(t, h, 4), table_array(t, h, 5)

@@ -9,11 +9,9 @@ A stepper never changes its input. Where it raises, nothing has happened.
 - `stages`: what steps are made of
 - `stepper`: what a stepper is
 - `splitting`: kicks and drifts in turn, of orders 2, 4 and 6
-- `extrapolation`: steps that choose their own size
 - `running`, `reversibility_check`: steps one after another, and taken back
 """
 
-from kcons.steppers.extrapolation import Extrapolation
 from kcons.steppers.reversibility_check import ReversibilityCheck
 from kcons.steppers.running import Observer, Trajectory, run
 from kcons.steppers.splitting import (
@@ -37,7 +35,6 @@ __all__ = [
     "BlanesMoan6",
     "BlanesMoan6a",
     "Composition",
-    "Extrapolation",
     "Geodesic",
     "KahanLi6",
     "Observer",

@@ -35,6 +35,8 @@ from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Listed, explained, stays
 
 _MAX_ITERATIONS = 50
+#: Largest rate of friction times length of a drift; exponentials of it are still numbers.
+_MOST_DAMPED = 600.0
 _EPS = float(np.finfo(float).eps)
 _FLOAT = np.dtype(np.float64)
 _EMPTY = np.empty(0)
@@ -204,7 +206,7 @@ class Interpreter:
             room[first:] = numbers
         if program.pairs:
             self.low, self.push, self.spare = room[begin:first].reshape(3, *shape)
-        if system.friction is not None:  # flights take another time than their length
+        if system.friction:  # flights take another time than their length
             for k, row in enumerate(program.rows):
                 if row.name == "fly":
                     room[ROOM + WIDTH * k + LENGTH] = self.length(row) / dt
@@ -352,9 +354,17 @@ class Interpreter:
         return x if self.shift is None else x + self.shift
 
     def length(self, row: Row) -> float:
-        """How long a flight is."""
+        """How long a flight is: between two halves of `damp`, (2/gamma) sinh(gamma h/2) for a time h."""
         friction, h = self.system.friction, row.length * self.dt
-        return h if friction is None else friction.flight(h)
+        if not friction:
+            return h
+        if not abs(friction * h) < _MOST_DAMPED:
+            raise InputError(
+                f"friction leaves nothing of the velocities in a step of {friction * h:g} divided by its rate; use a "
+                "shorter step",
+                item="dt",
+            )
+        return 2.0 * math.sinh(0.5 * friction * h) / friction
 
     def force_of(self, row: Row) -> FloatArray:
         """The forces of its group."""
@@ -444,8 +454,7 @@ class Interpreter:
 
     def damp(self, row: Row, begun: bool) -> None:
         """Friction of the system at fixed positions."""
-        assert self.system.friction is not None
-        self.system.friction.damp(self.place(row.here), self.v, row.length * self.dt, self.at(row.end))
+        self.v *= math.exp(-self.system.friction * (row.length * self.dt))
 
     # -- the end --------------------------------------------------------------------------------
 

@@ -83,8 +83,6 @@ class Program:
         What the kernel calls for these verbs; those that it does not know and that are not here are left to Python.
     groups : sequence of str
         Names of the groups of forces, in the order in which the interpreter has them.
-    python : collection of str
-        Verbs of the kernel that are left to Python, too.
 
     Attributes
     ----------
@@ -102,9 +100,8 @@ class Program:
         operations: Sequence[Operation],
         functions: Mapping[str, Any] | None = None,
         groups: Sequence[str] = ("",),
-        python: Sequence[str] = (),
     ) -> None:
-        self.rows = list(_rows(operations, functions or {}, {name: k for k, name in enumerate(groups)}, python))
+        self.rows = list(_rows(operations, functions or {}, {name: k for k, name in enumerate(groups)}))
         flights = [row.operation for row in self.rows if isinstance(row.operation, Fly)]
         self.pairs = len(flights) > 1 or any(flight.exact for flight in flights)
         self.ends = [row.end for row in self.rows]
@@ -128,9 +125,7 @@ class Program:
         return {**vars(self), "_numbers": None}  # addresses are of no use elsewhere
 
 
-def _rows(
-    operations: Sequence[Operation], functions: Mapping[str, Any], groups: Mapping[str, int], python: Sequence[str]
-) -> Iterator[Row]:
+def _rows(operations: Sequence[Operation], functions: Mapping[str, Any], groups: Mapping[str, int]) -> Iterator[Row]:
     kick = Kick(0.0)  # what is still to be taken
     here, time, met = 0, 0.0, Counter[str]()
     for number, operation in enumerate([*operations, None]):
@@ -143,7 +138,7 @@ def _rows(
         elif isinstance(operation, Kick):
             kick = operation
         elif isinstance(operation, Fly):
-            what = PYTHON if verb in python else kernel.CIRCLE if operation.exact else kernel.FLY
+            what = kernel.CIRCLE if operation.exact else kernel.FLY
             later = takewhile(lambda other: other.verb not in SHOWN, operations[number:])
             left = sum(len(other.flights) for other in later if isinstance(other, Fly))
             for length, end in zip(operation.flights, operation.ends, strict=True):
@@ -154,7 +149,6 @@ def _rows(
                 here, time, kick = there, end, Kick(0.0)
         else:
             what = CALL if verb in functions else kernel.PROJECT if verb == "project" else PYTHON
-            what = PYTHON if verb in python else what
             group = groups.get(kick.group if kick.fraction else operation.group, 0)
             times = (operation.fraction, kick.fraction, group, time, time, met[verb])
             yield Row(verb, what, here, here, *times, operation, functions.get(verb))

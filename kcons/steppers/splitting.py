@@ -114,15 +114,13 @@ class Splitting(Interpreted):
         known = self._known
         if known is not None and known[0] is system and known[1] is system.velocity_dependent:
             return known[2]
-        exact = whole = settled = damped = False
+        exact = settled = damped = False
         if system is not None:
-            settled, friction = system.velocity_dependent, system.friction
-            exact, damped = self.exact_flight and system.great_circles is not None, friction is not None
-            # With rates of its own for each atom, friction and flight are only composed as RATTLE flights are.
-            whole = exact and (friction is None or friction.uniform)
-        kind = exact, whole, settled, damped
+            exact = self.exact_flight and system.great_circles is not None
+            settled, damped = system.velocity_dependent, system.friction > 0
+        kind = exact, settled, damped
         if kind not in self._made:
-            flight = (1.0,) if whole else self.flight
+            flight = (1.0,) if exact else self.flight
             listed = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled, damped=damped)
             self._made[kind] = listed, Program(listed)
         if system is not None:

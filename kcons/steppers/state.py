@@ -21,6 +21,7 @@ from kcons.constraints.arguments import (
     check_call,
     finite_array,
     finite_number,
+    not_negative,
     read_only_view,
     refuse_other,
 )
@@ -32,7 +33,6 @@ from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
 from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
 from kcons.steppers.stages.compiled_operations import beyond, check_finite
-from kcons.steppers.stages.friction import Friction
 from kcons.steppers.stages.packed_system import PackedSystem, spheres_of, tables_without_rows
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
@@ -216,10 +216,11 @@ class System:
         Potential energy ``potential(x, t)``, for `total_energy`.
     velocity_dependent : bool
         Whether `force` takes the velocities too (magnetic fields, drag that is not linear).
-    friction : array_like, shape () or (n_atoms,)
-        Rates at which velocities die away besides, m dv/dt = ... - gamma m v, in inverse units of time: for all atoms,
-        or for each. Solved exactly, so that it takes no shorter step and no further evaluation of the force; see
-        `kcons.steppers.stages.friction`. Relative to space at rest, also where targets move.
+    friction : float
+        Rate at which velocities die away besides, m dv/dt = ... - gamma m v, in inverse units of time. At fixed
+        positions velocities fall off as exp(-gamma t), and in free flight x = x0 + u (1 - exp(-gamma t))/gamma, also
+        along constraints: it takes no shorter step and no further evaluation of the force. Relative to space at rest,
+        also where targets move.
     far : float
         From this many times the size of what is held away from the origin, states carry the remainder of their
         positions. Infinite: never, so that positions and velocities alone are the whole state.
@@ -240,7 +241,7 @@ class System:
         *,
         potential: Callable[[FloatArray, float], float] | None = None,
         velocity_dependent: bool = False,
-        friction: ArrayLike = 0.0,
+        friction: float = 0.0,
         far: float = FAR,
     ) -> None:
         refuse_other(motion, Motion, "motion", "a kcons.Motion")
@@ -271,13 +272,12 @@ class System:
         self.inverse_masses[motion.fixed_atoms] = 0.0
         #: The same for each coordinate, shape (n_atoms, 3).
         self.weights: FloatArray = np.repeat(self.inverse_masses, 3, axis=1)
-        rates = Friction(friction, motion, self.inverse_masses)
+        #: 0 where nothing is slowed down.
+        self.friction = not_negative(friction, "friction")
         #: The state that the last step ended in, whose arrays need not be looked at.
         self.last: State | None = None
         #: Steps on their way that have ended in a state, whose they are, what they depend on, and they themselves.
         self.going: tuple[State, Any, Any, Any] | None = None
-        #: None where nothing is slowed down.
-        self.friction: Friction | None = rates if rates.largest > 0 else None
 
     def follow(self, after: State, state: State) -> None:
         """Let steps of kicks and drifts go on from `state`: what the last one ended in, velocities in other digits."""
@@ -449,10 +449,6 @@ class System:
         refuse_clock(state.time, state.step, state.time_remainder)
         x, v = as_array(x, self._shape, "positions"), as_array(v, self._shape, "velocities")
         return x, v, None if f is None or not state.has_forces_of(self) else as_array(f, self._shape, "forces")
-
-    def resisted(self, f: FloatArray, v: FloatArray) -> FloatArray:
-        """Applied forces and friction together, where friction is not solved exactly."""
-        return f if self.friction is None else f + self.friction.force(v)
 
     def with_forces(self, state: State) -> State:
         """The state with its forces filled in."""

@@ -50,17 +50,14 @@ class Stepper(Protocol):
 
 
 def require_stepper(stepper: Any, item: str = "stepper") -> None:
-    """Refuse a class, a name, and what chooses its own steps.
+    """Refuse a class, or a name.
 
     Raises
     ------
     InputError
     """
     if isinstance(stepper, type) or not hasattr(stepper, "step"):
-        remedy = "give an object, such as kcons.Rattle()"
-        if hasattr(stepper, "states"):
-            remedy = "it chooses its own steps: iterate over its states(system, state, until)"
-        raise InputError(f"{item} is {stepper!r}; {remedy}", item=item)
+        raise InputError(f"{item} is {stepper!r}; give an object, such as kcons.Rattle()", item=item)
 
 
 class DropsSystemCaches:
@@ -124,8 +121,6 @@ def explained(error: ConvergenceError, system: System, state: State, dt: float, 
             f"the state before it was already off row {held.row_name(row)} by {miss[row]:.3g}; "
             "start from System.initial_state(..., project=True)"
         )
-    elif error.singular:
-        cause = "a held dihedral becomes undefined"
     else:
         cause = f"time step too large (dt = {system.shown_time(dt)})"
     return retold(error, f"step {number}: {cause}. {error}", type(error), number)

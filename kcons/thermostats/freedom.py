@@ -420,7 +420,7 @@ def refuse_dissipation(system: System, why: str) -> None:
     """
     if system.velocity_dependent:
         raise UnsupportedError(f"forces that depend on the velocities have no {why}")
-    if system.friction is not None:
+    if system.friction:
         raise UnsupportedError(
             "a System with friction has no temperature: what it takes out, a thermostat would put back elsewhere; "
             "leave it out of the System, and give the rate to Langevin, which brings noise with it"

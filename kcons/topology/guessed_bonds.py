@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -208,24 +210,17 @@ def close_pairs(x: FloatArray, lattice: FloatArray | None, reach: float) -> tupl
     if lattice is None:
         pairs = cKDTree(x).query_pairs(reach, output_type="ndarray").astype(np.int64)
         return pairs, np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
-    axes = np.flatnonzero(lattice[1].any(axis=0))
     fractional, y = wrapped_into(x, lattice)
     # Atoms within reach of a face of the cell are repeated beyond the opposite one.
     depth = reach * np.linalg.norm(lattice[1], axis=0)
-    whole, number, place = y, np.arange(len(x)), fractional
-    for axis in axes.tolist():
-        copies, owners, places = [whole], [number], [place]
-        for sign in range(-int(np.ceil(depth[axis])), int(np.ceil(depth[axis])) + 1):
-            if sign == 0:
-                continue
-            moved = place[:, axis] + sign
-            inside = (moved > -depth[axis]) & (moved < 1 + depth[axis])
-            copies.append(whole[inside] + sign * lattice[0][axis])
-            owners.append(number[inside])
-            shifted = place[inside].copy()
-            shifted[:, axis] += sign
-            places.append(shifted)
-        whole, number, place = np.concatenate(copies), np.concatenate(owners), np.concatenate(places)
+    images = product(*(range(-int(n), int(n) + 1) for n in np.ceil(depth)))
+    copies, owners = [], []
+    for image in np.array(list(images)):
+        moved = fractional + image
+        inside = (((moved > -depth) & (moved < 1 + depth)) | (depth == 0)).all(axis=1)
+        copies.append(y[inside] + image @ lattice[0])
+        owners.append(np.flatnonzero(inside))
+    whole, number = np.concatenate(copies), np.concatenate(owners)
     found = cKDTree(y).sparse_distance_matrix(cKDTree(whole), reach, output_type="ndarray")
     owned, away = np.sort(np.stack([found["i"], number[found["j"]]], axis=1), axis=1), found["v"]
     other = owned[:, 0] != owned[:, 1]

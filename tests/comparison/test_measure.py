@@ -282,10 +282,12 @@ def test_methods_that_are_there_are_not_run_again(monkeypatch):
 def test_progress_is_told():
     class Listener(measure.Watcher):
         def __init__(self):
+            super().__init__()
             self.said = []
 
-        def begin(self, what, total):
+        def piece(self, what, total):
             self.said.append(what)
+            return super().piece(what, total)
 
     listener = Listener()
     compare(chain(), ["rattle"], rounds=1, watcher=listener)

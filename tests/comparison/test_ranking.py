@@ -137,7 +137,7 @@ def test_steps_are_found_for_an_error():
     assert good and min(r["error"] for r in good) > 0.2 * target
     whole = table_of([*table.to_dict("records"), *rows], table.attrs)
     found = rank(whole, limit=target)
-    assert found.table.method.iloc[0] == "blanes-moan4" and found.table.value.iloc[0] <= target
+    assert found.table.method.iloc[0] == "blanes-moan4" and found.table.error.iloc[0] <= target
     with pytest.raises(InputError, match="the target error is -1; give a positive number"):
         find_steps(system, table, -1, reference)
     assert find_steps(system, table, 1e-16, reference) == []

@@ -42,7 +42,6 @@ from kcons.motion import Motion, minimize
 from kcons.steppers import (
     BlanesMoan6,
     BlanesMoan6a,
-    Extrapolation,
     Geodesic,
     Rattle,
     State,
@@ -251,13 +250,6 @@ def test_observers_cannot_change_states(name: str, stepper, motion: Motion) -> N
         run(system, system.with_forces(State(X, 0 * X)), 0.01, 3, stepper=stepper, observers=[tampering])
 
 
-def test_states_between_extrapolated_steps_cannot_be_changed(motion: Motion) -> None:
-    system = System(motion, lambda x, t: PULL)
-    for state in Extrapolation(1e-6).states(system, State(X, 0 * X), 1.0):
-        with pytest.raises(ValueError, match="read-only"):
-            state.velocities[:] = 0.0
-
-
 def test_a_run_goes_on_from_what_observers_kept(motion: Motion) -> None:
     seen: list[State] = []
     system = System(motion, lambda x, t: PULL)
@@ -268,15 +260,13 @@ def test_a_run_goes_on_from_what_observers_kept(motion: Motion) -> None:
     assert isinstance(seen[1], State) and seen[1].step == 5
 
 
-@pytest.mark.parametrize("name", ["function", "gradient", "hessian_vector", "time_derivatives"])
+@pytest.mark.parametrize("name", ["function", "gradient"])
 @pytest.mark.parametrize("family", [Custom, ImplicitSurface])
 def test_functions_of_rows_cannot_change_what_they_see(family, name: str) -> None:
     single = family is Custom
     given = {
         "function": lambda r, t: np.sum(r[..., 0] ** 2, axis=None if single else -1) if single else r[:, 0] ** 2,
         "gradient": lambda r, t: 2 * r * [1.0, 0.0, 0.0],
-        "hessian_vector": lambda r, v, t: 2 * v * [1.0, 0.0, 0.0],
-        "time_derivatives": lambda r, v, t: (0.0, 0.0),
     }
 
     def tampering(*arguments):
@@ -285,8 +275,7 @@ def test_functions_of_rows_cannot_change_what_they_see(family, name: str) -> Non
         return result
 
     functions = {**given, name: tampering}
-    order = ("function", "gradient", "hessian_vector")
-    row = family([0], *(functions[key] for key in order), target=None, time_derivatives=functions["time_derivatives"])
+    row = family([0], functions["function"], functions["gradient"], target=None, time_dependent=True)
     with pytest.raises(ValueError, match="read-only"):
         held([row]).acceleration(X, X, X)
 

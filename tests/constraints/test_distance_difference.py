@@ -26,7 +26,7 @@ def test_the_nearest_point_is_that_of_a_minimizer():
     """`restore_positions` for a far target, against SLSQP, which knows nothing of kcons."""
     row = DistanceDifference(TRANSFER, -4.0)
     held = ConstraintSet(row, X, M)
-    found = Motion(held, X, degenerate="raise").restore_positions(X, bonds=[])
+    found = Motion(held, X).restore_positions(X, bonds=[])
 
     def difference(y: np.ndarray) -> float:
         a, b, c = y.reshape(3, 3)

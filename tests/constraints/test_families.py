@@ -499,19 +499,3 @@ def test_what_may_be():
     ConstraintSet(Dihedral([0, 1, 2, 3], lambda t: 60.0 + t), twisted(30.0), np.ones(4))
     held = ConstraintSet([FixedAtoms([2]), LinearCombination([2, 3], [UP, [0, 0, -1]])], twisted(30.0), [1, 1, 0, 1])
     assert held.n_rows == 4  # fixed atoms need no mass
-
-
-@pytest.mark.parametrize("explicit", [0.0, 1.0])
-def test_a_wrong_derivative_of_coefficients_is_found_before_it_moves_anything(explicit):
-    """Wrong in the part that motion makes, or in the one of time itself."""
-
-    def coefficients(r, t):
-        return np.array([[r[0, 1] * np.cos(t), 1.0, 0.0]])
-
-    def derivative(r, v, t):
-        motion = v[0, 1] * np.cos(t)
-        return np.array([[(motion if explicit else 2 * motion) - (1 + explicit) * r[0, 1] * np.sin(t), 0.0, 0.0]])
-
-    item = CustomVelocity(0, coefficients, derivative, time_dependent=True)
-    with pytest.raises(InputError, match=r"derivative gives .* for x of its atom 0, but differences .* give"):
-        ConstraintSet(item, np.array([[0.3, 0.7, 0.1]]), np.ones(1), time=0.5)

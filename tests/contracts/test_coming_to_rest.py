@@ -9,7 +9,6 @@ from stepper_systems import gravity, system_of
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge
 from kcons.errors import CertificateError
 from kcons.steppers import (
-    Extrapolation,
     Geodesic,
     KahanLi6,
     Rattle,
@@ -48,12 +47,6 @@ def test_a_damped_pendulum_comes_to_rest(stepper) -> None:
     # And it may start again from there.
     again = system.initial_state(end.positions, end.velocities)
     assert run(system, again, 0.1, 10, stepper=stepper).step == 10
-
-
-def test_extrapolation_comes_to_rest() -> None:
-    system, start = pendulum()
-    *_, end = Extrapolation(1e-8).states(system, start, 40.0)
-    np.testing.assert_allclose(end.positions, [[0, 0, 0], [0, 0, -1], [0, 0, -2]], atol=1e-7)
 
 
 def test_settled_velocities_are_those_of_the_implicit_equation() -> None:

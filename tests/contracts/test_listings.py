@@ -67,7 +67,6 @@ def systems() -> dict[str, System | None]:
         "great circles": System(spheres),
         "friction": System(bond, friction=0.1),
         "friction on great circles": System(spheres, friction=0.1),
-        "frictions on great circles": System(spheres, friction=[0.1, 0.2, 0.3]),
         "forces of velocities": System(bond, lambda x, v, t: -v, velocity_dependent=True),
         "both": System(bond, lambda x, v, t: -v, velocity_dependent=True, friction=0.1),
     }
@@ -152,12 +151,10 @@ def test_what_a_system_makes_of_a_step() -> None:
     assert verbs("nothing known") == verbs("bonds") == verbs("great circles") == plain
     assert verbs("friction") == ["kick", *["damp", "fly", "damp"] * 2, "evaluate", "kick", "project"]
     assert verbs("friction on great circles") == ["kick", "damp", "fly", "damp", "evaluate", "kick", "project"]
-    assert verbs("frictions on great circles") == verbs("friction")
     assert verbs("forces of velocities") == ["kick", "fly", "settle"]
     assert verbs("both") == ["kick", *["damp", "fly", "damp"] * 2, "settle"]
     for stepper in (Geodesic(2), BlanesMoan4(), Langevin(1.0, 1.0, 1)):
         assert all(drift.exact and len(drift.flights) == 1 for drift in drifts("great circles", stepper))
         assert not any(drift.exact or len(drift.flights) == 1 for drift in drifts("bonds", stepper))
-    assert all(drift.exact for drift in drifts("frictions on great circles", Geodesic(2)))
     assert not any(drift.exact for drift in drifts("great circles", Rattle()))
     assert Suzuki4().operations(SYSTEMS["forces of velocities"])[2] == Settle(0.5 * Suzuki4().fractions[0])

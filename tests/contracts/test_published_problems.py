@@ -16,7 +16,7 @@ import pytest
 
 from kcons import ConstraintSet, Motion, System, run
 from kcons.constraints import Distance, Formula, Sphere
-from kcons.steppers import BlanesMoan6, Extrapolation, KahanLi6, Rattle
+from kcons.steppers import BlanesMoan6, KahanLi6, Rattle
 
 ROOT = Path(__file__).parents[2]
 LENGTH, SPRING, EPSILON, MASS, HEIGHT, FREQUENCY = 1.0, 0.5, 1e-2, 10.0, 0.1, 10.0
@@ -59,19 +59,13 @@ def test_car_axis_to_order_six(car):
     np.testing.assert_allclose(found / [1.0, 2.0 * LENGTH], MULTIPLIERS, rtol=0, atol=1e-9)
 
 
-def test_car_axis_by_extrapolation(car):
-    system, start = car
-    *_, end = Extrapolation(1e-9).states(system, start, 3.0)
-    np.testing.assert_allclose(end.positions[:, :2], POSITIONS, rtol=0, atol=1e-7)
-
-
 def test_car_axis_by_no_more_evaluations_than_dop853():
     """Of what the study measures."""
     script = runpy.run_path(str(ROOT / "examples" / "studies" / "own_constraints.py"))
-    found = {name: way() for name, way in script["CAR"].items() if name != "BlanesMoan6"}
+    found = {name: way() for name, way in script["CAR"].items()}
     errors = {name: script["car_error"](each) for name, each in found.items()}
-    assert max(errors.values()) < 1e-7 and errors["Extrapolation"] < errors["SciPy alone, DOP853"]
-    assert found["Extrapolation"][2] < found["SciPy alone, DOP853"][2]
+    assert max(errors.values()) < 1e-7 and errors["BlanesMoan6"] < errors["SciPy alone, DOP853"]
+    assert found["BlanesMoan6"][2] < found["SciPy alone, DOP853"][2]
 
 
 #: Least energies of unit charges on the unit sphere.
@@ -80,7 +74,7 @@ THOMSON = {4: 3.674234614, 6: 9.985281374, 12: 49.165253058, 20: 150.881568334}
 
 @pytest.mark.parametrize(
     ("stepper", "size"),
-    [*((Rattle(), size) for size in THOMSON), (KahanLi6(), 6), (BlanesMoan6(), 6), (Extrapolation(1e-6), 6)],
+    [*((Rattle(), size) for size in THOMSON), (KahanLi6(), 6), (BlanesMoan6(), 6)],
     ids=str,
 )
 def test_friction_ends_at_the_optimum_of_thomson(stepper, size):
@@ -94,9 +88,6 @@ def test_friction_ends_at_the_optimum_of_thomson(stepper, size):
     x = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
     motion = Motion(ConstraintSet(Sphere(np.arange(size), np.zeros(3), 1.0), x, np.ones(size)), x)
     system = System(motion, repulsion, friction=0.8)
-    if isinstance(stepper, Extrapolation):
-        *_, end = stepper.states(system, system.initial_state(x), 64.0)
-    else:
-        end = run(system, system.initial_state(x), 0.16, 400, stepper=stepper)
+    end = run(system, system.initial_state(x), 0.16, 400, stepper=stepper)
     r = np.linalg.norm(end.positions[:, None] - end.positions, axis=2)
     assert (1 / r[np.triu_indices(size, 1)]).sum() == pytest.approx(THOMSON[size], abs=1e-8)

@@ -71,12 +71,12 @@ MADE = {
     "Plane": {"atoms": [0], "normal": [1.0, 0.0, 1.0], "offset": 0.3},
     "Line": {"atoms": [0], "point": [0.1, 0.2, 0.3], "direction": [1.0, 0.0, 1.0]},
     "ImplicitSurface": {
-        **{"atoms": [0, 1], "function": heights, "gradient": ups, "hessian_vector": None, "target": 0.3},
-        **{"time_dependent": False, "time_derivatives": None, "length": 0.5, "time_step": 0.1},
+        **{"atoms": [0, 1], "function": heights, "gradient": ups, "target": 0.3},
+        **{"time_dependent": False, "length": 0.5, "time_step": 0.1},
     },
     "Custom": {
-        **{"atoms": [[0]], "function": height, "gradient": up, "hessian_vector": None, "target": 0.3},
-        **{"time_derivatives": None, "time_dependent": False, "translation_invariant": False, "period": 2.0},
+        **{"atoms": [[0]], "function": height, "gradient": up, "target": 0.3},
+        **{"time_dependent": False, "translation_invariant": False, "period": 2.0},
         **{"length": 0.5, "time_step": 0.1},
     },
     "Formula": {
@@ -90,15 +90,14 @@ MADE = {
         **{"target": 0.1},
     },
     "CustomVelocity": {
-        **{"atoms": [[0]], "coefficients": up, "derivative": None, "target": 0.1, "time_dependent": False},
+        **{"atoms": [[0]], "coefficients": up, "target": 0.1, "time_dependent": False},
         **{"translation_invariant": False, "length": 0.5, "time_step": 0.1},
     },
 }
 #: Arguments that are no measured numbers: atoms, functions, flags.
 OTHERS = {
     *("self", "pairs", "triples", "quads", "atoms", "bases", "groups", "axes", "group_a", "group_b", "back", "front"),
-    *("hub", "rim", "function", "gradient", "hessian_vector", "time_derivatives", "derivative"),
-    *("formula", "parameters"),
+    *("hub", "rim", "function", "gradient", "formula", "parameters"),
     *("mass_weighted", "time_dependent", "translation_invariant"),
 }
 #: How a number of each kind is written with a unit: what it is multiplied with, and the unit.

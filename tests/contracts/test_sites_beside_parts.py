@@ -133,21 +133,19 @@ def test_a_failure_beside_parts_takes_the_whole_step_back():
     for fails in (False, True):
         system, x, v = with_particles()
         stretch = openmm.CustomBondForce("r")
-        stretch.addGlobalParameter("wanted", 0.0)
         n = len(x) - 3
         stretch.addBond(n, n + 1, [])
-        rows = CollectiveRows(system, [Row(stretch, target="wanted")], positions=x)
+        rows = CollectiveRows(system, [Row(stretch, target=0.15)], positions=x)
         context = started(system, integrator := ProjectedIntegrator(1e-3, parts=[rows]), x, v)
-        context.setParameter("wanted", 0.15)
         integrator.applyVelocityConstraints(context)
         integrator.step(3)
         if fails:
             before = state_of(context)
-            context.setParameter("wanted", -1.0)
+            rows.set_target(integrator, 0, -1.0)
             with pytest.raises(KconsError):
                 integrator.step(3)
             np.testing.assert_array_equal(state_of(context), before)
-            context.setParameter("wanted", 0.15)
+            rows.set_target(integrator, 0, 0.15)
         integrator.step(3)
         ends.append(state_of(context))
         del context

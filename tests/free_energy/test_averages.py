@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import kstest, norm
 
-from kcons.errors import UnsupportedError
-from kcons.free_energy import averages
 from kcons.free_energy.averages import agreement, weighted_mean
 
 
@@ -37,7 +33,7 @@ def test_weights_that_belong_to_the_values():
     rng, b, found = np.random.default_rng(2), 1.0, []
     for _ in range(300):
         x = ar1(rng, 3000, 0.6)
-        mean = weighted_mean(x, log_weights=b * x[:, 0] + 900.0)
+        mean = weighted_mean(x, np.exp(b * x[:, 0]))
         found.append(abs(mean.value - b) / mean.error)
     for part, off in ((0.68, 0.08), (0.95, 0.04)):
         assert np.mean(np.array(found) < norm.ppf(0.5 + part / 2)) == pytest.approx(part, abs=off)
@@ -58,19 +54,9 @@ def test_weights_mean_what_repetition_means():
     x = rng.standard_normal(200)
     often = rng.integers(1, 4, 200)
     assert weighted_mean(x, often).value == pytest.approx([np.repeat(x, often).mean()], rel=1e-13)
-    one, other = weighted_mean(x, often), weighted_mean(x, log_weights=np.log(often) - 2000.0)
+    one, other = weighted_mean(x, often), weighted_mean(x, 1e-300 * often)
     assert one.error == pytest.approx(other.error, rel=1e-9)
     assert one.n == 200 and one.n_effective <= often.sum() ** 2 / (often**2).sum()
-
-
-def test_the_beginning_can_be_left_out():
-    rng = np.random.default_rng(5)
-    x = ar1(rng, 4000, 0.5)[:, 0] + 20.0 * np.exp(-np.arange(4000) / 100)
-    with pytest.warns(UserWarning, match="worth 1.* independent ones"):
-        biased = weighted_mean(x)
-    right = weighted_mean(x, equilibration=True)
-    assert 200 <= right.start <= 1500 and right.n == 4000 - right.start
-    assert abs(right.value[0]) < 4 * right.error[0] < 0.5 * abs(biased.value[0])
 
 
 def test_a_common_factor_of_weights_does_not_matter():
@@ -95,13 +81,6 @@ def test_a_series_that_never_changes_is_warned_of():
     assert found.error[0] > 0
 
 
-def test_the_package_that_is_missing_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pymbar", None)
-    with pytest.raises(UnsupportedError, match=r"kcons\[free-energy\]"):
-        averages.weighted_mean(np.arange(20.0), equilibration=True)
-    assert averages.weighted_mean(np.arange(64.0) % 3).error > 0  # errors take nothing but NumPy
-
-
 def test_windows_that_agree_do_so_with_the_right_probability():
     """p values of means that are the same are uniform; of means that are not, they vanish."""
     rng = np.random.default_rng(8)
@@ -109,18 +88,16 @@ def test_windows_that_agree_do_so_with_the_right_probability():
     covariances = [root @ root.T for root in roots]
     drawn = [3.0 + rng.standard_normal((2000, 2)) @ root.T for root in roots]
     found = [agreement(a, covariances[0], b, covariances[1]) for a, b in zip(*drawn, strict=True)]
-    assert all(each.degrees_of_freedom == 2 for each in found)
-    assert kstest([each.p_value for each in found], "uniform").pvalue > 0.01
-    assert agreement([3.0, 3.0], covariances[0], [3.0, 9.0], covariances[1]).p_value < 1e-4
+    assert kstest(found, "uniform").pvalue > 0.01
+    assert agreement([3.0, 3.0], covariances[0], [3.0, 9.0], covariances[1]) < 1e-4
 
 
 def test_agreement_of_single_numbers_and_of_exact_ones():
-    assert agreement(1.0, 0.04, 1.5, 0.0).chi_square == pytest.approx(6.25)
-    assert agreement([1.0], [[0.04]], [1.5], [[0.0]]).p_value == pytest.approx(0.01242, rel=1e-3)
-    assert agreement(1.0, 0.0, 1.0, 0.0) == (0.0, 0, 1.0)
-    assert agreement(1.0, 0.0, 1.1, 0.0).p_value == 0.0
+    assert agreement([1.0], [[0.04]], [1.5], [[0.0]]) == pytest.approx(0.01242, rel=1e-3)
+    assert agreement(1.0, 0.0, 1.0, 0.0) == 1.0
+    assert agreement(1.0, 0.0, 1.1, 0.0) == 0.0
     one = np.diag([1.0, 0.0])
-    assert agreement([0.0, 2.0], one, [1.0, 2.0], one).degrees_of_freedom == 1
+    assert agreement([0.0, 2.0], one, [1.0, 2.0], one) == pytest.approx(agreement(0.0, 1.0, 1.0, 1.0))
 
 
 def test_what_changes_without_any_weight_is_constant():
@@ -132,5 +109,5 @@ def test_what_changes_without_any_weight_is_constant():
 
 def test_differences_of_rounding_are_none():
     """The multiplier of two atoms alone is known exactly, and each side has another rounding."""
-    assert agreement(-7.75, 1e-28, -7.75 * (1 + 1e-13), 1e-28).p_value == 1.0
-    assert agreement(-7.75, 1e-28, -7.75 * (1 + 1e-6), 1e-28).p_value == 0.0
+    assert agreement(-7.75, 1e-28, -7.75 * (1 + 1e-13), 1e-28) == 1.0
+    assert agreement(-7.75, 1e-28, -7.75 * (1 + 1e-6), 1e-28) == 0.0

@@ -27,7 +27,6 @@ from kcons.free_energy import (
     Sample,
     Series,
     Settings,
-    agreement,
     fit_surface,
     integrate,
     mean_force,
@@ -37,6 +36,7 @@ from kcons.free_energy import (
     work_along,
     work_profile,
 )
+from kcons.free_energy.averages import agreement
 from kcons.free_energy.scans.scan_result import Grid
 
 TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
@@ -167,10 +167,8 @@ def series(values):
 
 N20, ONE = np.arange(20.0), np.diag([1.0, 0.0])
 MEANS = [
-    (lambda: series([1.0]).of("angle"), "name", "no coordinate 'angle'; there are r"),
     (lambda: mean_force(N20, 1.0), "series", r"give a kcons\.free_energy\.Series"),
     (lambda: mean_force(series([1.0] * 20), 0.0), "kT", "kT is 0.0; give a positive number"),
-    *((lambda n=n: mean_force(series([1.0] * 20), 1.0, discard=n), "discard", "discard") for n in (-1, 20, 0.5)),
     (lambda: mean_force(series([1.0] * 9), 1.0), "values", "too few"),
     (lambda: mean_force(series([1.0] * 9 + [1.1] * 9), 1.0), "r", r"r moved by 0\.1"),
     (lambda: mean_force(series([1.0] * 19 + [np.nan]), 1.0), "r", "values of r are not finite"),
@@ -182,7 +180,6 @@ MEANS = [
     (lambda: weighted_mean(N20, -np.ones(20)), "weights", "negative"),
     (lambda: weighted_mean(N20, np.zeros(20)), "weights", "positive"),
     (lambda: weighted_mean(N20, np.eye(20)[3]), "weights", "sample 3 has all of the weight"),
-    (lambda: weighted_mean(N20, np.ones(20), log_weights=N20), "log_weights", "one of them"),
     (lambda: agreement([0.0, 1.0], ONE, [0.0], [[1.0]]), "covariance", "two means of 2"),
     (lambda: agreement([0.0], ONE, [0.0], ONE), "covariance", "two means of 1"),
     (lambda: agreement([np.nan], [[1.0]], [0.0], [[1.0]]), "covariance", "not finite"),

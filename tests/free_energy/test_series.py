@@ -36,7 +36,6 @@ def test_a_run_records_by_name():
     assert len(series) == 41 and series.multiplier.shape == (41, 1)
     np.testing.assert_allclose(series.time, 0.01 * np.arange(41), atol=1e-12)
     assert series.off.max() < 1e-12
-    assert series.multipliers == {"turn": series.of("turn")[-1]} and series[:0].multipliers == {}
     assert repr(series) == "<Series: 41 samples of turn>"
     # A second recorder may go on where another stopped.
     again = Recorder(recorder.system, recorder.coordinates, series)
@@ -117,8 +116,6 @@ def test_damaged_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         Series.load(tmp_path / "nothing.npz")
     assert isinstance(series[0], Sample) and series[-1].time == series.time[-1] and len(series[:3]) == 3
-    with pytest.raises(InputError, match="no coordinate 'angle'; there are bond"):
-        series.of("angle")
 
 
 def test_mdanalysis_reads_the_text_as_an_auxiliary(tmp_path):
@@ -131,5 +128,5 @@ def test_mdanalysis_reads_the_text_as_an_auxiliary(tmp_path):
     read = np.array([step.data for step in XVGReader(str(tmp_path / "held.xvg"), time_selector=0)])
     assert read.shape == (9, 7)
     np.testing.assert_allclose(read[:, 0], series.time, atol=1e-10)
-    np.testing.assert_allclose(read[:, 2], series.of("turn"), rtol=1e-10)
-    np.testing.assert_allclose(read[:, 4], series.of("bond"), rtol=1e-10)
+    np.testing.assert_allclose(read[:, 2], series.multiplier[:, 0], rtol=1e-10)
+    np.testing.assert_allclose(read[:, 4], series.multiplier[:, 1], rtol=1e-10)

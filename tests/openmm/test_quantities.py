@@ -24,7 +24,6 @@ from kcons.errors import InputError
 from kcons.openmm import (
     CarriedConstraints,
     CollectiveRows,
-    ExpressionSurface,
     Langevin,
     NoseHoover,
     ProjectedIntegrator,
@@ -124,11 +123,6 @@ def test_surfaces():
         part.check(context)
     with pytest.raises(InputError, match="Sphere: radius is 5 K; give it in nm"):
         Sphere([0], [0, 0, 0], 5 * kelvin)
-    formula = ExpressionSurface([0, 1], "x-a", {"a": [5, 7.5] * angstrom}, length=3 * angstrom)
-    np.testing.assert_allclose(formula.parameters["a"], [0.5, 0.75])
-    assert formula.length == pytest.approx(0.3)
-    with pytest.raises(InputError, match="length is 3 K"):
-        ExpressionSurface([0], "x", length=3 * kelvin)
 
 
 def test_collective_variables_of_composite_units():
@@ -182,7 +176,7 @@ def test_arguments_of_methods():
 def test_positions_of_the_wrong_kind():
     for call in (
         lambda: hold(atoms(), [Distance([[0, 1]])], positions=X * kelvin),
-        lambda: surface_parts(Sphere([0], [1, 0, 0]), n_particles=4, positions=X * kelvin),
+        lambda: surface_parts(Sphere([0], [1, 0, 0]), system=atoms(), positions=X * kelvin),
         lambda: constraints_of(openmm.app.Topology(), X[:0] * kelvin),
     ):
         with pytest.raises(InputError, match=r"positions .*give it in nm"):

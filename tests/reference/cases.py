@@ -190,60 +190,19 @@ def _ellipse_xz(spec: Spec) -> list[held.Constraint]:
             spec["atom"],
             lambda x: x**2 @ weights - 1,
             lambda x: 2 * weights * x,
-            lambda x, v: 2 * weights * v,
         )
     ]
 
 
 def _rotating_plane(spec: Spec) -> list[held.Constraint]:
-    """F = x.n(t) with n = (-sin wt, cos wt, 0), n' = w e, n'' = -w^2 n."""
-    omega = spec["omega"]
-    return [
-        held.ImplicitSurface(
-            spec["atom"],
-            lambda x, t: x @ _normal(omega * t),
-            lambda x, t: np.broadcast_to(_normal(omega * t), x.shape),
-            lambda x, v, t: np.zeros_like(x),
-            time_derivatives=lambda x, v, t: (
-                -omega * x @ _radial(omega * t),
-                -2 * omega * v @ _radial(omega * t) - omega**2 * x @ _normal(omega * t),
-            ),
-        )
-    ]
+    return [held.Formula("y1*cos(w*t) - x1*sin(w*t)", spec["atom"], {"w": spec["omega"]})]
 
 
 def _rotating_ellipse(spec: Spec) -> list[held.Constraint]:
-    """The plane, and F = (x.e(t)/a)^2 + (z/b)^2 - 1 with e = (cos wt, sin wt, 0), e' = w n, e'' = -w^2 e."""
-    omega, wa, wb = spec["omega"], 1 / spec["a"] ** 2, 1 / spec["b"] ** 2
-    up = np.array([0.0, 0.0, 1.0])
-
-    def gradient(x: Array, t: float) -> Array:
-        e = _radial(omega * t)
-        return 2 * wa * (x @ e)[:, None] * e + 2 * wb * (x @ up)[:, None] * up
-
-    def time_derivatives(x: Array, v: Array, t: float) -> tuple[Array, Array]:
-        e, n = _radial(omega * t), _normal(omega * t)
-        q, dq, ddq = x @ e, omega * x @ n, -(omega**2) * x @ e  # q and its derivatives at fixed x
-        # F = wa q^2 + ...: F_t = 2 wa q q_t; 2 F_xt.v = 4 wa (q_t v.e + q w v.n); F_tt = 2 wa (q_t^2 + q q_tt)
-        mixed = 4 * wa * (dq * (v @ e) + q * omega * (v @ n))
-        return 2 * wa * q * dq, mixed + 2 * wa * (dq**2 + q * ddq)
-
-    ellipse = held.ImplicitSurface(
-        spec["atom"],
-        lambda x, t: wa * (x @ _radial(omega * t)) ** 2 + wb * (x @ up) ** 2 - 1,
-        gradient,
-        lambda x, v, t: gradient(v, t),
-        time_derivatives=time_derivatives,
-    )
-    return [*_rotating_plane(spec), ellipse]
-
-
-def _radial(angle: float) -> Array:
-    return np.array([np.cos(angle), np.sin(angle), 0.0])
-
-
-def _normal(angle: float) -> Array:
-    return np.array([-np.sin(angle), np.cos(angle), 0.0])
+    """The plane, and an ellipse that turns with it."""
+    numbers = {"w": spec["omega"], "a": spec["a"], "b": spec["b"]}
+    ellipse = "((x1*cos(w*t) + y1*sin(w*t))/a)**2 + (z1/b)**2 - 1"
+    return [*_rotating_plane(spec), held.Formula(ellipse, spec["atom"], numbers)]
 
 
 CONSTRAINTS: dict[str, Callable[[Spec], list[held.Constraint]]] = {

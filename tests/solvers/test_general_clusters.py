@@ -31,15 +31,12 @@ def weighted_square(weights: np.ndarray) -> held.Custom:
         np.arange(len(weights)),
         lambda r: np.sum(weights * r * r, axis=(-1, -2)),
         lambda r: 2 * weights * r,
-        lambda r, v: 2 * weights * v,
     )
 
 
 def ellipsoid(atoms: np.ndarray) -> held.ImplicitSurface:
     scale = np.array([1.0, 2.0, 3.0])
-    return held.ImplicitSurface(
-        atoms, lambda r: np.sum(scale * r * r, axis=1), lambda r: 2 * scale * r, lambda r, v: 2 * scale * v, target=None
-    )
+    return held.ImplicitSurface(atoms, lambda r: np.sum(scale * r * r, axis=1), lambda r: 2 * scale * r, target=None)
 
 
 def test_ten_thousand_particles_on_a_surface_are_one_batch() -> None:

@@ -167,13 +167,7 @@ def turning(rate: float = 1.3) -> ImplicitSurface:
         0,
         lambda r, t: r[:, 0] * np.sin(rate * t) - r[:, 1] * np.cos(rate * t),
         lambda r, t: np.tile([np.sin(rate * t), -np.cos(rate * t), 0.0], (len(r), 1)),
-        lambda r, v, t: np.zeros_like(r),
         time_dependent=True,
-        time_derivatives=lambda r, v, t: (
-            rate * (r[:, 0] * np.cos(rate * t) + r[:, 1] * np.sin(rate * t)),
-            2 * rate * (v[:, 0] * np.cos(rate * t) + v[:, 1] * np.sin(rate * t))
-            - rate**2 * (r[:, 0] * np.sin(rate * t) - r[:, 1] * np.cos(rate * t)),
-        ),
         length=1.0,
     )
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stepper_systems import rotor, system_of
+from stepper_systems import system_of
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Angle, Custom, Distance, FixedAtoms, ImplicitSurface, MovingTarget, Plane, Sphere
@@ -244,7 +244,7 @@ def test_methods_of_verbs_and_errors_get_the_number_of_the_step() -> None:
                 raise ImageError("half the cell apart")
 
     system, state = molecules(*GROUPS)
-    program = Program([Kick(0.25), Evaluate()], python=("evaluate",))
+    program = Program([Kick(0.25), Evaluate()])
     program.rows.insert(0, program.rows[0]._replace(name="damp", verb=0, length=0.7, kick=0.0))
     for table, value in ((program.ends, 0.0), (program.shown, False), (program.flies, False)):
         table.insert(0, value)
@@ -532,7 +532,7 @@ def test_steps_without_solution_are_the_engines(name) -> None:
                 taken += bool(calls) if many else 1
             elif isinstance(one, KconsError) and isinstance(two, KconsError):
                 assert type(one) is type(two) and one.row == two.row and one.atoms == two.atoms and one.step == 1
-                assert ("held dihedral" if one.singular else "time step too large") in str(one)
+                assert "time step too large" in str(one)
                 failed += 1
             else:
                 assert not many
@@ -675,9 +675,3 @@ def test_what_a_python_row_raises_once_is_not_lost(stepper, march, error) -> Non
                 run(system, state, 0.01, 12, stepper=stepper)
         assert distance(state, kept) == 0.0
     assert np.abs(system.motion.constraint_set.value(stepper.step(system, state, 0.01).positions)).max() < 1e-13
-
-
-def test_a_time_step_that_is_no_number() -> None:
-    system, state = rotor()
-    with pytest.raises(InputError, match="dt is nan"):
-        run(system, state, float("nan"), 3)

@@ -84,19 +84,6 @@ def test_observed_order_of_the_projected_equation(stepper, problem) -> None:
 # -- RATTLE -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("omega_dt", [0.1, 0.5, 0.9, 0.99])
-def test_free_rotor_turns_by_asin(omega_dt):
-    system, state = rotor(omega=1.0)
-    total = 0.0
-    for _ in range(50):
-        following = Rattle().step(system, state, omega_dt)
-        total += (angle_of(following) - angle_of(state)) % (2 * np.pi)
-        state = following
-    assert abs(total - 50 * np.arcsin(omega_dt)) <= 1e-11
-    with pytest.raises(ConvergenceError, match="time step too large"):
-        Rattle().step(system, state, omega_dt + 0.901)
-
-
 def test_state_off_the_constraints_is_named_as_the_cause():
     system, _ = rotor()
     crossed = State(np.array([[0.0, 9.0, 0.0], [0.0, -9.0, 0.0]]), np.array([[90.0, 0, 0], [-90.0, 0, 0]]))
@@ -236,15 +223,6 @@ def test_which_stages_leave_the_step() -> None:
 def test_bad_fractions(fractions, order, match) -> None:
     with pytest.raises(InputError, match=match):
         Composition(fractions, order)
-
-
-def test_own_fractions() -> None:
-    """Suzuki's fractal within itself: order 4 still, and said so."""
-    stepper = Composition([a * b for a in SUZUKI_4 for b in SUZUKI_4], 4)
-    assert stepper.order == 4 and stepper.force_evaluations == 25
-    system, state = rotor(force=lambda x, t: -x)
-    ends = [run(system, state, 0.1, 10, stepper=each).positions for each in (stepper, KahanLi6())]
-    np.testing.assert_allclose(*ends, rtol=0, atol=1e-7)
 
 
 # -- the geodesic splitting -------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def _rotation() -> np.ndarray:
     return q
 
 
-def hoop(atoms: object, omega: float = 0.8, exact: bool = True) -> kc.ImplicitSurface:
+def hoop(atoms: object, omega: float = 0.8) -> kc.ImplicitSurface:
     """A plane through the z axis that turns with omega: -x sin(wt) + y cos(wt) = 0."""
 
     def function(r, t):
@@ -46,36 +46,20 @@ def hoop(atoms: object, omega: float = 0.8, exact: bool = True) -> kc.ImplicitSu
     def normal(r, t):
         return np.tile([-np.sin(omega * t), np.cos(omega * t), 0.0], (len(r), 1))
 
-    def time_derivatives(r, v, t):
-        s, c = np.sin(omega * t), np.cos(omega * t)
-        rate = -omega * (r[:, 0] * c + r[:, 1] * s)
-        mixed = -omega * (v[:, 0] * c + v[:, 1] * s)
-        return rate, 2 * mixed - omega**2 * function(r, t)
-
-    return kc.ImplicitSurface(
-        atoms,
-        function,
-        normal,
-        (lambda r, v, t: np.zeros_like(r)) if exact else None,
-        time_dependent=True,
-        time_derivatives=time_derivatives if exact else None,
-    )
+    return kc.ImplicitSurface(atoms, function, normal, time_dependent=True)
 
 
-def saddle(atoms: object, exact: bool) -> kc.ImplicitSurface:
+def saddle(atoms: object) -> kc.ImplicitSurface:
     """z = (x^2 - y^2)/4 + x^3/9."""
     return kc.ImplicitSurface(
         atoms,
         lambda r: r[:, 2] - (r[:, 0] ** 2 - r[:, 1] ** 2) / 4 - r[:, 0] ** 3 / 9,
         lambda r: np.stack([-r[:, 0] / 2 - r[:, 0] ** 2 / 3, r[:, 1] / 2, np.ones(len(r))], axis=1),
-        (lambda r, v: np.stack([(-1 / 2 - 2 * r[:, 0] / 3) * v[:, 0], v[:, 1] / 2, np.zeros(len(r))], axis=1))
-        if exact
-        else None,
         target=None,
     )
 
 
-def spread(atoms: object, exact: bool) -> kc.Custom:
+def spread(atoms: object) -> kc.Custom:
     """exp(-|r_0 - r_1|^2/8) + |r_1 - r_2|^2/5 cos(t)."""
 
     def function(r, t):
@@ -87,43 +71,21 @@ def spread(atoms: object, exact: bool) -> kc.Custom:
         second = 2 * b / 5 * np.cos(t)
         return np.array([first, second - first, -second])
 
-    def hessian_vector(r, v, t):
-        a, da, db = r[0] - r[1], v[0] - v[1], v[1] - v[2]
-        first = (-da / 4 + a * (a @ da) / 16) * np.exp(-a @ a / 8)
-        second = 2 * db / 5 * np.cos(t)
-        return np.array([first, second - first, -second])
-
-    def time_derivatives(r, v, t):
-        b, db = r[1] - r[2], v[1] - v[2]
-        return -(b @ b) / 5 * np.sin(t), -4 * (b @ db) / 5 * np.sin(t) - (b @ b) / 5 * np.cos(t)
-
-    return kc.Custom(
-        atoms,
-        function,
-        gradient,
-        hessian_vector if exact else None,
-        time_derivatives=time_derivatives if exact else None,
-        time_dependent=True,
-        translation_invariant=True,
-    )
+    return kc.Custom(atoms, function, gradient, time_dependent=True, translation_invariant=True)
 
 
 def bare(atoms: object) -> kc.Custom:
-    whole = spread(atoms, exact=False)
+    whole = spread(atoms)
     return kc.Custom(atoms, whole.function, time_dependent=True, translation_invariant=True)
 
 
-def swirl(atoms: object, exact: bool) -> kc.CustomVelocity:
+def swirl(atoms: object) -> kc.CustomVelocity:
     """(r_1 + (t, 0, 0)) x r_0 . v_0 + |r_0|^2 e_z . v_1."""
 
     def coefficients(r, t):
         return np.array([np.cross(r[1] + [t, 0, 0], r[0]), [0.0, 0.0, r[0] @ r[0]]])
 
-    def derivative(r, v, t):
-        turning = np.cross(v[1] + [1, 0, 0], r[0]) + np.cross(r[1] + [t, 0, 0], v[0])
-        return np.array([turning, [0.0, 0.0, 2 * r[0] @ v[0]]])
-
-    return kc.CustomVelocity(atoms, coefficients, derivative if exact else None, time_dependent=True)
+    return kc.CustomVelocity(atoms, coefficients, time_dependent=True)
 
 
 CASES: dict[str, Callable[[], kc.Constraint]] = {
@@ -145,16 +107,13 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Elliptic cylinder": lambda: kc.Ellipsoid([4, 5], [0.0, 0.0, 0.0], [1.0, np.inf, 3.0], target=None),
     "Plane": lambda: kc.Plane([0, 1], [[1.0, 2.0, 3.0], [0.0, 0.0, 1.0]], offset=[0.2, -0.4]),
     "Line": lambda: kc.Line([3, 4], [0.1, 0.2, 0.3], [1.0, 1.0, -0.5]),
-    "ImplicitSurface": lambda: saddle([0, 3, 5], exact=True),
-    "ImplicitSurface differenced": lambda: saddle([0, 3, 5], exact=False),
-    "ImplicitSurface moving": lambda: hoop([0, 1], exact=True),
-    "ImplicitSurface moving differenced": lambda: hoop([0, 1], exact=False),
+    "ImplicitSurface": lambda: saddle([0, 3, 5]),
+    "ImplicitSurface moving": lambda: hoop([0, 1]),
     "CenterOfMass": lambda: kc.CenterOfMass([[0, 1, 2], [3, 4, 5]], axes=(0, 2)),
     "CenterDistance": lambda: kc.CenterDistance([[0, 1, 2], [3, 4, 5]], [[3, 4], [6, 7]]),
     "RadiusOfGyration": lambda: kc.RadiusOfGyration([[0, 1, 2, 3], [4, 5, 6, 7]]),
     "RadiusOfGyration equal weights": lambda: kc.RadiusOfGyration([0, 1, 2, 3, 5], mass_weighted=False),
-    "Custom": lambda: spread([[0, 1, 2], [5, 3, 4]], exact=True),
-    "Custom differenced": lambda: spread([[0, 1, 2], [5, 3, 4]], exact=False),
+    "Custom": lambda: spread([[0, 1, 2], [5, 3, 4]]),
     "Custom without a gradient": lambda: bare([[0, 1, 2], [5, 3, 4]]),
     "Formula": lambda: kc.Formula("z1*exp(x1/4) - a*sin(b*y1)", [0, 3], {"a": 0.4, "b": [1.0, 2.0]}, target=None),
     "Formula of differences": lambda: kc.Formula(
@@ -179,6 +138,5 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "LinearVelocity": lambda: kc.LinearVelocity([[0, 1], [5, 2]], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]], np.sin),
     "KnifeEdge": lambda: kc.KnifeEdge([0, 3], [1, 4], [[0.0, 0.0, 1.0], [0.2, 0.1, 1.0]], contact=[0.0, 0.3]),
     "Rolling": lambda: kc.Rolling([0, 3], [1, 4], [0.7, 1.5], [1.0, 0.2, 0.1], [0.1, 0.0, 1.0]),
-    "CustomVelocity": lambda: swirl([[0, 1], [6, 4]], exact=True),
-    "CustomVelocity differenced": lambda: swirl([[0, 1], [6, 4]], exact=False),
+    "CustomVelocity": lambda: swirl([[0, 1], [6, 4]]),
 }

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.plan.second_order.conversion import without_second_order_rows
+from kcons.plan.second_order import without_second_order_rows
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ HEXAGON_12 = [p for p in pairs_of(6) if p[1] - p[0] != 3]
 
 def converted(rows: Constraint | Sequence[Constraint], x: Array, **options: object) -> ConstraintSet:
     given = ConstraintSet(rows, x, np.ones(len(x)), **options)  # type: ignore[arg-type]
-    return without_second_order_rows(given, x, 0.0, convert=True)
+    return without_second_order_rows(given, x, 0.0)
 
 
 def rank_of(held: ConstraintSet, x: Array) -> int:

@@ -7,10 +7,9 @@ import openmm
 from openmm import unit
 from openmm_systems import context_of
 
-from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
+from kcons.constraints import Cylinder, Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.openmm.surfaces.landings import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator
 from kcons.steppers import State
 from kcons.steppers import System as CoreSystem
@@ -18,13 +17,12 @@ from kcons.steppers import System as CoreSystem
 #: Neither a multiple of the identity nor along an axis.
 TURN = np.linalg.qr(np.array([[1.0, 0.4, -0.3], [0.2, 1.0, 0.5], [-0.6, 0.1, 1.0]]))[0]
 CENTER = np.array([0.3, -0.2, 0.5])
-FORMULA = "b*x^2 + y^2 + 2*z^2 + 0.3*x*y*z - 1; b = 1.5"
+FORMULA = "b*x1**2 + y1**2 + 2*z1**2 + 0.3*x1*y1*z1"
 
 
 def _formula(atoms, x):
     # Each particle on a level of its own.
-    level = 1.5 * x[:, 0] ** 2 + x[:, 1] ** 2 + 2 * x[:, 2] ** 2 + 0.3 * x.prod(axis=1)
-    return ExpressionSurface(atoms, "b*x^2 + y^2 + 2*z^2 + 0.3*x*y*z - level; b = 1.5", {"level": level}, length=0.5)
+    return Formula(FORMULA, atoms, {"b": 1.5}, target=None)
 
 
 KINDS = {
@@ -37,7 +35,6 @@ KINDS = {
     "torus": lambda atoms, x: Torus(atoms, CENTER, TURN[0], 1.2),
     "formula": _formula,
 }
-QUADRICS = [kind for kind in KINDS if kind not in ("torus", "formula")]
 
 MASSES = np.array([1.0, 2.5, 40.0])
 POSITIONS = np.array([[1.2, 0.3, 0.8], [-0.5, 0.7, 0.1], [0.6, -1.0, 1.3]])
@@ -79,8 +76,8 @@ def on_surface(kind, scheme, dt, platform="Reference", *, atoms=(0, 1, 2), **arg
     """Integrator and context of the three particles, those of `atoms` on surfaces of one kind."""
     atoms = np.array(atoms)
     system = system_of()
-    surfaces, step = KINDS[kind](atoms, POSITIONS[atoms]), dt * unit.picosecond
-    integrator = SurfaceIntegrator(step, scheme, surfaces=surfaces, system=system, positions=POSITIONS, **arguments)
+    options = {"surfaces": KINDS[kind](atoms, POSITIONS[atoms]), "system": system, "device": False} | arguments
+    integrator = SurfaceIntegrator(dt * unit.picosecond, scheme, positions=POSITIONS, **options)
     return integrator, started(system, integrator, POSITIONS, VELOCITIES, platform)
 
 
@@ -100,10 +97,17 @@ def energy_of(context, integrator):
 def worst(integrator, context):
     """Largest distance from a surface (nm), and velocity across one relative to the speed."""
     x, v = state_of(context)
-    off = max(np.abs(part.distances(x)).max() for part in integrator.surfaces)
+    rows = integrator.surfaces
+    slopes = [item.gradient(x[item.atoms], 0.0)[:, 0] for item in rows]
+    sizes = [np.linalg.norm(slope, axis=1) for slope in slopes]
+    off = max(
+        np.abs((item.measure(x[item.atoms], 0.0) - item.target_at(0.0)) / size).max()
+        for item, size in zip(rows, sizes, strict=True)
+    )
+    held = [v[item.atoms[:, 0]] for item in rows]
     across = max(
-        (np.abs(np.einsum("ij,ij->i", part.normals(x), v[part.atoms])) / np.linalg.norm(v[part.atoms], axis=1)).max()
-        for part in integrator.surfaces
+        (np.abs(np.einsum("ij,ij->i", slope, u)) / size / np.linalg.norm(u, axis=1)).max()
+        for slope, size, u in zip(slopes, sizes, held, strict=True)
     )
     return off, across
 
@@ -112,7 +116,6 @@ def core_run(kind, stepper, dt, steps, atoms=(0, 1, 2)):
     """The same motion by kcons' own steppers: positions and velocities."""
     atoms = np.array(atoms)
     rows = KINDS[kind](atoms, POSITIONS[atoms])
-    rows = rows.rows() if isinstance(rows, ExpressionSurface) else rows
     motion = Motion(ConstraintSet(rows, POSITIONS, MASSES), POSITIONS)
     system = CoreSystem(motion, force_of)
     state: State = system.initial_state(POSITIONS, VELOCITIES, project=True)

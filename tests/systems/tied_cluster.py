@@ -85,7 +85,7 @@ def on_a_sphere(radius=RADIUS, strength=200.0, **options):
     system = cluster(strength)
     surface = Sphere([0], CENTER, radius)
     integrator = SurfaceIntegrator(0.002, surfaces=surface, system=system, **options)
-    return begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.surfaces[0])
+    return begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.parts[0])
 
 
 def row_at(target=0.30, strength=200.0, **options):
@@ -108,7 +108,6 @@ KINDS = {
     "Isokinetic": thermostatted(Isokinetic(300)),
     "isokinetic4": thermostatted(Isokinetic(300), scheme="isokinetic4"),
     "sphere": on_a_sphere,
-    "sphere, compiled": lambda **given: on_a_sphere(compiled=True, **given),
     "sphere, Langevin": lambda **given: on_a_sphere(ensemble=Langevin(300, 1.0), **given),
     "collective": row_at,
     "collective, Langevin": lambda **given: row_at(ensemble=Langevin(300, 1.0), **given),

@@ -20,14 +20,12 @@ from kcons.constraints.arguments import (
     check_call,
     positive,
     read_only_view,
-    unit,
 )
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import (
     FIRST_4,
     WRONG,
     Target,
-    contradiction,
     exact_step,
     first_derivative,
     first_derivative_4,
@@ -101,8 +99,8 @@ class Custom(PythonRows):
     What is not given is taken by central differences: the gradient from four values a coordinate, order four, at steps
     of 1e-3 `length` (about eleven digits if the function varies on the scale of `length`); the curvature from four
     gradients along v in the same way, or without these from eight values along v, order eight, at steps of `length`/50
-    (about ten digits); time derivatives by eighth-order formulas with step `time_step`. What is given is compared with
-    differences when the row is put into a set.
+    (about ten digits); time derivatives by eighth-order formulas with step `time_step`. A gradient that is given is
+    compared with differences when the row is put into a set. `Formula` is differentiated exactly.
 
     Parameters
     ----------
@@ -113,14 +111,10 @@ class Custom(PythonRows):
     gradient : callable, optional
         ``gradient(r) -> (width, 3)``; with `time_dependent`, ``(r, t)``. Where Numba has compiled it and the function,
         kernels call both without Python.
-    hessian_vector : callable, optional
-        ``hessian_vector(r, v) -> (width, 3)``, the Hessian of q times v; with `time_dependent`, ``(r, v, t)``.
     target : float, array_like, callable of time, MovingTarget or None
         Value held; None takes the initial one.
     time_dependent : bool
         Whether the functions take the time as their last argument.
-    time_derivatives : callable, optional
-        ``(r, v, t) -> (dq/dt, 2 (d2q/dr dt) . v + d2q/dt2)``, two floats.
     translation_invariant : bool
         Whether only differences of positions count; then minimum images apply in periodic cells.
     period : float, optional
@@ -131,7 +125,7 @@ class Custom(PythonRows):
         Step of the time differences: about 1/50 of the time over which the function changes.
     """
 
-    functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function", "hessian_vector", "time_derivatives")
+    functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function")
     kind = RowKind.FUNCTION
     singular = "{row}: value and gradient must be finite, and the gradient not zero; move the atoms"
 
@@ -140,9 +134,7 @@ class Custom(PythonRows):
         atoms: ArrayLike,
         function: Callable[..., Any],
         gradient: Callable[..., Any] | None = None,
-        hessian_vector: Callable[..., Any] | None = None,
         target: Target = None,
-        time_derivatives: Callable[..., Any] | None = None,
         *,
         time_dependent: bool = False,
         translation_invariant: bool = False,
@@ -151,14 +143,11 @@ class Custom(PythonRows):
         time_step: Duration = 0.02,
     ) -> None:
         super().__init__(atoms, target)
-        self.time_dependent = bool(time_dependent) or time_derivatives is not None
+        self.time_dependent = bool(time_dependent)
         last = ("t",) if self.time_dependent else ()
         check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME, needed=True)
         check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
-        check_call(f"{self.family}: hessian_vector", hessian_vector, ("r", "v", *last), TAKES_TIME)
-        check_call(f"{self.family}: time_derivatives", time_derivatives, ("r", "v", "t"))
         self.function, self.gradient_function = function, gradient
-        self.hessian_vector, self.time_derivatives = hessian_vector, time_derivatives
         self.translation_invariant, self.period = bool(translation_invariant), period
         self.length, self.time_step = length, time_step
 
@@ -209,12 +198,6 @@ class Custom(PythonRows):
         )
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        if self.hessian_vector is None:
-            return self._differenced_curvature(r, v, time)
-        product = self._call(self.hessian_vector, "hessian_vector", (self.width, 3), r, v, *self._time(time))
-        return _contract(product, v)
-
-    def _differenced_curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         speed, start, length = np.sqrt(_contract(v, v)), np.zeros(self.n_rows), self._length(r)
         along = v / np.where(speed > 0, speed, 1.0)[:, None, None]
         if self.gradient_function is None:
@@ -232,9 +215,6 @@ class Custom(PythonRows):
     def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         if not self.time_dependent:
             return super().time_terms(r, v, time)
-        if self.time_derivatives is not None:
-            both = self._call(self.time_derivatives, "time_derivatives", (2,), r, v, time)
-            return both[:, 0], both[:, 1]
         h = self.time_step
         rate = first_derivative(lambda t: self.measure(r, t), time, h, self.period)
         second = second_derivative(lambda t: self.measure(r, t), time, h, self.period)
@@ -285,43 +265,6 @@ class Custom(PythonRows):
 
             given = _contract(slope, along)
             self.refuse_input(~(np.abs(given - found) <= WRONG * size), first_row, worst, "gradient")
-        if self.hessian_vector is not None:
-            given, bent = self.curvature(r, along, time), self._differenced_curvature(r, along, time)
-            self.refuse_input(
-                ~(np.abs(given - bent) <= WRONG * (np.abs(bent) + size / length)),
-                first_row,
-                lambda k: (
-                    f"hessian_vector gives {given[k]:.6g} along a test direction, but differences of the function give "
-                    f"{bent[k]:.6g}; {remedy}"
-                ),
-                "hessian_vector",
-            )
-        if self.time_derivatives is not None:
-            self._check_time_derivatives(r, along, time, first_row)
-
-    def _check_time_derivatives(self, r: FloatArray, v: FloatArray, time: float, first_row: int) -> None:
-        def terms(t: float, speed: float = 0.0) -> tuple[FloatArray, FloatArray]:
-            return self.time_terms(r, speed * v, t)
-
-        for name, given, function, period in (
-            ("dq/dt", lambda t: terms(t)[0], lambda t: self.measure(r, t), self.period),
-            ("d2q/dt2", lambda t: terms(t)[1], lambda t: terms(t)[0], None),
-            (
-                "(d2q/dr dt) . v",
-                lambda t: (terms(t, 1.0)[1] - terms(t)[1]) / 2,
-                lambda t: _contract(self.gradient(r, t), v),
-                None,
-            ),
-        ):
-            found = contradiction(given, function, time, self.time_step, period)
-            if found is not None:
-                raise InputError(
-                    f"row {first_row + found.number}, {self.row_name(found.number)}: time_derivatives give "
-                    f"{found.given:.6g} for {name} at t = {found.time:g}, but differences give {found.found:.6g}; "
-                    "correct them, or leave them out",
-                    item="time_derivatives",
-                    atoms=self.atoms[found.number].tolist(),
-                )
 
 
 class ImplicitSurface(Custom):
@@ -333,9 +276,8 @@ class ImplicitSurface(Custom):
         The atoms; each is one row.
     function : callable
         ``function(r) -> (n_rows,)`` for positions of shape (n_rows, 3); with `time_dependent`, ``(r, t)``.
-    gradient, hessian_vector, time_derivatives : callable, optional
-        As for `Custom`, for all atoms: ``gradient(r) -> (n_rows, 3)``, ``hessian_vector(r, v) -> (n_rows, 3)``, and
-        ``time_derivatives(r, v, t)`` gives two arrays of shape (n_rows,).
+    gradient : callable, optional
+        As for `Custom`, for all atoms: ``gradient(r) -> (n_rows, 3)``.
     target : float, array_like, callable of time, MovingTarget or None
         Level held: 0 by default, None for the level each atom starts on.
     time_dependent, time_step
@@ -365,17 +307,14 @@ class ImplicitSurface(Custom):
         atoms: ArrayLike,
         function: Callable[..., Any],
         gradient: Callable[..., Any] | None = None,
-        hessian_vector: Callable[..., Any] | None = None,
         target: Target = 0.0,
         *,
         time_dependent: bool = False,
-        time_derivatives: Callable[..., Any] | None = None,
         length: _Length = None,
         time_step: Duration = 0.02,
     ) -> None:
         given: dict[str, Any] = {"time_dependent": time_dependent, "length": length, "time_step": time_step}
-        column = atom_column(atoms, self.family)
-        super().__init__(column, function, gradient, hessian_vector, target, time_derivatives, **given)
+        super().__init__(atom_column(atoms, self.family), function, gradient, target, **given)
 
     @property
     def kind(self) -> RowKind:  # type: ignore[override]
@@ -394,8 +333,6 @@ class ImplicitSurface(Custom):
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
         found = function(*(read_only_view(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments))
-        if name == "time_derivatives":
-            found = np.stack([np.broadcast_to(as_float_array(part, name), (self.n_rows,)) for part in found], axis=-1)
         result = as_float_array(found, f"ImplicitSurface: {name}")
         wanted = (self.n_rows, 3) if shape == (1, 3) else (self.n_rows, *shape)
         if result.shape != wanted:
@@ -416,11 +353,8 @@ class CustomVelocity(PythonRows, VelocityRows):
         Atoms of each row.
     coefficients : callable
         ``coefficients(r) -> (width, 3)`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``. It must
-        depend on nothing else. Where Numba has compiled it, kernels call it without Python.
-    derivative : callable, optional
-        ``derivative(r, v) -> (width, 3)``, the time derivative of the coefficients along the motion; with
-        `time_dependent`, ``(r, v, t)``, and the explicit time derivative included. Without it the coefficients
-        are differenced along the motion, order four: about eleven digits.
+        depend on nothing else. Where Numba has compiled it, kernels call it without Python. Its change along the motion
+        is differenced, order four: about eleven digits. `VelocityFormula` is differentiated exactly.
     target : float, array_like, callable of time, or MovingTarget
         What the row is held at, 0 by default.
     time_dependent : bool
@@ -432,13 +366,12 @@ class CustomVelocity(PythonRows, VelocityRows):
     """
 
     singular = "{row}: the coefficients are zero or not finite; move the atoms"
-    functions: ClassVar[tuple[str, ...]] = ("coefficients", "derivative")
+    functions: ClassVar[tuple[str, ...]] = ("coefficients",)
 
     def __init__(
         self,
         atoms: ArrayLike,
         coefficients: Callable[..., Any],
-        derivative: Callable[..., Any] | None = None,
         target: Target = 0.0,
         *,
         time_dependent: bool = False,
@@ -449,9 +382,7 @@ class CustomVelocity(PythonRows, VelocityRows):
         super().__init__(atoms, target)
         last = ("t",) if time_dependent else ()
         check_call("CustomVelocity: coefficients", coefficients, ("r", *last), TAKES_TIME, needed=True)
-        check_call("CustomVelocity: derivative", derivative, ("r", "v", *last), TAKES_TIME)
         self.coefficients = coefficients
-        self.derivative = derivative
         self.time_dependent = bool(time_dependent)
         self.translation_invariant = bool(translation_invariant)
         self.length = length
@@ -475,9 +406,6 @@ class CustomVelocity(PythonRows, VelocityRows):
 
     def _changes(self, k: int, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         """Rate of the coefficients of row `k` along v."""
-        if self.derivative is not None:
-            found = self.derivative(read_only_view(r), read_only_view(v), *self._time(time))
-            return np.asarray(self._checked(found, k, "derivative", r.shape))
         speed = float(np.sqrt(np.sum(v * v)))
         if speed == 0:
             return np.zeros_like(r)
@@ -485,36 +413,6 @@ class CustomVelocity(PythonRows, VelocityRows):
         if self.time_dependent:
             step = exact_step(min(step, self.time_step), time)
         return first_derivative_4(lambda s: self.row_gradient(k, r + s * v, time + s), 0.0, step)
-
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        super().check(r, time, first_row)
-        if self.derivative is None:
-            return
-        # A wrong derivative would give wrong motion without any other sign.
-        along = self.length * unit(np.random.default_rng(0).normal(size=(self.width, 3)), "along")
-        for k in range(self.n_rows):
-            self._check_derivative(k, r[k], along, 0.01, time, first_row)
-            if self.time_dependent:
-                self._check_derivative(k, r[k], np.zeros_like(along), self.time_step, time, first_row)
-
-    def _check_derivative(
-        self, k: int, r: FloatArray, v: FloatArray, time_step: float, time: float, first_row: int
-    ) -> None:
-        found = contradiction(
-            lambda s: self._changes(k, r + s * v, v, time + s),
-            lambda s: self.row_gradient(k, r + s * v, time + s),
-            0.0,
-            time_step,
-        )
-        if found is not None:
-            atom, axis = divmod(found.number, 3)
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: derivative gives {found.given:.6g} for {'xyz'[axis]} of its "
-                f"atom {self.atoms[k, atom]}, but differences of the coefficients give {found.found:.6g}; correct it, "
-                "or leave it out",
-                item="derivative",
-                atoms=self.atoms[k].tolist(),
-            )
 
 
 @cache

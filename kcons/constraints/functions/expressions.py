@@ -18,6 +18,7 @@ import os
 import re
 import sys
 import tempfile
+import uuid
 from collections.abc import Sequence
 from functools import cache
 from itertools import count
@@ -28,7 +29,6 @@ from typing import Any
 import numba
 import numpy as np
 
-from kcons.constraints.compilation import keep, kept
 from kcons.errors import InputError, UnsupportedError
 
 #: Characters of a formula, levels of its tree (a sum of n terms has n), and parts of its second derivatives.
@@ -306,8 +306,6 @@ class Code:
     second : callable
         v^T (d2q/dr2) v, dq/dt and 2 (d2q/dr dt) . v + d2q/dt2, of the coordinates, the velocities, the time and the
         parameters. Of velocities v . (d coefficients/dt).
-    plain_first, plain_second : callable
-        The same of plain numbers, in a tenth of the time; what is undefined raises, or is complex.
     invariant, moving : bool
         Whether a common shift of all atoms changes nothing; whether the time is in it.
     """
@@ -316,7 +314,6 @@ class Code:
         self.tree, self.row = tree, module.row
         self.first = FunctionType(module.first.py_func.__code__, _NUMPY)
         self.second = FunctionType(module.second.__code__, _NUMPY)
-        self.plain_first, self.plain_second = module.first.py_func, module.second
         self.invariant, self.moving = bool(module.INVARIANT), bool(module.MOVING)
 
 
@@ -324,23 +321,27 @@ _NUMPY: dict[str, Any] = {**FUNCTIONS, "copysign": np.copysign, "__builtins__": 
 
 
 def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], speeds: bool) -> ModuleType:
-    """The module of a formula, from its file if there is one that is whole."""
+    """The module of a formula, from its file if there is one."""
     meant = repr((formula.strip(), width, parameters, speeds)).encode()
     key = hashlib.sha256(Path(__file__).read_bytes() + meant).hexdigest()[:24]  # other code writes other files
     path = _folder() / f"formula_{key}.py"
-    text = kept(path)
-    if text is None:
-        text = _written(formula, tree, width, parameters, speeds).encode()
+    if path.is_file():
+        text = path.read_text(encoding="utf-8")
+    else:
+        text = _written(formula, tree, width, parameters, speeds)
+        unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
         try:
-            keep(path, text)
+            unfinished.write_text(text, encoding="utf-8")
+            os.replace(unfinished, path)
         except OSError as error:
+            unfinished.unlink(missing_ok=True)
             raise UnsupportedError(
                 f"the code of a formula cannot be written to {path.parent}: {error}; set NUMBA_CACHE_DIR to a folder "
                 "with space in it"
             ) from error
     # Numba looks for what it has kept by the names of modules.
     module = sys.modules[f"kcons_{path.stem}"] = ModuleType(f"kcons_{path.stem}")
-    exec(compile(b"\n" + text, path, "exec"), module.__dict__)  # the digest is the first line
+    exec(compile(text, path, "exec"), module.__dict__)
     return module
 
 

@@ -134,35 +134,19 @@ class Formula(Constraint):
     def row(self) -> Callable[[Any, Any, Any, Any], None]:  # type: ignore[override]
         return self.code().row
 
-    def _plain(self, function: Callable[..., tuple[float, ...]], time: float, *arrays: FloatArray) -> FloatArray | None:
-        """What a function of plain numbers gives for a single row, a row each; None where it is undefined."""
-        numbers = [number for array in arrays for number in array.ravel().tolist()]
-        try:
-            found = np.array(function(*numbers, float(time), *self.values[0].tolist()))
-        except (ValueError, ArithmeticError):
-            return None
-        return None if found.dtype.kind == "c" else found[:, None]
-
-    def _both(
-        self, plain: Callable[..., Any], function: Callable[..., Any], time: float, *arrays: FloatArray
-    ) -> Sequence[FloatArray]:
-        """Results of `function` for all rows, an array of one number a row each; of a single row by `plain` numbers."""
-        if self.n_rows == 1:
-            alone = self._plain(plain, time, *arrays)
-            if alone is not None:
-                return alone  # type: ignore[return-value]
+    def _evaluated_by(self, function: Callable[..., Any], time: float, *arrays: FloatArray) -> list[FloatArray]:
+        """Results of `function` for all rows, an array of one number a row each."""
         columns = [column for array in arrays for column in array.reshape(self.n_rows, -1).T]
         with np.errstate(all="ignore"):
             found = function(*columns, time, *self.values.T)
         return [np.broadcast_to(np.asarray(part, dtype=np.float64), (self.n_rows,)) for part in found]
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        code = self.code()
-        value, *slope = self._both(code.plain_first, code.first, time, *([r] if self.holonomic else [r, 0.0 * r]))
+        value, *slope = self._evaluated_by(self.code().first, time, *([r] if self.holonomic else [r, 0.0 * r]))
         return np.array(value), np.array(slope).T.reshape(r.shape).copy()
 
     def _second(self, r: FloatArray, v: FloatArray, time: float) -> Sequence[FloatArray]:
-        return self._both(self.code().plain_second, self.code().second, time, r, v)
+        return self._evaluated_by(self.code().second, time, r, v)
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         return self._second(r, v, time)[0]

@@ -51,8 +51,6 @@ class AseRecorder:
         multipliers in eV by the unit of the coordinate.
     coordinates : mapping of str to Constraint
         As for `HeldCoordinates`.
-    constraint_forces : bool
-        Whether ``atoms.arrays["constraint_forces"]`` (eV/angstrom) is written too. Takes a solve of all rows.
 
     Attributes
     ----------
@@ -70,10 +68,8 @@ class AseRecorder:
     ``dynamics.attach(AseRecorder(dynamics, {"torsion": torsion}), interval=10)``
     """
 
-    def __init__(
-        self, dynamics: MolecularDynamics, coordinates: Mapping[str, Constraint], *, constraint_forces: bool = False
-    ) -> None:
-        self.dynamics, self.constraint_forces = dynamics, constraint_forces
+    def __init__(self, dynamics: MolecularDynamics, coordinates: Mapping[str, Constraint]) -> None:
+        self.dynamics = dynamics
         self.coordinates = named(coordinates)
         for name in self.coordinates:
             if "=" in name or name in _TAKEN:
@@ -125,9 +121,6 @@ class AseRecorder:
         for name, value, multiplier in zip(held.names, sample.value, sample.multiplier, strict=True):
             atoms.info[name], atoms.info[f"multiplier of {name}"] = float(value), float(multiplier)
         atoms.info["ln det Z"] = sample.log_det_z
-        if self.constraint_forces:
-            assert self._motion is not None
-            atoms.set_array("constraint_forces", self._motion.constraint_force(x, v, np.asarray(forces), time))
 
 
 class AseWindows(Sampler):

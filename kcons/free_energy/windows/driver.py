@@ -302,7 +302,7 @@ def combine_sides(
     covariances = np.array([side.covariance * np.outer(per, per) for side in sides.values()])
     covariance, chance = covariances.sum(axis=0) / len(sides) ** 2, math.nan
     if len(sides) == 2:
-        chance = agreement(forces[0], covariances[0], forces[1], covariances[1]).p_value
+        chance = agreement(forces[0], covariances[0], forces[1], covariances[1])
         if chance < UNLIKELY:
             half = (forces[0] - forces[1]) / 2
             covariance = covariance + np.outer(half, half)

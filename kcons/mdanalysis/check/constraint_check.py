@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -17,14 +17,20 @@ from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
 from kcons.mdanalysis.check.deviations import Found, RowTable
-from kcons.mdanalysis.check.endings import broken_by, damage_of, ending_of
-from kcons.mdanalysis.check.precision import by_frame, described, grid_of, precision_of, precision_of_reader
+from kcons.mdanalysis.check.endings import Break, broken_by, damage_of, ending_of
+from kcons.mdanalysis.check.precision import (
+    FilePrecision,
+    by_frame,
+    described,
+    grid_of,
+    precision_of,
+    precision_of_reader,
+)
 from kcons.mdanalysis.check.result import Asked, CheckResult, result_of
 from kcons.mdanalysis.check.targets import AtomNames, TargetFile
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, open_universe, quiet
@@ -66,9 +72,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
     target_error : float or ndarray, shape (n_atoms,)
         Rounding of the targets, in angstrom a coordinate, of each atom or of all; for 'given' targets that were
         measured in another file.
-    removed : int, optional
-        Degrees of freedom that the engine took away besides: 3 where it stops the center of mass. Found from the
-        total momentum by default.
     rank : bool
         Whether to find the rank, which takes longer than the frames of a short trajectory.
     worst : int
@@ -102,7 +105,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         tolerance: float = 1e-4,
         precision: float | None = None,
         target_error: float | FloatArray = 0.0,
-        removed: int | None = None,
         rank: bool = True,
         worst: int = 10,
         names: tuple[str, str] | None = None,
@@ -128,8 +130,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             raise InputError(
                 f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
             )
-        if removed is not None:
-            removed = whole_number(removed, "removed", 0)
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         described = topology_of(universe)
@@ -148,7 +148,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         self._path = str(getattr(reader, "filename", None) or "")
         names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         remarks = [f"no temperature: {reason}"] if reason else []
-        self.asked = Asked(names, labels, mode, text, removed, int(worst), remarks + _remarks_on(reader))
+        self.asked = Asked(names, labels, mode, text, int(worst), remarks + _remarks_on(reader))
         self._given, self._tolerance, self._wants_rank = given, float(tolerance), rank
         self._target_error = np.broadcast_to(errors, n_atoms)
         self._precision = precision_of_reader(reader, precision)
@@ -197,7 +197,9 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             self._look_for_grid(numbers)
         self._bind(int(numbers[0]))
         self._damage = damage_of(self._trajectory)
-        self.results = Results()  # those of an earlier run need not go to other processes
+        given = self._masses if self._trajectory.ts.has_velocities else None
+        precision = self._by_frame or self._precision
+        self._compute = _Frames(self._trajectory, self._rows, given, self._velocities, self._damage, precision)
         self._first_pass = self.asked.mode == "mean"
         if self._first_pass:
             super().run(**chosen, **options)
@@ -279,35 +281,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             item="trajectory",
         )
 
-    def _compute(
-        self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
-    ) -> Any:
-        """Look at one worker's frames, in order, up to the first that cannot be used.
-
-        MDAnalysis' own loop ends in an error there, and sends the whole analysis back.
-        """
-        numbers, trajectory, previous = indexed_frames[:, 1], self._trajectory, -1
-        found = Found.nothing(self._rows.set.n_rows, numbers)
-        shown = getattr(self, "_verbose", False) if verbose is None else verbose
-        with quiet(), ProgressBar(total=len(numbers), verbose=shown, **(progressbar_kwargs or {})) as bar:
-            for k, number in enumerate(numbers.tolist()):
-                try:
-                    if self._damage is not None and number >= self._damage.frame:
-                        found.broken = self._damage
-                    else:
-                        # Seeking reads compressed files from their beginning.
-                        ts = trajectory.next() if 0 <= previous == number - 1 else trajectory[number]
-                        previous = number
-                        v = ts.velocities if ts.has_velocities and self._velocities else None
-                        self._rows.look(found, k, ts, self._precision_at(number), self._masses, v)
-                except (*READ_ERRORS, KconsError) as error:
-                    found.broken = broken_by(error, trajectory, number)
-                if found.broken is not None:
-                    found.units, found.frames = found.units[:k], found.frames[:k]
-                    break
-                bar.update()
-        return SimpleNamespace(frames=found.frames["frame"], times=found.frames["time"], results=Results(found=found))
-
     def _get_aggregator(self) -> ResultsGroup:
         return ResultsGroup(lookup={"found": Found.joined})
 
@@ -337,6 +310,51 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         if "check" not in self.results:
             raise InputError("nothing was looked at yet; call run() first", item="check")
         return self.results.check  # type: ignore[no-any-return]
+
+
+@dataclass
+class _Frames:
+    """The work of one worker, which is all that goes to other processes.
+
+    MDAnalysis' own loop ends in an error at the first frame that cannot be used, and takes the whole analysis there
+    and back.
+    """
+
+    trajectory: Any
+    rows: RowTable
+    #: None where there are no velocities, or no masses.
+    masses: FloatArray | None
+    velocities: bool
+    damage: Break | None
+    #: Of all frames, or of each.
+    precision: FilePrecision | Sequence[FilePrecision]
+
+    def __call__(
+        self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
+    ) -> Any:
+        """Look at frames, in order, up to the first that cannot be used."""
+        numbers, trajectory, previous = indexed_frames[:, 1], self.trajectory, -1
+        found = Found.nothing(self.rows.n_rows, numbers)
+        with quiet(), ProgressBar(total=len(numbers), verbose=bool(verbose), **(progressbar_kwargs or {})) as bar:
+            for k, number in enumerate(numbers.tolist()):
+                try:
+                    if self.damage is not None and number >= self.damage.frame:
+                        found.broken = self.damage
+                    else:
+                        # Seeking reads compressed files from their beginning.
+                        ts = trajectory.next() if 0 <= previous == number - 1 else trajectory[number]
+                        previous = number
+                        v = ts.velocities if ts.has_velocities and self.velocities else None
+                        told = self.precision
+                        told = told if isinstance(told, FilePrecision) else told[number]
+                        self.rows.look(found, k, ts, told, self.masses, v)
+                except (*READ_ERRORS, KconsError) as error:
+                    found.broken = broken_by(error, trajectory, number)
+                if found.broken is not None:
+                    found.units, found.frames = found.units[:k], found.frames[:k]
+                    break
+                bar.update()
+        return SimpleNamespace(frames=found.frames["frame"], times=found.frames["time"], results=Results(found=found))
 
 
 def _masses(

@@ -163,6 +163,16 @@ class RowTable:
         found, told = (self._made_of(errors, slopes) for errors in (precision.half_step(x), target_error))
         self._allow(np.where(self.measured, found, told))
 
+    @property
+    def n_rows(self) -> int:
+        return len(self._table)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What `look` needs, in other processes: to copy all of it takes longer than to look at some frames."""
+        kept = {"_dimensions", "_cell", "_table", "_given", "_runs", "_is_held", "others", "_rows"}
+        kept |= {"_atoms", "means"} if self.others is not None else set()
+        return {name: value for name, value in vars(self).items() if name in kept}
+
     def _made_of(self, errors: FloatArray, slopes: Any) -> FloatArray:
         """What errors of coordinates make of each row, at most: of lengths exactly, of others to first order and more.
 

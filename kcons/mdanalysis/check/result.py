@@ -186,8 +186,6 @@ class Asked:
     #: Where targets come from, 'given', 'first' or 'mean', and the same in words.
     mode: str
     targets: str
-    #: Degrees of freedom that the MD engine took away; None to find them.
-    removed: int | None
     #: Number of rows to name.
     worst: int
     #: What there is to say besides, and what is known beforehand to be missing.
@@ -228,7 +226,7 @@ def result_of(
     }
     freedom, temperature = None, None
     if rank is not None:
-        freedom, kelvin = _temperatures(found, rank, masses, asked.removed, remarks)
+        freedom, kelvin = _temperatures(found, rank, masses, remarks)
         if kelvin is not None:
             series["temperature K"] = kelvin.tolist()
             line = fitted(times, kelvin)
@@ -387,22 +385,18 @@ def _gaps(found: Found, table: RowTable, untold: NDArray[np.bool_], targets: str
     return gaps
 
 
-def _temperatures(
-    found: Found, rank: int, masses: FloatArray, removed: int | None, remarks: list[str]
-) -> tuple[int, FloatArray | None]:
+def _temperatures(found: Found, rank: int, masses: FloatArray, remarks: list[str]) -> tuple[int, FloatArray | None]:
     """Degrees of freedom, and temperatures in K by frame where there are velocities and masses; remarks are added."""
     freedom = 3 * int(np.count_nonzero(masses > 0)) - rank
     twice = np.array(found.frames["kinetic"])
     has = np.isfinite(twice)
     if not has.any():
-        return max(freedom - (removed or 0), 0), None
-    if removed is None:
-        center = (found.frames["momentum"][has] ** 2).sum(axis=1) / masses.sum()
-        still = float(center.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean())
-        removed = 3 if still and freedom > 3 else 0
-        what = "at rest: 3 degrees of freedom less" if removed else "not at rest: it counts"
-        remarks.append(f"the center of mass is {what}")
-    freedom -= removed
+        return max(freedom, 0), None
+    center = (found.frames["momentum"][has] ** 2).sum(axis=1) / masses.sum()
+    still = float(center.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean()) and freedom > 3
+    what = "at rest: 3 degrees of freedom less" if still else "not at rest: it counts"
+    remarks.append(f"the center of mass is {what}")
+    freedom -= 3 * still
     if freedom <= 0:
         remarks.append("no temperature: the constraints leave no degree of freedom")
         return 0, None

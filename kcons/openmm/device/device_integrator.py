@@ -6,6 +6,7 @@ import ctypes
 import json
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 from uuid import uuid4
 from xml.etree import ElementTree
@@ -34,6 +35,7 @@ from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.steps import write_step
 from kcons.openmm.states import box_of, positions_of
+from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, listed
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import chain_fractions
@@ -200,7 +202,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _write(self, program: Program) -> Step:
         """A step without parts: kernels hold their rows."""
         step = Step(program, self.scheme, (), self._ensemble)
-        write_step(step, self._own_step)
+        write_step(step)
         for part in self.parts:
             part.program = self.program
         return step
@@ -460,6 +462,13 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     library.kcons_plan_order(made, order.ctypes.data_as(_WHOLES), order.size)
 
 
+class DeviceSurfaceIntegrator(SurfaceIntegrator, DeviceIntegrator):
+    """`SurfaceIntegrator` whose steps are kernels of a plugin."""
+
+    def _surface_parts(self, surfaces: Any, system: openmm.System | None, positions: Any) -> Sequence[Any]:
+        return listed(surfaces, positions, 2**31 if positions is None else len(positions))
+
+
 def choose(
     device: bool | None,
     timestep: Any,
@@ -467,9 +476,10 @@ def choose(
     *,
     parts: Sequence[Any] = (),
     ensemble: Ensemble | None = None,
+    classes: tuple[type[ProjectedIntegrator], type[DeviceIntegrator]] = (ProjectedIntegrator, DeviceIntegrator),
     **others: Any,
 ) -> tuple[type[ProjectedIntegrator], str]:
-    """The class of an integrator that may run on the device, see `ProjectedIntegrator`, and why it is not this one.
+    """The class of an integrator that may run on the device, of two, and why it is the first.
 
     Raises
     ------
@@ -482,12 +492,13 @@ def choose(
     if not why:
         try:
             build.library()
-            return DeviceIntegrator, ""
+            return classes[1], ""
         except UnsupportedError as error:
             why = str(error)
     if device:
         raise UnsupportedError(f"no steps on the device: {why}; leave out device=True for a CustomIntegrator")
-    return ProjectedIntegrator, why
+    return classes[0], why
 
 
 ProjectedIntegrator._on_device = staticmethod(choose)
+SurfaceIntegrator._on_device = staticmethod(partial(choose, classes=(SurfaceIntegrator, DeviceSurfaceIntegrator)))

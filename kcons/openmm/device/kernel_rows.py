@@ -14,8 +14,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.motion import Motion
-from kcons.openmm.callback_rows.callbacks import Passage, cell_of
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Passage, cell_of, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
 from kcons.openmm.device.rows import DeviceRows, rows_of
 from kcons.openmm.integrator.part import Part, Solver
@@ -62,7 +61,7 @@ class KernelRows(CarriedConstraints):
         self._parts = parts
         carried = [part for part in parts if isinstance(part, CarriedConstraints)]
         self.given: list[Constraint] = list(accepted(constraints_of(parts)))
-        self.groups = frozenset().union(*(part.groups for part in carried))
+        self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
         #: The engine of what `hold` made, until the Context is known.
         self._carried = carried[0]._engine if len(carried) == len(parts) == 1 else None
         #: Whether rows take periodic images: as `hold` was told, else as the System.

@@ -64,6 +64,7 @@ class ItemWriter:
     def __init__(self, name: str, pattern: Pattern, record: Record, first_row: int, held: HeldRows) -> None:
         self.name, self.record, self.held = name, record, held
         self.rows, self.count = pattern.rows, len(pattern.rows)
+        self.single = pattern.atoms.shape[1] == 1
         self.row_number = f"{first_row}+cluster*{self.count}"
         #: Whether the matrix is in the precision of forces.
         self.coarse = self.count >= FEW and not any(row.depends for row in self.rows)
@@ -235,11 +236,13 @@ class ItemWriter:
             along = "+".join(f"o{k}[{1 + c}]*g{k}[{c}]" for c in range(3 * len(row.atoms)))
             return f" if (!({along} > 0)) bad = {k};\n"
 
+        # A row of one particle is met to rounding, by one more iteration.
+        first, stop, then = (", last = 0", "there && last", " last = there;") if self.single else ("", "there", "")
         missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};")
         fail = f"{{FAIL({self.row_number}+bad, off[bad]); return;}}\n"
         return (
-            f"{self._begin('positions', 'h', 'd')}{self._reference('time-h')}{self._each(start)} int bad = -1;\n"
-            f" for (int turn = 0;; turn++) {{\n int there = 1;\n{self._each(turn)} if (there) break;\n"
+            f"{self._begin('positions', 'h', 'd')}{self._reference('time-h')}{self._each(start)} int bad = -1{first};\n"
+            f" for (int turn = 0;; turn++) {{\n int there = 1;\n{self._each(turn)} if ({stop}) break;{then}\n"
             f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored(False)}{self._solved()} }}\n"
             f"{self._each(turned)} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
         )

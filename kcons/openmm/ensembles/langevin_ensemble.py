@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
-from typing import Any, Self
 
 import openmm
 from openmm import unit
@@ -150,8 +149,7 @@ class LangevinRespa(Langevin):
     """
 
     adds_up = False
-    groups: tuple[int, ...]
-    counts: tuple[int, ...]
+    steps: tuple[tuple[int, int], ...]
     slow_kicks: SlowKicks
 
     def __init__(
@@ -162,8 +160,10 @@ class LangevinRespa(Langevin):
         slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(temperature, friction)
-        if not isinstance(steps, Mapping):
-            raise InputError("steps must name each force group, as {0: 1, 1: 4}", item="steps")
+        try:
+            steps = dict(steps)
+        except (TypeError, ValueError):
+            raise InputError("steps must name each force group, as {0: 1, 1: 4}", item="steps") from None
         for group in steps:
             if isinstance(group, bool) or not isinstance(group, int) or not 0 <= group < 32:
                 raise InputError(f"force group {group!r} is no number from 0 to 31", item="steps")
@@ -171,39 +171,37 @@ class LangevinRespa(Langevin):
         if len(levels) < 2:
             raise InputError(f"steps are of {len(levels)} force group; give two or more, or use Langevin", item="steps")
         middle_of(levels, slow_kicks)
-        counts = tuple(level.steps for level in levels)
-        self._keep(groups=tuple(int(level.group) for level in levels), counts=counts, slow_kicks=slow_kicks)
+        self._keep(steps=tuple((int(level.group), level.steps) for level in levels), slow_kicks=slow_kicks)
 
     def __repr__(self) -> str:
-        steps = dict(zip(self.groups, self.counts, strict=True))
         middle = ", slow kicks in the middle" if self.slow_kicks == "middle" else ""
-        return f"{type(self).__name__}({self.temperature:g} K, {self.friction:g}/ps, steps {steps}{middle})"
+        return f"{type(self).__name__}({self.temperature:g} K, {self.friction:g}/ps, steps {dict(self.steps)}{middle})"
 
     @property
     def levels(self) -> tuple:  # type: ignore[type-arg]
         """Groups from the slowest to the fastest, see `kcons.thermostats.multistep.respa`."""
-        return levels_of({str(group): count for group, count in zip(self.groups, self.counts, strict=True)})
+        return levels_of({str(group): count for group, count in self.steps})
 
     def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         return nested(self.levels, (1.0,), middle=self.slow_kicks == "middle")
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""
-        idle = set(self.groups) - groups_in(integrator)
+        steps = dict(self.steps)
+        idle = set(steps) - groups_in(integrator)
         if idle:
             raise InputError(
                 f"force group {min(idle)} is left out by setIntegrationForceGroups, and steps give it "
-                f"{dict(zip(self.groups, self.counts, strict=True))[min(idle)]}: all groups in steps act; take those "
-                "forces out of the System",
+                f"{steps[min(idle)]}: all groups in steps act; take those forces out of the System",
                 item="steps",
             )
         system = context.getSystem()
         for force in system.getForces():
-            left = groups_of(force) - set(self.groups)
+            left = groups_of(force) - set(steps)
             if left:
                 raise InputError(
                     f"{type(force).__name__} is in force group {min(left)}, which has no number of steps; "
-                    f"there are {', '.join(map(str, self.groups))}",
+                    f"there are {', '.join(map(str, steps))}",
                     item="steps",
                 )
         if any(system.isVirtualSite(k) for k in range(system.getNumParticles())):
@@ -238,11 +236,6 @@ class LangevinRespa(Langevin):
         _write_all(step, done[ends:])
         step.note_end()
         return True
-
-    def replaced(self, **changes: Any) -> Self:
-        steps = dict(zip(self.groups, self.counts, strict=True))
-        kept = {"temperature": self.temperature, "friction": self.friction, "slow_kicks": self.slow_kicks}
-        return type(self)(**{**kept, "steps": steps, **changes})
 
 
 def _write_all(step: Step, operations: Sequence[Operation]) -> None:

@@ -9,7 +9,7 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import positive
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import UnsupportedError
 from kcons.openmm.integrator.ensemble import Ensemble, Integrator, Step
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
@@ -73,18 +73,26 @@ class IsokineticSpheres(Ensemble):
         substeps: int = 3,
         slow_kicks: Literal["ends", "middle"] = "ends",
     ) -> None:
-        kelvin = positive(kelvins(temperature), "temperature")
-        gamma = number(friction, unit.picosecond**-1, "friction")
         if spheres == "global":
             raise UnsupportedError(
                 "spheres='global' needs sums over all particles; choose 'split', 'axes' or 'cluster'"
             )
-        levels = None if steps is None else {str(group): count for group, count in steps.items()}
-        made: dict[str, Any] = {"spheres": spheres, "auxiliary": auxiliary, "substeps": substeps}
-        bath = OnArrays(1.0, gamma, 0, steps=levels, slow_kicks=slow_kicks, **made)
-        given = None if steps is None else tuple(steps.items())
-        self._keep(temperature=kelvin, friction=gamma, steps=given, slow_kicks=slow_kicks, **made)
-        self._keep(_operations=bath.operations())
+        self._keep(
+            temperature=positive(kelvins(temperature), "temperature"),
+            friction=number(friction, unit.picosecond**-1, "friction"),
+            steps=None if steps is None else tuple(dict(steps).items()),
+            spheres=spheres,
+            auxiliary=auxiliary,
+            substeps=substeps,
+            slow_kicks=slow_kicks,
+        )
+        self._on_arrays()
+
+    def _on_arrays(self) -> OnArrays:
+        given: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "temperature"}
+        if given["steps"] is not None:
+            given["steps"] = {str(group): count for group, count in given["steps"]}
+        return OnArrays(1.0, given.pop("friction"), 0, **given)
 
     def __repr__(self) -> str:
         return f"IsokineticSpheres({self.temperature:g} K, {self.friction:g}/ps, spheres={self.spheres!r})"
@@ -95,8 +103,7 @@ class IsokineticSpheres(Ensemble):
             raise UnsupportedError(f"{self!r} has a scheme of its own; leave out {scheme!r}")
 
     def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
-        found: tuple[Operation, ...] = vars(self)["_operations"]
-        return found
+        return self._on_arrays().operations()
 
     def declare(self, program: Program) -> None:
         kT, friction = self.settings().values()
@@ -116,17 +123,3 @@ class IsokineticSpheres(Ensemble):
 
     def settings(self) -> dict[str, float]:
         return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}
-
-    def at(self, temperature: float) -> IsokineticSpheres:
-        return self.replaced(temperature=positive(temperature, "temperature"))
-
-    def with_friction(self, friction: float) -> IsokineticSpheres:
-        if not friction > 0:
-            raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
-        return self.replaced(friction=friction)
-
-    def replaced(self, **changes: object) -> IsokineticSpheres:
-        """The same with other arguments."""
-        kept = {name: value for name, value in vars(self).items() if name != "_operations"}
-        kept["steps"] = None if kept["steps"] is None else dict(kept["steps"])
-        return type(self)(**{**kept, **changes})  # type: ignore[arg-type]

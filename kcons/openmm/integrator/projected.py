@@ -15,7 +15,7 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
-from kcons.errors import InputError, KconsError, MissingSettingError, UnsupportedError
+from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context
 from kcons.openmm.integrator.minimization import descend
@@ -133,7 +133,7 @@ class ProjectedIntegrator(Integrator):
     def __new__(cls, *args: Any, device: bool | None = None, **kwargs: Any) -> ProjectedIntegrator:
         """Of this class, or of the one that runs on the device."""
         kind, why = cls, ""
-        if cls is ProjectedIntegrator and device is not False:
+        if "_on_device" in vars(cls) and device is not False:
             kind, why = cls._on_device(device, *args, **kwargs)
         made = object.__new__(kind)
         made._refused = why
@@ -187,13 +187,10 @@ class ProjectedIntegrator(Integrator):
         for k, part in enumerate(self.parts, start=1):
             part.begin_program(k)
         step = Step(program, self.scheme, self.parts, self._ensemble)
-        write_step(step, self._own_step)
+        write_step(step)
         for part in self.parts:
             part.program = self.program
         return step
-
-    #: A kind of step of its own, see `write_step`.
-    _own_step: Callable[[Step], bool] | None = None
 
     def __repr__(self) -> str:
         held = "".join(f", {part!r}" for part in self.parts)
@@ -372,7 +369,9 @@ class ProjectedIntegrator(Integrator):
                 return
             guard.since_check += done
             failure = self._failure(code, first + done + 1)
-            if "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
+            if isinstance(failure, NonFiniteError) and not np.isfinite(motion_of(context)).all():
+                guard.put_back()  # a force is seen in the step after the one whose velocities it has spoilt
+            elif "loose" in self.program.numbers and self.getGlobalVariableByName("loose"):
                 self.program.write("between", 0.0)
                 self.applyVelocityConstraints(context)
             guard.leave()
@@ -742,7 +741,7 @@ class ProjectedIntegrator(Integrator):
             The file has another program.
         """
         device = 'type="KconsProgram"' in xml
-        if device and cls is ProjectedIntegrator:
+        if device and "_on_device" in vars(cls):
             cls = cls._on_device(True, 0.0, scheme, **arguments)[0]  # loads what the file is read by
         plain = openmm.XmlSerializer.deserialize(xml)
         given = {"tolerance": plain.getConstraintTolerance(), "device": False, **arguments}

@@ -1,13 +1,16 @@
-"""What all surface parts of an integrator share: rows of one atom each, their parameters, checks and errors."""
+"""Particles that are each on one surface, as a part of an integrator: a program, checks, errors.
+
+The value of a row, less its target, is an expression of OpenMM, which differentiates it. Two force groups carry s and
+s^2/2 as energies of each particle. With f1 = -grad s and f2 = -s grad s, and G0 the gradient where the drift began, a
+Newton step of s(xu + l G0) = 0 is l += (f2.G0)/(f1.G0)^2.
+"""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
 import openmm
-from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints.constraint import Constraint, IntArray
@@ -15,81 +18,132 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
+from kcons.openmm.collective.coordinates import free_groups
+from kcons.openmm.device.c_writer import openmm_expression
+from kcons.openmm.device.held_rows import function_on_device
 from kcons.openmm.integrator.part import BOND, NEAR, Part, Solver, Violation
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import refuse_agents, require_context
+from kcons.openmm.integrator.system_checks import SURFACE_NAME, refuse_agents, require_context
 from kcons.openmm.quantities import masses_of
 from kcons.openmm.states import motion_of, positions_of
 
 #: A start that is farther from its surface (nm), or has a larger share of its velocity across it, is refused.
 START_TOLERANCE = 1e-6
 CARRIER = "hold them with kcons' constraint objects instead, by the carrier (kcons.openmm.hold)"
+#: Newton steps at most. The loop ends after steps of less than this (nm): the number of right digits doubles, so that
+#: the last of them ends within rounding of the surface.
+MOST_STEPS = 12
+_LAST_STEP = 1e-9
+#: Farther than this, in gradients, no Newton step goes.
+_FARTHEST = 5
+#: What such a step may be larger by, for each nm from the origin.
+_MISSED = 1e-12
+#: Positions and velocities beyond this count as not finite.
+_FAR = 1e9
 
 
 class SurfaceRows(Part):
-    """Atoms that are each on one surface, as a `Part` of an integrator.
+    """Particles that are each on one surface, as a `Part` of an integrator.
 
     Parameters
     ----------
     rows : sequence of Constraint
         kcons objects over one atom a row, lengths in nm, with explicit targets that rest.
-    n_particles : int
-        Particles of the System.
+    system : openmm.System
+        Gets two forces for each object, in two force groups that no other force uses.
 
-    Attributes
-    ----------
-    bonded : bool
-        Whether the System may have constraints of its own, on other particles.
+    Raises
+    ------
+    UnsupportedError
+        A row that is no expression; force groups that are lacking.
     """
 
-    bonded = True
-    #: Whether `fly_alone` moves x before it needs the velocity of the drift for the last time.
-    moves = False
+    evaluates = True
 
-    def __init__(self, rows: Sequence[Constraint], n_particles: int) -> None:
-        self.rows = tuple(rows)
-        self.atoms: IntArray = np.concatenate([item.atoms[:, 0] for item in self.rows])
-        self.n_particles = n_particles
-
-    # -- parameters -----------------------------------------------------------------------------
-
-    def _gather(self, *values: ArrayLike) -> FloatArray:
-        """One array over all rows from one array for each object."""
-        return np.concatenate([np.asarray(value, dtype=np.float64) for value in values])
-
-    def _parameter(self, p: Program, name: str, words: str, values: FloatArray, elsewhere: float = 0.0) -> str:
-        """Declare a variable that holds a number or vector of each row, and `elsewhere` for other particles."""
-        table = np.full((self.n_particles, 3), elsewhere)
-        table[self.atoms] = values if values.ndim == 2 else values[:, None]
-        return p.vector_setting(name, words, table)
-
-    def _fail(self, p: Program, solved: str, words: str) -> None:
-        """Set `failed` unless the expression `solved` is 1 for each degree of freedom (NaN counts as 0)."""
-        p.number("unsolved", "how many degrees of freedom found no solution")
-        p.sum("unsolved", f"1-{solved}", words)
-        p.let("failed", f"select(unsolved, {self.code}, failed)", "which part has no solution")
+    def __init__(self, rows: Sequence[Constraint], system: openmm.System) -> None:
+        self.given = tuple(rows)
+        self.atoms: IntArray = np.concatenate([item.atoms[:, 0] for item in self.given])
+        self.n_particles = system.getNumParticles()
+        self.alone = system.getNumConstraints() == 0
+        pairs = [_forces(item) for item in self.given]
+        self._pair = tuple(free_groups(system, 2, "these surfaces")[-2:])
+        self.groups = frozenset(self._pair)
+        for pair in pairs:
+            for group, force in zip(self._pair, pair, strict=True):
+                force.setForceGroup(group)
+                force.setName(SURFACE_NAME)
+                system.addForce(force)
 
     # -- the program ----------------------------------------------------------------------------
 
-    @abstractmethod
-    def fly(self, p: Program, u: str, h: str) -> None:
-        """Find the landing of a drift of length `h` with velocity `u` from x, on the surface; x and v stay."""
+    def declare(self, program: Program) -> None:
+        p = program
+        on = np.zeros((self.n_particles, 3))
+        on[self.atoms] = 1.0
+        p.vector_setting("i_on", "1 for particles on a surface", on)
+        p.setting("i_solved", "Newton steps of less than this (nm) are the last", _LAST_STEP)
+        p.setting("i_missed", "how much larger they may be for each nm from the origin", _MISSED)
+        p.vector("i_gradient", "minus gradient where the drift began")
+        p.vector("i_slope", "f1, minus gradient of the row")
+        p.vector("i_step", "f2, then the Newton step")
+        p.vector("i_push", "way from where the particle flew to its landing")
+        p.number("i_count", "Newton steps done")
+        p.number("i_miss", "sum of squares of the last Newton steps, in nm^2")
+        p.number("unsolved", "how many degrees of freedom found no solution")
 
-    @abstractmethod
-    def impulse(self, h: str) -> str:
-        """After `fly`: the expression that, added to u, makes x + h u land; 0 for other particles."""
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """Rows are Forces, whose gradients are of the size of 1 kJ/mol/nm."""
+        missed = max(_MISSED, precision.forces, 10 * precision.force_step)
+        program.set("i_missed", missed)
+        program.set("i_solved", max(_LAST_STEP, 100 * missed))
 
-    def fly_alone(self, p: Program, u: str, h: str) -> None:
-        """The whole drift, where no other part has rows; without a landing x and v stay."""
-        self.fly(p, u, h)
-        p.each("v", f"select(failed, v, {u}+{self.impulse(h)})", "impulse of the surface")
-        p.each("x", f"select(failed, x, x+{h}*v)", "fly onto the surface")
+    def remember(self, program: Program) -> None:
+        program.each("i_gradient", f"f{self._pair[0]}", "minus the gradient")
+
+    def land(self, program: Program, h: str) -> None:
+        p = program
+        p.each("i_push", f"select(step({_FAR}-abs(x)), 0, x)", "no Newton step yet; NaN or huge is left as it is")
+        p.each("x", f"select(step({_FAR}-abs(x)), x, x_last)", "only finite positions may be looked at")
+        p.let("i_count", "0", "no Newton step yet")
+        p.let("i_miss", "1", "not yet on the surfaces")
+        with p.loop(f"select(step({MOST_STEPS}-1-i_count), i_miss, 0) > i_solved^2", "Newton's method"):
+            # Force groups must not appear in vector expressions.
+            p.each("i_slope", f"f{self._pair[0]}", "minus gradient")
+            p.each("i_step", f"f{self._pair[1]}", "minus value times gradient")
+            p.each(
+                "i_step",
+                f"-i_on*i_gradient*min({_FARTHEST}, max(-{_FARTHEST}, "
+                "dot(i_step, i_gradient)/(dot(i_slope, i_gradient)^2+1-i_on)))",
+                "what a Newton step takes away from x, never far away",
+            )
+            p.each("x", "x-i_step", "nearer to the surface")
+            p.each("i_push", "i_push-i_step", "the way so far")
+            p.sum("i_miss", "i_step^2", "how far they moved")
+            p.let("i_count", "i_count+1", "one more")
+        small = f"step(i_solved+i_missed*abs(x)-abs(i_step))*step({_FAR}-abs(i_push))"
+        p.sum(
+            "unsolved", f"1-{small}*step(dot(i_slope, i_gradient))", "the last step is small, the gradient not reversed"
+        )
+        p.let("failed", f"select(unsolved, {self.code}, failed)", "which part has no solution")
+        p.each("x", "select(failed, x_last, x)", "a failed step goes nowhere")
+
+    def land_alone(self, program: Program, u: str, h: str) -> None:
+        """No velocity is a difference of positions, whose rounding grows as 1/h."""
+        program.each("x", f"x+{h}*{u}", "fly; not on the surface")
+        self.land(program, h)
+        program.each("v", f"select(failed, v, {u}+i_push/{h})", "impulse of the surface")
+
+    def project(self, program: Program) -> None:
+        p = program
+        self.remember(p)
+        p.each("v", "v-i_gradient*dot(i_gradient, v)/(dot(i_gradient, i_gradient)+1-i_on)", "tangent to the surface")
 
     # -- running --------------------------------------------------------------------------------
 
     def row_name(self, k: int) -> str:
         """For example 'Sphere(4)'."""
-        for item in self.rows:
+        for item in self.given:
             if k < item.n_rows:
                 return item.row_name(k)
             k -= item.n_rows
@@ -98,7 +152,7 @@ class SurfaceRows(Part):
     def distances(self, x: FloatArray) -> FloatArray:
         """How far each atom is from its surface in nm (to first order), from positions of all particles."""
         found = []
-        for item in self.rows:
+        for item in self.given:
             r = x[item.atoms]
             slope = item.gradient(r, 0.0)[:, 0]
             found.append((item.measure(r, 0.0) - item.target_at(0.0)) / np.sqrt(np.einsum("ij,ij->i", slope, slope)))
@@ -106,7 +160,7 @@ class SurfaceRows(Part):
 
     def normals(self, x: FloatArray) -> FloatArray:
         """Unit normals, shape (n_rows, 3)."""
-        slopes = np.concatenate([item.gradient(x[item.atoms], 0.0)[:, 0] for item in self.rows])
+        slopes = np.concatenate([item.gradient(x[item.atoms], 0.0)[:, 0] for item in self.given])
         return np.asarray(slopes / np.sqrt(np.einsum("ij,ij->i", slopes, slopes))[:, None])
 
     def attach(self, program: Program, context: openmm.Context) -> None:
@@ -115,8 +169,8 @@ class SurfaceRows(Part):
         if found != self.n_particles:
             raise InputError(
                 f"surfaces were made for {self.n_particles} particles, and the System has {found}; make them again "
-                "with system= or the right n_particles=",
-                item="n_particles",
+                "for this one",
+                item="system",
             )
 
     def check(self, context: openmm.Context, velocities: bool = True) -> None:
@@ -127,10 +181,6 @@ class SurfaceRows(Part):
         refuse_system(context.getSystem(), self.atoms)
         require_context(context)
         x, v = motion_of(context)
-        first = 0
-        for item in self.rows:
-            item.check(x[item.atoms], 0.0, first)
-            first += item.n_rows
         miss = self._worst(x, v if velocities else None)
         if miss is None:
             return
@@ -150,8 +200,12 @@ class SurfaceRows(Part):
         return self._worst(x, v if velocities else None)
 
     def _worst(self, x: FloatArray, v: FloatArray | None) -> Violation | None:
+        first = 0
+        for item in self.given:
+            item.check(x[item.atoms], 0.0, first)
+            first += item.n_rows
         allowed = START_TOLERANCE * np.maximum(1.0, np.abs(x[self.atoms]).max(axis=1))
-        near = NEAR * np.concatenate([_length(item) for item in self.rows])
+        near = NEAR * np.concatenate([_length(item) for item in self.given])
         miss = Violation.worst("positions", self.distances(x), allowed, self.row_name, self._atoms_of, near)
         if miss is not None or v is None:
             return miss
@@ -167,15 +221,18 @@ class SurfaceRows(Part):
     def solver_at(self, context: openmm.Context) -> Solver:
         """The engine for these atoms."""
         require_context(context)
-        return Solver(engine(context, [self], positions_of(context)), self.atoms)
+        return Solver(engine(context, self.given, positions_of(context)), self.atoms)
 
     def rank(self, context: openmm.Context) -> int:
         """One for each atom: rows on different atoms are independent."""
         return len(self.atoms)
 
-    def _error(self, solved: FloatArray, step: int, residuals: FloatArray) -> KconsError:
-        """The error for a step, from what `_fail` saw at each row (NaN where something was not finite)."""
-        unknown = np.flatnonzero(~np.isfinite(solved))
+    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
+        last, push = (
+            np.array([[v[0], v[1], v[2]] for v in integrator.getPerDofVariableByName(name)])[self.atoms]
+            for name in ("i_step", "i_push")
+        )
+        unknown = np.flatnonzero(~np.all(np.abs(push) <= _FAR, axis=1))  # also where it is NaN
         if len(unknown):
             atom = int(self.atoms[unknown[0]])
             return NonFiniteError(
@@ -185,21 +242,33 @@ class SurfaceRows(Part):
                 atom=atom,
                 step=step,
             )
-        k = int(np.argmin(solved))
+        miss = np.sqrt(np.einsum("ij,ij->i", last, last))
+        k = int(np.argmax(miss))
         atom = int(self.atoms[k])
         return ConvergenceError(
             f"step {step}: particle {atom} finds no position on its surface, {self.row_name(k)}: time step too "
             "large; positions and velocities are those before the step",
-            residual=float(residuals[k]),
+            residual=float(miss[k]),
             row=k,
             atoms=[atom],
             step=step,
         )
 
-    def _values(self, integrator: openmm.CustomIntegrator, name: str) -> FloatArray:
-        """A number of each row, from a variable of the program."""
-        table = np.array([[v[0], v[1], v[2]] for v in integrator.getPerDofVariableByName(name)])
-        return np.asarray(table[self.atoms, 0])
+
+def _forces(item: Constraint) -> tuple[openmm.CustomExternalForce, openmm.CustomExternalForce]:
+    """s, value less target, and s^2/2 as forces on the particles of an object."""
+    value = openmm_expression(function_on_device(item))
+    pair = (
+        openmm.CustomExternalForce(f"row_value-row_target; {value}"),
+        openmm.CustomExternalForce(f"0.5*(row_value-row_target)^2; {value}"),
+    )
+    numbers = np.column_stack([item.target_at(0.0), item.parameters().reshape(item.n_rows, -1)])
+    for force in pair:
+        for name in ("row_target", *(f"row_p{k}" for k in range(numbers.shape[1] - 1))):
+            force.addPerParticleParameter(name)
+        for atom, values in zip(item.atoms[:, 0].tolist(), numbers.tolist(), strict=True):
+            force.addParticle(atom, values)
+    return pair
 
 
 def _length(item: Constraint) -> FloatArray:
@@ -208,13 +277,13 @@ def _length(item: Constraint) -> FloatArray:
     return np.where(radius > 0, radius, BOND)
 
 
-def engine(context: openmm.Context, parts: Sequence[SurfaceRows], x: FloatArray) -> Motion:
-    """The solver of kcons for the atoms of these parts alone, in their order, at positions x of all particles."""
-    system, atoms = context.getSystem(), np.concatenate([part.atoms for part in parts])
+def engine(context: openmm.Context, rows: Sequence[Constraint], x: FloatArray) -> Motion:
+    """The solver of kcons for the atoms of rows alone, in their order, at positions x of all particles."""
+    system, atoms = context.getSystem(), np.concatenate([item.atoms[:, 0] for item in rows])
     new_index = np.zeros(system.getNumParticles(), dtype=np.int64)
     new_index[atoms] = np.arange(len(atoms))
-    rows = [item.renumbered(new_index) for part in parts for item in part.rows]
-    return Motion(ConstraintSet(rows, x[atoms], masses_of(system)[atoms]), x[atoms])
+    own = [item.renumbered(new_index) for item in rows]
+    return Motion(ConstraintSet(own, x[atoms], masses_of(system)[atoms]), x[atoms])
 
 
 def refuse_system(system: openmm.System, atoms: IntArray) -> None:

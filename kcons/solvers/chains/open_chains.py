@@ -17,7 +17,7 @@ from kcons.solvers.tolerances import MAX_ROUNDS
 
 
 @njit(cache=True, nogil=True)
-def _positions(careful, alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
+def _positions(alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
     """This and the next two as `kcons.solvers.addressable_solvers` says."""
     lengths = wanted if wanted.size else table_array(tables, integers(tables), LENGTHS)
     return project(None, x, x_ref, v, inv_dt, lengths, lattice, kind, none_of(tables), tables)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.distance_clusters import resolved
@@ -36,11 +35,10 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
 )
 from kcons.solvers.sparse.elimination import FAST, make_pattern, number_atoms
-from kcons.solvers.sparse.step_control import factor_serves, go_back, hopeless, keep, overshot, refines
+from kcons.solvers.sparse.step_control import factor_serves, hopeless, refines
 from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
 from kcons.solvers.tolerances import (
     EPS,
-    MAX_HALVINGS,
     NEAR,
     NEWTON_TOLERANCE,
     ROUNDING,
@@ -69,7 +67,6 @@ class SparseDistances(AddressableSolver):
     """
 
     name = "SparseDistances"
-    ways = False, True
 
     def __init__(
         self,
@@ -101,9 +98,9 @@ class SparseDistances(AddressableSolver):
                 *(pattern.clusters, numbered, atom_start, w, links.ravel(), pattern.columns, pattern.targets),
                 *(couplings, w[ends].sum(axis=1), pairs.astype(np.uint32).ravel(), lengths[pattern.order]),
                 # As `sparse.substitution` says: lines of rows and of entries; pivots. Then where rows began, where
-                # atoms were, moves and solution, and the two that are kept.
+                # atoms were, moves and solution.
                 *(room(8 * n), room(4 * n_entries), room(n), room(4 * n), room(4 * n_atoms)),
-                *(room(4 * n_atoms), room(n), room(4 * n_atoms), room(n)),
+                *(room(4 * n_atoms), room(n)),
             )
         )
         self.kernels, self.numbers = Kernels(_positions, _tangents, _apply, resolved=_resolved), np.zeros(3)
@@ -131,14 +128,6 @@ class SparseDistances(AddressableSolver):
         found: FloatArray = np.sqrt(np.einsum("ki,ki->k", self._bonds, self._bonds))
         found *= self._solution
         return found
-
-
-def sparse_distances(
-    constraint_set: ConstraintSet, rows: IntArray, inverse_masses: FloatArray, time: float = 0.0
-) -> SparseDistances:
-    """The sparse solver, which has step control, for distance rows."""
-    pairs = np.array([constraint_set.row_atoms(int(row)) for row in rows], dtype=np.int64)
-    return SparseDistances(rows, pairs, constraint_set.target(time)[rows], inverse_masses)
 
 
 @njit(cache=True)
@@ -218,7 +207,7 @@ def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
+    alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
 ):
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
@@ -227,7 +216,7 @@ def _positions(  # type: ignore[no-untyped-def]
     weights, state, entries = at_piece(t, h, 8), at_piece(t, h, _STATE), at_piece(t, h, 12)
     pivots, starts, places = at_piece(t, h, _PIVOTS), at_piece(t, h, 14), at_piece(t, h, 15)
     moves, solution = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
-    kept_moves, kept_solution, periodic = at_piece(t, h, 18), at_piece(t, h, 19), kind != OPEN
+    periodic = kind != OPEN
     lengths = at_first(wanted) if wanted.size else at_piece(t, h, _LENGTHS)
     worst, worst_row, most = 0.0, -1, 0
     for c in range(h[1] - h[0] - 1):
@@ -238,20 +227,11 @@ def _positions(  # type: ignore[no-untyped-def]
             state, starts, places, moves, solution,
         )  # fmt: skip
         previous = np.inf
-        best = np.inf
         factored = False
         iteration = 0
-        halvings = 0
         while True:
             if iteration > 0:
                 error, total = _measure(first, last, lengths, links, state, starts, moves)
-            if overshot(careful, iteration, error, total, best):
-                if halvings == MAX_HALVINGS:
-                    return False, error, iteration, _worst(first, last, state, lengths)
-                halvings += 1
-                go_back(4 * first_atom, 4 * last_atom, moves, kept_moves)
-                go_back(first, last, solution, kept_solution)
-                continue
             # max() may drop a NaN; the sum cannot.
             if not (total < np.inf) or hopeless(iteration, error, previous):
                 return False, error, iteration, _worst(first, last, state, lengths)
@@ -260,11 +240,6 @@ def _positions(  # type: ignore[no-untyped-def]
             # Rounding may stop short of it in ill-conditioned sets; what the positions resolve is enough.
             if error > 0.5 * previous and error < NEAR and _within_rounding(first, last, state, lengths, places, links):
                 break
-            if careful:
-                best = total
-                halvings = 0
-                keep(4 * first_atom, 4 * last_atom, moves, kept_moves)
-                keep(first, last, solution, kept_solution)
             if factor_serves(factored, error, previous):
                 forward(first, last, links, columns, state, entries)
             else:

@@ -42,12 +42,11 @@ from kcons.solvers.kernels.two_and_four_wide import (
 from kcons.solvers.sparse.elimination import FAST, make_pattern, make_triples, number_atoms
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, first_flat, miss
-from kcons.solvers.sparse.step_control import factor_serves, go_back, hopeless, keep, overshot, refines, stalled
+from kcons.solvers.sparse.step_control import factor_serves, hopeless, refines, stalled
 from kcons.solvers.sparse.substitution import update
 from kcons.solvers.tolerances import (
     EPS,
     MANY_ITERATIONS,
-    MAX_HALVINGS,
     NEWTON_TOLERANCE,
     PIVOT_TOLERANCE,
     ROUNDING,
@@ -58,7 +57,7 @@ from kcons.solvers.tolerances import (
 #: How much closer than positions rows of velocities are held: what they are off by is a speed times a short time.
 CLOSER = 16.0
 #: Of the pieces of `SparseRows.tables`, those that are named.
-_PIVOTS, _MOVES, _SOLUTION, _FUNCTIONS, _MOVED = 16, 20, 21, 26, 27
+_PIVOTS, _MOVES, _SOLUTION, _FUNCTIONS, _MOVED = 16, 20, 21, 24, 25
 #: Signatures of what `_positions` and `_tangents` call by address, so that it is compiled once and not into both.
 _RANGE = types.int64, types.int64
 _FACTOR = types.none(*_RANGE, *(5 * (INDICES,)), *(5 * (NUMBERS,)))
@@ -82,7 +81,6 @@ class SparseRows(AddressableSolver):
     """
 
     name = "SparseRows"
-    ways = False, True
 
     def __init__(
         self,
@@ -124,8 +122,7 @@ class SparseRows(AddressableSolver):
                 *(np.where(constraint_set.holonomic, constraint_set.target(0.0), 0.0)[self.rows], lines),
                 # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.substitution`.
                 *(room(2 * n), room(4 * len(pattern.columns))),
-                *(room(n), room(n), room(n), room(numbers), room(numbers), room(n)),
-                *(room(numbers), room(n), room(numbers), room(numbers)),
+                *(room(n), room(n), room(n), room(numbers), room(numbers), room(n), room(numbers), room(numbers)),
                 _addresses(self._given.kinds),
                 room(4 * int(slots[-1])),  # by slot, as quads: what `_take_off` says
             )
@@ -321,7 +318,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
+    alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
 ):
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
@@ -330,8 +327,8 @@ def _positions(  # type: ignore[no-untyped-def]
     triple, sides, masses, scale = at_piece(u, h, 8), at_piece(u, h, 9), at_piece(t, h, 10), at_piece(t, h, 11)
     lines, state, entries, pivots = at_piece(t, h, 13), at_piece(t, h, 14), at_piece(t, h, 15), at_piece(t, h, _PIVOTS)
     values, inverse_rounding, base = at_piece(t, h, 17), at_piece(t, h, 18), at_piece(t, h, 19)
-    moves, solution, kept_moves = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION), at_piece(t, h, 22)
-    kept_solution, origin, functions = at_piece(t, h, 23), at_piece(t, h, 25), at_piece(h, h, _FUNCTIONS)
+    moves, solution = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
+    origin, functions = at_piece(t, h, 23), at_piece(h, h, _FUNCTIONS)
     moved, periodic = at_piece(t, h, _MOVED), kind != OPEN
     goals, parameters = at_first(wanted) if wanted.size else at_piece(t, h, 12), at_first(numbers)
     worst, worst_row, most = 0.0, -1, 0
@@ -343,10 +340,8 @@ def _positions(  # type: ignore[no-untyped-def]
         )  # fmt: skip
         matrix = first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
         error = np.inf
-        best = np.inf
         factored = False
         iteration = 0
-        halvings = 0
         while True:
             previous = error
             call_evaluate(functions[0], (
@@ -356,14 +351,6 @@ def _positions(  # type: ignore[no-untyped-def]
             error, total, excess, bad = _measure(
                 first, last, kinds, parameters, links, goals, scale, inverse_rounding, values, state
             )
-            if overshot(careful, iteration, error, total, best):
-                if halvings == MAX_HALVINGS:
-                    return False, error, iteration, bad
-                halvings += 1
-                go_back(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
-                go_back(first, last, solution, kept_solution)
-                error = previous
-                continue
             if not (total < np.inf):
                 return False, np.inf, iteration, _first_not_finite(first, last, state)
             if hopeless(iteration, error, previous):
@@ -373,11 +360,6 @@ def _positions(  # type: ignore[no-untyped-def]
                 break
             if stalled(iteration, error, previous, excess, last - first):
                 break
-            if careful:
-                best = total
-                halvings = 0
-                keep(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
-                keep(first, last, solution, kept_solution)
             if factor_serves(factored, error, previous):
                 _call_forward(functions[3], (first, last, links, columns, state, entries))
             else:
@@ -418,7 +400,7 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
     triple, sides, masses, lines = at_piece(u, h, 8), at_piece(u, h, 9), at_piece(t, h, 10), at_piece(t, h, 13)
     state, entries, pivots, values = at_piece(t, h, 14), at_piece(t, h, 15), at_piece(t, h, _PIVOTS), at_piece(t, h, 17)
     base, moves, solution = at_piece(t, h, 19), at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
-    speeds, functions, moved = at_piece(t, h, 24), at_piece(h, h, _FUNCTIONS), at_piece(t, h, _MOVED)
+    speeds, functions, moved = at_piece(t, h, 22), at_piece(h, h, _FUNCTIONS), at_piece(t, h, _MOVED)
     driven, goals, parameters, periodic = wanted.size > 0, at_first(wanted), at_first(numbers), kind != OPEN
     worst, worst_row, most = 0.0, -1, 0
     for c in range(h[1] - h[0] - 1):

@@ -2,5 +2,4 @@
 
 - `compiled_operations`: operations one after another in one compiled call
 - `packed_system`: what compiled operations know of a system
-- `friction`: friction of the system
 """

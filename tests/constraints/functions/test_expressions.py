@@ -111,7 +111,7 @@ def test_shifts_are_found_out_where_multiplying_out_has_no_end(formula, found):
 
 def test_large_numbers_are_written_as_such():
     code = code_of("x1*12345678901234567890*1e100 + (9*x1)**40", 1, ())
-    assert code.plain_first(2.0, 0.0, 0.0, 0.0)[0] == pytest.approx(2 * 12345678901234567890e100 + 18.0**40)
+    assert code.first(2.0, 0.0, 0.0, 0.0)[0] == pytest.approx(2 * 12345678901234567890e100 + 18.0**40)
 
 
 def test_a_gradient_of_zero_is_refused_before_anything_is_written(tmp_path, monkeypatch):
@@ -194,23 +194,3 @@ def test_another_process_needs_neither_sympy_nor_the_compiler(tmp_path):
     assert {path.suffix for path in files} == {".py", ".nbi", ".nbc"}
     assert projected(tmp_path, "sympy") == (first, "")
     assert files == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda text: "\n".join(text.rstrip().splitlines()[:-1]) + "\n",
-        lambda text: text[: len(text) // 2],
-        lambda text: "",
-        lambda text: text.replace("2", "3"),
-    ],
-    ids=["a line", "half", "empty", "other numbers"],
-)
-def test_a_file_that_is_damaged_is_written_anew_and_that_is_said(tmp_path, damage):
-    first, _ = projected(tmp_path)
-    (file,) = tmp_path.rglob("formula_*.py")
-    whole = file.read_text()
-    file.write_text(damage(whole))
-    again, said = projected(tmp_path)
-    assert again == first and file.read_text() == whole
-    assert said.count("is damaged") == 1 and file.name in said

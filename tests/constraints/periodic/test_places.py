@@ -58,7 +58,6 @@ PLACES = {
         [1, 2],
         lambda r: float(np.sum((r - s[1:3] - 8.0) ** 2)),
         lambda r: 2.0 * (r - s[1:3] - 8.0),
-        lambda r, v: 2.0 * v,
     ),
     "Formula of a fixed atom": lambda s: (
         FixedAtoms(3),

@@ -25,6 +25,28 @@ MUTANTS = {
             "test_device_integrator.py::test_which_steps_are_made_on_the_device",
         ),
     ],
+    "openmm/device/c_writer.py": [
+        (
+            're.sub(r"pow\\((.*), (.*)\\)", r"(\\«1→2»)^(\\2)", text)',
+            "test_surface_rows.py::test_formulas_are_read_by_openmm",
+        ),
+    ],
+    "openmm/device/large_clusters.py": [
+        (
+            "key=lambda k: («k in last, →»k)",
+            "test_rows.py::test_levels_have_rows_that_share_no_entry",
+        ),
+        (
+            "level[min(mine)] = «max(level[min(mine)], level[place] + 1)→level[place] + 1»",
+            "test_rows.py::test_levels_have_rows_that_share_no_entry",
+        ),
+    ],
+    "openmm/device/small_clusters.py": [
+        (
+            '"there« && last→»"',
+            "test_surface_steps.py::test_the_device_holds_the_same_surfaces",
+        ),
+    ],
     "openmm/device/device_integrator.py": [
         (
             "self._advance(context, again«→ - 1»)",

@@ -113,12 +113,7 @@ MUTANTS = {
     "motion/failures.py": [
         (
             "_beside(then[first], then[first + 1]) <= «0→-1».0",
-            "test_failures.py::test_a_run_that_ends_where_a_dihedral_is_straight_names_no_time_step",
-        ),
-        (
-            '        «    here, step = ahead, ahead - here\n        return ""→return self._straightened(*reque'
-            "st[1::-1], rows)»",
-            "test_failures.py::test_a_dihedral_that_is_passed_in_small_parts_is_not_named",
+            "test_failures.py::test_a_dihedral_that_becomes_straight_is_named",
         ),
     ],
     "plan/clusters.py": [

@@ -20,7 +20,7 @@ MUTANTS = {
         ),
         (
             "«self._left == (context.getStepCount(), box_of(context))→True»",
-            "test_steps.py::test_changes_from_outside_reach_the_next_step",
+            "test_steps.py::test_change_of_the_box",
         ),
     ],
     "openmm/integrator/steps.py": [
@@ -151,7 +151,7 @@ MUTANTS = {
     ],
     "openmm/ensembles/langevin_ensemble.py": [
         (
-            "«groups_of(force)→{force.getForceGroup()}» - set(self.groups)",
+            "«groups_of(force)→{force.getForceGroup()}» - set(steps)",
             "test_respa_ensemble.py::test_forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
         ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "test_langevin_ensemble.py"),
@@ -202,13 +202,21 @@ MUTANTS = {
             "test_row_program.py::test_many_steps_look_less_often",
         ),
     ],
-    "openmm/surfaces/landings.py": [
+    "openmm/surfaces/surface_rows.py": [
         (
-            "super()«._declare_solution(p)→»",
-            "test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
+            'f"select(failed, v, {u}«+→-»i_push/{h})"',
+            "test_surface_steps.py::test_the_steps_are_those_of_the_core",
+        ),
+        (
+            "«*step(dot(i_slope, i_gradient))→»",
+            "test_surface_rows.py::test_a_landing_where_the_surface_looks_the_other_way_is_none",
         ),
     ],
     "openmm/callback_rows/carried_constraints.py": [
+        (
+            "self.carries_rest = «not integrator.thermostatted→False»",
+            "test_carried_constraints.py::test_velocities_are_those_of_the_core",
+        ),
         (
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "test_part.py::test_integrators_in_turn_hold_the_same_part",
@@ -216,12 +224,6 @@ MUTANTS = {
         (
             "return self.motion.rank« - 3 * fixed→»",
             "test_carried_constraints.py::test_particles_without_mass_take_no_degree_of_freedom",
-        ),
-    ],
-    "openmm/callback_rows/callbacks.py": [
-        (
-            "self.carries_rest = «not integrator.thermostatted→False»",
-            "test_carried_constraints.py::test_velocities_are_those_of_the_core",
         ),
     ],
 }

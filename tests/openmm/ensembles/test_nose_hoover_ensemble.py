@@ -140,6 +140,22 @@ def test_a_chain_in_the_middle_conserves_energy_to_order_two(platform):
     np.testing.assert_allclose(-np.diff(np.log2(spans)), 2, atol=0.2)
 
 
+def test_a_chain_in_the_middle_is_the_same_chain_in_small_steps():
+    """The link's velocity of both differs by the square of the time step."""
+    system, x, v = alanine("HBonds")
+    apart = []
+    for n in (100, 200):
+        links = []
+        for ensemble in (NoseHoover(300.0, 20.0), NoseHooverMiddle(300.0, 20.0)):
+            integrator = ProjectedIntegrator(0.05 / n, ensemble=ensemble, tolerance=1e-12)
+            context = run(system, integrator, x, 1.2 * v, n)
+            links.append(integrator.getGlobalVariableByName("link1"))
+            del context
+        apart.append(abs(links[0] - links[1]))
+        assert abs(links[0]) > 5 * apart[-1]
+    assert np.log2(apart[0] / apart[1]) == pytest.approx(2, abs=0.3)
+
+
 def test_a_chain_in_the_middle_is_time_reversible():
     """With velocities and links turned round, 50 steps of 4 fs lead back; without the links they do not."""
     system, x, v = alanine("AllBonds")

@@ -246,7 +246,6 @@ def test_nan_at_the_start():
 
 @platforms
 @pytest.mark.parametrize(("rows", "error"), [(9, ConvergenceError), (12, NonFiniteError)])
-@pytest.mark.usefixtures("without_device")
 def test_solvers_that_do_not_converge_are_found(rows, error, platform):
     """A planar ring by many of its distances breaks OpenMM's solver, which says nothing."""
     system, x = hexagon(rows)

@@ -22,11 +22,10 @@ from openmm_systems import (
     water_box,
 )
 
-from kcons.constraints import Angle, Dihedral, Distance, Sphere, Torus
+from kcons.constraints import Angle, Dihedral, Distance, Formula, Sphere, Torus
 from kcons.errors import CertificateError, ConvergenceError, UnsupportedError
 from kcons.openmm import (
     CollectiveRows,
-    ExpressionSurface,
     Isokinetic,
     Langevin,
     ProjectedIntegrator,
@@ -36,7 +35,6 @@ from kcons.openmm import (
 )
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.system_checks import SystemRows
-from kcons.openmm.surfaces.landings import ImplicitRows
 
 less_than_double = pytest.mark.parametrize("platform", [p for p in on_gpus("single") if "double" not in str(p.id)])
 mixed = pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
@@ -280,7 +278,7 @@ def on_surfaces(system, x):
     given = [
         Sphere([0], center=(0, 0, 0)),
         Torus([1], center=(0, 0, 0), axis=(0, 0, 1), major_radius=0.5),
-        ExpressionSurface([2], f"x^2+y^2+3*z-({level!r})"),
+        Formula("x1**2+y1**2+3*z1", [2], target=level),
     ]
     return list(surface_parts(given, system=system, positions=x))
 
@@ -297,7 +295,7 @@ def on_surfaces(system, x):
     ),
 )
 def test_parts_run_in_any_precision(held, scheme, platform):
-    """Rows within 2e-6 where forces are single numbers, surfaces of formulas within 1e-8 where they are integers.
+    """Rows within 2e-6 where forces are single numbers, surfaces within 1e-8 where they are integers.
 
     By the values that were asked for, not those the program finds.
     """
@@ -309,7 +307,7 @@ def test_parts_run_in_any_precision(held, scheme, platform):
     precision = Precision(*platform.split())
     y = state_of(context)[0]
     for part in parts:
-        exact = 1e-8 if isinstance(part, ImplicitRows) else 1e-11
+        exact = 1e-8 if held is on_surfaces else 1e-11
         limit = exact if precision.name == "double" else 2e-6
         off = part.residuals(context) if held is rows_of_two_kinds else part.distances(y)
         assert np.abs(off).max() < limit
@@ -337,7 +335,6 @@ def test_dependent_rows_are_found_in_any_precision(platform):
 
 
 @less_than_double
-@pytest.mark.usefixtures("without_device")
 def test_rows_of_constraint_objects_need_more_than_single_numbers(platform):
     precision = Precision(*platform.split())
     system, x, v = free_alanine()
@@ -367,7 +364,6 @@ def test_rows_of_constraint_objects_need_more_than_single_numbers(platform):
         if "single" not in p.id and ("double" in p.id) == (name == "suzuki4")
     ],
 )
-@pytest.mark.usefixtures("without_device")
 def test_constraint_objects_are_held_in_mixed_precision(some, kind, platform):
     """Bonds, angles and a dihedral at 2 fs to what single numbers leave of a correction, 1e-9; doubles to rounding."""
     precision = Precision(*platform.split())
@@ -395,7 +391,6 @@ def test_constraint_objects_are_held_in_mixed_precision(some, kind, platform):
         if "single" not in p.id
     ],
 )
-@pytest.mark.usefixtures("without_device")
 def test_carried_molecules_that_cross_a_face_of_the_box_are_no_failure(periodic, platform, caplog):
     """As those of OpenMM: rounded to single numbers at the face, held to 1e-9 nm again one step later."""
     precision = Precision(*platform.split())
@@ -416,7 +411,7 @@ def test_some_particles_or_all_are_the_same_motion(monkeypatch):
     """What callbacks are given does not change a bit of what is computed."""
     ends = []
     for every in (False, True):
-        monkeypatch.setattr("kcons.openmm.callback_rows.callbacks.hands_over_all", lambda every=every: every)
+        monkeypatch.setattr("kcons.openmm.callback_rows.carried_constraints.hands_over_all", lambda every=every: every)
         system, x, v = free_alanine()
         integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
         context = started(system, integrator, x, v)
@@ -473,7 +468,6 @@ def test_rows_beside_constraints_of_the_system(kind, options, platform):
 
 @mixed
 @pytest.mark.parametrize("kind, ensemble", [("carried", Langevin(300, 1)), ("free", None), ("free", Langevin(300, 1))])
-@pytest.mark.usefixtures("without_device")
 def test_rows_that_would_see_old_positions_are_refused(kind, ensemble, platform):
     system, x, v, part = beside_water(kind)
     integrator = ProjectedIntegrator(1e-3, parts=[part], ensemble=ensemble)

@@ -78,7 +78,6 @@ def test_computations_and_listing_go_together():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.usefixtures("without_device")
 def test_listings_are_complete(kind):
     """Every computation of an integrator has a line, in order; blocks are indented."""
     integrator = KINDS[kind]().integrator

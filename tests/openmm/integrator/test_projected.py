@@ -35,7 +35,6 @@ PS = unit.picosecond
 # -- arguments --------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("without_device")
 def test_units_and_arguments():
     assert ProjectedIntegrator(2 * unit.femtoseconds).getStepSize() == 0.002 * PS
     assert ProjectedIntegrator(0.002).getConstraintTolerance() == 1e-10

@@ -190,7 +190,6 @@ def test_set_target_outlives_a_state():
     assert copy.copy(made.integrator).program.settings == made.integrator.program.settings
 
 
-@pytest.mark.usefixtures("without_device")
 def test_a_setting_has_a_method_of_its_own():
     """Written by its number, as programs do that copy all variables, it has its value again in the next step."""
     made = thermostatted(Langevin(300, 1.0))()
@@ -358,7 +357,6 @@ def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context(how):
 
 @pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6", Splitting((0.3, 0.4, 0.3), (0.5, 0.5))], ids=str)
 @pytest.mark.parametrize("parts", [False, True])
-@pytest.mark.usefixtures("without_device")
 def test_xml_has_the_bare_program(scheme, parts):
     """What reads it makes the same steps; `from_xml` takes what no file contains."""
     system, x, v = loose_alanine()
@@ -409,7 +407,6 @@ def test_the_bare_program_makes_the_same_steps(kind):
     np.testing.assert_allclose(state_of(context), state_of(made.context), rtol=0, atol=1e-9)
 
 
-@pytest.mark.usefixtures("without_device")
 def test_files_of_something_else_are_refused():
     for other in (openmm.VerletIntegrator(1e-3), openmm.CustomIntegrator(1e-3)):
         with pytest.raises(InputError, match="another program"):

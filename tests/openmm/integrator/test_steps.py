@@ -13,6 +13,7 @@ from openmm_parts import HeldCoordinates
 from openmm_systems import (
     PLATFORMS,
     alanine,
+    context_of,
     dumbbell,
     holding,
     loose_alanine,
@@ -22,6 +23,7 @@ from openmm_systems import (
     started,
     state_of,
     total_energy,
+    water_box,
 )
 from tied_cluster import KINDS, bond
 
@@ -143,6 +145,24 @@ def test_changes_from_outside_reach_the_next_step(change):
     np.testing.assert_allclose(contexts[0], contexts[1], rtol=1e-12)
 
 
+def test_change_of_the_box():
+    """OpenMM keeps the forces of a CustomIntegrator when the box is changed; `step` sees that."""
+    system, x = water_box(27)
+    wider = 1.02 * np.array([row._value for row in system.getDefaultPeriodicBoxVectors()])
+    context = started(system, integrator := ProjectedIntegrator(1e-3, tolerance=1e-12), x, np.zeros_like(x))
+    integrator.step(5)
+    context.setPeriodicBoxVectors(*wider)
+    fresh = context_of(system, other := ProjectedIntegrator(1e-3, tolerance=1e-12))
+    fresh.setPeriodicBoxVectors(*wider)
+    fresh.setPositions(state_of(context)[0])
+    fresh.setVelocities(state_of(context)[1])
+    integrator.step(5)
+    other.step(5)
+    # SETTLE has lengths in single precision.
+    np.testing.assert_allclose(state_of(context)[0], state_of(fresh)[0], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(state_of(context)[1], state_of(fresh)[1], rtol=0, atol=1e-4)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_parameters_of_forces_are_used_in_the_next_step(kind):
     made, fresh, old = KINDS[kind](), KINDS[kind](), KINDS[kind]()
@@ -229,7 +249,6 @@ def held(kind, **arguments):
 
 
 @pytest.mark.parametrize("kind", LEAN)
-@pytest.mark.usefixtures("without_device")
 def test_calls_of_any_length_make_the_same_motion(kind):
     """Within a call steps leave out what only a reader of velocities needs."""
     ends, parts = [], []
@@ -282,7 +301,6 @@ def test_steps_in_tens_are_those_of_one_call(kind):
     ],
     ids=["rattle", "blanes-moan4", "Langevin", "Isokinetic", "collective", "carried"],
 )
-@pytest.mark.usefixtures("without_device")
 def test_evaluations_of_forces_in_tens(make, more):
     """OpenMM evaluates the forces once a step (five times in that of order 4), in however many calls."""
     system, x, v = alanine()
@@ -333,7 +351,6 @@ def test_failure_where_nobody_looked():
 
 
 @pytest.mark.parametrize("agent", ["barostat", "thermostat", "momentum"])
-@pytest.mark.usefixtures("without_device")
 def test_agents_of_the_system(agent):
     """A carried row stays exact where a barostat moves x between steps; a thermostat meets complete velocities."""
     system = openmm.System()
@@ -388,7 +405,6 @@ def test_a_number_of_steps_that_is_none_is_refused(kind):
 
 
 @pytest.mark.parametrize("before", [100, 0])
-@pytest.mark.usefixtures("without_device")
 def test_checks_that_come_more_often_make_no_step_more(before):
     """Steps since the last check may be more than the new interval."""
     system, x, v = dumbbell()

@@ -1,9 +1,6 @@
-"""Surfaces: landings in closed form, compiled and by formula; what is checked, put right and refused."""
+"""Surfaces: expressions of rows; what is checked, put right and refused."""
 
 from __future__ import annotations
-
-import copy
-from threading import Thread
 
 import numpy as np
 import openmm
@@ -14,7 +11,6 @@ from surface_cases import (
     FORMULA,
     KINDS,
     POSITIONS,
-    QUADRICS,
     VELOCITIES,
     on_surface,
     started,
@@ -23,10 +19,9 @@ from surface_cases import (
     worst,
 )
 
-from kcons.constraints import Sphere
+from kcons.constraints import Formula, Sphere, Torus
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import (
-    ExpressionSurface,
     Isokinetic,
     Langevin,
     NoseHooverMiddle,
@@ -36,52 +31,36 @@ from kcons.openmm import (
 )
 
 
-@pytest.mark.parametrize("kind", QUADRICS)
-@pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
-def test_compiled_landing_is_the_same(kind, scheme):
-    pair = [on_surface(kind, scheme, 0.02, atoms=(2, 0), compiled=compiled) for compiled in (False, True)]
-    for integrator, _ in pair:
-        integrator.step(50)
-    (x, v), (x2, v2) = (state_of(context) for _, context in pair)
-    assert np.abs(x - x2).max() <= 1e-13
-    assert np.abs(v - v2).max() <= 1e-13
-    assert max(worst(*pair[1])) <= 1e-14
-
-
 @pytest.mark.parametrize("kind", [ProjectedIntegrator, SurfaceIntegrator])
 @pytest.mark.parametrize(
     "options",
     [
-        {},
         {"ensemble": Langevin(300, 0.0)},
         {"ensemble": Isokinetic(300, momentum="free")},
         {"ensemble": NoseHooverMiddle(300, 5.0)},
     ],
     ids=repr,
 )
-def test_parts_that_are_compiled_go_where_the_others_go(kind, options):
-    """In any integrator and ensemble, also after an integrator whose drifts follow great circles."""
-    ends = []
-    for compiled in (False, True):
-        system = system_of()
-        spheres = [Sphere([k], [0.0, 0.0, 0.0], float(np.linalg.norm(POSITIONS[k]))) for k in (0, 2)]
-        parts = surface_parts(spheres, system=system, compiled=compiled)
-        if compiled:
-            SurfaceIntegrator(0.01, "geodesic", parts=parts)
-        context = context_of(system, integrator := kind(0.01, parts=parts, **options), "Reference")
-        context.setPositions(POSITIONS)
-        context.setVelocities(VELOCITIES)
-        integrator.applyVelocityConstraints(context)
-        integrator.step(20)
-        integrator.check()
-        ends.append(state_of(context))
-    assert np.abs(np.array(ends[1]) - ends[0]).max() <= 1e-13
-
-
-def test_a_step_without_landing_is_told_by_openmm_s_own_arithmetic_too():
+def test_surfaces_are_held_in_every_ensemble(kind, options):
     system = system_of()
-    parts = surface_parts(Sphere([0], [0, 0, 0], float(np.linalg.norm(POSITIONS[0]))), system=system, compiled=True)
-    integrator = SurfaceIntegrator(1.0 * unit.picosecond, parts=parts, ensemble=Langevin(300, 0.0))
+    spheres = [Sphere([k], [0.0, 0.0, 0.0], float(np.linalg.norm(POSITIONS[k]))) for k in (0, 2)]
+    parts = surface_parts(spheres, system=system)
+    context = context_of(system, integrator := kind(0.01, parts=parts, device=False, **options), "Reference")
+    context.setPositions(POSITIONS)
+    context.setVelocities(VELOCITIES)
+    integrator.applyVelocityConstraints(context)
+    integrator.step(20)
+    integrator.check()
+    x, v = state_of(context)
+    for k in (0, 2):
+        assert np.linalg.norm(x[k]) == pytest.approx(np.linalg.norm(POSITIONS[k]), abs=1e-14)
+        assert abs(x[k] @ v[k]) <= 1e-13
+
+
+def test_a_step_without_landing_is_told_in_every_ensemble():
+    system = system_of()
+    parts = surface_parts(Sphere([0], [0, 0, 0], float(np.linalg.norm(POSITIONS[0]))), system=system)
+    integrator = SurfaceIntegrator(1.0 * unit.picosecond, parts=parts, ensemble=Langevin(300, 0.0), device=False)
     context = context_of(system, integrator, "Reference")
     context.setPositions(POSITIONS)
     context.setVelocities(100 * VELOCITIES)
@@ -89,42 +68,22 @@ def test_a_step_without_landing_is_told_by_openmm_s_own_arithmetic_too():
         integrator.step(1)
 
 
-def test_copies_of_a_system_make_steps_in_threads():
-    """Each drift begins where the particles of its own Context are."""
-    n = 20
-    system = openmm.System()
-    for _ in range(n):
-        system.addParticle(10.0)
-    parts = surface_parts(Sphere(np.arange(n), [0, 0, 0], 1.0), system=system, compiled=True)
-    ends = {}
-
-    def go(seed, name):
-        integrator = SurfaceIntegrator(2e-3, parts=copy.deepcopy(parts), check_every=0)
-        context = context_of(copy.deepcopy(system), integrator)
-        x, v = np.random.default_rng(seed).normal(size=(2, n, 3))
-        context.setPositions(x / np.linalg.norm(x, axis=1)[:, None])
-        context.setVelocities(v)
-        integrator.applyVelocityConstraints(context)
-        integrator.step(1000)
-        ends[name] = np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
-
-    for seed in (0, 1):
-        go(seed, f"{seed} alone")
-    threads = [Thread(target=go, args=(seed, seed)) for seed in (0, 1)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for seed in (0, 1):
-        np.testing.assert_array_equal(ends[seed], ends[f"{seed} alone"])
+def test_a_landing_where_the_surface_looks_the_other_way_is_none():
+    """From the inner equator of a torus to the one across."""
+    system = system_of([1.0], "320*x", 0)
+    torus = Torus([0], [0, 0, 0], [0, 0, 1], 1.0, 0.2)
+    integrator = SurfaceIntegrator(0.1 * unit.picosecond, surfaces=torus, system=system, device=False)
+    context = started(system, integrator, [[0.8, 0, 0]], [[0, 0, 0]])
+    integrator.check()
+    with pytest.raises(ConvergenceError, match="finds no position"):
+        integrator.step(1)
 
 
-def test_formula_with_intermediate_values_and_parameters():
+def test_formulas_with_parameters():
     x = np.array([[0.8164965809277261, 0, 0], [0, 1.0, 0], [0, 0, 3.0]])
     system = system_of()
-    integrator = SurfaceIntegrator(
-        0.01, surfaces=[ExpressionSurface([0, 1], FORMULA), ExpressionSurface(2, "z-a", {"a": 3.0})], system=system
-    )
+    surfaces = [Formula(FORMULA, [0, 1], {"b": 1.5}, target=1.0), Formula("z1-a", 2, {"a": 3.0})]
+    integrator = SurfaceIntegrator(0.01, surfaces=surfaces, system=system, device=False)
     context = started(system, integrator, x, [[0, 1, 0], [1, 0, 0], [1, 1, 0]])
     integrator.step(100)
     there, _ = state_of(context)
@@ -133,16 +92,45 @@ def test_formula_with_intermediate_values_and_parameters():
     assert there[2, 2] == pytest.approx(3.0, abs=1e-14)
 
 
-def test_refused_parameters_of_a_formula():
-    for values in ([1.0, 2.0], np.nan):
-        with pytest.raises(InputError, match="one finite number"):
-            ExpressionSurface([0], "x-a", {"a": values})
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "x1**2 - 3*y1/z1 + pi*z1**-2 - (x1*y1)**0.5",
+        "sin(x1)*cos(y1) + atan2(z1, x1) + asin(0.1*x1) + acos(0.1*y1) + atan(z1) + tan(0.2*x1)",
+        "-exp(-x1)**2 + log(y1) + abs(z1 - 5) + sinh(x1) + cosh(y1) + tanh(z1) + 1e-3*x1**3.5",
+    ],
+)
+def test_formulas_are_read_by_openmm(formula):
+    """Value and gradient, where powers, signs and functions of both agree."""
+    item = Formula(formula, [0], target=0.25)
+    r = np.array([[0.7, 1.3, 2.1]])
+    system = system_of([1.0], "0", 0)
+    (part,) = surface_parts(item, system=system)
+    context = context_of(system, openmm.VerletIntegrator(1e-3), "Reference")
+    context.setPositions(r)
+    one, two = (context.getState(energy=True, forces=True, groups={group}) for group in sorted(part.groups))
+    value, slope = item.measure(r[None], 0.0)[0] - 0.25, item.gradient(r[None], 0.0)[0, 0]
+    assert one.getPotentialEnergy()._value == pytest.approx(value, rel=1e-13)
+    assert two.getPotentialEnergy()._value == pytest.approx(0.5 * value**2, rel=1e-13)
+    np.testing.assert_allclose(one.getForces(asNumpy=True)._value[0], -slope, rtol=1e-13)
+    np.testing.assert_allclose(two.getForces(asNumpy=True)._value[0], -value * slope, rtol=1e-13)
+
+
+def test_what_is_no_expression_is_refused():
+    class Winds(Sphere):
+        @staticmethod
+        def row(r, p, t, out):
+            Sphere.row(r, p, t, out)
+            out[0] = np.rint(out[0])
+
+    with pytest.raises(UnsupportedError, match="'rint' in it"):
+        surface_parts(Winds([0], [0, 0, 0], 1.0), system=system_of())
 
 
 def test_leaves_room_for_the_groups_of_the_user():
     system = system_of()
     system.getForce(0).setForceGroup(31)
-    integrator = SurfaceIntegrator(0.001, surfaces=ExpressionSurface([0], "x"), system=system)
+    integrator = SurfaceIntegrator(0.001, surfaces=Formula("x1", [0]), system=system, device=False)
     assert integrator.row_groups == {29, 30}
     assert integrator.getIntegrationForceGroups() & 0xFFFFFFFF == 0xFFFFFFFF ^ (1 << 30 | 1 << 29)
 
@@ -183,13 +171,15 @@ def test_systems_that_surfaces_do_not_go_with(spoil, words):
     system = system_of()
     spoil(system)
     with pytest.raises(UnsupportedError, match=words):
-        SurfaceIntegrator(0.001, surfaces=surface, system=system)
-    # Also where the System was not given.
-    integrator = SurfaceIntegrator(0.001, surfaces=surface, n_particles=3)
+        SurfaceIntegrator(0.001, surfaces=surface, system=system, device=False)
+    # Also where that was done later.
+    system = system_of()
+    integrator = SurfaceIntegrator(0.001, surfaces=surface, system=system, device=False)
+    spoil(system)
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
     context.setPositions(POSITIONS)
     with pytest.raises(UnsupportedError, match=words):
-        integrator.surfaces[0].check(context)
+        integrator.parts[0].check(context)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,0 +1,868 @@
+"""Rows that are singular only at second order: found at set-up, converted to linear rows or refused.
+
+Rows may depend on each other in two ways. Methane by all ten distances has nine independent gradients on
+the whole surface: any nine rows hold what ten hold, and a pseudo-inverse deals with it. CO2 by three
+distances has two independent gradients where it is straight, yet cannot bend, because a bend by e changes
+a distance by e^2: no iteration converges there, and no first-order theory holds.
+
+The difference is the solvability condition A A+ b = b (notes eq. 95): at a singular point of the second
+kind there are admissible velocities, A v = 0, for which no acceleration exists. With omega^T A = 0 this
+reads omega . (v^T d2sigma/dx2 v) = 0, which is tested here for random v.
+
+A group of atoms held rigid by such rows is collinear or planar, and what the rows mean is linear:
+x_a = (1 - c) x_i + c x_j on a line, x_a = c_i x_i + c_j x_j + c_k x_k in a plane, with one distance or
+three between the bases. These rows are regular and hold all distances in the group.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import scipy.sparse as sp
+
+from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.internal import Distance
+from kcons.constraints.linear import LinearRelation
+from kcons.constraints.periodic.one_piece import BoolArray
+from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.constraints.vectors import extent, row_norms
+from kcons.errors import SingularGeometryError
+from kcons.plan.independent_blocks import fixed_atoms, row_blocks
+from kcons.solvers.tolerances import LOST
+
+#: Larger blocks are first reduced to their internal coordinates, then to their distances, and what is
+#: still larger is tested by sparse inertia counts.
+DENSE_LIMIT = 900
+DENSE_ENTRIES = 4_000_000
+#: Triangles whose targets are as flat as this are linear groups wherever their atoms are at the start.
+_FLAT_TARGETS = 1e-12
+#: Blocks of one shape that start off their targets are analyzed where they belong, until this many in a
+#: row turn out regular.
+_REGULAR_SAMPLES = 100
+_INTERNAL = frozenset({"Distance", "Angle", "Dihedral", "LinearRelation", "LinearCombination"})
+_LEVELS: tuple[Callable[[Constraint], bool], ...] = (
+    lambda item: True,
+    lambda item: item.family in _INTERNAL and item.translation_invariant,
+    lambda item: item.holds_length,
+)
+#: Directions that a step of Gauss-Newton leaves out. Towards a flat geometry singular values go with the square root of
+#: the residual, to 1e-7, and have to count.
+STEP_CUT = 1e-9
+#: Size of the displacements that break special geometries, relative to the shortest row.
+DISPLACEMENT = 1e-2
+#: Part of the curvature outside the range of A that is more than rounding (or than the differences of a
+#: user's gradient).
+UNSOLVABLE = 1e-4
+#: Families whose rows a linear or planar group makes superfluous.
+_CONVERTIBLE = frozenset({"Distance", "Angle", "Dihedral"})
+#: Extent across a line or plane, relative to the extent along it, that still counts as flat.
+FLAT = 1e-6
+#: Relative misfit between the targets and a flat geometry above which the conversion is refused.
+MISFIT = 1e-6
+
+
+def without_second_order_rows(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> ConstraintSet:
+    """The same set with second-order-singular rows replaced by linear ones.
+
+    Parameters
+    ----------
+    constraint_set : ConstraintSet
+    positions : ndarray, shape (n_atoms, 3)
+        Positions on or near the surface.
+    time : float
+
+    Returns
+    -------
+    ConstraintSet
+        The given object itself if it is regular.
+
+    Raises
+    ------
+    SingularGeometryError
+        Rows that cannot be converted; the message says what to hold instead.
+    """
+    bodies: list[FlatBody] = []
+    sigma: FloatArray | None = None
+    for stack in _stacks(constraint_set, positions, time):
+        sigma = constraint_set.value(positions, time) if sigma is None else sigma
+        suspects = stack.suspects(constraint_set, positions, time)
+        straight, done = stack.straight_triangles(constraint_set, suspects, time)
+        bodies += straight
+        for rows in stack.rows[suspects & ~done]:
+            bodies += find_flat_bodies(LocalRows(constraint_set, rows, positions, time))
+        regular = 0
+        for rows in stack.rows[stack.off_target(constraint_set, positions, sigma, time) & ~suspects]:
+            block = LocalRows(constraint_set, rows, positions, time).restored()
+            regular += 1
+            if block.singular(block.x):
+                bodies += find_flat_bodies(block)
+                regular = 0
+            if regular >= _REGULAR_SAMPLES:
+                break
+    if not bodies:
+        return constraint_set
+    return with_flat_bodies(constraint_set, bodies, positions, time)
+
+
+@dataclass
+class _Stack:
+    """Blocks of one shape.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (n_blocks, n_rows)
+    atoms : ndarray of int, shape (n_blocks, n_atoms)
+    """
+
+    rows: IntArray
+    atoms: IntArray
+
+    def chosen(self, which: IntArray | BoolArray) -> _Stack:
+        return _Stack(self.rows[which], self.atoms[which])
+
+    def suspects(self, constraint_set: ConstraintSet, x: FloatArray, time: float) -> BoolArray:
+        """Blocks that are singular at second order at `x`, shape (n_blocks,)."""
+        unit, curvature = self._dense(constraint_set, x, time)
+        doubtful: BoolArray = np.asarray(np.isfinite(unit).all(axis=(1, 2)))
+        doubtful[doubtful] = _deficient(unit[doubtful])
+        if doubtful.any() and not doubtful.all():
+            few = self.chosen(doubtful)
+            doubtful[doubtful] = few.suspects(constraint_set, x, time)
+            return doubtful
+        if doubtful.any():
+            extent = np.ptp(x[self.atoms], axis=1).max(axis=1)
+            doubtful = unsolvable(unit, curvature, np.where(extent > 0, extent, 1.0))
+        return doubtful
+
+    def _dense(
+        self, constraint_set: ConstraintSet, x: FloatArray, time: float
+    ) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
+        """Row-normalized A of each block, fixed atoms' columns zero, and the curvatures of the same rows."""
+        n_blocks, n_rows = self.rows.shape
+        n_atoms = self.atoms.shape[1]
+        a = np.zeros((n_blocks, n_rows, n_atoms, 3))
+        pieces: list[tuple[Constraint, FloatArray, IntArray, IntArray, IntArray]] = []
+        for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
+            block, row = np.nonzero((self.rows >= start) & (self.rows < start + item.n_rows))
+            if len(block) == 0:
+                continue
+            part = item.select(self.rows[block, row] - start)
+            slots = np.argmax(self.atoms[block][:, None, :] == part.atoms[:, :, None], axis=2)
+            r = constraint_set.gather(part, x)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                a[block[:, None], row[:, None], slots] = part.gradient(r, time)
+            pieces.append((part, r, block, row, slots))
+        free = ~np.isin(self.atoms, fixed_atoms(constraint_set))
+        a *= free[:, None, :, None]
+        unit = a.reshape(n_blocks, n_rows, -1)
+        norms = np.linalg.norm(unit, axis=2)
+        norms = np.where(norms > 0, norms, 1.0)
+
+        def curvature(v: FloatArray) -> FloatArray:
+            field = v.reshape(n_blocks, n_atoms, 3) * free[:, :, None]
+            bent = np.zeros((n_blocks, n_rows))
+            for part, r, block, row, slots in pieces:
+                bent[block, row] = part.curvature(r, field[block[:, None], slots], time)
+            return bent / norms
+
+        return unit / norms[:, :, None], curvature
+
+    def straight_triangles(
+        self, constraint_set: ConstraintSet, suspects: BoolArray, time: float
+    ) -> tuple[list[FlatBody], BoolArray]:
+        """Collinear triatomics held by three distances, all at once, and which blocks they are."""
+        done = np.zeros(len(self.rows), bool)
+        if self.rows.shape[1] != 3 or self.atoms.shape[1] != 3:
+            return [], done
+        pairs = np.full((constraint_set.n_rows, 2), -1)
+        for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
+            if item.holds_length and not isinstance(item.target, MovingTarget):
+                pairs[start : start + item.n_rows] = item.atoms
+        sides = pairs[self.rows]
+        plain = (sides >= 0).all(axis=(1, 2)) & ~np.isin(self.atoms, fixed_atoms(constraint_set)).any(axis=1)
+        if not plain.any():
+            return [], done
+        length = constraint_set.target(time)[self.rows]
+        order = np.argsort(length, axis=1)
+        length = np.take_along_axis(length, order, axis=1)
+        sides = np.take_along_axis(sides, order[:, :, None], axis=1)
+        excess = np.abs(length[:, 0] + length[:, 1] - length[:, 2]) / length[:, 2]
+        done = plain & ((suspects & (excess <= MISFIT)) | (excess <= _FLAT_TARGETS))
+        bodies = []
+        for k in np.flatnonzero(done):
+            i, j = sides[k, 2]
+            middle = self.atoms[k].sum() - i - j
+            from_i = length[k, 0] if i in sides[k, 0] else length[k, 1]
+            c = from_i / (length[k, 0] + length[k, 1])
+            bodies.append(
+                FlatBody(
+                    atoms=self.atoms[k],
+                    rows=self.rows[k],
+                    bases=sides[k, 2],
+                    pairs=sides[k, 2:],
+                    lengths=length[k, 2:],
+                    tied=np.array([middle]),
+                    weights=np.array([[1.0 - c, c]]),
+                    linearized=7,
+                )
+            )
+        return bodies, done
+
+    def off_target(self, constraint_set: ConstraintSet, x: FloatArray, sigma: FloatArray, time: float) -> BoolArray:
+        """Blocks so far from their targets that their geometry says nothing about the surface."""
+        miss = np.abs(sigma[self.rows] / constraint_set.scale[self.rows]).max(axis=1)
+        result = miss > 1e-10
+        if self.rows.shape[1] <= 3 or not result.any():
+            return np.zeros_like(result)
+        far = np.flatnonzero(result)
+        unit, _ = self.chosen(far)._dense(constraint_set, x, time)
+        if unit.shape[1] <= unit.shape[2]:
+            # At a distance s from a flat geometry the smallest singular value is s, and the rows are off by s^2.
+            smallest = np.linalg.svd(unit, compute_uv=False)[:, -1]
+            far = far[miss[far] > 0.1 * smallest**2]
+        result[:] = False
+        result[far] = True
+        return result
+
+
+def _deficient(unit: FloatArray) -> BoolArray:
+    """Which blocks have dependent rows, shape (n_blocks,)."""
+    if unit.shape[1] > unit.shape[2]:
+        return np.ones(len(unit), bool)
+    squares = np.linalg.eigvalsh(unit @ unit.transpose(0, 2, 1))
+    return np.asarray(squares[:, 0] <= LOST**2 * squares[:, -1])
+
+
+def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> Iterator[_Stack]:
+    """All blocks small enough for dense algebra, by shape; tests larger ones on the way."""
+    rows: IntArray | None = None
+    for accept in _LEVELS:
+        members, starts = row_blocks(constraint_set, accept, rows)
+        sizes = np.diff(starts)
+        if len(sizes) == 0:
+            return
+        label = np.repeat(np.arange(len(sizes)), sizes)
+        incidence = constraint_set.incidence[members]
+        touched = np.repeat(label, np.diff(incidence.indptr)) * constraint_set.n_atoms + incidence.indices
+        label_of_atom, atoms = np.divmod(np.unique(touched), constraint_set.n_atoms)
+        widths = np.bincount(label_of_atom, minlength=len(sizes))
+        first_atom = np.concatenate([[0], np.cumsum(widths)])
+        large = (np.minimum(sizes, 3 * widths) > DENSE_LIMIT) | (sizes * 3 * widths > DENSE_ENTRIES)
+        shapes = np.stack([sizes, widths], axis=1)
+        for n_rows, n_atoms in np.unique(shapes[~large], axis=0):
+            same = np.flatnonzero((sizes == n_rows) & (widths == n_atoms))
+            chunk = max(1, DENSE_ENTRIES // int(n_rows * 3 * n_atoms))
+            for lo in range(0, len(same), chunk):
+                some = same[lo : lo + chunk, None]
+                yield _Stack(members[starts[some] + np.arange(n_rows)], atoms[first_atom[some] + np.arange(n_atoms)])
+        rows = np.sort(members[large[label]])
+        if len(rows) == 0:
+            return
+    for k in np.flatnonzero(large).tolist():
+        _check_large(constraint_set, members[starts[k] : starts[k + 1]], positions, time)
+
+
+def _check_large(constraint_set: ConstraintSet, rows: IntArray, positions: FloatArray, time: float) -> None:
+    """Refuse a block too large for dense algebra whose rank is lower here than at positions nearby."""
+    part, atoms = constraint_set.subset(rows)
+    x = positions[atoms]
+    free = ~np.isin(atoms, fixed_atoms(constraint_set))
+    shortest = float(part.measure(x, time).min())
+    rng = np.random.default_rng(20090131)
+    away = x + DISPLACEMENT * shortest * rng.standard_normal(x.shape) * free[:, None]
+    here, nearby = (_lost_rows(part, y, free, time) for y in (x, away))
+    if here > nearby:
+        names = ", ".join(constraint_set.row_name(int(r)) for r in rows[:4])
+        raise SingularGeometryError(
+            f"constraint set singular at this geometry: the {len(rows)} rows {names}, ... have rank "
+            f"{len(rows) - here} here but {len(rows) - nearby} at positions nearby. Hold collinear and coplanar "
+            "groups by x_a = sum c_i x_i (LinearRelation) instead of all their distances",
+            rows=rows,
+            atoms=atoms,
+        )
+
+
+def _lost_rows(part: ConstraintSet, x: FloatArray, free: BoolArray, time: float) -> int:
+    """Rows less rank: eigenvalues of A A^T below LOST^2, counted by Sylvester's law of inertia."""
+    a = part.jacobian(x, time)
+    a.data *= np.repeat(free, 3)[a.indices]
+    norms = row_norms(a)
+    a.data *= np.repeat(1.0 / np.where(norms > 0, norms, 1.0), np.diff(a.indptr))
+    shifted = (a @ a.T - LOST**2 * sp.eye_array(part.n_rows)).tocsc()
+    from scipy.sparse.linalg import splu  # slow to import, seldom needed
+
+    factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return int(np.sum(factor.U.diagonal() < 0))
+
+
+# -- one block ----------------------------------------------------------------------------------------------
+
+
+def unsolvable(unit: FloatArray, curvature: Callable[[FloatArray], FloatArray], extent: FloatArray) -> BoolArray:
+    """Whether A a = -v^T (d2sigma/dx2) v has no solution for some v with A v = 0.
+
+    Parameters
+    ----------
+    unit : ndarray, shape (n_blocks, n_rows, n_coordinates)
+        A of several blocks, rows scaled to unit norm.
+    curvature : callable
+        Maps v, shape (n_blocks, n_coordinates), to the curvatures, shape (n_blocks, n_rows), of the scaled rows.
+    extent : ndarray, shape (n_blocks,)
+        Length scale of each block.
+
+    References
+    ----------
+    Notes, eqs. 92 and 95.
+    """
+    u, s, vt = np.linalg.svd(unit, full_matrices=True)
+    cut = LOST * s[:, :1]
+    lost = np.ones(unit.shape[:2], bool)
+    lost[:, : s.shape[1]] = s <= cut
+    free = np.ones((len(unit), unit.shape[2]), bool)
+    free[:, : s.shape[1]] = s <= cut
+    rng = np.random.default_rng(20060921)
+    result = np.zeros(len(unit), bool)
+    for _ in range(3):
+        v = np.einsum("bk,bkn->bn", np.where(free, rng.standard_normal(free.shape), 0.0), vt)
+        b = curvature(v)
+        outside = np.where(lost, np.einsum("brk,br->bk", u, b), 0.0)
+        # Rigid translations have no curvature but rounding.
+        size = np.linalg.norm(b, axis=1) + 1e-9 * np.einsum("bn,bn->b", v, v) / extent
+        result |= np.linalg.norm(outside, axis=1) > UNSOLVABLE * size
+    return result
+
+
+class LocalRows:
+    """One block of rows on its own atoms, with dense algebra.
+
+    Parameters
+    ----------
+    constraint_set : ConstraintSet
+    rows : ndarray of int
+        Rows of the block, sorted.
+    positions : ndarray, shape (n_atoms, 3)
+    time : float
+    pinned : ndarray of bool, optional
+        Fixed atoms of the block; by default those that FixedAtoms of the set hold.
+    """
+
+    def __init__(
+        self,
+        constraint_set: ConstraintSet,
+        rows: IntArray,
+        positions: FloatArray,
+        time: float,
+        pinned: BoolArray | None = None,
+    ) -> None:
+        self.rows = rows
+        self.time = time
+        self.set = constraint_set
+        self.part, self.atoms = constraint_set.subset(rows)
+        self.x = positions[self.atoms]
+        if pinned is None:
+            pinned = np.isin(self.atoms, fixed_atoms(constraint_set))
+        self.pinned: BoolArray = pinned
+        self.row_atoms = [self.part.row_atoms(k) for k in range(self.part.n_rows)]
+
+    def inside(self, atoms: IntArray) -> IntArray:
+        """Rows (block numbering) of convertible families with all their atoms among `atoms` (block numbering)."""
+        chosen = np.zeros(len(self.atoms), bool)
+        chosen[atoms] = True
+        return np.array(
+            [
+                k
+                for k, members in enumerate(self.row_atoms)
+                if chosen[members].all() and self.part.locate(k)[0].family in _CONVERTIBLE
+            ],
+            dtype=np.int64,
+        )
+
+    def unit_jacobian(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Row-normalized A without the columns' part of fixed atoms, and the norms."""
+        a = self.part.jacobian(x, self.time).toarray()
+        a[:, np.repeat(self.pinned, 3)] = 0.0
+        norms = np.linalg.norm(a, axis=1)
+        return a / np.where(norms > 0, norms, 1.0)[:, None], norms
+
+    def decomposed(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+        """u, s and v^T of these rows, all singular vectors, and their rank."""
+        u, s, vt = np.linalg.svd(self.unit_jacobian(x)[0], full_matrices=True)
+        return u, s, vt, int(np.sum(s > LOST * s[0]))
+
+    def singular(self, x: FloatArray, rows: IntArray | None = None) -> bool:
+        """Whether these rows (all by default) are singular at second order at `x`."""
+        rows = np.arange(self.part.n_rows) if rows is None else rows
+        if len(rows) < 2:
+            return False
+        unit, _ = self.unit_jacobian(x)
+
+        def curvature(v: FloatArray) -> FloatArray:
+            return self.unit_curvature(x, v)[None, rows]
+
+        return bool(unsolvable(unit[None, rows], curvature, np.array([extent_of(x)]))[0])
+
+    def unit_curvature(self, x: FloatArray, v: FloatArray) -> FloatArray:
+        """v^T (d2sigma/dx2) v of the rows that `unit_jacobian` scales, shape (n_rows,)."""
+        _, norms = self.unit_jacobian(x)
+        field = np.where(self.pinned[:, None], 0.0, v.reshape(-1, 3))
+        bent = [c.curvature(self.part.gather(c, x), field[c.atoms], self.time) for c in self.part.constraints]
+        return np.asarray(np.concatenate(bent) / np.where(norms > 0, norms, 1.0))
+
+    def stressed(self, x: FloatArray) -> IntArray:
+        """Rows (block numbering) that take part in a dependence omega^T A = 0."""
+        u, _, _, rank = self.decomposed(x)
+        return np.flatnonzero(np.einsum("rk,rk->r", u[:, rank:], u[:, rank:]) > 1e-10)
+
+    def rank(self, x: FloatArray, rows: IntArray | None = None) -> int:
+        unit, _ = self.unit_jacobian(x)
+        s = np.linalg.svd(unit if rows is None else unit[rows], compute_uv=False)
+        return int(np.sum(s > LOST * s[0])) if len(s) else 0
+
+    def restored(self) -> LocalRows:
+        """The same block at positions that fulfil its targets, as nearly as Gauss-Newton gets there."""
+        x = self.x.copy()
+        held = self.part.holonomic
+        for _ in range(60):
+            sigma = self.part.value(x, self.time)
+            # Towards a flat geometry the singular value is the square root of this, 1e-7: lost by any measure.
+            if np.max(np.abs(sigma) / self.part.scale) < 1e-14:
+                break
+            unit, norms = self.unit_jacobian(x)
+            step = np.linalg.lstsq(unit[held], -(sigma / np.where(norms > 0, norms, 1.0))[held], rcond=STEP_CUT)[0]
+            x = x + step.reshape(x.shape)
+        other = copy.copy(self)
+        other.x = x
+        return other
+
+    def rigid_pairs(self) -> tuple[BoolArray, int]:
+        """Pairs of atoms that keep their distance at positions nearby, and the rank there."""
+        rng = np.random.default_rng(20090131)
+        n = len(self.atoms)
+        step = DISPLACEMENT * self._shortest()
+        best, rigid = -1, np.eye(n, dtype=bool)
+        for _ in range(3):
+            x = self.x + step * rng.standard_normal(self.x.shape)
+            x[self.pinned] = self.x[self.pinned]
+            _, _, vt, rank = self.decomposed(x)
+            if rank <= best:
+                continue
+            best = rank
+            # A few random motions show every pair that can move.
+            motions = rng.standard_normal((8, vt.shape[0] - rank)) @ vt[rank:]
+            motions = motions.reshape(8, n, 3)
+            motions[:, self.pinned] = 0.0
+            apart = self.unwrapped(x)
+            apart = apart[:, None] - apart[None, :]
+            lengths = np.linalg.norm(apart, axis=2) + np.eye(n)
+            rates = np.zeros((n, n))
+            for motion in motions:
+                along = np.einsum("ijc,ijc->ij", apart / lengths[:, :, None], motion[:, None] - motion[None, :])
+                rates = np.maximum(rates, np.abs(along))
+            rigid = rates < 1e-7
+        return rigid, best
+
+    def unwrapped(self, x: FloatArray) -> FloatArray:
+        """Positions made whole across the boundary, following the rows."""
+        if self.part.lattice is None:
+            return x
+        whole = x.copy()
+        placed = np.zeros(len(x), bool)
+        placed[0] = True
+        rows = [r for item in self.part.constraints for r in self.part.gather(item, x)]
+        for _ in range(len(x)):
+            if placed.all():
+                break
+            for members, r in zip(self.row_atoms, rows, strict=True):
+                known = placed[members]
+                if known.any() and not known.all():
+                    base = int(np.argmax(known))
+                    whole[members[~known]] = whole[members[base]] + r[~known] - r[base]
+                    placed[members] = True
+        return whole
+
+    def _shortest(self) -> float:
+        lengths = [
+            np.linalg.norm(np.diff(self.part.gather(c, self.x), axis=1), axis=2).min()
+            for c in self.part.constraints
+            if c.width > 1 and c.n_rows
+        ]
+        return float(min(lengths)) if lengths else extent_of(self.x)
+
+
+def extent_of(x: FloatArray) -> float:
+    """Length scale of a group of points."""
+    size = extent(x)
+    return size if size > 0 else max(float(np.max(np.abs(x))), 1.0)
+
+
+# -- linear and planar groups -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FlatBody:
+    """Atoms on a line (two bases) or in a plane (three), and what holds them regularly.
+
+    Attributes
+    ----------
+    atoms, rows : ndarray of int
+        The atoms, and the rows that the linear ones replace.
+    bases : ndarray of int, shape (2,) or (3,)
+    pairs, lengths : ndarray, shape (1, 2), (1,) or (3, 2), (3,)
+        Distances between the bases.
+    tied : ndarray of int, shape (n,)
+        The other atoms.
+    weights : ndarray, shape (n, n_bases)
+        x_tied = weights @ x_bases.
+    linearized : int
+        Degrees of freedom that the replaced rows leave at first order; the body itself has 5 or 6.
+    """
+
+    atoms: IntArray
+    rows: IntArray
+    bases: IntArray
+    pairs: IntArray
+    lengths: FloatArray
+    tied: IntArray
+    weights: FloatArray
+    linearized: int
+
+    def __str__(self) -> str:
+        """For example 'atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows'."""
+        distances, linear = len(self.pairs), 3 * len(self.tied)
+        return (
+            f"atoms {_listed(self.atoms)} {'on a line' if len(self.bases) == 2 else 'in a plane'}: {distances} "
+            f"distance{'s' if distances > 1 else ''} and {linear} linear rows in place of {len(self.rows)} rows"
+        )
+
+    def renumbered(self, atoms: IntArray, rows: IntArray) -> FlatBody:
+        """The same body where atom a is called atoms[a] and row k rows[k]."""
+        return replace(
+            self,
+            atoms=atoms[self.atoms],
+            rows=rows[self.rows],
+            bases=atoms[self.bases],
+            pairs=atoms[self.pairs],
+            tied=atoms[self.tied],
+        )
+
+
+def find_flat_bodies(block: LocalRows) -> list[FlatBody]:
+    """Linear and planar rigid groups that make a block singular at second order.
+
+    Raises
+    ------
+    SingularGeometryError
+        If the block is singular for another reason, or a group's targets do not fit its flat geometry.
+    """
+    rigid, generic = block.rigid_pairs()
+    x = block.unwrapped(block.x)
+    stressed = block.stressed(block.x)
+    loaded = np.unique(np.concatenate([block.row_atoms[k] for k in stressed]))
+    found: list[IntArray] = []
+    for body in _cliques(rigid):
+        subsets = [body] if affine_dimension(x[body]) <= 2 else _flat_subsets(x, np.intersect1d(body, loaded))
+        found += [atoms for atoms in subsets if block.singular(block.x, block.inside(atoms))]
+    groups = _merged(found, x)
+    if not groups:
+        raise _unresolved(block, generic)
+    bodies = [_body(block, atoms, x) for atoms in groups]
+    bodies = _without_repeats(block, bodies)
+    _check_result(block, bodies, generic)
+    return [body.renumbered(block.atoms, block.rows) for body in bodies]
+
+
+def affine_dimension(x: FloatArray) -> int:
+    """1 for points on a line, 2 in a plane, 3 otherwise, up to `FLAT`."""
+    s = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
+    return max(1, int(np.sum(s > FLAT * s[0])))
+
+
+def _cliques(rigid: BoolArray) -> list[IntArray]:
+    """Rigid bodies of three atoms and more: two of them share a hinge (two atoms) at most."""
+    bodies: list[BoolArray] = []
+    for i, j in np.argwhere(np.triu(rigid, 1)):
+        common = rigid[i] & rigid[j]
+        common[[i, j]] = False
+        for body in bodies:
+            if body[i] and body[j]:
+                common &= ~body
+        while common.any():
+            k = int(np.argmax(common))
+            body = rigid[i] & rigid[j] & rigid[k]
+            bodies.append(body)
+            common &= ~body
+    return [np.flatnonzero(b) for b in bodies]
+
+
+def _flat_subsets(x: FloatArray, atoms: IntArray) -> list[IntArray]:
+    """Largest coplanar (four atoms and more) and collinear (three and more) subsets of a rigid body."""
+    y = x[atoms]
+    size = extent_of(y)
+    found: dict[bytes, IntArray] = {}
+    for i, j in combinations(range(len(atoms)), 2):
+        axis = (y[j] - y[i]) / np.linalg.norm(y[j] - y[i])
+        away = y - y[i]
+        across = away - np.outer(away @ axis, axis)
+        off = np.linalg.norm(across, axis=1)
+        line = off < FLAT * size
+        if line.sum() >= 3:
+            found.setdefault(line.tobytes(), atoms[line])
+        for k in range(j + 1, len(atoms)):
+            if line[k]:
+                continue
+            normal = np.cross(axis, across[k] / off[k])
+            plane = np.abs(away @ normal) < FLAT * size
+            if plane.sum() >= 4:
+                found.setdefault(plane.tobytes(), atoms[plane])
+    return list(found.values())
+
+
+def _merged(found: list[IntArray], x: FloatArray) -> list[IntArray]:
+    """Groups on the same line (two common atoms) or in the same plane (three off a line) become one."""
+    groups = [set(atoms.tolist()) for atoms in found]
+    changed = True
+    while changed:
+        changed = False
+        for a, b in combinations(range(len(groups)), 2):
+            shared = sorted(groups[a] & groups[b])
+            if len(shared) < 2:
+                continue
+            union = sorted(groups[a] | groups[b])
+            same_line = affine_dimension(x[union]) == 1
+            same_plane = len(shared) >= 3 and affine_dimension(x[union]) == 2 and affine_dimension(x[shared]) == 2
+            contained = groups[a] <= groups[b] or groups[b] <= groups[a]
+            if same_line or same_plane or contained:
+                groups[a] = set(union)
+                del groups[b]
+                changed = True
+                break
+    return [np.array(sorted(g), dtype=np.int64) for g in groups]
+
+
+def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
+    """What holds a flat group: bases, their distances, and the weights of the other atoms."""
+    inside = block.inside(atoms)
+    moving = [k for k in inside if isinstance(block.part.locate(int(k))[0].target, MovingTarget)]
+    linearized = 3 * len(atoms) - int(block.pinned[atoms].sum()) * 3 - block.rank(block.x, inside)
+    flat = affine_dimension(x[atoms])
+    if moving:
+        raise SingularGeometryError(
+            _sentence(linearized, flat, block.atoms[atoms])
+            + "; it cannot be converted, since a target among these atoms is a function of time",
+            rows=block.rows[inside],
+            atoms=block.atoms[atoms],
+        )
+    plane = _fitted(block, atoms, inside, x, flat, linearized)
+    bases, weights = _bases(block, atoms, inside, plane)
+    others = np.setdiff1d(np.arange(len(atoms)), bases)
+    held = np.array(list(combinations(bases, 2)))
+    lengths = np.linalg.norm(plane[held[:, 0]] - plane[held[:, 1]], axis=1)
+    pairs = atoms[held]
+    for k in inside:
+        item, row = block.part.locate(int(k))
+        if item.holds_length:
+            same = np.flatnonzero((np.sort(pairs, axis=1) == np.sort(item.atoms[row])).all(axis=1))
+            # A base distance that was held stays at its own target, to the last bit.
+            lengths[same] = np.asarray(item.target)[row]
+    return FlatBody(
+        atoms=atoms,
+        rows=inside,
+        bases=atoms[list(bases)],
+        pairs=pairs,
+        lengths=lengths,
+        tied=atoms[others],
+        weights=weights[others],
+        linearized=linearized,
+    )
+
+
+def _fitted(
+    block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, flat: int, linearized: int
+) -> FloatArray:
+    """Coordinates along the line or in the plane that fulfil the targets, shape (n, 1) or (n, 2).
+
+    Gauss-Newton within the plane, where the rows are regular; starts from the present positions.
+    """
+    y = x[atoms]
+    center = y.mean(axis=0)
+    axes = np.linalg.svd(y - center)[2][:flat]
+    plane = (y - center) @ axes.T
+    columns = (3 * atoms[:, None] + np.arange(3)).ravel()
+    scale = block.part.scale[inside]
+    whole = x.copy()
+    best, miss = plane, np.inf
+    for _ in range(30):
+        whole[atoms] = center + plane @ axes
+        sigma = block.part.value(whole, block.time)[inside]
+        size = float(np.max(np.abs(sigma) / scale))
+        if not size < miss:
+            break
+        best, miss = plane, size
+        if size < 1e-16:
+            break
+        a = block.part.jacobian(whole, block.time)[inside][:, columns].toarray()
+        a = np.einsum("rnc,fc->rnf", a.reshape(len(inside), len(atoms), 3), axes).reshape(len(inside), -1)
+        step = np.linalg.lstsq(a / scale[:, None], -sigma / scale, rcond=STEP_CUT)[0]
+        plane = plane + step.reshape(plane.shape)
+    if not miss <= MISFIT:
+        whole[atoms] = center + best @ axes
+        worst = int(np.argmax(np.abs(block.part.value(whole, block.time)[inside]) / scale))
+        row = int(block.rows[inside[worst]])
+        raise SingularGeometryError(
+            _sentence(linearized, flat, block.atoms[atoms])
+            + f"; it cannot be converted, since the targets do not fit a {('linear', 'planar')[flat - 1]} group: "
+            f"row {block.set.row_name(row)} stays off by {miss:.2g} (relative)",
+            rows=block.rows[inside],
+            atoms=block.atoms[atoms],
+        )
+    return best
+
+
+def _bases(
+    block: LocalRows, atoms: IntArray, inside: IntArray, plane: FloatArray
+) -> tuple[tuple[int, ...], FloatArray]:
+    """Two or three bases far apart (fixed atoms and pairs already held preferred), and all atoms' weights."""
+    n, flat = plane.shape
+    held = {tuple(sorted(block.row_atoms[k])) for k in inside if len(block.row_atoms[k]) == 2}
+    fixed = block.pinned[atoms]
+    candidates = list(range(n))
+    if flat == 2 and n > 40:
+        # The outermost atoms in a few directions; all triples of a large sheet would be too many.
+        angles = np.linspace(0, np.pi, 16, endpoint=False)
+        reach = plane @ np.stack([np.cos(angles), np.sin(angles)])
+        outer = np.concatenate([np.argmax(reach, 0), np.argmin(reach, 0), np.flatnonzero(fixed)[:8]])
+        candidates = np.unique(outer).tolist()
+    choices = list(combinations(candidates, flat + 1))
+    corners = plane[np.array(choices)]
+    edges = corners[:, 1:] - corners[:, :1]
+    size = np.abs(edges[:, 0, 0]) if flat == 1 else np.abs(np.linalg.det(edges))
+    good = np.flatnonzero(size >= 0.5 * size.max()) if flat == 2 else np.flatnonzero(size >= 0.999 * size.max())
+
+    def merit(k: int) -> tuple[int, int, float]:
+        pairs = combinations(choices[k], 2)
+        kept = sum(tuple(sorted((atoms[i], atoms[j]))) in held for i, j in pairs)
+        return int(fixed[list(choices[k])].sum()), kept, float(size[k])
+
+    bases = choices[max(good.tolist(), key=merit)]
+    corner = plane[list(bases)]
+    system = np.vstack([corner.T, np.ones(flat + 1)])
+    weights = np.linalg.solve(system, np.vstack([plane.T, np.ones(n)])).T
+    # Round so that the weights sum to one: the relation then does not depend on the origin.
+    weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
+    return bases, weights
+
+
+def _without_repeats(block: LocalRows, bodies: list[FlatBody]) -> list[FlatBody]:
+    """Leave out base distances that other bodies hold already (two planar groups with a common edge)."""
+    if len(bodies) < 2:
+        return bodies
+    for b in range(len(bodies)):
+        for k in reversed(range(len(bodies[b].pairs))):
+            body = bodies[b]
+            fewer = replace(body, pairs=np.delete(body.pairs, k, axis=0), lengths=np.delete(body.lengths, k))
+            trial = [*bodies[:b], fewer, *bodies[b + 1 :]]
+            if _rebuilt(block, trial).rank(block.x) == _rebuilt(block, bodies).rank(block.x):
+                bodies = trial
+    return bodies
+
+
+def _rebuilt(block: LocalRows, bodies: list[FlatBody]) -> LocalRows:
+    rebuilt = with_flat_bodies(block.part, bodies, block.x, block.time)
+    return LocalRows(rebuilt, np.arange(rebuilt.n_rows), block.x, block.time, pinned=block.pinned)
+
+
+def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> None:
+    """The new rows must be regular, and the replaced ones must follow from them, to second order.
+
+    First order is not enough: flat plates hinged in a ring can fold as long as each is held alone, while the
+    distances between them resist the fold at second order.
+    """
+    new = _rebuilt(block, bodies)
+    u, s, vt, rank = new.decomposed(block.x)
+    old, _ = block.unit_jacobian(block.x)
+    if np.abs(old @ vt[rank:].T).max(initial=0.0) > 1e-4 or new.singular(block.x):
+        raise _unresolved(block, generic)
+    rng = np.random.default_rng(20060921)
+    for _ in range(3):
+        v = rng.standard_normal(len(vt) - rank) @ vt[rank:]
+        a = -((u[:, :rank].T @ new.unit_curvature(block.x, v)) / s[:rank]) @ vt[:rank]
+        bent = block.unit_curvature(block.x, v)
+        miss = old @ a + bent
+        # Rigid motion has no curvature but rounding.
+        size = np.linalg.norm(bent) + 1e-5 * (v @ v) / extent_of(block.x)
+        if np.linalg.norm(miss) > UNSOLVABLE * size:
+            raise _unresolved(block, generic)
+
+
+def with_flat_bodies(
+    constraint_set: ConstraintSet, bodies: Sequence[FlatBody], positions: FloatArray, time: float
+) -> ConstraintSet:
+    """The set with the bodies' rows replaced: what is kept, then distances between bases, then relations."""
+    drop = np.unique(np.concatenate([b.rows for b in bodies]))
+    pieces: list[Constraint] = []
+    for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
+        lo, hi = np.searchsorted(drop, [start, start + item.n_rows])
+        if lo == hi:
+            pieces.append(item)
+        elif hi - lo < item.n_rows:
+            pieces.append(item.select(np.setdiff1d(np.arange(item.n_rows), drop[lo:hi] - start)))
+    pairs = np.concatenate([b.pairs for b in bodies])
+    lengths = np.concatenate([b.lengths for b in bodies])
+    # Bodies that share an edge hold it once.
+    _, first = np.unique(np.sort(pairs, axis=1), axis=0, return_index=True)
+    first.sort()
+    if len(first):
+        pieces.append(Distance(pairs[first], lengths[first]))
+    for n_bases in (2, 3):
+        same = [b for b in bodies if len(b.bases) == n_bases and len(b.tied)]
+        if same:
+            pieces.append(
+                LinearRelation(
+                    np.concatenate([b.tied for b in same]),
+                    np.concatenate([np.tile(b.bases, (len(b.tied), 1)) for b in same]),
+                    np.concatenate([b.weights for b in same]),
+                )
+            )
+    new = constraint_set.replaced(pieces, positions, time)
+    new.conversions = tuple(bodies)
+    return new
+
+
+def _listed(atoms: IntArray) -> str:
+    return ", ".join(str(a) for a in atoms[:8]) + (", ..." if len(atoms) > 8 else "")
+
+
+def _sentence(linearized: int, flat: int, atoms: IntArray) -> str:
+    shown = _listed(atoms)
+    freedom, shape, remedy = (
+        (5, "collinear", "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead")
+        if flat == 1
+        else (
+            6,
+            "coplanar",
+            "hold three distances and x_a = c_i x_i + c_j x_j + c_k x_k (LinearRelation) for the other atoms instead",
+        )
+    )
+    return (
+        f"constraint set singular at this geometry: {linearized} linearized degrees of freedom but the rigid body "
+        f"has {freedom} (atoms {shown} are {shape}); {remedy}"
+    )
+
+
+def _unresolved(block: LocalRows, generic: int) -> SingularGeometryError:
+    names = ", ".join(block.set.row_name(int(r)) for r in block.rows[:4]) + (", ..." if len(block.rows) > 4 else "")
+    here = block.rank(block.x)
+    free = 3 * int(np.sum(~block.pinned))
+    return SingularGeometryError(
+        f"constraint set singular at this geometry: {free - here} linearized degrees of freedom here but "
+        f"{free - generic} at positions nearby; rows {names} resist some motion only at second order, and no linear "
+        "or planar rigid group explains it. Leave out the rows that do this, start from another geometry, or hold "
+        "the atoms by x_a = sum c_i x_i (LinearRelation)",
+        rows=block.rows,
+        atoms=block.atoms,
+    )

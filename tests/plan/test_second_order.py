@@ -1,0 +1,521 @@
+"""Groups that are flat or straight: which are converted, left alone, refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import numpy as np
+import pytest
+from flat_groups import BENZENE, CO2, CONVERTED, FORMATE, Array, converted, counts, pairs_of, rank_of, ring, turned
+
+from kcons.constraints import (
+    Angle,
+    Constraint,
+    Dihedral,
+    Distance,
+    FixedAtoms,
+    LinearRelation,
+    MovingTarget,
+    Plane,
+    Sphere,
+)
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import SingularGeometryError
+from kcons.motion import Motion
+from kcons.plan.second_order import LocalRows, unsolvable, without_second_order_rows
+
+TETRAHEDRON = 0.63 * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+METHANE = np.vstack([np.zeros((1, 3)), TETRAHEDRON])
+ETHYLENE = np.array([[0.0, 0, 0], [1.34, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [1.84, 0.9, 0], [1.84, -0.9, 0]])
+ETHYLENE_BONDS = [(0, 1), (0, 2), (0, 3), (1, 4), (1, 5)]
+ETHYLENE_ANGLES = [(1, 0, 2), (1, 0, 3), (2, 0, 3), (0, 1, 4), (0, 1, 5), (4, 1, 5)]
+BENZENE_BONDS = [(i, (i + 1) % 6) for i in range(6)] + [(i, i + 6) for i in range(6)]
+BENZENE_ANGLES = [
+    t for i in range(6) for t in (((i - 1) % 6, i, (i + 1) % 6), ((i - 1) % 6, i, i + 6), ((i + 1) % 6, i, i + 6))
+]
+
+
+@pytest.mark.parametrize("case", CONVERTED)
+def test_flat_groups_become_linear_rows_of_full_rank(case: str) -> None:
+    shape, pairs, expected, freedom = CONVERTED[case]
+    x = turned(shape)
+    held = converted(Distance(pairs), x)
+    assert counts(held) == expected
+    assert rank_of(held, x) == held.n_rows == 3 * len(x) - freedom
+    assert np.abs(held.value(x)).max() < 4e-15 * np.abs(x).max()
+
+
+@pytest.mark.parametrize(
+    ("x", "bonds", "angles", "expected", "freedom"),
+    [
+        (BENZENE, BENZENE_BONDS, BENZENE_ANGLES, (3, 27), 6),
+        (ETHYLENE, ETHYLENE_BONDS, ETHYLENE_ANGLES, (5, 6), 7),
+        (FORMATE, [(0, 1), (0, 2), (0, 3)], [(1, 0, 2), (1, 0, 3), (2, 0, 3)], (3, 3), 6),
+    ],
+    ids=["benzene", "ethylene", "formate"],
+)
+def test_planar_groups_held_by_bonds_and_angles_are_converted(
+    x: Array, bonds: list, angles: list, expected: tuple[int, int], freedom: int
+) -> None:
+    """Three angles around a planar center sum to 360 degrees, and less as soon as it leaves the plane."""
+    x = turned(x)
+    held = converted([Distance(bonds), Angle(angles)], x)
+    assert counts(held) == expected
+    assert rank_of(held, x) == held.n_rows == 3 * len(x) - freedom
+    given = ConstraintSet([Distance(bonds), Angle(angles)], x, np.ones(len(x)))
+    moved = rigidly_moved(held, x)
+    assert np.abs(given.value(moved)).max() < 1e-14
+
+
+def rigidly_moved(held: ConstraintSet, x: Array) -> Array:
+    """A point of the converted surface some way off."""
+    motion = Motion(held, x)
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        x = motion.project_positions(x + 0.1 * rng.standard_normal(x.shape), x)
+    return x
+
+
+LEFT_ALONE: dict[str, tuple[object, list[Constraint], int]] = {
+    "one bond twice": ([[0, 0, 0], [1, 0, 0]], [Distance([(0, 1), (1, 0)])], 1),
+    "methane by 10 distances": (METHANE, [Distance(pairs_of(5))], 9),
+    "methane by bonds and angles": (
+        METHANE,
+        [Distance([(0, i) for i in range(1, 5)]), Angle([(i, 0, j) for i, j in combinations(range(1, 5), 2)])],
+        9,
+    ),
+    "octahedron by 15": (np.vstack([np.eye(3), -np.eye(3)]), [Distance(pairs_of(6))], 12),
+    "bipyramid by 10": (np.vstack([ring(3), [[0, 0, 1.0], [0, 0, -1.0]]]), [Distance(pairs_of(5))], 9),
+    "hexagon with an atom above all of it": (np.vstack([ring(6), [[0.2, 0.1, 1.3]]]), [Distance(pairs_of(7))], 15),
+    "benzene by its bonds": (BENZENE, [Distance(BENZENE_BONDS)], 12),
+    "water by three distances": ([[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0]], [Distance(pairs_of(3))], 3),
+    "water by bonds and angle": (
+        [[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0]],
+        [Distance([(0, 1), (0, 2)]), Angle([(1, 0, 2)])],
+        3,
+    ),
+    "straight chain": ([[k, 0, 0] for k in range(6)], [Distance([(k, k + 1) for k in range(5)])], 5),
+    "planar zigzag by bonds, angles and trans dihedrals": (
+        [[0, 0, 0], [1, 0.5, 0], [2, 0, 0], [3, 0.5, 0], [4, 0, 0]],
+        [
+            Distance([(k, k + 1) for k in range(4)]),
+            Angle([(k, k + 1, k + 2) for k in range(3)]),
+            Dihedral([(0, 1, 2, 3), (1, 2, 3, 4)]),
+        ],
+        9,
+    ),
+    "planar center by bonds and an improper": (
+        FORMATE,
+        [Distance([(0, 1), (0, 2), (0, 3)]), Dihedral([(1, 0, 2, 3)])],
+        4,
+    ),
+    "ethylene by bonds, angles and dihedrals": (
+        ETHYLENE,
+        [
+            Distance(ETHYLENE_BONDS),
+            Angle(ETHYLENE_ANGLES),
+            Dihedral([(2, 0, 1, 4), (2, 0, 1, 5), (3, 0, 1, 4), (3, 0, 1, 5)]),
+        ],
+        12,
+    ),
+    "CO2 held on its line and by three distances": (
+        CO2,
+        [Distance(pairs_of(3)), LinearRelation(1, [0, 2], [0.5, 0.5])],
+        4,
+    ),
+    "square in a plane that is held": (
+        ring(4),
+        [Distance(pairs_of(4)), Plane([0, 1, 2, 3], normal=[0, 0, 1], offset=0.0)],
+        9,
+    ),
+    "bond on a sphere": ([[1, 0, 0], [0, 1, 0]], [Distance([(0, 1)]), Sphere([0, 1], center=[0, 0, 0])], 3),
+    "atom between two fixed ones": (
+        [[0, 0, 0], [1, 0.5, 0], [2, 0, 0]],
+        [Distance([(0, 1), (1, 2)]), FixedAtoms([0, 2])],
+        8,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LEFT_ALONE)
+def test_regular_and_merely_dependent_rows_are_left_alone(case: str) -> None:
+    shape, rows, rank = LEFT_ALONE[case]
+    x = np.array(shape, dtype=float)
+    given = ConstraintSet(rows, x, np.ones(len(x)))
+    assert rank_of(given, x) == rank
+    assert without_second_order_rows(given, x, 0.0) is given
+
+
+def test_boat_of_cyclohexane_is_left_alone() -> None:
+    """Its twelve rows have rank 11 along the whole boat family, 12 beside it: a motion, not a singularity."""
+    pairs = [(i, (i + 1) % 6) for i in range(6)] + [(i, (i + 2) % 6) for i in range(6)]
+    lengths = np.repeat([1.5, 3.0 * np.sin(np.radians(109.47 / 2))], 6)
+    start = ring(6)
+    start[:, 2] = [0.6, 0, 0, 0.6, 0, 0]
+    held = ConstraintSet(Distance(pairs, lengths), start, np.ones(6))
+    boat = start
+    for _ in range(30):  # Gauss-Newton to the exact boat; it keeps the symmetry
+        boat = boat - (np.linalg.pinv(held.jacobian(boat).toarray(), rcond=1e-6) @ held.value(boat)).reshape(-1, 3)
+    assert np.abs(held.value(boat)).max() < 1e-15
+    assert rank_of(held, boat) == 11
+    assert without_second_order_rows(held, boat, 0.0) is held
+
+
+@pytest.mark.parametrize("degrees", [179.0, 179.9, 179.99])
+def test_nearly_collinear_triatomic_is_left_alone(degrees: float) -> None:
+    a = np.radians(degrees)
+    x = turned([[1, 0, 0], [0, 0, 0], [np.cos(a), np.sin(a), 0]])
+    held = ConstraintSet(Distance(pairs_of(3)), x, np.ones(3))
+    assert without_second_order_rows(held, x, 0.0) is held
+
+
+def test_smallest_singular_value_at_179_9_degrees() -> None:
+    """8.7e-4 (hard case H06): far above what counts as lost."""
+    a = np.radians(179.9)
+    x = np.array([[1, 0, 0], [0, 0, 0], [np.cos(a), np.sin(a), 0]])
+    rows = ConstraintSet(Distance(pairs_of(3)), x, np.ones(3)).jacobian(x).toarray() / np.sqrt(2)
+    assert np.linalg.svd(rows, compute_uv=False)[-1] == pytest.approx(8.7266e-4, rel=1e-4)
+
+
+# -- refusals ---------------------------------------------------------------------------------------------
+
+
+def refuse(rows: Constraint | Sequence[Constraint], x: Array) -> SingularGeometryError:
+    given = ConstraintSet(rows, x, np.ones(len(x)))
+    before = x.copy()
+    with pytest.raises(SingularGeometryError) as caught:
+        without_second_order_rows(given, x, 0.0)
+    np.testing.assert_array_equal(x, before)
+    return caught.value
+
+
+def test_targets_that_fit_no_flat_geometry_are_refused() -> None:
+    """With the degrees of freedom, and what to hold instead."""
+    error = refuse(Distance(pairs_of(3), [1.16, 2.31, 1.16]), turned(CO2))
+    assert str(error).startswith(
+        "constraint set singular at this geometry: 7 linearized degrees of freedom but the rigid body has 5"
+    )
+    assert "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead" in str(error)
+    assert error.rows == (0, 1, 2) and error.atoms == (0, 1, 2)
+    assert "targets do not fit a linear group" in str(error)
+    for n, linearized in ((4, 7), (6, 9)):
+        x = ring(n)
+        lengths = ConstraintSet(Distance(pairs_of(n)), x, np.ones(n)).target()
+        lengths[3] *= 1 + 1e-4
+        error = refuse(Distance(pairs_of(n), lengths), turned(x))
+        assert f"{linearized} linearized degrees of freedom but the rigid body has 6" in str(error)
+        assert "hold three distances and" in str(error) and "targets do not fit a planar group" in str(error)
+
+
+def test_moving_target_in_a_flat_group_is_refused() -> None:
+    breathing = MovingTarget(lambda t: 1.16 * (1 + 0.01 * np.sin(t)))
+    error = refuse([Distance([(0, 1), (1, 2)], breathing), Distance([(0, 2)])], turned(CO2))
+    assert "function of time" in str(error)
+
+
+REFUSED: dict[str, tuple[object, Callable[[], list[Constraint]]]] = {
+    "four-bar linkage folded onto a line": (
+        [[0, 0, 0], [1, 0, 0], [2, 0, 0], [1.0, 0, 0.0]],
+        lambda: [Distance([(0, 1), (1, 2), (2, 3), (3, 0)])],
+    ),
+    "chain stretched between two fixed atoms": (
+        [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]],
+        lambda: [Distance([(0, 1), (1, 2), (2, 3)]), FixedAtoms([0, 3])],
+    ),
+    "hexagon by its bonds and long diagonals": (
+        ring(6),
+        lambda: [Distance([(i, (i + 1) % 6) for i in range(6)] + [(i, i + 3) for i in range(3)])],
+    ),
+    "sphere touching a plane": (
+        [[0, 0, 1.0]],
+        lambda: [Sphere([0], center=[0, 0, 0]), Plane([0], normal=[0, 0, 1], offset=1.0)],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_singular_mechanisms_are_refused(case: str) -> None:
+    """Nothing linear holds what these rows hold; they are named, with their degrees of freedom."""
+    shape, rows = REFUSED[case]
+    x = np.array(shape, dtype=float)
+    if case.startswith("four-bar"):
+        x[3, 0] = 1.0
+    error = refuse(rows(), x)
+    assert "linearized degrees of freedom here but" in str(error) and "#0" in str(error)
+
+
+def test_flat_sheet_of_triangles_too_large_for_dense_algebra_is_refused() -> None:
+    """1,540 bonds of a flat triangulated sheet: every inner atom could leave the plane at first order."""
+    x = np.array([(i + 0.5 * (j % 2), np.sqrt(0.75) * j, 0.0) for i in range(23) for j in range(23)])
+    near = [
+        (a, b) for a in range(len(x)) for b in range(a + 1, min(len(x), a + 50)) if np.linalg.norm(x[a] - x[b]) < 1.01
+    ]
+    assert len(near) > 1400
+    error = refuse(Distance(near), x)
+    assert "at positions nearby" in str(error)
+
+
+def test_large_regular_network_is_left_alone() -> None:
+    """A cubic lattice of 1,331 atoms and 3,630 bonds, by the sparse test."""
+    n = 11
+    index = np.arange(n**3).reshape(n, n, n)
+    x = np.stack(np.unravel_index(index.ravel(), (n, n, n)), axis=1).astype(float)
+    links = [
+        np.stack([np.moveaxis(index, k, 0)[:-1].ravel(), np.moveaxis(index, k, 0)[1:].ravel()], axis=1)
+        for k in range(3)
+    ]
+    x += 0.05 * np.random.default_rng(0).standard_normal(x.shape)
+    held = ConstraintSet(Distance(np.concatenate(links)), x, np.ones(len(x)))
+    assert without_second_order_rows(held, x, 0.0) is held
+
+
+def test_many_molecules_are_found_one_by_one() -> None:
+    """200 waters, 200 CO2 and 20 benzenes in one object: only the flat ones change."""
+    rng = np.random.default_rng(9)
+    water = np.array([[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0]])
+    shapes = [water] * 200 + [CO2] * 200 + [BENZENE] * 20
+    starts = np.concatenate([[0], np.cumsum([len(s) for s in shapes])])
+    x = np.vstack([turned(s, seed=k) + 20 * rng.standard_normal(3) for k, s in enumerate(shapes)])
+    pairs = np.vstack([np.array(pairs_of(len(s))) + o for s, o in zip(shapes, starts, strict=False)])
+    held = converted(Distance(pairs), x)
+    assert counts(held) == (600 + 200 + 60, 600 + 20 * 27)
+    assert np.abs(held.value(x)).max() < 1e-13
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["bonds and angles", "bonds and 1-3 distances", "all distances"])
+def test_molecules_of_the_g2_set(what: str) -> None:
+    """159 real geometries, flat ones and symmetric ones: none is refused, and what was asked for is held."""
+    build = pytest.importorskip("ase.build")
+    names = pytest.importorskip("ase.collections").g2.names
+    neighbors = pytest.importorskip("ase.neighborlist")
+    rng = np.random.default_rng(0)
+    converted_sets = 0
+    for name in names:
+        atoms = build.molecule(name)
+        x = atoms.positions.copy()
+        near = neighbors.neighbor_list("ij", atoms, neighbors.natural_cutoffs(atoms, mult=1.15))
+        bonds = [(int(i), int(j)) for i, j in zip(*near, strict=True) if i < j]
+        if len(x) < 3 or not bonds:
+            continue
+        links: list[list[int]] = [[] for _ in x]
+        for i, j in bonds:
+            links[i].append(j)
+            links[j].append(i)
+        angles = [(i, j, k) for j in range(len(x)) for i, k in combinations(sorted(links[j]), 2)]
+        rows: list[Constraint]
+        if what == "bonds and angles":
+            if any(abs(atoms.get_angle(*t)) > 179.99 for t in angles) or not angles:
+                continue
+            rows = [Distance(bonds), Angle(angles)]
+        elif what == "bonds and 1-3 distances":
+            rows = [Distance(sorted({*bonds, *((min(i, k), max(i, k)) for i, _, k in angles)}))]
+        else:
+            rows = [Distance(pairs_of(len(x)))]
+        given = ConstraintSet(rows, x, atoms.get_masses())
+        motion = Motion(given, x)
+        converted_sets += motion.constraint_set is not given
+        y = x
+        for _ in range(5):
+            # Acrylonitrile has C-C-N at 179.2 degrees, 0.009 A off the line: steps must stay below that.
+            y = motion.project_positions(y + 1e-3 * rng.standard_normal(x.shape), y)
+        assert np.max(np.abs(given.value(y)) / given.scale) <= 2e-14, name
+        a = motion.acceleration(y, motion.project_velocities(y, rng.standard_normal(x.shape)), np.ones(x.shape))
+        assert np.all(np.isfinite(a)), name
+    assert converted_sets >= 30
+
+
+def porphin_like():
+    """Four flat five-rings in a flat ring of bridges: all bonds, and all distances of second neighbors."""
+    x, pairs = [], set()
+    for k in range(4):
+        center = 3.1 * np.array([np.cos(k * np.pi / 2), np.sin(k * np.pi / 2), 0])
+        first = len(x)
+        for t in np.pi + k * np.pi / 2 + 2 * np.pi * np.arange(5) / 5:
+            x.append(center + 1.18 * np.array([np.cos(t), np.sin(t), 0]))
+        pairs |= {tuple(sorted((first + i, first + (i + 1) % 5))) for i in range(5)}
+    for k in range(4):
+        here, there = 5 * k + 4, 5 * ((k + 1) % 4) + 1
+        middle = 0.5 * (x[here] + x[there])
+        x.append(middle * (1 + 0.25 / np.linalg.norm(middle)))
+        pairs |= {(here, len(x) - 1), (there, len(x) - 1)}
+    bonded = [[j for p in pairs if i in p for j in p if j != i] for i in range(len(x))]
+    seconds = {(a, b) for near in bonded for a in near for b in near if a < b}
+    return np.array(x), sorted(pairs | seconds)
+
+
+def test_hinged_plates_that_lock_each_other_are_refused():
+    """Each five-ring alone can be held by linear rows; that they cannot fold against each other cannot."""
+    x, pairs = porphin_like()
+    with pytest.raises(SingularGeometryError, match="27 linearized degrees of freedom here but 8 at positions nearby"):
+        Motion(ConstraintSet(Distance(pairs), x, np.ones(len(x))), x)
+    # One of the plates is fine.
+    ring = [p for p in pairs if max(p) < 5]
+    motion = Motion(ConstraintSet(Distance(ring), x[:5], np.ones(5)), x[:5])
+    assert motion.degrees_of_freedom == 6
+
+
+# -- what the converted rows do ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "case", ["CO2 by 3", "OCS by 3", "hexagon by 15", "formate by 6", "benzene by 66", "two squares with a common edge"]
+)
+def test_all_distances_hold_over_2000_steps(case: str) -> None:
+    """RATTLE steps by hand with forces in all directions; every original distance to 1e-14."""
+    shape, pairs, _, _ = CONVERTED[case]
+    x = turned(shape) * 1.0
+    x -= x.mean(axis=0)
+    masses = np.random.default_rng(5).uniform(1.0, 16.0, len(x))
+    given = ConstraintSet(Distance(pairs), x, masses)
+    motion = Motion(given, x)
+    rng = np.random.default_rng(6)
+    pull = rng.standard_normal((len(x), 3))
+    m = masses[:, None]
+    dt, worst = 0.02, 0.0
+    v = motion.project_velocities(x, 0.3 * rng.standard_normal(x.shape))
+    lengths = given.target()
+
+    def force(x: Array) -> Array:
+        return pull - 0.5 * x
+
+    for _ in range(2000):
+        v += 0.5 * dt * force(x) / m
+        x = motion.project_positions(x + dt * v, x, velocities=v, dt=dt)
+        v += 0.5 * dt * force(x) / m
+        v = motion.project_velocities(x, v)
+        worst = max(worst, float(np.max(np.abs(given.value(x)) / lengths)))
+    assert worst <= 1e-14
+
+
+def test_out_of_plane_force_turns_the_ring_as_a_rigid_body() -> None:
+    """Accelerations of the converted hexagon are those of Euler's rigid body, to rounding."""
+    rng = np.random.default_rng(2)
+    x = turned(ring(6))
+    masses = rng.uniform(1, 20, 6)
+    motion = Motion(ConstraintSet(Distance(pairs_of(6)), x, masses), x)
+    f = rng.standard_normal((6, 3))
+    f[2] += 3.0
+    a = motion.acceleration(x, np.zeros_like(x), f)
+    m = masses[:, None]
+    center = (m * x).sum(axis=0) / masses.sum()
+    d = x - center
+    inertia = np.sum(
+        masses[:, None, None]
+        * (np.einsum("ij,ij->i", d, d)[:, None, None] * np.eye(3) - d[:, :, None] * d[:, None, :]),
+        axis=0,
+    )
+    expected = f.sum(axis=0) / masses.sum() + np.cross(np.linalg.solve(inertia, np.cross(d, f).sum(axis=0)), d)
+    np.testing.assert_allclose(a, expected, atol=1e-13 * np.abs(expected).max())
+
+
+def test_targets_of_base_distances_are_kept_to_the_last_bit() -> None:
+    lengths = np.array([1.1600000000000001, 2.3299999999999996, 1.17])
+    held = converted(Distance(pairs_of(3), lengths), turned([[0, 0, 0], [1.16, 0, 0], [2.33, 0, 0]]))
+    assert held.target()[0] == lengths[1]
+
+
+def test_weights_follow_the_targets_and_not_a_stretched_start() -> None:
+    bent = CO2 + np.array([[0, 0, 0], [0, 0.02, 0], [0, 0, 0]])
+    for shape, proper in ((1.2 * CO2, CO2), (bent, CO2), (1.2 * ring(6), ring(6))):
+        x, pairs = turned(shape), pairs_of(len(shape))
+        lengths = ConstraintSet(Distance(pairs), proper, np.ones(len(x))).target()
+        given = ConstraintSet(Distance(pairs, lengths), x, np.ones(len(x)))
+        motion = Motion(given, x)
+        restored = motion.restore_positions(x)
+        assert motion.rank == 3 * len(x) - (5 if len(x) == 3 else 6)
+        assert np.max(np.abs(given.value(restored)) / lengths) < 1e-14
+
+
+@pytest.mark.parametrize("noise", [1e-7, 1e-4, 1e-3])
+def test_puckered_start_with_planar_targets_is_held_as_planar(noise: float) -> None:
+    x0 = turned(ring(6))
+    lengths = ConstraintSet(Distance(pairs_of(6)), x0, np.ones(6)).target()
+    x = x0 + noise * np.random.default_rng(4).standard_normal(x0.shape)
+    given = ConstraintSet(Distance(pairs_of(6), lengths), x, np.ones(6))
+    motion = Motion(given, x)
+    assert motion.rank == motion.constraint_set.n_rows == 12
+    restored = motion.restore_positions(x)
+    assert np.max(np.abs(given.value(restored)) / lengths) < 1e-14
+
+
+def test_many_puckered_rings_are_all_found() -> None:
+    """More of them than regular blocks are sampled; noise of 1e-3 on planar targets."""
+    rng = np.random.default_rng(0)
+    flat = np.vstack([turned(ring(4), seed=k) + 20 * rng.standard_normal(3) for k in range(150)])
+    pairs = np.vstack([np.array(pairs_of(4)) + 4 * k for k in range(150)])
+    lengths = ConstraintSet(Distance(pairs), flat, np.ones(600)).target()
+    held = converted(Distance(pairs, lengths), flat + 1e-3 * rng.standard_normal(flat.shape))
+    assert counts(held) == (450, 450)
+
+
+def test_group_across_a_periodic_boundary() -> None:
+    x = np.mod(ring(6) + np.array([3.0, 0.2, 9.9]), 10.0)
+    held = converted(Distance(pairs_of(6)), x, cell=[10.0, 10.0, 10.0])
+    assert counts(held) == (3, 9)
+    assert np.abs(held.value(x)).max() < 1e-14
+
+
+def test_only_the_rows_of_the_flat_group_change() -> None:
+    """A rigid water and a flexible tail beside and on the ring stay as they were."""
+    water = np.array([[5.0, 5, 5], [5.96, 5, 5], [4.76, 5.93, 5]])
+    x = np.vstack([ring(6), [[2.9, 0, 0.3], [3.3, 1.4, 0.1]], water])
+    rows = [Distance([(0, 6), (6, 7), *pairs_of(6)]), Distance([(8, 9), (8, 10), (9, 10)])]
+    held = converted(rows, x)
+    assert [(c.family, c.n_rows) for c in held.constraints] == [
+        ("Distance", 2),
+        ("Distance", 3),
+        ("Distance", 3),
+        ("LinearRelation", 9),
+    ]
+    assert held.constraints[0].atoms.tolist() == [[0, 6], [6, 7]]
+    assert rank_of(held, x) == held.n_rows == 17
+
+
+def test_fixed_atoms_become_bases() -> None:
+    x = ring(6)
+    held = converted([Distance(pairs_of(6)), FixedAtoms([2])], x)
+    motion = Motion(held, x)
+    assert motion.degrees_of_freedom == 3
+    relation = held.constraints[-1]
+    assert relation.family == "LinearRelation" and (relation.atoms[:, 1:] == 2).any(axis=1).all()
+
+
+# -- one block ----------------------------------------------------------------------------------------------
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+ALL = [[i, j] for i in range(4) for j in range(i)]
+
+
+def local(x, rows):
+    held = ConstraintSet(rows, x, np.ones(len(x)))
+    return LocalRows(held, np.arange(held.n_rows), x, 0.0)
+
+
+def test_a_row_without_gradient_that_bends_is_unsolvable():
+    """sigma = y^2/2 where A = 0; with A = (1, 0) there is always an acceleration along x."""
+    bent = lambda v: v[:, 1:] ** 2  # noqa: E731
+    assert unsolvable(np.zeros((1, 1, 2)), bent, np.ones(1)).tolist() == [True]
+    assert unsolvable(np.array([[[1.0, 0.0]]]), bent, np.ones(1)).tolist() == [False]
+    # Dependent rows that bend alike: any acceleration does for both, or for none.
+    twice = np.array([[[1.0, 0.0], [1.0, 0.0]]])
+    assert unsolvable(twice, lambda v: np.repeat(v[:, 1:] ** 2, 2, axis=1), np.ones(1)).tolist() == [False]
+    assert unsolvable(twice, lambda v: v[:, 1:] ** 2 * [1.0, 2.0], np.ones(1)).tolist() == [True]
+
+
+@pytest.mark.parametrize(("x", "singular", "rank"), [(TETRAHEDRON, False, 6), (SQUARE, True, 5)])
+def test_all_distances_of_four_atoms(x, singular, rank):
+    rows = local(x, Distance(ALL))
+    assert rows.singular(rows.x) is singular and rows.rank(rows.x) == rank
+    assert len(rows.stressed(rows.x)) == (6 if singular else 0)
+    # Without a diagonal the square may fold: its five rows are independent.
+    assert not rows.singular(rows.x, np.array([0, 1, 2, 3, 5]))
+
+
+def test_pairs_that_keep_their_distance_nearby():
+    """Two triangles that share a side, flat as a square: only the pair across may come nearer."""
+    rows = local(SQUARE, Distance([[0, 1], [1, 2], [0, 2], [2, 3], [0, 3]]))
+    rigid, rank = rows.rigid_pairs()
+    assert rank == 5
+    assert sorted(map(tuple, np.argwhere(~rigid).tolist())) == [(1, 3), (3, 1)]
