@@ -1,6 +1,7 @@
 """Install, import, a step and a command on each Python from 3.11 on that this machine has.
 
-First with the source distribution, then with the wheel.
+First with the source distribution, then with the wheel. `--oldest 3.12` prints the path of the oldest Python from 3.12
+on that this machine has, and nothing where there is none.
 
 Looks for python3.x on the PATH and for what pyenv has installed. Says what is left out, and why.
 """
@@ -76,6 +77,13 @@ def smoke(python, folder):
     return True
 
 
+def oldest(least):
+    """Path of the oldest released Python from `least` on; '' without any."""
+    found = [(version_of(python), python) for python in candidates()]
+    good = [(v[:3], str(python)) for v, python in found if len(v) == 4 and v[3] == "final" and v[:2] >= least]
+    return min(good, default=(None, ""))[1]
+
+
 def main(work):
     good, done = True, {}
     for python in candidates():
@@ -98,4 +106,7 @@ def main(work):
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    if sys.argv[1] == "--oldest":
+        print(oldest(tuple(map(int, sys.argv[2].split(".")))))
+    else:
+        sys.exit(main(Path(sys.argv[1])))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from docutils import nodes
@@ -41,6 +42,8 @@ suppress_warnings = ["myst.header", "config.cache", "ref.python"]
 # Of one name in several classes the nearest is linked. Docstrings write code between single backquotes.
 default_role = "code"
 autodoc_member_order = "bysource"
+# Described also where they are not installed.
+autodoc_mock_imports = [name for name in ("torch", "torch_sim") if find_spec(name) is None]
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"
 napoleon_google_docstring = False

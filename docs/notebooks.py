@@ -19,8 +19,8 @@ from nbformat import v4
 
 TUTORIALS = Path(__file__).resolve().parent / "tutorials"
 PYTHON = re.compile(r"^```python\n(.*?)\n```$", re.MULTILINE | re.DOTALL)
-#: Tutorials on a program that no extra installs: they run where it is there.
-NEEDS = {"replica_exchange": "openmmtools"}
+#: Tutorials on a program that `all` does not install: they run where it is there.
+NEEDS = {"replica_exchange": "openmmtools", "torsions_at_once": "torch_sim"}
 LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?:)[^)]*\)")
 
 

@@ -8,6 +8,7 @@
 - `steppers`, `thermostats`: dynamics on constraints
 - `models`: flows and growth under constraints
 - `ase`, `openmm`, `mdanalysis`: MD engines and files, imported by name: ``from kcons.ase import constrain``
+- `batched`, `torchsim`: many copies at once on PyTorch, with gradients; TorchSim
 - `free_energy`: free energies along held coordinates, and relaxed scans
 - `comparison`, `cli`: which method and which step; the command
 """

@@ -171,6 +171,8 @@ class ConvergenceError(KconsError, RuntimeError):
         Its atoms.
     cluster : int
         Number of the cluster, -1 if unknown.
+    copy : int
+        Number of the system in a batch, -1 elsewhere.
     step : int or None
         Step number, where a stepper knows it.
     positions : ndarray, shape (n_atoms, 3), or None
@@ -178,6 +180,7 @@ class ConvergenceError(KconsError, RuntimeError):
     """
 
     positions: Any = None
+    copy: int = -1
 
     def __init__(
         self,
@@ -255,6 +258,8 @@ EXTRAS = {
     "tblite": "xtb",
     "sympy": "formulas",
     "pymbar": "free-energy",
+    "torch": "torch",
+    "torch_sim": "torchsim",
 }
 
 

@@ -7,6 +7,7 @@ import gc
 import locale
 import os
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
@@ -36,6 +37,10 @@ LITTLE = {
 USUAL: dict[str, dict[str, object]] = {}
 #: Modules of the package and of its tests, as they are called when they are imported.
 FILES = list(HERE.rglob("*.py"))
+#: Folders of tests that need a package which is not among the extras of `all`; `.ci/run` runs them in an environment of
+#: their own.
+NEEDS = {"batched": "torch", "torchsim": "torch_sim"}
+collect_ignore = [folder for folder, package in NEEDS.items() if find_spec(package) is None]
 OWN = sorted({"kcons", "tests"} | {path.parent.name if path.stem == "__init__" else path.stem for path in FILES})
 
 
@@ -44,6 +49,10 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     """Workers take files one after another, not turns in each: what a module shares is made once."""
     if getattr(config.option, "numprocesses", None) and config.option.dist == "no":
         config.option.dist = "worksteal"
+
+
+def pytest_report_header() -> list[str]:
+    return [f"tests/{folder} is left out: {NEEDS[folder]} is not installed" for folder in collect_ignore]
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -87,7 +87,8 @@ def test_extras_are_those_of_the_package():
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for package, extra in errors.EXTRAS.items():
         listed = project["optional-dependencies"][extra]
-        assert any(entry.lower().startswith(package.lower()) for entry in listed), (package, extra)
+        distribution = package.lower().replace("_", "-")
+        assert any(entry.lower().startswith(distribution) for entry in listed), (package, extra)
     needed = " ".join(project["dependencies"]).lower()
     assert not [package for package in errors.EXTRAS if package.lower() in needed]
 

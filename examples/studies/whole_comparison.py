@@ -159,7 +159,7 @@ def rows(key: str, quick: bool) -> Iterator[dict[str, Any]]:
     names = [
         method.name
         for method in METHODS.values()
-        if method.follows
+        if method.holds
         and (method.usual or (method.engine == "arrays" and not quick))
         and not method.name.startswith(part.without or ("-",))
         and (method.engine != "OpenMM" or method.refuses(system) is None)

@@ -18,7 +18,7 @@ from kcons.cli.terminal import console, show
 from kcons.errors import EXTRAS
 
 #: Names of distributions that differ from those of the packages.
-DISTRIBUTIONS = {"MDAnalysis": "mdanalysis", "openmm": "OpenMM"}
+DISTRIBUTIONS = {"MDAnalysis": "mdanalysis", "openmm": "OpenMM", "torch_sim": "torch-sim-atomistic"}
 NEEDED = ("numpy", "scipy", "numba", "rich")
 THREADS = ("OMP_NUM_THREADS", "OPENMM_CPU_THREADS", "NUMBA_NUM_THREADS")
 

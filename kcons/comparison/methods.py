@@ -37,7 +37,6 @@ Refuses = Callable[[TestSystem], str | None]
 #: Lines of Python with $made_by (the test system), $step, $steps, and $ps (the step in ps); or a test system to them.
 Code = str | Callable[[TestSystem], str]
 
-Kind = Literal["trajectory", "baseline", "thermostat"]
 Engine = Literal["arrays", "ASE", "OpenMM"]
 ENGINES = get_args(Engine)
 
@@ -52,20 +51,10 @@ class Method:
     engine: str
     force_evaluations: int
     adaptive: bool
-    kind: Kind
+    holds: bool
     usual: bool
     refuses_too: Refuses
     code: Code | None
-
-    @property
-    def holds(self) -> bool:
-        """Whether it holds what the test system holds."""
-        return self.kind != "baseline"
-
-    @property
-    def follows(self) -> bool:
-        """Whether it is to follow the reference trajectory."""
-        return self.kind == "trajectory"
 
     def refuses(self, system: TestSystem) -> str | None:
         """Why it cannot run a test system, or None."""
@@ -98,7 +87,7 @@ def add_method(
     engine: Engine = "arrays",
     force_evaluations: Count = 1,
     adaptive: bool = False,
-    kind: Kind = "trajectory",
+    holds: bool = True,
     usual: bool = True,
     refuses: Refuses = lambda system: None,
     code: Code | None = None,
@@ -119,8 +108,8 @@ def add_method(
         Of a step. Steps are as many times longer than RATTLE's, so that all cost about the same.
     adaptive : bool
         Whether its setting is a relative tolerance.
-    kind : {'trajectory', 'baseline', 'thermostat'}
-        A baseline holds nothing, and only its cost is stated. Of a thermostat no error of a trajectory can be stated.
+    holds : bool
+        Whether it holds what the test system holds; of one that does not, a baseline, only the cost is stated.
     usual : bool
         Whether it runs unless methods are named.
     refuses : callable, optional
@@ -130,7 +119,7 @@ def add_method(
         $steps and $ps (the step in ps); or a test system to them.
     """
     METHODS[name] = made = Method(
-        name, title or name, start, engine, force_evaluations, adaptive, kind, usual, refuses, code
+        name, title or name, start, engine, force_evaluations, adaptive, holds, usual, refuses, code
     )
     return made
 
@@ -278,7 +267,7 @@ for _name, _title, _stepper in (
     )
 
 
-add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", kind="baseline")
+add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", holds=False)
 
 
 def independent_rows(system: TestSystem, held: ConstraintSet | None = None) -> ConstraintSet:
@@ -434,7 +423,7 @@ add_method(
     partial(_in_ase, lambda system: []),
     title="baseline: ASE Verlet, nothing held",
     engine="ASE",
-    kind="baseline",
+    holds=False,
 )
 
 
@@ -550,10 +539,6 @@ def _bonds_in_openmm(system: TestSystem) -> str | None:
     return None if system.bonds is not None else "a System holds distances only"
 
 
-def _kelvin(system: TestSystem) -> str | None:
-    return _bonds_in_openmm(system) if system.units.energy == "eV" else "the units of the test system know no kelvin"
-
-
 def _bonds_or_surfaces(system: TestSystem) -> str | None:
     return None if _engine(system).surfaces else _bonds_in_openmm(system)
 
@@ -567,15 +552,13 @@ def in_openmm(
 ) -> None:
     """Register an integrator as `_in_openmm` takes it."""
     each = evaluations(given[0]) if given and isinstance(given[0], str) else 1
-    more: dict[str, Any] = {"refuses": _bonds_in_openmm, "force_evaluations": each} | options
-    if more.get("kind", "trajectory") == "trajectory":
-        more["code"] = partial(_lines_in_openmm, integrator, given, tolerance, how)
     add_method(
         name,
         partial(_in_openmm, integrator, given, tolerance, how),
         title=f"OpenMM {title}",
         engine="OpenMM",
-        **more,
+        code=partial(_lines_in_openmm, integrator, given, tolerance, how),
+        **({"refuses": _bonds_in_openmm, "force_evaluations": each} | options),
     )
 
 
@@ -588,11 +571,6 @@ for _name, _title, _own, _given in (
         _plain = _t == DEFAULT
         _full, _usual = _name if _plain else f"{_name}-{exponent(_t)}", _plain or _name == "openmm-verlet"
         in_openmm(_full, f"{_title}, {exponent(_t)}", _own, *_given, tolerance=_t, usual=_usual)
-for _name, _title, _own in (
-    ("openmm-middle-bath", "LangevinMiddle, 300 K", "LangevinMiddleIntegrator"),
-    ("openmm-nose-hoover-bath", "NoseHoover, 300 K", "NoseHooverIntegrator"),
-):
-    in_openmm(_name, _title, _own, 300.0, 1.0, tolerance=DEFAULT, kind="thermostat", refuses=_kelvin)
 for _scheme in (*USUAL, "geodesic", "yoshida4", "blanes-moan6a"):
     _usual = _scheme in USUAL
     in_openmm(f"openmm-kcons-{_scheme}", f"+ kcons {_scheme}", "ProjectedIntegrator", _scheme, usual=_usual)
@@ -617,7 +595,7 @@ add_method(
     partial(_in_openmm, "VerletIntegrator", (), DEFAULT, "free"),
     title="baseline: OpenMM Verlet, nothing held",
     engine="OpenMM",
-    kind="baseline",
+    holds=False,
 )
 
 

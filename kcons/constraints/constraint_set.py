@@ -248,6 +248,20 @@ class ConstraintSet:
             (np.concatenate(data), np.concatenate(columns), indptr), shape=(self.n_rows, 3 * self.n_atoms)
         )
 
+    def target_rates(self, time: float = 0.0, order: int = 1) -> FloatArray:
+        """Rates of what rows are held at, or of `order` 2 their accelerations, shape (n_rows,).
+
+        Of velocity rows what they are held at, and its rate.
+        """
+        time = finite_number(time, "time")
+
+        def rate(c: Constraint) -> FloatArray:
+            if order == 2:
+                return _second_rate(c, time)
+            return self._rate(c, None, time)
+
+        return self._rows(rate)
+
     def velocity_target(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """c with A v = c for admissible velocities, shape (n_rows,); 0 where nothing moves by itself."""
         time = finite_number(time, "time")
@@ -269,10 +283,8 @@ class ConstraintSet:
 
         def b_of(c: Constraint, r: FloatArray, time: float) -> FloatArray:
             u = velocities[c.atoms]
-            if not c.holonomic:
-                return _rate_at(c, time) - c.curvature(r, u, time)
-            second = c.target.acceleration_at(time, c.n_rows, c.period) if isinstance(c.target, MovingTarget) else 0.0
-            return second - c.acceleration_terms(r, u, time)
+            bend = c.acceleration_terms(r, u, time) if c.holonomic else c.curvature(r, u, time)
+            return _second_rate(c, time) - bend
 
         return self._of_rows(x, time, b_of)
 
@@ -699,6 +711,12 @@ def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> N
 
 def _rate_at(c: Constraint, time: float) -> FloatArray:
     return c.target.rate_at(time, c.n_rows, c.period) if isinstance(c.target, MovingTarget) else np.zeros(c.n_rows)
+
+
+def _second_rate(c: Constraint, time: float) -> FloatArray:
+    if not c.holonomic or not isinstance(c.target, MovingTarget):
+        return _rate_at(c, time)
+    return c.target.acceleration_at(time, c.n_rows, c.period)
 
 
 def _compact(item: Constraint, atoms: IntArray) -> Constraint:

@@ -228,14 +228,6 @@ def parallel_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> Numbe
     return np.eye(len(P)) - P
 
 
-def velocity_projector(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
-    """M_par+ M = 1 - M^-1/2 B+ B M^1/2, the projector of velocities, orthogonal in the mass metric."""
-    A = _real_matrix(matrix)
-    root = _Root(masses, A.shape[1])
-    V = row_space(root.weighted(A), rtol)
-    return np.asarray(np.eye(A.shape[1]) - root.from_weighted(V) @ root.times(V).T)
-
-
 def project_velocities(
     matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0, rtol: float = RANK_TOLERANCE
 ) -> FloatArray:

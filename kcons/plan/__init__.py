@@ -1,6 +1,7 @@
 """Which solver holds which rows.
 
 - `clusters`: rows that belong together, and the shape of each cluster
+- `clusters_alike`: clusters of equal rows, and an order in which the rows of one are eliminated
 - `independent_blocks`: pieces of a cluster whose ranks add up
 - `rank`: the number of independent rows
 - `second_order`: rows that are singular only at second order, converted

@@ -279,13 +279,9 @@ def make_plan(
                 flat = shape.rows.ravel()
                 ends = shape.atoms[:, shape.pairs].reshape(-1, 2)
                 shape = Shape("SparseDistances", flat, shape.clusters, False, pairs=ends)
+            if not plan.eliminate_last[shape.rows].any() and small_enough(clusters):
+                mark_dependent_rows(constraint_set, clusters, inverse_masses, positions, time, plan.eliminate_last)
             if not isinstance(solver, GeneralClusters):
-                if (
-                    shape.kind == "SparseDistances"
-                    and not plan.eliminate_last[shape.rows].any()
-                    and small_enough(clusters)
-                ):
-                    mark_dependent_rows(constraint_set, clusters, inverse_masses, positions, time, plan.eliminate_last)
                 solver = solver_of(shape, constraint_set, inverse_masses, labels, time, plan.eliminate_last)
         plan.solvers.append(solver)
         plan.whole.append(whole and not (isinstance(solver, GeneralClusters) and solver.winds))

@@ -42,7 +42,7 @@ def registry(monkeypatch):
 
 def errors(system, *names):
     table = compare(system, names, budget=30, rounds=0)
-    assert set(table.status) <= {"ok", "thermostat"}, list(table.note)
+    assert set(table.status) == {"ok"}, list(table.note)
     return table, [list(table[table.method == name].error) for name in names]
 
 
@@ -82,8 +82,6 @@ def test_what_is_wrong_with_a_method_is_said(registry):
         add_method("wrong", lambda system, dt: None, engine="gromacs")
     with pytest.raises(InputError, match="force_evaluations is 0; give a whole number, 1 or more"):
         add_method("wrong", lambda system, dt: None, force_evaluations=0)
-    with pytest.raises(InputError, match="kind is 'bath'; choose 'trajectory', 'baseline' or 'thermostat'"):
-        add_method("wrong", lambda system, dt: None, kind="bath")
     assert "wrong" not in registry
     with pytest.raises(InputError, match=r"there is no method 'ratle' \(did you mean 'rattle'"):
         choose(["ratle"])
@@ -240,14 +238,6 @@ def test_leapfrogs_of_openmm_and_tolerances():
         assert 1e-3 * tolerance < found.sigma[0] < 3 * tolerance
 
 
-def test_thermostats_state_no_error():
-    system = built("alanine", 1)
-    system = replace(system, time_steps=system.time_steps[:1])
-    table, _ = errors(system, "openmm-middle-bath", "openmm-nose-hoover-bath")
-    assert set(table.status) == {"thermostat"}
-    assert table.error.isna().all() and table.slope.isna().all() and (table.step_seconds > 0).all()
-
-
 CALLS = []
 
 
@@ -308,7 +298,6 @@ def test_which_methods_run():
         ("openmm-verlet", "sphere", "a System holds distances only"),
         ("openmm-surface-rattle", "rotor", "no particle is held on a surface"),
         ("openmm-verlet", "butane", "no OpenMM System"),
-        ("openmm-middle-bath", "rotor", "know no kelvin"),
         ("ase-bonds", "sphere", "ASE has no constraint that holds an atom on a sphere"),
     ],
 )

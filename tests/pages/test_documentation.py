@@ -21,13 +21,14 @@ from kcons.motion import Motion
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-#: Studies with tests of their own, in tests/studies, and scripts that write no table.
+#: Scripts with tests of their own, in tests/studies and tests/batched, and those that write no table.
 OWN = {*("harness", "bare_solvers", "bare_systems", "hard_cases", "stability", "solvers_alone", "whole_comparison")}
+OWN |= {"batched", "water_model_by_gradients"}
 PLAIN = {"constraint_figures", "own_constraints"}
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
-EXAMPLES = [*sorted((ROOT / "examples").glob("*.py")), *STUDIES]
-#: Pages on a program that no extra installs.
-NEEDS = {
+EXAMPLES = [*(path for path in sorted((ROOT / "examples").glob("*.py")) if path.stem not in OWN), *STUDIES]
+#: Pages on a program that `all` does not install; those on torch run in tests/torchsim.
+NEEDS = {"batched.md": "torch_sim"} | {
     f"tutorials/{name}.md": package for name, package in runpy.run_path(ROOT / "docs/notebooks.py")["NEEDS"].items()
 }
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -90,11 +91,11 @@ def test_example_runs(script, tmp_path, monkeypatch):
 
 
 def test_examples_are_short_and_listed_under_the_tutorials():
-    """Fifteen scripts that a user reads and changes; each says what it shows and how it is run."""
+    """Sixteen scripts that a user reads and changes; each says what it shows and how it is run."""
     scripts = sorted((ROOT / "examples").glob("*.py"))
     page = (ROOT / "docs" / "tutorials" / "index.md").read_text(encoding="utf-8")
     listed = re.findall(r"\]\(\.\./\.\./examples/(\w+\.py)\)", page)
-    assert sorted(listed) == [script.name for script in scripts] and len(scripts) == 15
+    assert sorted(listed) == [script.name for script in scripts] and len(scripts) == 16
     for script in scripts:
         text = script.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= 60 and not re.search(r"\d", script.name), script.name

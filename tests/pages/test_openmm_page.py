@@ -14,7 +14,7 @@ PAGE = (DOCS / "openmm.md").read_text(encoding="utf-8")
 
 def test_listing_on_the_page_is_that_of_the_integrator():
     (shown,) = re.findall(r"^```text\n(constraints of the System\b.*?)\n```", PAGE, re.MULTILINE | re.DOTALL)
-    assert shown == ProjectedIntegrator(0.002).listing()
+    assert shown == ProjectedIntegrator(0.002, device=False).listing()
 
 
 def test_table_of_schemes():

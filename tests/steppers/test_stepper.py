@@ -103,7 +103,7 @@ def test_force_evaluations_are_as_declared(stepper) -> None:
 @pytest.mark.parametrize(
     "stepper",
     [
-        Langevin(1.0, 0.5, 1, conserve_momentum=True),
+        Langevin(1.0, 0.5, 1),
         Isokinetic(1.0),
         HamiltonianMonteCarlo(1.0, 2, 3),
         IsokineticSpheres(1.0, 0.5, 2),

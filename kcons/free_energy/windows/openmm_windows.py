@@ -21,8 +21,7 @@ from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
 from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, Row
-from kcons.openmm.callback_rows.callbacks import cell_of
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, cell_of, refuse_virtual_sites
 from kcons.openmm.callback_rows.hold import constraints_about
 from kcons.openmm.collective.coordinates import formula_rows
 from kcons.openmm.device.device_integrator import choose
@@ -272,13 +271,7 @@ class _Simulation:
         self._on_device = choose(None, dt, parts=parts, ensemble=ensemble)[0] is DeviceIntegrator
         if not self._on_device:
             rows = [
-                Row(
-                    _force_of(name, item, wraps),
-                    float(a),
-                    (float(b) - float(a)) / duration,
-                    period=item.period,
-                    name=name,
-                )
+                Row(_force_of(name, item, wraps), float(a), (float(b) - float(a)) / duration, item.period, name=name)
                 for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
             ]
             parts = [CollectiveRows(system, rows, positions=sampler.positions)]

@@ -1,6 +1,5 @@
 """Constraint objects of kcons in OpenMM, held by callbacks on the CPU.
 
-- `callbacks`: the functions that OpenMM calls, and the engine behind them
-- `carried_constraints`: the part of an integrator that holds the rows
+- `carried_constraints`: the part of an integrator that holds the rows, and the functions that OpenMM calls
 - `hold`: constraints taken out of a System and carried
 """

@@ -1,10 +1,30 @@
-"""The constraint objects of kcons as a part of an integrator of OpenMM (see `callback_rows.callbacks`)."""
+"""Constraint objects of kcons as a part of an integrator: PythonForces carry positions to the engine, corrections back.
+
+A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three of
+them, each in a force group of its own, serve one set of rows:
+
+* `remember`: the positions at the start of a drift, where gradients are taken. Returns no force. Left out where the
+  last drift has ended there for sure.
+* `land`: positions after free flight. Its 'force' is the change that brings them onto the rows, x = x + f.
+* `project`: positions x + v/1024 ps. Its 'force' is the change of v that makes it tangent to the rows at x. What
+  rounding takes from v on this way follows in a second call, except for thermostats.
+
+Each returns an 'energy' of 0, or 1 where the engine raised an error: nothing may be raised through OpenMM, so the
+error is kept and the integrator told to take the step back. Outside of steps all three return nothing to speak of:
+rows that are fulfilled need no correction.
+
+GPUs keep forces as multiples of 2^-32, and CustomIntegrator reads them divided by 2^32 - 1. In mixed precision
+positions are pairs of single numbers, 48 bits: a PythonForce of all particles gets both, one of some particles only the
+first. What it returns becomes single numbers: corrections have relative errors up to 6e-8. From the rounded correction
+the engine knows the positions in OpenMM, to rounding.
+"""
 
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable
-from typing import Self
+import weakref
+from collections.abc import Callable, Iterable
+from typing import Any, Self, cast
 
 import numpy as np
 import openmm
@@ -13,23 +33,17 @@ from openmm import unit
 
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
-from kcons.openmm.callback_rows.callbacks import (
-    CARRY_SCALE,
-    LOW_SCALE,
-    PHASES,
-    SPEED_SCALE,
-    Callback,
-    Engine,
-    cell_of,
-)
 from kcons.openmm.collective.coordinates import free_groups
+from kcons.openmm.integrator.ensemble import Integrator
 from kcons.openmm.integrator.part import NEAR, Part, Solver, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import stages_of
 from kcons.openmm.integrator.system_checks import (
     ROW_NAME,
     forces_of,
@@ -38,9 +52,368 @@ from kcons.openmm.integrator.system_checks import (
     require_context,
     virtual_sites,
 )
-from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
+from kcons.openmm.quantities import accepted, masses_of, nanometers, number, with_massless_atoms
 from kcons.openmm.states import forces_at, positions_of
 from kcons.openmm.topology import bonds_of
+from kcons.steppers.operations import Exchange
+from kcons.steppers.state import START_TOLERANCE
+
+#: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbor list, and v is rounded to
+#: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
+#: no digit.
+SPEED_SCALE = 1024.0
+#: What that takes from v is carried after it, multiplied by this: less than a thousandth of a nanometer at 100 nm from
+#: the origin.
+LOW_SCALE = 2.0**27
+
+#: Corrections are carried multiplied by this: on GPUs forces are whole multiples of 2^-32.
+CARRY_SCALE = 2.0**20
+#: What GPUs multiply forces with, and what CustomIntegrator divides them by.
+_TO_WHOLE, _FROM_WHOLE = 2.0**32, 2.0**32 - 1
+
+PHASES = ("remember", "land", "project")
+
+
+def hands_over_all() -> bool:
+    """Whether callbacks are to be given the positions of all particles: a platform here may have mixed precision."""
+    platforms = map(openmm.Platform.getPlatform, range(openmm.Platform.getNumPlatforms()))
+    return any("Precision" in platform.getPropertyNames() for platform in platforms)
+
+
+class Passage:
+    """Between OpenMM and an engine that knows some of its particles.
+
+    Parameters
+    ----------
+    atoms : ndarray of int, shape (n_atoms,)
+        The particles of the engine.
+    n_particles : int
+        Of the System.
+
+    Attributes
+    ----------
+    precision : Precision
+        That of the Context.
+    some : bool
+        Whether OpenMM hands over the engine's particles only; all where a platform here may have mixed precision.
+    """
+
+    def __init__(self, atoms: IntArray, n_particles: int) -> None:
+        self.atoms = atoms
+        self.precision = Precision("", "double")
+        self.some = len(atoms) < n_particles and not hands_over_all()
+        #: Positions and corrections of all particles, where OpenMM hands over all.
+        self._all = None if self.some or len(atoms) == n_particles else np.zeros((2, n_particles, 3))
+        self._nothing = np.zeros((len(atoms), 3))
+
+    def take(self, state: openmm.State, out: FloatArray) -> None:
+        """Positions of the engine's particles, shape (n_atoms, 3), nm."""
+        # The public getPositions(asNumpy=True) makes the same call, and a Quantity: 20 times as slow.
+        if self._all is None:
+            state._getVectorAsNumpy(openmm.State.Positions, out)
+        else:
+            state._getVectorAsNumpy(openmm.State.Positions, self._all[0])
+            np.take(self._all[0], self.atoms, axis=0, out=out)
+
+    def give(self, force: FloatArray | None) -> FloatArray:
+        """What is returned to OpenMM for a force on the engine's particles; None for no force."""
+        force = self._nothing if force is None else force
+        if self._all is None:
+            return force
+        self._all[1][self.atoms] = force
+        return self._all[1]
+
+    def carried(self, change: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The force that carries a change, and the change that arrives."""
+        if not self.precision.rounds_lengths:
+            return change * CARRY_SCALE, change
+        force = change * (CARRY_SCALE * _FROM_WHOLE / _TO_WHOLE)
+        if self.precision.name != "double":
+            force = force.astype(np.float32).astype(np.float64)
+        return force, np.trunc(force * _TO_WHOLE) / (_FROM_WHOLE * CARRY_SCALE)
+
+    def same(self, x: FloatArray, y: FloatArray) -> bool:
+        """Whether positions of a Context, and those it should have, are the same to its rounding."""
+        if not self.precision.rounds_lengths:
+            return np.array_equal(x, y)
+        return bool(np.abs(x - y).max(initial=0.0) <= 4 * self.precision.place * np.abs(y).max(initial=0.0))
+
+    def grain(self, reach: float) -> float:
+        """Spacing of coordinates at a distance from the origin."""
+        return float(np.spacing(reach)) if self.precision.name == "double" else 2 * self.precision.place * reach
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """What positions, of the scale of a row, and velocities, of their size, may be off."""
+        if self.precision.name == "double":
+            return START_TOLERANCE, START_TOLERANCE
+        return self.precision.tolerance, self.precision.speeds
+
+
+class Engine:
+    """What the three callbacks share: the engine, where the particles are, and how far the step is."""
+
+    def __init__(
+        self,
+        constraints: tuple[Constraint, ...],
+        positions: FloatArray,
+        masses: FloatArray,
+        cell: FloatArray | None,
+        time: unit.Quantity | float,
+    ) -> None:
+        time = number(time, unit.picosecond, "time")
+        held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
+        self.motion = Motion(held, positions, time=time)
+        self.masses, self.cell = masses, cell
+        self.atoms: IntArray = held.touched
+        #: Where the carried particles are in arrays of all.
+        self._held: slice | IntArray = slice(None) if len(self.atoms) == len(masses) else self.atoms
+        n, local = masses.shape[0], (len(self.atoms), 3)
+        #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
+        self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+        self._moved = np.zeros((n, 3))
+        #: Where the carried particles are, in step with OpenMM's own positions to the last bit.
+        self._x, self._read = np.zeros(local), np.zeros(local)
+        #: To and from OpenMM.
+        self.passage = Passage(self.atoms, n)
+        rows = self.motion.constraint_set.n_rows
+        self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
+        #: Whether the times of a drift matter, or its length.
+        self.timed = self.motion.constraint_set.moving or not self.motion.constraint_set.holonomic.all()
+        resting = [c.atoms.ravel() for c in held.constraints if c.fixes_atoms]
+        fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
+        #: Which of the carried particles do not move.
+        self._fixed = np.searchsorted(self.atoms, fixed)
+        self._integrator: Callable[[], Integrator | None] = lambda: None
+        self._lean = False
+        self._fractions: tuple[float, ...] = (1.0,)
+        self._nodes: tuple[float, ...] = (0.0, 1.0)
+        #: Whether velocities are projected between the drifts of a step, too.
+        self._within = False
+        self._error: BaseException | None = None
+        self._between_steps, self._began, self._stage = True, (0.0, 0), 0
+        #: Time and step count where the present run of steps began.
+        self._ran: tuple[float, int] | None = None
+        #: The step size of that run, ps.
+        self._made_with = 0.0
+        #: Whether what is lost in carrying v is carried after it, and whether that comes next.
+        self.carries_rest, self._rest_to_come = False, False
+        #: Whether it is known where the drift begins.
+        self._begun = False
+        #: Free positions of the drift and what brings them onto the rows.
+        self._landing: tuple[FloatArray, FloatArray] | None = None
+
+    def follow(self, integrator: Integrator, lean: bool) -> None:
+        """Take times and step sizes from this integrator; `lean` as for parts."""
+        self._lean = lean
+        self._push.fill(np.nan)
+        self._push_before.fill(np.nan)
+        self._integrator = weakref.ref(integrator)
+        self.carries_rest = not integrator.thermostatted
+        operations = integrator.ensemble.operations(integrator.scheme)
+        self._within = any(isinstance(operation, Exchange) for operation in operations)
+        self._fractions = tuple(stages_of(operations)[0])
+        self._nodes = (0.0, *np.cumsum(self._fractions)[:-1].tolist(), 1.0)
+
+    def take_precision(self, precision: Precision) -> None:
+        """The Context is known. Where positions have 48 bits, what v loses on its way is less than forces know."""
+        self.passage.precision = precision
+        if precision.name != "double":
+            self.carries_rest = False
+
+    def begin_run(self) -> None:
+        """Whatever was asked between steps, the next call belongs to the beginning of one."""
+        self._between_steps, self._rest_to_come, self._ran = True, False, None
+        if self._made_with != self._dt:  # impulses of steps of another length are not to be mixed
+            self._made_with = self._dt
+            self._push.fill(np.nan)
+
+    # -- callbacks ------------------------------------------------------------------------------
+
+    def remember(self, state: openmm.State) -> None:
+        began = self._time(state), state.getStepCount()
+        if self._between_steps or began != self._began:
+            self._between_steps, self._began, self._stage, self._error = False, began, -1, None
+            if self.cell is not None:
+                self.follow_cell(state)
+        self._stage += 1
+        self.passage.take(state, self._x)
+        self._begin_drift()
+
+    def stand_at(self, x: FloatArray) -> None:
+        """Particles are here, where others may have moved them: positions of all, shape (n_particles, 3)."""
+        np.copyto(self._x, x[self.atoms])
+        self._begin_drift()
+
+    def _begin_drift(self) -> None:
+        self._landing, self._begun = None, True
+        self._start[self._held] = self._x
+
+    def land(self, state: openmm.State) -> FloatArray | None:
+        there, read = self._there, self._read
+        self.passage.take(state, read)
+        if self._landing is not None and np.array_equal(read, self._landing[0]):
+            return self._landing[1]  # force and energy are asked for one by one
+        if not self.timed and self.passage.same(read, self._x):
+            return None  # at rest, or forces are asked for between steps
+        if not self._begun:
+            self._begin_drift()  # where the last drift ended: nobody has moved x since
+        self._begun = False
+        there[self._held] = read
+        then, now, h = self._times(self._stage)
+        impulse = self._impulse if len(self._fractions) == 1 else None
+        # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
+        moved = self._moved
+        moved.fill(0.0)
+        self.motion.project_positions(
+            there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, flight=h, out=there,
+            multipliers=impulse,
+        )  # fmt: skip
+        change = np.array(moved[self._held])
+        fixed = self._fixed
+        change[fixed] = there[self.atoms[fixed]] - read[fixed]
+        # What the velocity stage before found belongs to the same positions as this impulse.
+        self._push, self._push_before = self._push_before, self._push
+        self._push.fill(0.0)
+        change, arriving = self.passage.carried(change)
+        np.add(read, arriving, out=self._x)
+        self._landing = (read.copy(), change)
+        return change
+
+    def project(self, state: openmm.State) -> FloatArray | None:
+        read = self._read
+        self.passage.take(state, read)
+        read -= self._x
+        if self._rest_to_come:
+            self._rest_to_come = False
+            return self._project_rest(read) if read.any() else None
+        # Thermostats project within a step, too.
+        self._between_steps = not self._within or self._stage >= len(self._fractions) - 1
+        if not self.timed and not read.any():
+            return None
+        self._rest_to_come = self.carries_rest
+        read *= SPEED_SCALE
+        push = self._push if len(self._fractions) == 1 else None
+        return self.passage.carried(self._tangent(read, push) - read)[0]
+
+    def _project_rest(self, read: FloatArray) -> FloatArray:
+        """The same for what was too small to be carried with v, as large as it comes: any factor will do."""
+        read *= SPEED_SCALE
+        change = self._tangent(read, None) - read
+        if self.motion.plan.driven:
+            # The rate that the rows demand is in v already.
+            change -= self._tangent(np.zeros_like(read), None)
+        return self.passage.carried(change)[0]
+
+    def _tangent(self, read: FloatArray, multipliers: FloatArray | None) -> FloatArray:
+        """Velocities of the carried particles, projected."""
+        v, x = self._v, self._start
+        v[self._held], x[self._held] = read, self._x
+        now = self._times(self._stage if self._within else len(self._nodes) - 2)[1]
+        self.motion.project_velocities(x, v, time=now, out=v, multipliers=multipliers)
+        return np.array(v[self._held])
+
+    def _time(self, state: openmm.State) -> float:
+        """Where a step begins. After setStepSize the clock of Reference and CPU goes on with the first step size."""
+        time, count = _number(state.getTime()), state.getStepCount()
+        self._ran = self._ran or (time, count)
+        dt = self._dt
+        expected = self._ran[0] + (count - self._ran[1]) * dt
+        return expected if abs(time - expected) > 1e-6 * dt else time
+
+    @property
+    def _dt(self) -> float:
+        integrator = self._integrator()
+        return 0.0 if integrator is None else _number(integrator.getStepSize())
+
+    def _times(self, stage: int) -> tuple[float, float, float]:
+        """Beginning, end and length of a drift."""
+        if not self.timed:
+            return 0.0, 0.0, 0.0
+        dt, start = self._dt, self._began[0]
+        stage = min(max(stage, 0), len(self._fractions) - 1)
+        return start + self._nodes[stage] * dt, start + self._nodes[stage + 1] * dt, self._fractions[stage] * dt
+
+    def follow_cell(self, state: openmm.State) -> None:
+        cell = cell_of(state.getPeriodicBoxVectors())
+        if self.cell is None or not np.array_equal(cell, self.cell):
+            self.motion.set_cell(cell)
+            self.cell = cell
+
+    def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
+        """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
+        change = None
+        try:
+            if phase == "remember":
+                self.remember(state)
+            elif self._error is None:
+                change = self.land(state) if phase == "land" else self.project(state)
+            elif phase == "project":
+                self._between_steps, self._rest_to_come = True, False
+        except BaseException as error:
+            self._error, change = error, None
+        return (0.0 if self._error is None else 1.0), self.passage.give(change)
+
+    # -- afterwards -----------------------------------------------------------------------------
+
+    def step_multipliers(self) -> FloatArray:
+        integrator = self._integrator()
+        # A drift of velocities that were not made tangent has pushed for that as well.
+        whole = self._lean and integrator is not None and integrator.getGlobalVariableByName("led") != 0
+        unknown = len(self._fractions) != 1 or (np.isnan(self._push_before).any() and not whole)
+        if integrator is None or integrator.thermostatted or unknown:
+            raise InputError(
+                "multipliers of a step need two steps of a scheme with one drift, at constant energy and with "
+                "device=False; multipliers(context) gives those of any state",
+                item="scheme",
+            )
+        dt = self._made_with
+        return np.asarray(self._impulse / dt**2 - (0.0 if whole else self._push_before / dt))
+
+    def explained_error(self, step: int) -> KconsError:
+        error = self._error
+        self._error = None
+        if error is None:
+            return ConvergenceError(f"step {step}: the carried rows failed without saying why", step=step)
+        cause = "time step too large, or a state off the rows. " if isinstance(error, ConvergenceError) else ""
+        if isinstance(error, KconsError):
+            error.args = (f"step {step}: {cause}{error}", *error.args[1:])
+            error.step = step  # type: ignore[attr-defined]
+        elif isinstance(error, Exception):
+            error.add_note(f"in step {step}, from the function of a constraint; the step was taken back")
+        return cast(KconsError, error)
+
+
+class Callback:
+    """The function of one PythonForce."""
+
+    def __init__(self, engine: Engine, phase: str) -> None:
+        self.engine, self.phase = engine, phase
+
+    def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
+        return self.engine.answer(self.phase, state)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise UnsupportedError(
+            "rows of hold belong to their System: copy the System, or write it to XML, before the call of hold"
+        )
+
+
+# -- what OpenMM gives ----------------------------------------------------------------------------
+
+
+def _number(quantity: unit.Quantity) -> float:
+    return float(quantity.value_in_unit(unit.picosecond))
+
+
+def cell_of(vectors: Any) -> FloatArray:
+    """Box vectors of a State (a Quantity) or of a System (a list of them), nm, shape (3, 3)."""
+    plain = (
+        vectors.value_in_unit(unit.nanometer)
+        if unit.is_quantity(vectors)
+        else [edge.value_in_unit(unit.nanometer) for edge in vectors]
+    )
+    return np.array([[edge[0], edge[1], edge[2]] for edge in plain], dtype=np.float64)
 
 
 class CarriedConstraints(Part):

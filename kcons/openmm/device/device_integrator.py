@@ -17,12 +17,12 @@ import openmm
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import KconsError, UnsupportedError
+from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import molecules_of
 from kcons.openmm.device.held_rows import refusal as rows_refusal
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
-from kcons.openmm.device.kernels import PLAIN, VERBS, NoRows, Op, plan, room_for
+from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import CHAIN_ORDER, NoseHoover, NoseHooverMiddle
@@ -202,7 +202,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _write(self, program: Program) -> Step:
         """A step without parts: kernels hold their rows."""
         step = Step(program, self.scheme, (), self._ensemble)
-        write_step(step, self._own_step)
+        write_step(step)
         for part in self.parts:
             part.program = self.program
         return step
@@ -301,7 +301,7 @@ class DeviceIntegrator(ProjectedIntegrator):
         nothing acts on the System that is random. Else it stays there.
         """
         step, context = int(told[_STEP]), guard.context
-        error: KconsError = self.rows.failure(int(told[_ROW]), told[_RESIDUAL], step)
+        error: ConvergenceError = self.rows.failure(int(told[_ROW]), told[_RESIDUAL], step)
         again = step - 1 - context.getStepCount()
         if again > 0 and guard.undisturbed and not guard.moving and self.program.made_under == self.conditions(context):
             try:
@@ -334,7 +334,8 @@ class DeviceIntegrator(ProjectedIntegrator):
         Yields
         ------
         x, v, f : ndarray, shape (n, 3)
-            Positions, velocities and applied forces of the particles of `record`, in ascending order.
+            Positions, velocities and applied forces of the particles of `record`, in ascending order; molecules are
+            in one piece, in any cell.
         time : float
         """
         room, n = room_for(len(self._recorded)), len(self._recorded)
@@ -357,9 +358,6 @@ class DeviceIntegrator(ProjectedIntegrator):
         told = (ctypes.c_double * 7)()
         build.library().kcons_told(self._address, told)
         return list(told)
-
-    def _execute(self, guard: Guard, steps: int) -> None:
-        raise NotImplementedError
 
     # -- variables, as the CustomIntegrator has them ------------------------------------------------
 
@@ -438,12 +436,10 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
             members = np.ascontiguousarray(atoms, dtype=np.int32)
             library.kcons_plan_cluster(made, members.ctypes.data_as(_WHOLES), members.size)
         return
-    rows: Any = NoRows()
-    if n or part is not None:
-        positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
-        box = np.array(given.box[:9]).reshape(3, 3)
-        made_of = masses, (pairs, lengths), positions, box if box.any() else None, given.time
-        rows = KernelRows(()).rows_at(*made_of) if part is None else part.rows_at(*made_of)
+    positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
+    box = np.array(given.box[:9]).reshape(3, 3)
+    held = KernelRows(()) if part is None else part
+    rows = held.rows_at(masses, (pairs, lengths), positions, box if box.any() else None, given.time)
     if integrator is not None:
         integrator.rows = rows
     platform = given.platform.decode()

@@ -6,20 +6,21 @@ whose code or tables are written once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from kcons.constraints import Constraint, Formula
-from kcons.constraints.constraint import IntArray, RowKind
+from kcons.constraints import Constraint
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.functions.straight_line import Function, function_of
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
-from kcons.openmm.device.c_writer import c_function, c_rate, openmm_expression
+from kcons.openmm.device.c_writer import c_functions
+from kcons.plan.clusters_alike import alike
 
 #: Rows, atoms of a cluster and atoms of a row up to which a work-item has the cluster in registers.
 ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4
@@ -37,7 +38,7 @@ def refusal(parts: Any) -> str:
     """
     try:
         for item in constraints_of(parts):
-            function_of(item)
+            function_on_device(item)
     except UnsupportedError as error:
         return str(error)
     return ""
@@ -77,49 +78,7 @@ def molecules_of(pairs: IntArray, parts: Any) -> list[IntArray]:
 # -- functions --------------------------------------------------------------------------------------
 
 
-class Function(NamedTuple):
-    """What rows are computed by. Rows of objects with the same function share its code.
-
-    `known` are the first parameters where they are the same in all rows; a formula is a function of `numbers` (how
-    many of positions, and of parameters), and `second` gives its rate, if the time is in it.
-    """
-
-    row: Callable[..., Any]
-    known: tuple[float, ...] = ()
-    second: Callable[..., Any] | None = None
-    numbers: tuple[int, int] = (0, 0)
-    is_distance: bool = False
-
-    def _formula(self, r: Any, p: Any, t: Any, out: Any) -> None:
-        places, parameters = self.numbers
-        given = [*(r[k] for k in range(places)), t, *(p[k] for k in range(parameters))]
-        out.update(enumerate(self.row(*given)))
-
-    def text(self, name: str, space: str = "") -> str:
-        """Its C function; with the time in it, also ``NAME_rate``."""
-        places, parameters = self.numbers
-        text = c_function(name, self._formula if places else self.row, space, self.known)
-        if self.second is not None:
-            text += c_rate(f"{name}_rate", self.second, places // 3, parameters, space)
-        return text
-
-    def expression(self) -> str:
-        """Its value for a force of OpenMM, see `openmm_expression`."""
-        return openmm_expression(self._formula if self.numbers[0] else self.row)
-
-
-@cache
-def _linear(size: int) -> Callable[..., None]:
-    """The row of `LinearRows`, whose coefficients are their parameters."""
-
-    def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        out[0] = sum((p[k] * r[k] for k in range(size)), 0.0)
-        out.update({1 + k: p[k] for k in range(size)})
-
-    return row
-
-
-def function_of(item: Constraint) -> Function:
+def function_on_device(item: Constraint) -> Function:
     """The function of an object's rows.
 
     Raises
@@ -127,21 +86,13 @@ def function_of(item: Constraint) -> Function:
     UnsupportedError
         Rows that only Python can compute, or whose function cannot be written in C.
     """
-    if item.functions or (item.row is None and item.kind is not RowKind.LINEAR):
+    found = function_of(item)
+    if found is None:
         raise UnsupportedError(
             f"{item!r} is a function of Python, which no device can call; write it as a Formula, or leave it to the "
             "host (device=False)"
         )
-    if isinstance(item, Formula):
-        code = item.code()
-        numbers = (3 if item.holonomic else 6) * item.width, len(item.names)
-        found = Function(code.first, (), code.second if item.holonomic and code.moving else None, numbers)
-    elif item.row is None:
-        found = Function(_linear(3 * item.width))
-    else:
-        known = [float(item.width)] if item.uses_masses else item.parameters()[0, : item.alike].tolist()
-        found = Function(item.row, tuple(known), is_distance=item.holds_length)
-    found.text("looked_at")
+    c_functions("looked_at", found)
     return found
 
 
@@ -227,7 +178,7 @@ class HeldRows:
         for item, start in zip(held.constraints, held.starts, strict=False):
             self.parameters += list(item.parameters().reshape(item.n_rows, -1))
             atoms += list(item.atoms)
-            number = -1 if item.fixes_atoms else known.setdefault(function_of(item), len(known))
+            number = -1 if item.fixes_atoms else known.setdefault(function_on_device(item), len(known))
             # OpenMM keeps molecules in one piece: its own constraints know no images.
             open_ = held.lattice is None or start + item.n_rows <= summed_from
             how = np.full(item.n_rows, STORED if not item.relative else RELATIVE if open_ else NEAREST)
@@ -244,20 +195,11 @@ class HeldRows:
 
     def _patterns(self, rows: list[Row], atoms: list[IntArray]) -> list[Pattern]:
         plan = self.motion.plan
-        order = np.lexsort((plan.eliminate_last, plan.labels))
-        order = order[plan.labels[order] >= 0]
-        cuts = np.flatnonzero(np.diff(plan.labels[order])) + 1
-        found: dict[tuple[Row, ...], tuple[list[list[int]], list[IntArray]]] = {}
-        for cluster in np.split(order, cuts) if len(order) else []:
-            place: dict[int, int] = {}
-            pattern = []
-            for row in cluster.tolist():
-                local = tuple(place.setdefault(a, len(place)) for a in atoms[row].tolist())
-                pattern.append(rows[row]._replace(atoms=local))
-            mine = found.setdefault(tuple(pattern), ([], []))
-            mine[0].append(list(place))
-            mine[1].append(cluster)
-        return [Pattern(key, np.array(each[0]), np.array(each[1])) for key, each in found.items()]
+        found = alike(plan.labels, plan.eliminate_last, rows, atoms)
+        return [
+            Pattern(tuple(row._replace(atoms=local) for row, local in key), each.atoms, each.rows)
+            for key, each in found.items()
+        ]
 
     def cells_of(self, x: FloatArray) -> FloatArray:
         """Whole cells that bring the atoms of the rows `in_cells` beside the first one, one row after another."""

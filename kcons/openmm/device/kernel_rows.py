@@ -14,8 +14,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.motion import Motion
-from kcons.openmm.callback_rows.callbacks import Passage, cell_of
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, refuse_virtual_sites
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Passage, cell_of, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
 from kcons.openmm.device.rows import DeviceRows, rows_of
 from kcons.openmm.integrator.part import Part, Solver

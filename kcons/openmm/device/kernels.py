@@ -95,6 +95,12 @@ _COMMON = """
 #define AWAY(a, p, sign) {mixed i_ = cells[3*(p)], j_ = cells[3*(p)+1], k_ = cells[3*(p)+2]; \\
   x[3*(a)] = x[3*(a)] sign (i_*box0.x+j_*box1.x+k_*box2.x); \\
   x[3*(a)+1] = x[3*(a)+1] sign (j_*box1.y+k_*box2.y); x[3*(a)+2] = x[3*(a)+2] sign k_*box2.z;}
+/* In double precision Newton's last turn has all digits. */
+#ifdef USE_DOUBLE_PRECISION
+#define HELD_TO min(tolerance, (mixed) 1e-13)
+#else
+#define HELD_TO tolerance
+#endif
 #define RESTS(p) ((p) < 0 ? -1-(p) : (p))
 #define TINY ((mixed) 1e-37f)
 /* The first failure is kept; kernels that are launched later do nothing. */
@@ -171,7 +177,7 @@ def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_grou
     passed = [array for array in arrays if array.name in _PASSED or array.name.startswith("rows_")]
     typed = ["int step", "int launch", "mixed tolerance", *(f"mixed4 {name}" for name in _BOX)]
     typed += [f"GLOBAL {a.kind}* {a.name}" for a in passed] + ["LOCAL_ARG mixed* scratch"] * (scratch > 0)
-    names = ["step", "launch", "tolerance", *_BOX, *(a.name for a in passed)] + ["scratch"] * (scratch > 0)
+    names = ["step", "launch", "HELD_TO", *_BOX, *(a.name for a in passed)] + ["scratch"] * (scratch > 0)
     forces = [f"force{k}" for k in range(slots)]
     if plain:
         given = "void** pointers, const double* reals, const int* integers, int GROUP_ID, int NUM_GROUPS"
@@ -339,7 +345,8 @@ _CLOSED_FORM = """ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(
  if (GROUP_ID == 0) {memory[M_growth] += z+log(scale); if (scale < (mixed) 1e-4f) memory[M_lost] += 1;}
 """
 #: Half a push of all links, the first of which then scales velocities, and half a push; see `kcons.openmm.NoseHoover`.
-_CHAIN = """ mixed link[LINKS], factor = 1, place = memory_before[M_chain_place], inertia = P_kT/(P_frequency*P_frequency);
+_CHAIN = """ mixed link[LINKS], factor = 1, place = memory_before[M_chain_place];
+ mixed inertia = P_kT/(P_frequency*P_frequency);
  const mixed parts[PARTS] = {SHARES};
  for (int k = 0; k < LINKS; k++) link[k] = memory_before[M_link1+k];
  for (int part = 0; part < PARTS; part++) {
@@ -561,10 +568,10 @@ class Kernels:
             h, time = _of_dt(length), f"{_time(op, end)}+flight*h"
             loop = f" for (int flight = 0; flight < {count}; flight++)"
             free = f"{loop} EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
-            start = f"{loop} {{ROOM mixed h = {h};\n"
+            start = f"{loop} {{ROOM const mixed h = {h}, per_h = 1/h;\n"
             aim = " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
             moved = (
-                " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]/h;}\n }\n"
+                " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }\n"
             )
             solve = f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {time}, x, d, w);\n if (failure[0] == 0)\n"
             self._add(free, start + aim + solve + moved)
@@ -779,23 +786,6 @@ class Plan(NamedTuple):
     slots: int
 
 
-class NoRows:
-    """What kernels hold where nothing is held, and what they need to know of rows; see `kcons.openmm.device.rows`."""
-
-    block = 10**9
-    looks = False
-    shapes: Sequence[Shape] = ()
-    arrays: Sequence[Array] = ()
-    source = ""
-    scratch = 0
-    work_group = 64
-    fixed = placed = _NONE
-
-    def renew(self, *state: Any) -> dict[str, FloatArray]:
-        """Nothing changes with time."""
-        return {}
-
-
 def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, held: Any) -> Plan:
     """Everything that the plugin needs.
 
@@ -808,7 +798,7 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     masses : ndarray, shape (n_particles,)
     groups : int
         Bit mask of the force groups that act.
-    held : DeviceRows or NoRows
+    held : DeviceRows
     """
     operations = [Op._make(tuple(v) if isinstance(v, list) else v for v in op) for op in described["operations"]]
     names_of_groups = dict.fromkeys(op.group for op in operations if op.verb == "evaluate")

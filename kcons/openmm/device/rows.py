@@ -18,6 +18,7 @@ from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.openmm.callback_rows.carried_constraints import with_massless_atoms
+from kcons.openmm.device.c_writer import c_functions
 from kcons.openmm.device.held_rows import IN_CELLS, STORED, HeldRows, Pattern, constraints_of
 from kcons.openmm.device.kernels import Array, Shape
 from kcons.openmm.device.large_clusters import LargeClusters, group_size
@@ -88,7 +89,7 @@ class DeviceRows:
         small = [pattern for pattern in held.patterns if pattern.small]
         large = [pattern for pattern in held.patterns if not pattern.small]
         used = sorted({row.function for pattern in small for row in pattern.rows})
-        texts = [_COMMON, *(held.functions[f].text(f"rows_f{f}") for f in used)]
+        texts = [_COMMON, *(c_functions(f"rows_f{f}", held.functions[f]) for f in used)]
         self.shapes: list[Shape] = []
         order: list[IntArray] = []
         tables = [np.zeros(1)]

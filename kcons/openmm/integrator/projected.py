@@ -187,13 +187,10 @@ class ProjectedIntegrator(Integrator):
         for k, part in enumerate(self.parts, start=1):
             part.begin_program(k)
         step = Step(program, self.scheme, self.parts, self._ensemble)
-        write_step(step, self._own_step)
+        write_step(step)
         for part in self.parts:
             part.program = self.program
         return step
-
-    #: A kind of step of its own, see `write_step`.
-    _own_step: Callable[[Step], bool] | None = None
 
     def __repr__(self) -> str:
         held = "".join(f", {part!r}" for part in self.parts)

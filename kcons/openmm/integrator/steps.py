@@ -9,15 +9,8 @@ from kcons.openmm.integrator.ensemble import Step, use
 # -- kinds of step --------------------------------------------------------------------------------
 
 
-def write_step(step: Step, own: Callable[[Step], bool] | None = None) -> None:
-    """Write the program of a step.
-
-    Parameters
-    ----------
-    step : Step
-    own : callable, optional
-        A kind of step of the integrator's own, which returns False where it leaves the step to the others.
-    """
+def write_step(step: Step) -> None:
+    """Write the program of a step."""
     p, ensemble = step.program, step.ensemble
     if step.lazy:
         use(p, "between")
@@ -26,10 +19,9 @@ def write_step(step: Step, own: Callable[[Step], bool] | None = None) -> None:
         use(p, "v_middle", "v_end")
         # Where others have set v since, it is theirs that counts.
         p.kinetic_energy = "m*u*u/2; u=select(spread*delta(v-v_end), v_middle, v)"
-    if not (own is not None and own(step)):
-        use(p, "xu")
-        if not ensemble.write(step):
-            _kind(step)(step)
+    use(p, "xu")
+    if not ensemble.write(step):
+        _kind(step)(step)
     use(p, "ending", "motion")
     with p.when("ending != 0", "a call ends"):
         p.sum("motion", "v*v", "are velocities finite?")
@@ -148,7 +140,7 @@ def _declare_guards(step: Step) -> None:
         use(p, "call", "moved")
 
 
-def see_who_moved(step: Step) -> None:
+def _see_who_moved(step: Step) -> None:
     """How far x is from where the last step ended; where a call begins, Python has to look at what others moved."""
     p = step.program
     p.sum("moved", "(x-x_last)^2", "barostats, setPositions and minimizers move x between steps")
@@ -182,7 +174,7 @@ def _up_to_forces(step: Step, then: Callable[[Step], None]) -> None:
     with p.when("failed = 0", "a step, and nothing failed before"):
         p.let_others_act()
     if step.kept:
-        see_who_moved(step)
+        _see_who_moved(step)
     with p.when("failed = 0", "after a failure nothing moves"):
         if step.kept:
             with p.when("moved+stale != 0", "others did"):
@@ -290,7 +282,7 @@ def _lean_step(step: Step) -> None:
     with p.when("select(failed, 0, looked) != 0", "x and v may have been changed"):
         p.each("v_last", "v", "to come back to")
         p.let_others_act()
-        see_who_moved(step)
+        _see_who_moved(step)
     with p.when("failed = 0", "after a failure nothing moves"):
         with p.when("looked != 0", "x and v may have been changed"):
             with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):

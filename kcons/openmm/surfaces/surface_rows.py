@@ -19,7 +19,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.openmm.collective.coordinates import free_groups
-from kcons.openmm.device.held_rows import function_of
+from kcons.openmm.device.c_writer import openmm_expression
+from kcons.openmm.device.held_rows import function_on_device
 from kcons.openmm.integrator.part import BOND, NEAR, Part, Solver, Violation
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
@@ -256,7 +257,7 @@ class SurfaceRows(Part):
 
 def _forces(item: Constraint) -> tuple[openmm.CustomExternalForce, openmm.CustomExternalForce]:
     """s, value less target, and s^2/2 as forces on the particles of an object."""
-    value = function_of(item).expression()
+    value = openmm_expression(function_on_device(item))
     pair = (
         openmm.CustomExternalForce(f"row_value-row_target; {value}"),
         openmm.CustomExternalForce(f"0.5*(row_value-row_target)^2; {value}"),

@@ -7,10 +7,34 @@ parted by blanks; parameters in brackets are left out where any will do.
 
 from pathlib import Path
 
-from mutants import ase_dynamics, device, files, free_energies, models, openmm_programs, solvers, steppers, studies
+from mutants import (
+    ase_dynamics,
+    batched,
+    device,
+    files,
+    free_energies,
+    models,
+    openmm_programs,
+    solvers,
+    steppers,
+    studies,
+    torchsim,
+)
 
 TESTS = Path(__file__).resolve().parents[2]
-MODULES = (solvers, openmm_programs, models, steppers, files, studies, free_energies, ase_dynamics, device)
+MODULES = (
+    solvers,
+    openmm_programs,
+    models,
+    steppers,
+    files,
+    studies,
+    free_energies,
+    ase_dynamics,
+    device,
+    torchsim,
+    batched,
+)
 
 
 def both(text: str) -> tuple[str, str]:

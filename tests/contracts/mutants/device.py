@@ -19,6 +19,12 @@ MUTANTS = {
             "test_molecule_spheres.py::test_trajectories_are_those_on_arrays",
         ),
     ],
+    "openmm/device/build.py": [
+        (
+            "if not (accelerated() «or→and» is_built()):",
+            "test_device_integrator.py::test_which_steps_are_made_on_the_device",
+        ),
+    ],
     "openmm/device/c_writer.py": [
         (
             're.sub(r"pow\\((.*), (.*)\\)", r"(\\«1→2»)^(\\2)", text)',
@@ -42,6 +48,14 @@ MUTANTS = {
         ),
     ],
     "openmm/device/device_integrator.py": [
+        (
+            "self._advance(context, again«→ - 1»)",
+            "test_device_integrator.py::test_a_failure_leaves_the_state_before_the_step",
+        ),
+        (
+            "yield x, v, f, time + (k «+ 1→+ 0») * every * self._dt",
+            "test_device_integrator.py::test_records_are_the_states_after_steps",
+        ),
         (
             "if told[_FAILED]«→ and False»:",
             "test_device_integrator.py::test_rows_without_solution_are_told_and_taken_back",

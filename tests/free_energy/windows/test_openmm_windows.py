@@ -47,9 +47,8 @@ def test_two_torsions_far_from_the_structure(tmp_path):
 @pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
 def test_windows_on_the_device_are_those_of_the_program(tmp_path, monkeypatch):
     """A hundred steps, the states recorded on the device: multipliers, weights and what belongs to them."""
-    settings = Settings(
-        timestep=1.0, thermostat="isokinetic", relax=0, pull=10, equilibration=10, production=80, every=8
-    )
+    steps = {"relax": 0, "pull": 16, "equilibration": 20, "production": 64, "every": 2}
+    settings = Settings(timestep=1.0, friction=1e-30, **steps)  # noise of 1e-14: each has its own
     found = []
     for why in ("", "there is no compiler"):
         monkeypatch.setattr(build, "reluctance", lambda why=why: why)

@@ -17,8 +17,7 @@ from openmm_systems import context_of as context_on
 from kcons.constraints import Custom, Distance
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import CarriedConstraints, ProjectedIntegrator, hold
-from kcons.openmm.callback_rows.callbacks import CARRY_SCALE, Passage
-from kcons.openmm.callback_rows.carried_constraints import refuse_single_precision
+from kcons.openmm.callback_rows.carried_constraints import CARRY_SCALE, Passage, refuse_single_precision
 from kcons.openmm.integrator.precision import Precision
 
 # -- what passes ------------------------------------------------------------------------------------
@@ -41,7 +40,7 @@ class Messenger:
 
 def sent(platform, some, monkeypatch):
     """Where particles are after the change, and what the messenger has seen."""
-    monkeypatch.setattr("kcons.openmm.callback_rows.callbacks.hands_over_all", lambda: not some)
+    monkeypatch.setattr("kcons.openmm.callback_rows.carried_constraints.hands_over_all", lambda: not some)
     system = openmm.System()
     for _ in X:
         system.addParticle(1.0)

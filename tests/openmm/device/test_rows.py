@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from kcons.constraints import Angle, CenterDistance, Custom, Distance, Formula, Plane, Sphere
+from kcons.constraints.functions.straight_line import Function
 from kcons.constraints.target import MovingTarget
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.device.c_writer import c_function
+from kcons.openmm.device.c_writer import c_functions
 from kcons.openmm.device.held_rows import molecules_of, refusal
-from kcons.openmm.device.large_clusters import elimination
 from kcons.openmm.device.rows import rows_of
+from kcons.plan.clusters_alike import elimination
 from tests.systems.constraint_cases import CASES, MASSES, TIME, scattered
 from tests.systems.device_rows import PlainRows
 from tests.systems.rows_in_cells import CHAIN, ROWS
@@ -270,14 +271,14 @@ def _divides(r, p, t, out):
 
 
 def test_what_is_not_straight_is_refused():
-    with pytest.raises(UnsupportedError, match=r"_with_a_branch is not written in C.*the function greater"):
-        c_function("f", _with_a_branch)
+    with pytest.raises(UnsupportedError, match=r"_with_a_branch is.*the function greater.*not written in C"):
+        c_functions("f", Function(_with_a_branch))
     with pytest.raises(UnsupportedError, match="the function floor"):
-        c_function("f", lambda r, p, t, out: out.update({0: np.floor(r[0])}))
+        c_functions("f", Function(lambda r, p, t, out: out.update({0: np.floor(r[0])})))
 
 
 def test_whole_numbers_are_not_divided_as_such():
-    text = c_function("f", _divides, "GLOBAL ", known=(2.0,))
+    text = c_functions("f", Function(_divides, (2.0,)), "GLOBAL ")
     assert "1/2" not in text and "((mixed) 0.5)" in text and "GLOBAL mixed* out" in text
     assert text.count("r[") == 6
 

@@ -411,7 +411,7 @@ def test_some_particles_or_all_are_the_same_motion(monkeypatch):
     """What callbacks are given does not change a bit of what is computed."""
     ends = []
     for every in (False, True):
-        monkeypatch.setattr("kcons.openmm.callback_rows.callbacks.hands_over_all", lambda every=every: every)
+        monkeypatch.setattr("kcons.openmm.callback_rows.carried_constraints.hands_over_all", lambda every=every: every)
         system, x, v = free_alanine()
         integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
         context = started(system, integrator, x, v)

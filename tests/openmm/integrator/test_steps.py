@@ -13,6 +13,7 @@ from openmm_parts import HeldCoordinates
 from openmm_systems import (
     PLATFORMS,
     alanine,
+    context_of,
     dumbbell,
     holding,
     loose_alanine,
@@ -22,6 +23,7 @@ from openmm_systems import (
     started,
     state_of,
     total_energy,
+    water_box,
 )
 from tied_cluster import KINDS, bond
 
@@ -141,6 +143,24 @@ def test_changes_from_outside_reach_the_next_step(change):
         contexts.append(state_of(context))
         spring.setBondParameters(0, 0, 1, 0.2, 100.0)
     np.testing.assert_allclose(contexts[0], contexts[1], rtol=1e-12)
+
+
+def test_change_of_the_box():
+    """OpenMM keeps the forces of a CustomIntegrator when the box is changed; `step` sees that."""
+    system, x = water_box(27)
+    wider = 1.02 * np.array([row._value for row in system.getDefaultPeriodicBoxVectors()])
+    context = started(system, integrator := ProjectedIntegrator(1e-3, tolerance=1e-12), x, np.zeros_like(x))
+    integrator.step(5)
+    context.setPeriodicBoxVectors(*wider)
+    fresh = context_of(system, other := ProjectedIntegrator(1e-3, tolerance=1e-12))
+    fresh.setPeriodicBoxVectors(*wider)
+    fresh.setPositions(state_of(context)[0])
+    fresh.setVelocities(state_of(context)[1])
+    integrator.step(5)
+    other.step(5)
+    # SETTLE has lengths in single precision.
+    np.testing.assert_allclose(state_of(context)[0], state_of(fresh)[0], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(state_of(context)[1], state_of(fresh)[1], rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", KINDS)

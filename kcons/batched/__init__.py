@@ -1,0 +1,24 @@
+"""Constraints on many systems at once, on PyTorch tensors, for potentials that run there; differentiable.
+
+Clusters of equal shape are solved side by side, across copies and molecules, on a processor or a GPU. What is held is
+said by the engines (`kcons.Motion`) of the systems. Gradients go through positions, velocities, masses and lengths, by
+the equations at the solution.
+
+- `row_functions`: families of constraints on tensors
+- `clusters`: the equations of clusters that look alike
+- `lanes`, `levels`: how they are solved: elimination written out, or sparse elimination by levels
+- `groups`: where the clusters of a batch are in its tensors
+- `projections`: projections that torch differentiates
+- `batch`: many systems, and what is asked of them
+- `steps`: RATTLE and Langevin dynamics
+"""
+
+from kcons.errors import with_extra
+
+try:
+    from kcons.batched.batch import Batch, Solved
+    from kcons.batched.steps import gbaoab, rattle
+except ModuleNotFoundError as error:
+    raise with_extra(error, "kcons.batched") from error
+
+__all__ = ["Batch", "Solved", "gbaoab", "rattle"]

@@ -1,0 +1,437 @@
+"""Many systems, or many copies of one, held side by side on a device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcons.batched.groups import Group, kinds_of
+from kcons.batched.projections import Projection, Task
+from kcons.constraints.arguments import IntArray
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.motion.report import Report
+
+#: Parts of its scale that a row may be off by, and so many roundings in single precision.
+ACCEPTED, ROUNDINGS = 1e-10, 1e3
+#: Projections after which failures are looked for, where looking waits for the device.
+CHECK_EVERY = 100
+
+
+class Solved(NamedTuple):
+    """Positions on the rows, by how much atoms were moved, M^-1 A^T Lambda, and Lambda by row in natural units."""
+
+    positions: Tensor
+    push: Tensor
+    multipliers: Tensor
+
+
+class Batch:
+    """Constrained motion of many systems at once, on PyTorch tensors, differentiable.
+
+    Clusters of equal shape are solved side by side, whichever systems they belong to. Classes, names, rank,
+    conversions and refusals are those of the engines. All methods leave what they are given as it was.
+
+    Parameters
+    ----------
+    motions : Motion or sequence of Motion
+        Engines of the systems, one a system; the same object may come any number of times.
+    copies : int
+        How many times all of these are there.
+    device : str or torch.device
+    dtype : torch.dtype
+        torch.float64 or torch.float32.
+    compiled : bool
+        Whether steps for small clusters are compiled by `torch.compile`, once for each shape: some ten seconds, after
+        which a projection takes a third of the time on a processor, and a few launches on a GPU.
+    check_every : int, optional
+        Projections of positions after which failures are looked for: 1 on a processor, and 100 on a GPU, where looking
+        waits for the device.
+
+    Attributes
+    ----------
+    systems : tuple of Motion
+    n_systems, n_atoms, n_rows : int
+        All together.
+    atom_starts, row_starts : ndarray of int, shape (n_systems + 1,)
+        Where atoms and rows of each system begin; those of all systems follow each other.
+    system_idx : Tensor, shape (n_atoms,)
+        System of each atom.
+    masses : Tensor, shape (n_atoms,)
+    targets : Tensor, shape (n_rows,)
+        What rows are held at; of moving targets, at time 0.
+    ranks, degrees_of_freedom : Tensor, shape (n_systems,)
+
+    Raises
+    ------
+    UnsupportedError
+        A function of a user that cannot be run on tensors.
+    InputError
+        No systems, no copies, or another type of number.
+    """
+
+    def __init__(
+        self,
+        motions: Motion | Sequence[Motion],
+        copies: int = 1,
+        *,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float64,
+        compiled: bool = False,
+        check_every: int | None = None,
+    ) -> None:
+        given = [motions] if isinstance(motions, Motion) else list(motions)
+        if not given or copies < 1 or not all(isinstance(each, Motion) for each in given):
+            raise InputError("give a kcons.Motion and the number of copies, or a list of Motions", item="motions")
+        if dtype not in (torch.float64, torch.float32):
+            raise InputError(f"dtype is {dtype}; give torch.float64 or torch.float32", item="dtype")
+        self.systems = tuple(given * copies)
+        self.device, self.dtype, self.compiled = torch.device(device), dtype, compiled
+        self.check_every = check_every or (1 if self.device.type == "cpu" else CHECK_EVERY)
+        self.n_systems = len(self.systems)
+        self.atom_starts = _starts([each.n_atoms for each in self.systems])
+        self.row_starts = _starts([each.constraint_set.n_rows for each in self.systems])
+        self.n_atoms, self.n_rows = int(self.atom_starts[-1]), int(self.row_starts[-1])
+        self._numbers: dict[Motion, list[int]] = {}
+        for number, each in enumerate(self.systems):
+            self._numbers.setdefault(each, []).append(number)
+        self.system_idx = torch.as_tensor(
+            np.repeat(np.arange(self.n_systems), np.diff(self.atom_starts)), device=self.device
+        )
+        self.masses = self._joined(lambda each: each.masses)
+        self.targets = self._joined(lambda each: each.constraint_set.target(0.0))
+        self.ranks = self._joined(lambda each: [each.rank], torch.int64)
+        self.degrees_of_freedom = self._joined(lambda each: [each.degrees_of_freedom], torch.int64)
+        self._still, self._calls = torch.zeros_like(self.targets), 0
+        # Fixed atoms, in the order of their rows.
+        self._fixed_rows = self._placed(self.row_starts, lambda each: each.plan.pinned_rows)
+        self._fixed = self._placed(
+            self.atom_starts, lambda each: [each.constraint_set.row_atoms(row)[0] for row in each.plan.pinned_rows[::3]]
+        )
+        self._massless = self.masses <= 0
+        self._free = ~self._massless
+        self._free[self._fixed] = False
+        self._massless[self._fixed] = False
+        self._inverse_masses = self._inverse(self.masses)
+        self._moving = any(each.constraint_set.moving for each in self._numbers)
+        self._is_position = self._joined(lambda each: each.constraint_set.holonomic, torch.bool)
+        self._holonomic = bool(self._is_position.all())
+        self._set_lattices()
+        self._groups = self._grouped(True)
+
+    def _joined(self, of: Any, dtype: torch.dtype | None = None) -> Tensor:
+        """Numbers of each system, one after another."""
+        known = {each: of(each) for each in self._numbers}
+        whole = np.concatenate([known[each] for each in self.systems])
+        return torch.as_tensor(whole, device=self.device, dtype=dtype or self.dtype)
+
+    def _placed(self, starts: IntArray, of: Any) -> Tensor:
+        """Numbers of atoms or rows of all systems."""
+        some = [np.asarray(of(each), dtype=np.int64) + start for each, start in zip(self.systems, starts, strict=False)]
+        return torch.as_tensor(np.concatenate(some), device=self.device)
+
+    def _inverse(self, masses: Tensor) -> Tensor:
+        return torch.where(self._free, 1.0 / torch.where(self._free, masses, 1.0), 0.0)
+
+    def _grouped(self, velocity_rows: bool) -> list[Group]:
+        parts: dict[Any, list[Any]] = {}
+        for motion, numbers in self._numbers.items():
+            for pattern, kind in kinds_of(motion, velocity_rows).items():
+                where = np.stack([numbers, self.atom_starts[numbers], self.row_starts[numbers]], axis=1)
+                parts.setdefault(pattern, []).append((kind, where))
+        return [Group(pattern, each, self.masses, self.compiled) for pattern, each in parts.items()]
+
+    @cached_property
+    def _position_groups(self) -> list[Group]:
+        """Without rows of velocities."""
+        return self._groups if self._holonomic else self._grouped(False)
+
+    # -- cells ----------------------------------------------------------------------------------------
+
+    def _set_lattices(self) -> None:
+        """Cells and their inverses, with zeros for directions without periodicity, and the trees of whole rows."""
+        self._lattice: Tensor | None = None
+        self._tree: list[Tensor] = []
+        sets = {each: each.constraint_set for each in self._numbers}
+        if all(each.lattice is None for each in sets):
+            return
+        open_ = np.stack([np.eye(3), np.zeros((3, 3))])
+        self._lattice = self._joined(lambda each: [open_ if each.lattice is None else each.lattice])
+        if all(held.images is None for held in sets.values()):
+            return
+
+        def parents(each: Motion) -> IntArray:
+            found, images = np.arange(each.n_atoms), sets[each].images
+            if images is not None:
+                found[images.atoms] = images.parents
+            return found
+
+        # By turns atoms farther along the tree.
+        self._tree = [self._placed(self.atom_starts, parents)]
+        while bool((self._tree[-1] != self._tree[-1][self._tree[-1]]).any()):
+            self._tree.append(self._tree[-1][self._tree[-1]])
+
+    def set_cell(self, cells: Tensor) -> None:
+        """Change the periodic cells, as barostats do; which directions are periodic stays as it is.
+
+        Parameters
+        ----------
+        cells : Tensor, shape (n_systems, 3, 3) or (3, 3)
+            Lattice vectors as rows.
+
+        Raises
+        ------
+        InputError
+            Cells of another shape, or for systems without.
+        """
+        whole = torch.as_tensor(cells, dtype=self.dtype, device=self.device)
+        if self._lattice is None or whole.shape not in ((3, 3), (self.n_systems, 3, 3)):
+            wanted = f"(3, 3) or ({self.n_systems}, 3, 3), where Motions have one"
+            raise InputError(f"cells have shape {tuple(whole.shape)}; give {wanted}", item="cells")
+        periodic = self._lattice[:, 1].any(1, keepdim=True)
+        whole = torch.where(periodic.transpose(1, 2), whole.expand(self.n_systems, 3, 3), self._lattice[:, 0])
+        self._lattice = torch.stack([whole, torch.linalg.inv(whole) * periodic], 1)
+
+    def _tree_cells(self, x: Tensor) -> Tensor | None:
+        """Cells by which atoms of whole rows stand off where they are stored, (n_atoms, 3)."""
+        if not self._tree or self._lattice is None:
+            return None
+        inverse = self._lattice[self.system_idx, 1]
+        cells = -torch.round(torch.einsum("nx,nxy->ny", x - x[self._tree[0]], inverse))
+        for parent in self._tree[:-1]:
+            cells = cells + cells[parent]
+        return cells
+
+    # -- what is given --------------------------------------------------------------------------------
+
+    def _flat(self, x: Tensor, item: str) -> Tensor:
+        if not isinstance(x, Tensor) or x.shape[-1:] != (3,) or x.numel() != 3 * self.n_atoms:
+            shape = tuple(getattr(x, "shape", ())) or type(x).__name__
+            wanted = f"a tensor of shape ({self.n_atoms}, 3) or (copies, atoms, 3)"
+            raise InputError(f"{item} must be {wanted}, not {shape}", item=item)
+        if x.dtype != self.dtype or x.device.type != self.device.type:
+            here = f"{self.dtype} on {self.device}; convert it"
+            raise InputError(f"{item}: {x.dtype} on {x.device}, but this batch is {here}", item=item)
+        return x.reshape(-1, 3)
+
+    def _all(self, values: Tensor, count: int, item: str) -> Tensor:
+        """Numbers of all systems, from those or from the numbers of one of many copies."""
+        sizes = {count, count // self.n_systems} if len(self._numbers) == 1 else {count}
+        if not isinstance(values, Tensor) or values.ndim != 1 or len(values) not in sizes:
+            wanted = f"({count},), or those of one system where all are copies"
+            raise InputError(f"{item} must be a tensor of shape {wanted}", item=item)
+        return values.to(self.dtype).repeat(count // max(len(values), 1))
+
+    def weights(self, masses: Tensor | None = None) -> Tensor:
+        """Inverse masses, 0 for fixed atoms, shape (n_atoms,); of other `masses` than those of the engines.
+
+        Raises
+        ------
+        UnsupportedError
+            Rows that are defined by the masses of their engine, such as centers of mass.
+        """
+        if masses is None:
+            return self._inverse_masses
+        for item in (item for motion in self._numbers for item in motion.constraint_set.constraints):
+            if item.uses_masses:
+                raise UnsupportedError(f"{item!r} is defined by the masses of its Motion; make another with other ones")
+        return self._inverse(self._all(masses, self.n_atoms, "masses"))
+
+    def _targets_at(self, time: float) -> Tensor:
+        return self._joined(lambda each: each.constraint_set.target(time)) if self._moving else self.targets
+
+    def _rates_at(self, time: float, order: int) -> Tensor:
+        if not self._moving and self._holonomic:
+            return self._still
+        return self._joined(lambda each: each.constraint_set.target_rates(time, order))
+
+    def _task(self, of_positions: bool, time: float, start: float, flight: float = 0.0) -> Task:
+        t, t_start = (torch.tensor(each, dtype=self.dtype, device=self.device) for each in (time, start))
+        groups = self._groups if flight or not of_positions else self._position_groups
+        own = self._inverse_masses, self.targets if of_positions else self._still
+        return Task(of_positions, flight != 0, groups, t, t_start, self._lattice, self._tree_cells, own)
+
+    def _with_fixed(self, y: Tensor, rows: Tensor) -> Tensor:
+        """With what the rows of fixed atoms say of these."""
+        return y.index_copy(0, self._fixed, rows[self._fixed_rows].reshape(-1, 3)) if len(self._fixed) else y
+
+    # -- what is asked --------------------------------------------------------------------------------
+
+    def solve_positions(
+        self,
+        x_new: Tensor,
+        x_reference: Tensor,
+        *,
+        time: float = 0.0,
+        reference_time: float | None = None,
+        flight: float = 0.0,
+        targets: Tensor | None = None,
+        masses: Tensor | None = None,
+    ) -> Solved:
+        """Solve sigma(x_new + M^-1 A(x_reference)^T Lambda) = 0 for each system, by Newton's method.
+
+        Derivatives are those of the solution, by one solve with the transposed matrix.
+
+        Parameters
+        ----------
+        x_new, x_reference : Tensor, shape (n_atoms, 3) or (copies, atoms, 3)
+            Positions to correct, and those whose gradients give the directions.
+        time, reference_time : float
+            Times of both; `reference_time` defaults to `time`.
+        flight : float
+            Time from `x_reference` to `x_new`, for rows of velocities; see `Motion.project_positions`.
+        targets : Tensor, shape (n_rows,) or (rows of one system,), optional
+            What rows are held at, in place of what the engines say.
+        masses : Tensor, shape (n_atoms,) or (atoms of one system,), optional
+
+        Returns
+        -------
+        Solved
+            Velocities are to change by ``push/dt``, which knows nothing of the rounding of positions.
+
+        Raises
+        ------
+        ConvergenceError
+            No solution near enough, in this or an earlier call: see `check`.
+        InputError
+            Another shape or type of number.
+        """
+        x, start = self._flat(x_new, "x_new"), self._flat(x_reference, "x_reference")
+        reference_time = time if reference_time is None else reference_time
+        held = self._targets_at(time) if targets is None else self._all(targets, self.n_rows, "targets")
+        if not self._holonomic:
+            middle = held if targets is not None else self._targets_at(0.5 * (time + reference_time))
+            held = torch.where(self._is_position, held, flight * middle)
+        task = self._task(True, time, reference_time, flight)
+        found = Projection.apply(self._with_fixed(x, held), start, held, self.weights(masses), task)
+        self._calls += 1
+        if self._calls >= self.check_every:
+            self.check()
+        positions, push, multipliers = found
+        return Solved(positions.reshape(x_new.shape), push.reshape(x_new.shape), _by_copy(multipliers, x_new))
+
+    def project_positions(self, x_new: Tensor, x_reference: Tensor, **options: Any) -> Tensor:
+        """Positions on the rows: those of `solve_positions`, which tells the options and the errors."""
+        return self.solve_positions(x_new, x_reference, **options).positions
+
+    def project_velocities(self, x: Tensor, v: Tensor, *, time: float = 0.0, masses: Tensor | None = None) -> Tensor:
+        """Nearest admissible velocities in the mass metric: A v = c.
+
+        Shapes and `masses` are as for `solve_positions`, the `time` is that of positions.
+        """
+        here, task = self._flat(x, "x"), self._task(False, time, time)
+        rates = self._rates_at(time, 1)
+        if self._moving:
+            drift = torch.zeros_like(rates)
+            for group in task.groups:
+                each = group.solver.drift(task.problem(group, here, here, rates, self._inverse_masses))
+                drift = drift.index_put((group.rows,), each.expand(group.rows.shape))
+            rates = rates - drift
+        speeds = self._with_fixed(self._flat(v, "v"), rates)
+        return Projection.apply(speeds, here, rates, self.weights(masses), task)[0].reshape(v.shape)
+
+    def project_forces(self, x: Tensor, forces: Tensor) -> Tensor:
+        """What is left of forces on the surface, for optimizers, as `Motion.project_forces`."""
+        here, f = self._flat(x, "x"), self._flat(forces, "forces")
+        pulled = self._inverse_masses[:, None] * f
+        task = self._task(False, 0.0, 0.0)
+        found = Projection.apply(pulled, here, self._still, self._inverse_masses, task)[0] * self.masses[:, None]
+        return torch.where(self._free[:, None], found, self._massless[:, None] * f).reshape(forces.shape)
+
+    def multipliers(
+        self, x: Tensor, v: Tensor, forces: Tensor, *, time: float = 0.0, masses: Tensor | None = None
+    ) -> Tensor:
+        """lambda of the constraint forces A^T lambda, in natural units; of least norm where rows depend on each other.
+
+        Shapes are as for `solve_positions`; the result has shape (n_rows,) or (copies, rows).
+        """
+        here, speed, f = self._flat(x, "x"), self._flat(v, "v"), self._flat(forces, "forces")
+        w, rates, task = self.weights(masses), self._rates_at(time, 2), self._task(False, time, time)
+        a = self._with_fixed(w[:, None] * f, rates)
+        lam, held = torch.zeros_like(rates), f.reshape(-1)
+        for group in task.groups:
+            of = task.problem(group, here, here, rates, w)
+            of = of._replace(held=of.held.expand(group.rows.shape))
+            each, force = group.solver.respond(of, speed.reshape(-1)[group.flat], a.reshape(-1)[group.flat])
+            lam = lam.index_put((group.rows,), each)
+            held = held.index_add(0, group.flat.reshape(-1), force.reshape(-1))
+        if len(self._fixed):
+            # What fixed atoms' rows supply: M a less the forces and those of the other rows.
+            inert = self.masses if masses is None else self._all(masses, self.n_atoms, "masses")
+            rest = (inert[:, None] * a - held.reshape(-1, 3))[self._fixed]
+            lam = lam.index_copy(0, self._fixed_rows, rest.reshape(-1))
+        return _by_copy(lam, x)
+
+    # -- what is told ---------------------------------------------------------------------------------
+
+    def check(self) -> None:
+        """Look at the residuals of all projections of positions since the last look.
+
+        Raises
+        ------
+        ConvergenceError
+            A row of a system was off, or not finite: with the numbers of both as `copy` and `row`. Where several calls
+            are looked at together, positions since the last look are not right.
+        """
+        calls, self._calls = self._calls, 0
+        limit = max(ACCEPTED, ROUNDINGS * torch.finfo(self.dtype).eps)
+        groups = [*self._groups, *(self._position_groups if self._position_groups is not self._groups else [])]
+        worst = [(group, group.worst) for group in groups]
+        for group, off in worst:
+            if bool((off <= limit).all()):
+                continue
+            for each in groups:
+                each.worst = torch.zeros_like(each.worst)
+            k, lane = (~(off <= limit)).nonzero()[0].tolist()
+            residual, copy = float(off[k, lane]), int(group.systems[lane])
+            row, held = int(group.rows[k, lane]) - int(self.row_starts[copy]), self.systems[copy].constraint_set
+            said = f"is off by {residual:.3g} of its scale" if np.isfinite(residual) else "has turned or is not finite"
+            error = ConvergenceError(
+                f"copy {copy}, row {held.row_name(row)} {said} in one of the last {calls} projections: there is no "
+                "solution near enough. Take a smaller time step, or start on the rows (Motion.restore_positions)",
+                residual=residual,
+                tolerance=limit,
+                row=row,
+                atoms=held.row_atoms(row).tolist(),
+            )
+            error.copy = copy
+            raise error
+
+    def report(self, x: Tensor, v: Tensor | None = None, *, time: float = 0.0) -> list[Report]:
+        """What each system's engine reports of its positions, and velocities: residuals, rank, kinds of clusters."""
+        both = (x, x) if v is None else (x, v)
+        here, speed = (self._flat(each, "x or v").detach().cpu().double().numpy() for each in both)
+        found = []
+        for k, motion in enumerate(self.systems):
+            some, before = slice(*self.atom_starts[k : k + 2]), motion.lattice
+            if before is not None and self._lattice is not None:
+                motion.set_cell(self._lattice[k, 0].cpu().double().numpy(), before[1].any(axis=0).tolist())
+            found.append(motion.report(here[some], None if v is None else speed[some], time, condition=False))
+            if before is not None:
+                motion.set_cell(before[0], before[1].any(axis=0).tolist())
+        return found
+
+    def select(self, systems: Sequence[int]) -> Batch:
+        """A batch of some of the systems, in this order, in their cells."""
+        numbers = np.arange(self.n_systems)[list(systems)].tolist()
+        some = [self.systems[k] for k in numbers]
+        made = Batch(some, device=self.device, dtype=self.dtype, compiled=self.compiled, check_every=self.check_every)
+        if self._lattice is not None and made._lattice is not None:
+            made._lattice = self._lattice[numbers]
+        return made
+
+    def __repr__(self) -> str:
+        return f"<Batch: {self.n_rows} rows on {self.n_atoms} atoms of {self.n_systems} systems>"
+
+
+def _starts(counts: Sequence[int]) -> IntArray:
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+
+def _by_copy(rows: Tensor, like: Tensor) -> Tensor:
+    return rows.reshape(like.shape[0], -1) if like.ndim == 3 else rows

@@ -1,0 +1,111 @@
+"""Time steps of a batch, as functions that torch differentiates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcons.batched.batch import Batch
+
+#: Forces, of the shape of positions.
+Force = Callable[[Tensor], Tensor]
+
+
+def _kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: float, time: float, masses: Tensor | None) -> Tensor:
+    """Velocities after forces have acted for a time h, on the rows."""
+    w = batch.weights(masses).reshape(*x.shape[:-1], 1)
+    return batch.project_velocities(x, v + h * w * forces, time=time, masses=masses)
+
+
+def _drift(batch: Batch, x: Tensor, v: Tensor, h: float, time: float, **held: Any) -> tuple[Tensor, Tensor]:
+    """Positions a time h later on the rows, and velocities with the impulse that has kept them there."""
+    found = batch.solve_positions(x + h * v, x, time=time + h, reference_time=time, flight=h, **held)
+    return found.positions, v + found.push / h
+
+
+def rattle(
+    batch: Batch,
+    force: Force,
+    x: Tensor,
+    v: Tensor,
+    forces: Tensor,
+    dt: float,
+    *,
+    time: float = 0.0,
+    targets: Tensor | None = None,
+    masses: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One step of RATTLE: order two, reversible; differentiable in all that are tensors.
+
+    Parameters
+    ----------
+    batch : Batch
+    force : callable
+        Forces at positions, of the same shape.
+    x, v, forces : Tensor, shape (n_atoms, 3) or (copies, atoms, 3)
+        Positions and velocities on the rows, and the forces there.
+    dt, time : float
+        The step, and the time at its beginning.
+    targets, masses : Tensor, optional
+        As for `Batch.solve_positions`.
+
+    Returns
+    -------
+    x, v, forces : Tensor
+        At the end of the step.
+
+    References
+    ----------
+    H. C. Andersen, J. Comput. Phys. 52, 24 (1983).
+    """
+    half = 0.5 * dt * batch.weights(masses).reshape(*x.shape[:-1], 1)
+    x, v = _drift(batch, x, v + half * forces, dt, time, targets=targets, masses=masses)
+    forces = force(x)
+    return x, _kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces
+
+
+def gbaoab(
+    batch: Batch,
+    force: Force,
+    x: Tensor,
+    v: Tensor,
+    forces: Tensor,
+    dt: float,
+    kT: float | Tensor,
+    friction: float,
+    *,
+    generator: torch.Generator | None = None,
+    time: float = 0.0,
+    **held: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One step of Langevin dynamics, g-BAOAB; differentiable as `rattle`, which tells what else is given.
+
+    Parameters
+    ----------
+    kT : float or Tensor
+        Temperature as an energy; a tensor is broadcast to velocities.
+    friction : float
+        Rate at which velocities are forgotten.
+    generator : torch.Generator, optional
+        Of the noise.
+    **held : Tensor
+        Targets and masses.
+
+    References
+    ----------
+    B. Leimkuhler and C. Matthews, Proc. R. Soc. A 472, 20160138 (2016).
+    """
+    masses = held.get("masses")
+    v = _kick(batch, x, v, forces, 0.5 * dt, time, masses)
+    x, v = _drift(batch, x, v, 0.5 * dt, time, **held)
+    kept = torch.exp(torch.as_tensor(-friction * dt, dtype=x.dtype, device=x.device))
+    noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
+    w = batch.weights(masses).reshape(*x.shape[:-1], 1)
+    v = kept * v + torch.sqrt((1 - kept * kept) * kT * w) * noise
+    v = batch.project_velocities(x, v, time=time + 0.5 * dt, masses=masses)
+    x, v = _drift(batch, x, v, 0.5 * dt, time + 0.5 * dt, **held)
+    forces = force(x)
+    return x, _kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces

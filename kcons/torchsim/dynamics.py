@@ -1,0 +1,234 @@
+"""Dynamics on constraints for `torch_sim.integrate`: constant energy, Langevin dynamics, Nosé-Hoover chains.
+
+Each is a pair (init, step) with the arguments and units of TorchSim's own. A failed step leaves the state as it was.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch_sim import SimState, calc_kinetic_energy
+from torch_sim.integrators import INTEGRATOR_KWARG_UNITS, IntegratorKwargUnits, MDState
+from torch_sim.integrators.md import InverseTimeArg, NoseHooverChain, TimeArg, construct_nose_hoover_chain
+from torch_sim.models.interface import ModelInterface
+from torch_sim.units import unit_factor_from_annotation
+
+from kcons.errors import ConvergenceError, NonFiniteError
+from kcons.torchsim.constraints_object import Constraints, constraints_of
+
+__all__ = ["Integrator", "NoseHooverState", "langevin", "nose_hoover", "nve"]
+
+#: Without other settings, as in TorchSim: tau over time step, and friction times time step.
+PERIODS, FRICTION = 10.0, 0.01
+
+State = TypeVar("State", bound=MDState)
+
+
+class Integrator(NamedTuple):
+    """What `torch_sim.integrate` takes: ``init(state, model, kT=...)``, then ``step(state, model, dt=..., kT=...)``."""
+
+    init: Callable[..., Any]
+    step: Callable[..., Any]
+
+
+@dataclass(kw_only=True)
+class NoseHooverState(MDState):
+    """State of dynamics with a chain of thermostats for each system; slices and joins keep the right chains.
+
+    Attributes
+    ----------
+    chain_positions, chain_momenta : torch.Tensor, shape (n_systems, chain_length)
+    tau, target_kT : torch.Tensor, shape (n_systems,)
+        Period of the first thermostat, and the thermal energy of the last step.
+    """
+
+    chain_positions: torch.Tensor
+    chain_momenta: torch.Tensor
+    tau: torch.Tensor
+    target_kT: torch.Tensor
+
+    _system_attributes = {*MDState._system_attributes, "chain_positions", "chain_momenta", "tau", "target_kT"}
+
+    def get_number_of_degrees_of_freedom(self) -> torch.Tensor:
+        """3n less the rank, less 3 where no row knows a place in space: the center of mass then stays at rest."""
+        return super().get_number_of_degrees_of_freedom() - 3 * _free(self)
+
+    @property
+    def chain(self) -> NoseHooverChain:
+        """The chain in the form of TorchSim, for example for `torch_sim.nvt_nose_hoover_invariant`."""
+        freedom = self.get_number_of_degrees_of_freedom()
+        masses = (self.target_kT * self.tau**2)[:, None].repeat(1, self.chain_positions.shape[1])
+        masses[:, 0] *= freedom
+        kinetic = calc_kinetic_energy(masses=self.masses, momenta=self.momenta, system_idx=self.system_idx)
+        # Functions of TorchSim write into the momenta.
+        return NoseHooverChain(self.chain_positions, self.chain_momenta.clone(), masses, self.tau, kinetic, freedom)
+
+
+def _start(state: SimState, model: ModelInterface, kT: Any, at_rest: bool) -> MDState:
+    """A state with forces, on the constraints, its momenta projected, or drawn if it has none."""
+    held = constraints_of(state)
+    held.check_fits(state)
+    start = copy.copy(state)
+    start.positions = held.move(state, state.positions)[0]
+    masses = state.masses[:, None]
+    given = getattr(state, "momenta", None)
+    if given is None:
+        given = torch.randn(start.positions.shape, device=state.device, dtype=state.dtype, generator=start.rng)
+        given = torch.sqrt(_each(state, kT, atoms=True) * masses) * given
+        if at_rest:
+            # Rows of systems that are free to move know no place in space: this leaves velocities on them.
+            sums = torch.zeros((state.n_systems, 4), dtype=state.dtype, device=state.device)
+            sums = sums.index_add(0, state.system_idx, torch.cat([given, masses], dim=1))
+            given = given - masses * (_free(state)[:, None] * sums[:, :3] / sums[:, 3:])[state.system_idx]
+    momenta = masses * held.tangent(start, given / masses)
+    output = model(start)
+    made = MDState.from_state(start, momenta=momenta, energy=output["energy"], forces=output["forces"])
+    made.store_model_extras(output)
+    return made
+
+
+def _free(state: SimState) -> torch.Tensor:
+    """1 for systems whose rows know no place in space, else 0; shape (n_systems,)."""
+    free = torch.ones(state.n_systems, dtype=torch.long, device=state.device)
+    held = constraints_of(state)
+    for motion, k in zip(held.motions, held.system_idx.tolist(), strict=True):
+        free[k] = all(item.translation_invariant for item in motion.constraint_set.constraints)
+    return free
+
+
+def _each(state: SimState, value: Any, atoms: bool = False) -> torch.Tensor:
+    """A number or one for each system, shape (n_systems,), or as a column for all atoms."""
+    numbers = torch.as_tensor(value, device=state.device, dtype=state.dtype).expand(state.n_systems)
+    return numbers[state.system_idx, None] if atoms else numbers.clone()
+
+
+def _whole(step: Callable[..., State]) -> Callable[..., State]:
+    """A step that fails leaves the state as it was; forces that are not finite are told as such."""
+
+    @functools.wraps(step)
+    def made(state: State, model: ModelInterface, **settings: Any) -> State:
+        before = dict(state.__dict__)
+        try:
+            return step(state, model, **settings)
+        except BaseException as error:
+            bad = (~torch.isfinite(state.forces).all(dim=1)).nonzero().ravel()
+            state.__dict__.clear()
+            state.__dict__.update(before)
+            if not isinstance(error, ConvergenceError):
+                raise
+            if not len(bad):
+                error.add_note("In TorchSim: take a smaller timestep; the state is as before the step")
+                raise
+            atom, system = int(bad[0]), int(state.system_idx[bad[0]])
+            raise NonFiniteError(
+                f"force of atom {atom} (in system {system}) is not finite: look at what the model returned; the state "
+                "is as before the step",
+                item="force",
+                atom=atom,
+            ) from error
+
+    return made
+
+
+def _project(state: MDState, held: Constraints) -> None:
+    masses = state.masses[:, None]
+    state.momenta = masses * held.tangent(state, state.momenta / masses)
+
+
+def _kick(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
+    """Let forces act for `dt`; those between atoms whose distance is held may be any."""
+    state.momenta = state.momenta + dt * state.forces
+    _project(state, held)
+
+
+def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
+    """Fly for `dt` and onto the constraints; momenta change by the same correction, and may leave the tangent plane."""
+    masses = state.masses[:, None]
+    positions, push = held.move(state, state.positions + dt * state.momenta / masses)
+    state.positions = positions
+    state.momenta = state.momenta + masses * push / dt
+
+
+def _evaluate(state: MDState, model: ModelInterface) -> None:
+    output = model(state)
+    state.energy, state.forces = output["energy"], output["forces"]
+    state.store_model_extras(output)
+
+
+def _nve_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any) -> MDState:
+    return _start(state, model, kT, at_rest=True)
+
+
+def _rattle(state: State, model: ModelInterface, dt: Any) -> State:
+    held, dt = constraints_of(state), _each(state, dt, atoms=True)
+    _kick(state, held, dt / 2)
+    _drift(state, held, dt)
+    _evaluate(state, model)
+    _kick(state, held, dt / 2)
+    return state
+
+
+@_whole
+def _nve_step(state: State, model: ModelInterface, *, dt: Any, **_: Any) -> State:
+    return _rattle(state, model, dt)
+
+
+def _langevin_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any) -> MDState:
+    return _start(state, model, kT, at_rest=False)
+
+
+@_whole
+def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, gamma: Any = None) -> MDState:
+    held, dt = constraints_of(state), _each(state, dt, atoms=True)
+    keep = torch.exp(torch.full_like(dt, -FRICTION) if gamma is None else -_each(state, gamma, atoms=True) * dt)
+    _kick(state, held, dt)
+    _drift(state, held, dt / 2)
+    noise = torch.randn(state.momenta.shape, device=state.device, dtype=state.dtype, generator=state.rng)
+    spread = torch.sqrt(_each(state, kT, atoms=True) * (1 - keep**2) * state.masses[:, None])
+    state.momenta = keep * state.momenta + spread * noise
+    _project(state, held)
+    _drift(state, held, dt / 2)
+    _project(state, held)
+    _evaluate(state, model)
+    return state
+
+
+def _nose_hoover_init(
+    state: SimState, model: ModelInterface, *, kT: Any, dt: Any, tau: Any = None, chain_length: int = 3
+) -> NoseHooverState:
+    made = _start(state, model, kT, at_rest=True)
+    rest = torch.zeros((state.n_systems, chain_length), dtype=state.dtype, device=state.device)
+    period = _each(state, PERIODS * dt if tau is None else tau)
+    chain = {"chain_positions": rest, "chain_momenta": rest.clone(), "tau": period, "target_kT": _each(state, kT)}
+    return NoseHooverState.from_state(made, **chain)
+
+
+@_whole
+def _nose_hoover_step(state: NoseHooverState, model: ModelInterface, *, dt: Any, kT: Any) -> NoseHooverState:
+    state.target_kT = _each(state, kT)
+    half_step = construct_nose_hoover_chain(dt, state.chain_positions.shape[1], 3, 3, state.tau).half_step
+    for first in (True, False):
+        momenta, chain = half_step(state.momenta, state.chain, state.target_kT, state.system_idx)
+        state.momenta, state.chain_positions, state.chain_momenta = momenta, chain.positions, chain.momenta
+        if first:
+            state = _rattle(state, model, dt)
+    return state
+
+
+#: Constant energy by RATTLE. Momenta are drawn without that of the center of mass.
+nve = Integrator(_nve_init, _nve_step)
+#: Langevin dynamics by geodesic BAOAB, with ``gamma`` as in TorchSim. Momenta are those before the kick, which have the
+#: right temperature.
+langevin = Integrator(_langevin_init, _langevin_step)
+#: Nosé-Hoover chains around RATTLE; ``tau`` and ``chain_length`` in ``init_kwargs``, as in TorchSim.
+nose_hoover = Integrator(_nose_hoover_init, _nose_hoover_step)
+
+# `torch_sim.integrate` converts settings of the integrators that are listed: from 1/ps and ps, as for its own.
+for pair, name, call, unit in ((langevin, "gamma", "step", InverseTimeArg), (nose_hoover, "tau", "init", TimeArg)):
+    factors = ((call, unit_factor_from_annotation(unit)),)
+    INTEGRATOR_KWARG_UNITS.update({pair: {name: IntegratorKwargUnits(factors)}})  # type: ignore[dict-item]

@@ -1,0 +1,48 @@
+"""Batches on PyTorch: iterations, derivatives, elimination by levels, images, failures; they need torch."""
+
+ENGINE, BATCH, GRADIENTS = (
+    "batched/test_" + name + ".py::test_" for name in ("against_the_engine", "batch", "gradients")
+)
+
+MUTANTS = {
+    "batched/clusters.py": [
+        ("torch.where(d > «0→-9e99», 0.0, torch.inf)", BATCH + "a_bond_that_has_turned_is_no_solution"),
+        (
+            "back = [«-each→each» for each in self.spread(slope, a)]",
+            GRADIENTS + "derivatives_are_those_of_the_solution",
+        ),
+        ("way=of.way «-→+» moved)", GRADIENTS + "derivatives_are_those_of_the_solution[blade]"),
+        ("(d * lam).sum(1).T«→*2».unsqueeze(-1)", ENGINE + "chains_and_rows_that_depend_on_others"),
+    ],
+    "batched/levels.py": [
+        (
+            "s.index_add_(0, taken, factor[which] * s[beside], alpha=«-1→1»)",
+            ENGINE + "chains_and_rows_that_depend_on_others",
+        ),
+    ],
+    "batched/groups.py": [
+        (
+            "sums = «-→+»torch.round(",
+            ENGINE + "rows_take_the_images_that_the_engine_takes",
+        ),
+    ],
+    "batched/projections.py": [
+        (
+            "torch.maximum(«group.worst→size», size / group.scale)",
+            BATCH + "a_failure_names_copy_and_row_when_it_is_looked_for",
+        ),
+    ],
+    "batched/row_functions.py": [
+        ("[«0.5→1.0» * middle + way", ENGINE + "families_are_held_as_the_engine_holds_them[CustomVelocity]"),
+    ],
+    "batched/batch.py": [
+        (
+            "torch.where(self._is_position, held, «flight→1.0» * middle)",
+            ENGINE + "families_are_held_as_the_engine_holds_them",
+        ),
+        ("made._lattice = self._lattice[«numbers→:1»]", BATCH + "systems_are_selected_with_their_cells"),
+    ],
+    "batched/steps.py": [
+        ("v + found.push / «h→(2 * h)»", BATCH + "rattle_is_that_of_the_engine_and_reversible"),
+    ],
+}

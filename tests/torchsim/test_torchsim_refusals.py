@@ -1,0 +1,153 @@
+"""What is refused, each before anything has changed, in a sentence with a remedy."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import torch_sim as ts
+from torch_models import Butanes, Drops, K, butane, drop, state_of
+
+from kcons.constraints import Distance, LinearVelocity
+from kcons.errors import InputError, UnsupportedError
+from kcons.torchsim import hold, nve, report
+
+
+def held(n=2):
+    state = drop(n)
+    hold(state, "water")
+    return state
+
+
+@pytest.mark.parametrize(
+    ("constraints", "options", "says"),
+    [
+        ("hbond", {}, "did you mean 'hbonds'"),
+        ("hbonds, allbonds", {}, "two names of bonds"),
+        ("water", {"water_geometry": "tip9p"}, "no water model"),
+        ("allbonds", {"bonds": [[0, 99]]}, "99"),
+        ([], {}, "nothing is to be held"),
+        ([Distance([0, 40])], {}, "40"),
+        ([Distance([0, 1], [2.0])], {}, "project=True"),
+        ([3.0], {}, "constraints of kcons.constraints"),
+    ],
+    ids=str,
+)
+def test_bad_input_is_named_and_leaves_the_state(constraints, options, says):
+    state = drop(2)
+    x = state.positions.clone()
+    with pytest.raises(InputError, match=says):
+        hold(state, constraints, **options)
+    assert state.constraints == [] and torch.equal(state.positions, x)
+
+
+def test_the_system_is_named():
+    state = ts.concatenate_states([drop(2), drop(2, 1)])
+    state.positions[7, 0] += 0.2
+    with pytest.raises(InputError, match="Distance") as error:
+        hold(state, "water", water_geometry="tip3p")
+    assert "system 1" in " ".join(error.value.__notes__)
+
+
+@pytest.mark.parametrize(
+    "row", [Distance([0, 1], lambda t: [1.0 + t]), LinearVelocity(0, [[1, 0, 0]])], ids=["moving target", "velocities"]
+)
+def test_rows_that_need_the_time_are_refused(row):
+    with pytest.raises(UnsupportedError, match=r"kcons\.steppers"):
+        hold(drop(1), [row])
+
+
+def test_other_objects_are_refused():
+    with pytest.raises(InputError, match=r"torch_sim\.SimState"):
+        hold(drop(1).to_atoms(), "water")
+    with pytest.raises(InputError, match=r"call kcons\.torchsim\.hold"):
+        nve.init(drop(1), Drops(), kT=300 * K)
+    with pytest.raises(InputError, match=r"call kcons\.torchsim\.hold"):
+        report(drop(1))
+
+
+def test_constraints_of_torchsim_beside_are_refused():
+    state = drop(2)
+    state.constraints = ts.constraints.FixCom([0])
+    with pytest.raises(UnsupportedError, match="FixCom"):
+        hold(state, "water")
+    state = held()
+    with pytest.raises(InputError, match="in one call"):
+        hold(state, "water")
+    state.constraints = [*state.constraints, ts.constraints.FixCom([0])]
+    with pytest.raises(UnsupportedError, match="FixCom"):
+        nve.init(state, Drops(), kT=300 * K)
+
+
+@pytest.mark.parametrize("integrator", ["nve", "nvt_langevin", "nvt_nose_hoover", "nvt_vrescale"])
+def test_integrators_of_torchsim_are_refused(integrator):
+    """They cool the system: positions are corrected and momenta are not."""
+    with pytest.raises(UnsupportedError, match=r"kcons\.torchsim\.nve, langevin or nose_hoover"):
+        ts.integrate(held(), Drops(), integrator=ts.Integrator(integrator), n_steps=2, temperature=300, timestep=0.001)
+
+
+@pytest.mark.filterwarnings("ignore")  # TorchSim's own about constraints
+@pytest.mark.parametrize("integrator", [name for name in ts.Integrator if name.startswith("npt")])
+def test_constant_pressure_is_refused(integrator):
+    x = drop(8).positions.numpy()
+    state = state_of(x, [8, 1, 1] * 8, np.tile([15.999, 1.008, 1.008], 8), cell=9.3 * np.eye(3))
+    hold(state, "water")
+    with pytest.raises(UnsupportedError, match="at constant pressure there is none"):
+        ts.integrate(
+            state,
+            WithStress(),
+            integrator=integrator,
+            n_steps=2,
+            temperature=300,
+            timestep=0.001,
+            external_pressure=0.0,
+        )
+
+
+class WithStress(Drops):
+    def __init__(self):
+        super().__init__()
+        self._compute_stress = True
+
+    def forward(self, state, **_):
+        return {**super().forward(state), "stress": torch.zeros((state.n_systems, 3, 3), dtype=state.dtype)}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda state: setattr(state, "masses", 2 * state.masses), "mass"),
+        (lambda state: setattr(state, "cell", 1.1 * state.cell), "cell"),
+    ],
+    ids=["masses", "cell"],
+)
+def test_a_state_that_has_become_another_is_refused(change, says):
+    x = drop(2).positions.numpy()
+    state = state_of(x, [8, 1, 1] * 2, np.tile([15.999, 1.008, 1.008], 2), cell=12.0 * np.eye(3))
+    hold(state, "water")
+    change(state)
+    with pytest.raises(InputError, match=rf"system 0 .*{says}.*hold again"):
+        nve.init(state, Drops(), kT=300 * K)
+
+
+def test_rows_that_are_singular_are_converted():
+    """Three distances of atoms in a line are singular at second order."""
+    line = state_of([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]], [8, 6, 8], [16.0, 12.0, 16.0])
+    hold(line, Distance([[0, 1], [1, 2], [0, 2]]))
+    assert line.get_number_of_degrees_of_freedom().tolist() == [5]
+
+
+def test_bonds_that_are_given_are_taken():
+    state, bonds = butane(), Butanes().first.T.tolist()
+    with pytest.raises(InputError, match="has no bonds of"):
+        hold(state, "allbonds", bonds=bonds[1:4], guess_bonds=False)
+    hold(state, "allbonds", bonds=bonds, guess_bonds=False)
+    assert state.constraints[0].motions[0].rank == 13
+
+
+def test_importing_kcons_imports_no_torch():
+    code = "import sys, kcons, kcons.ase; print({'torch', 'torch_sim'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"
