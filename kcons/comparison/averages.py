@@ -211,14 +211,13 @@ def compare_averages(
     *,
     cheap: TestSystem | None = None,
     steps: Sequence[float] | None = None,
-    frictions: Sequence[float] | None = None,
     budget: Positive = 20.0,
     rng: Rng = 1,
     done: pd.DataFrame | None = None,
     keep: Callable[[pd.DataFrame], None] | None = None,
     watcher: Watcher | None = None,
 ) -> pd.DataFrame:
-    """Run samplers at several steps and frictions.
+    """Run samplers at several steps, with frictions of 1 in 12.5 and 1 in 50 steps of the cheap forces.
 
     Parameters
     ----------
@@ -231,8 +230,6 @@ def compare_averages(
     steps : sequence of float, optional
         In the unit of time that is shown; by default those of the test system, or 1, 2 and 4 steps of the cheap forces
         (samplers that do not use these: 1 and 2).
-    frictions : sequence of float, optional
-        Internal units; 1 in 12.5 and 1 in 50 steps of the cheap forces by default.
     budget : float
         Seconds of processor time for each sampler over all its runs.
     rng : int, numpy.random.Generator or None
@@ -249,8 +246,8 @@ def compare_averages(
     Raises
     ------
     InputError
-        Unknown sampler; a system without a temperature; other atoms or constraints with the cheap forces; steps,
-        frictions or a budget that are not positive.
+        Unknown sampler; a system without a temperature; other atoms or constraints with the cheap forces; steps or a
+        budget that are not positive.
     """
     if not system.thermal_energy:
         raise InputError(f"{system.name} has no temperature: compare its trajectories instead", item="criterion")
@@ -261,7 +258,7 @@ def compare_averages(
     for step in steps or ():
         if not (math.isfinite(step) and step > 0):
             raise InputError(f"time step {step:g} {system.units.time}: give a positive number", item="dt")
-    rates = [rate / inner for rate in FRICTIONS] if frictions is None else list(frictions)
+    rates = [rate / inner for rate in FRICTIONS]
     planned: dict[str, list[tuple[float, float]]] = {}
     for sampler in chosen:
         usual = [k * inner for k in ((1, 2, 4) if sampler.several else (1, 2))] if cheap else system.time_steps

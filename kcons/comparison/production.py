@@ -77,7 +77,7 @@ def _climb(system: TestSystem, dt: float, seconds: float) -> float:
     energies: list[float] = []
     for _ in range(RECORDS):
         state = run(made, state, dt, every, stepper=stepper)
-        energies.append(system.potential.watched_energy(state.positions) + made.kinetic_energy(state.velocities))
+        energies.append(system.potential.watched(state.positions)[0] + made.kinetic_energy(state.velocities))
     found = slope(np.arange(float(RECORDS)), np.array(energies))
     return found.value / found.error if found.error > 0 else 0.0
 

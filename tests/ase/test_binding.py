@@ -67,21 +67,6 @@ def test_company_on_the_same_atoms_is_refused(other, first):
         atoms.get_forces()
 
 
-def test_constrain_beside_something_else():
-    atoms = loose_waters(2)
-    atoms.set_constraint(FixAtoms([4]))
-    held = constrain(atoms, Distance([0, 1]))
-    assert [type(c).__name__ for c in atoms.constraints] == ["FixAtoms", "Constraints"]
-    assert atoms.get_number_of_degrees_of_freedom() == 18 - 3 - 1
-    new = atoms.positions + np.random.default_rng(0).normal(scale=0.01, size=(6, 3))
-    fixed = atoms.positions[4].copy()
-    atoms.set_positions(new)
-    assert np.array_equal(atoms.positions[4], fixed) and off(atoms, held) <= 1e-14
-    with pytest.raises(UnsupportedError, match="FixAtoms acts on atom 4"):
-        constrain(atoms, Distance([4, 5]))
-    assert len(atoms.constraints) == 2
-
-
 def test_forces_only_company_is_welcome():
     atoms, held = rigid(2)
     atoms.set_constraint([held, Hookean(a1=0, a2=3, rt=2.5, k=1.0), FixCom()])
@@ -139,15 +124,6 @@ def test_a_new_cell_does_not_rebuild_the_engine():
     # A copy with another cell gets the engine with its own.
     assert peer.constraints[0].engine(peer).constraint_set.half_width == pytest.approx(3)
     assert held.engine(atoms).constraint_set.half_width == pytest.approx(2.95)
-
-
-def test_rows_that_are_given_anew_are_held():
-    atoms = molecule("CH3CH2OH")
-    held = constrain(atoms, Distance([0, 1]))
-    held.constraints = (*held.constraints, Distance([1, 2]))
-    assert atoms.get_number_of_degrees_of_freedom() == 27 - 2
-    atoms.set_positions(atoms.positions + np.random.default_rng(0).normal(scale=0.01, size=(9, 3)))
-    assert off(atoms, held) <= 1e-14
 
 
 def test_copies_in_cells_of_their_own():

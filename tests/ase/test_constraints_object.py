@@ -10,12 +10,12 @@ from ase import Atoms, units
 from ase.build import fcc111, molecule
 from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
-from ase.constraints import FixAtoms, FixBondLengths
+from ase.constraints import FixBondLengths
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, Free, loose_waters, off, random, rigid, slip
 
-from kcons.ase import ConstrainedDynamics, Constraints, constrain, rigid_water
+from kcons.ase import Constraints, constrain, rigid_water
 from kcons.ase.topology import bonds_of
 from kcons.constraints import CenterDistance, Dihedral, Distance
 from kcons.errors import ContradictionError, InfeasibleError, InputError
@@ -255,26 +255,6 @@ def test_projection_that_fails_late_changes_nothing(error, monkeypatch):
     assert np.array_equal(atoms.positions, before)
     assert np.array_equal(atoms.get_momenta(), momenta, equal_nan=True)
     assert atoms.constraints == []
-
-
-@pytest.mark.parametrize(
-    ("given", "named"),
-    [
-        (FixAtoms([0]), r"FixAtoms\(indices=\[0\]\) is no kcons constraint; from_ase_constraints"),
-        (Constraints(Distance([0, 1])), r"Constraints\(1 rows.* is no kcons constraint.* the attribute constraints"),
-        (None, "None is no kcons constraint"),
-        (["hbonds"], r"'hbonds' is no kcons constraint.* constraints_of\(atoms, name\)"),
-        ("hbonds", r"'hbonds' is no kcons constraint.* constraints_of\(atoms, name\)"),
-    ],
-)
-def test_what_is_no_constraint_is_named(given, named):
-    atoms = molecule("H2O")
-    atoms.calc = Free()
-    with pytest.raises(InputError, match=named):
-        Constraints(given)
-    with pytest.raises(InputError, match=named):
-        ConstrainedDynamics(atoms, FS, constraints=given)
-    assert atoms.constraints == [] and "momenta" not in atoms.arrays
 
 
 # -- changes of the atoms ---------------------------------------------------------------------------

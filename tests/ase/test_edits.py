@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ase import units
 from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.md.andersen import Andersen
 from ase.md.bussi import Bussi
 from ase.md.langevin import Langevin
-from ase.md.nptberendsen import NPTBerendsen
 from ase.md.nvtberendsen import NVTBerendsen
 from ase.md.verlet import VelocityVerlet
 from ase.optimize import BFGS, FIRE
-from ase_systems import FS, Free, dumbbells, off, random, water_gas
+from ase_systems import FS, Free, off, random, water_gas
 
 from kcons.ase import (
     ConstrainedDynamics,
@@ -156,15 +154,6 @@ def test_an_edit_in_a_new_cell_is_an_edit():
     atoms.positions[0] += 0.05
     with pytest.raises(InputError, match=r"restore\(atoms\)"):
         run.run(1)
-
-
-def test_berendsen_scales_atoms_in_each_step():
-    atoms, held = dumbbells(6)
-    pressure = {"pressure_au": units.bar, "taup": 100 * FS, "compressibility_au": 10 / units.GPa}
-    run = NPTBerendsen(atoms, FS, temperature_K=300, taut=100 * FS, **pressure)
-    volume = atoms.get_volume()
-    run.run(20)
-    assert atoms.get_volume() != volume and off(atoms, held) <= 1e-12
 
 
 # -- what is at fault -------------------------------------------------------------------------------

@@ -60,12 +60,3 @@ def test_waters_in_nanometers():
     with pytest.raises(InputError, match="multiply by 10 where these are in nm") as raised:
         rigid_water(water, "tip3p")
     assert list(raised.value.atoms) == [0]
-
-
-@pytest.mark.parametrize("geometry", [(1.0, 200.0), (1.0, 1.9106), (-1, 100), (1,), 1.0, ("a", "b"), (np.nan, 100)])
-def test_a_geometry_that_is_none_is_refused(geometry):
-    water = molecule("H2O")
-    with pytest.raises(InputError, match=r"geometry|degrees"):
-        rigid_water(water, geometry)
-    with pytest.raises(InputError, match=r"geometry|degrees"):
-        constraints_of(water, water_geometry=geometry)

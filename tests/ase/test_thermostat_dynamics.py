@@ -424,15 +424,8 @@ def test_another_calculator_on_the_atoms():
 # -- failures ---------------------------------------------------------------------------------------
 
 BAD = [
-    ("isokinetic", {"temperature_K": "hot"}, "temperature_K is .*give a positive number"),
-    ("nose-hoover", {"tdamp": 0}, "tdamp is 0"),
     ("langevin", {"step": math.nan}, "the time step is"),
     ("langevin", {"step": -FS}, "noise cannot be taken back"),
-    ("monte carlo", {"keep": 1.5}, "keep is 1.5"),
-    ("two steps", {"fast_steps": 1}, "both take 1 steps"),
-    ("two steps", {"bath": "hot"}, "bath is 'hot'"),
-    ("two steps", {"slow": 3}, "slow is 3; give an ASE calculator"),
-    ("two steps", {"auxiliary": 2}, "auxiliary is no option with bath='langevin'"),
     ("spheres", {"spheres": "axes", "auxiliary": 0}, "radius 0"),
 ]
 
@@ -444,20 +437,6 @@ def test_bad_input_changes_nothing(kind, options, words):
     with pytest.raises((InputError, UnsupportedError), match=words):
         made(kind, atoms, **options).run(1)
     assert equal(before, state(atoms)) and (atoms.calc is calculator or "step" in options)
-
-
-def test_one_calculator_twice_and_calculators_of_other_atoms():
-    class Stubborn(Waves):
-        """Of atoms of its own, whatever it is asked for."""
-
-        def get_forces(self, atoms):
-            return super().get_forces(waters(3))
-
-    calc = Waves()
-    with pytest.raises(InputError, match="the same calculator"):
-        made("two steps", waters(2), fast=calc, slow=calc)
-    with pytest.raises(InputError, match=r"slow computes forces of shape \(9, 3\) of 9 atoms \(H6O3\), not of these 6"):
-        made("two steps", waters(2), fast=calc, slow=Stubborn(), difference=True)
 
 
 def test_isokinetic_without_motion():
@@ -565,16 +544,6 @@ def test_monte_carlo_is_what_arrays_give(stepper, step):
     assert dyn.get_time() == pytest.approx(there.time)
 
 
-def test_a_proposal_costs_what_its_stepper_costs():
-    """One evaluation for the start, then those of the stepper: none for energies, rejections or ways back."""
-    atoms = wells()
-    dyn = sampler(atoms, steps=3, stepper=BlanesMoan4(), timestep=14 * FS)
-    before = atoms.calc.calls
-    dyn.run(20)
-    assert 0 < dyn.counts.accepted < 20
-    assert atoms.calc.calls - before <= 20 * 18 + 1
-
-
 def test_logs_and_trajectories_of_proposals(tmp_path):
     atoms, energies = wells(), []
     dyn = sampler(atoms, timestep=7 * FS, trajectory=str(tmp_path / "run.traj"))
@@ -642,15 +611,6 @@ def test_logs_and_trajectories_cost_no_call(tmp_path):
     both = Waves().get_potential_energy(atoms) + Waves(0.05).get_potential_energy(atoms)
     assert frames[-1].get_potential_energy() == pytest.approx(both, rel=1e-12)
     assert len((tmp_path / "run.log").read_text().splitlines()) == 6
-
-
-def test_slow_kicks_in_the_middle_of_a_step():
-    atoms, slow = waters(2), Waves(0.05)
-    moving = made("spheres", atoms, 4 * FS, slow=slow, slow_kicks="middle")
-    moving.run(5)
-    assert slow.calls == 6 and moving.evaluations == {"fast": 25, "slow": 5}  # one call looked whether it fits
-    assert moving.state.forces is None
-    assert "slow_kicks='middle'" in repr(moving.stepper)
 
 
 def test_forces_that_ase_objects_add():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from functools import partial
 from pathlib import Path
 
 import ase.io
@@ -13,12 +12,9 @@ from ase import Atoms
 from ase.build import molecule
 
 from kcons.ase import (
-    ConstrainedLangevin,
     constrain,
     constraints_of,
-    draw_velocities,
     repartition_hydrogen_mass,
-    rigid_water,
 )
 from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, repair_elements, snapshot_of, velocities_of
 from kcons.errors import InputError
@@ -31,9 +27,6 @@ def peptide():
     atoms.new_array("residuenames", np.array(["SER"] * 4))
     atoms.new_array("residuenumbers", np.array([4] * 4))
     return atoms
-
-
-LANGEVIN = {"timestep": 1.0, "temperature_K": 300, "friction": 0.01}
 
 
 def test_bonds_are_guessed_where_none_are_given():
@@ -54,15 +47,6 @@ def test_a_molecule_that_ase_wrote_to_a_pdb_file_keeps_its_bonds(tmp_path):
         assert rows[0].atoms.tolist() == wanted[0].atoms.tolist()
         with pytest.warns(UserWarning, match="8 bonds were guessed"):
             assert constraints_of(back, held)[0].n_rows == rows[0].n_rows
-
-
-@pytest.mark.parametrize("call", [constraints_of, constrain, ConstrainedLangevin, draw_velocities, rigid_water])
-def test_a_list_of_frames_is_no_atoms(call):
-    more = {constrain: {"constraints": []}, ConstrainedLangevin: LANGEVIN, draw_velocities: {"temperature_K": 300}}
-    call = partial(call, **more.get(call, {}))
-    with pytest.raises(InputError, match=r"atoms must be an ase.Atoms .* not list; of several, give one") as caught:
-        call([molecule("H2O")])
-    assert caught.value.item == "atoms"
 
 
 def test_atoms_without_a_place_have_no_bonds():

@@ -199,7 +199,6 @@ def test_a_sampler_of_ones_own_goes_on_and_its_lines_run():
         ({"budget": 0}, "budget is 0; give a positive number"),
         ({"steps": [4.0, -3.0]}, "time step -3 fs: give a positive number"),
         ({"steps": [4.0, 4000.0]}, "a step of 4000 fs is too long"),
-        ({"frictions": [0.1, -1.0]}, "friction is"),
         ({"system": small("rotor")}, "rotor has no temperature"),
         ({"cheap": small("water")}, "different atoms"),
         ({"cheap": replace(chain(), constraint_set=FEWER)}, "different constraints"),

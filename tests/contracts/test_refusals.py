@@ -25,6 +25,7 @@ from kcons.errors import (
     InfeasibleError,
     InputError,
     KconsError,
+    NonFiniteError,
     SingularGeometryError,
     UnsupportedError,
 )
@@ -52,6 +53,8 @@ def names() -> dict[str, Any]:
     held = kcons.ConstraintSet(kcons.constraints.Distance([0, 1]), X, MASSES)
     motion = kcons.Motion(held, X)
     system = kcons.System(motion, force)
+    groups = kcons.thermostats.ForceGroups({"fast": force, "slow": lambda x, t: -2 * x})
+    moving = kcons.Motion(kcons.ConstraintSet(kcons.constraints.Distance([0, 1], lambda t: 1.0 + t), X, MASSES), X)
     atoms = molecule("H2O")
     atoms.calc = EMT()
     return found | {
@@ -66,6 +69,9 @@ def names() -> dict[str, Any]:
         "HELD": held,
         "MOTION": motion,
         "SYSTEM": system,
+        "GROUPED": kcons.System(motion, groups),
+        "MOVING": kcons.System(moving, force),
+        "TWO": {"temperature_K": 300, "friction": 0.1, "fast_steps": 4},
         "STATE": system.initial_state(X),
         "ATOMS": atoms,
         "openmm_system": openmm_system,
@@ -352,6 +358,49 @@ REFUSED: list[tuple[str, type[KconsError], str | None]] = [
     ("Splitting([1.0], [1.0])", InputError, "kicks"),
     ("ConstrainedDynamics(ATOMS.copy(), 0.1, Rattle)", InputError, "stepper"),
     ("MOTION.acceleration(X, V, X / 0)", InputError, "force"),
+    ("TemperatureSplit(SYSTEM).add(X[:2])", InputError, "positions"),
+    ("TemperatureSplit(SYSTEM).add(X, X[:2])", InputError, "forces"),
+    ("TemperatureSplit(SYSTEM).add(X * nan)", InputError, ""),
+    ("TemperatureSplit(SYSTEM).add(X, X * nan)", NonFiniteError, "force"),
+    ("TemperatureSplit(SYSTEM).result()", InputError, "samples"),
+    ('TemperatureSplit(SYSTEM, groups={"ends": [1]}).add(X)', InputError, "groups"),
+    ("TemperatureSplit(MOVING)", UnsupportedError, None),
+    ('slow_share(GROUPED, [X], "medium")', InputError, "group"),
+    ("slow_share(GROUPED, X)", InputError, "frames"),
+    ("slow_share(GROUPED, X[None, :3])", InputError, "positions"),
+    ("slow_share(GROUPED, X[None, ::-1])", InputError, "positions"),
+    ("slow_share(GROUPED, X[None], displacement=0.0)", InputError, "displacement"),
+    ("slow_share(SYSTEM, X[None])", UnsupportedError, None),
+    ("slow_share(System(MOVING.motion, GROUPED.force), X[None])", UnsupportedError, None),
+    ("mean([1.0, 2.0, 3.0, nan] * 10)", InputError, "values"),
+    ("ForceGroups.difference(force, force)", InputError, "slow"),
+    ("ForceGroups.difference(lambda x, t: x[:2], force)(X, 0.0)", InputError, "forces"),
+    ('ForceGroups({"fast": force, "slow": lambda x, t: x[:2]})(X, 0.0)', InputError, "slow"),
+    ("NoseHooverChain(1.0, 1.0).check(MOVING)", UnsupportedError, None),
+    ("Isokinetic(1.0).check(MOVING)", UnsupportedError, None),
+    ("IsokineticSpheres(1.0, 1.0, 3).check(MOVING)", UnsupportedError, None),
+    ('IsokineticDynamics(ATOMS.copy(), 0.1, "hot")', InputError, "temperature_K"),
+    ("ConstrainedNoseHoover(ATOMS.copy(), 0.1, 300, 0)", InputError, "tdamp"),
+    ("ConstrainedMonteCarlo(ATOMS.copy(), 0.1, 300, 3, keep=1.5)", InputError, "keep"),
+    ("MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=ATOMS.calc, **TWO)", InputError, "slow"),
+    ("MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=3, **TWO)", InputError, "slow"),
+    ('MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=3, **{**TWO, "fast_steps": 1})', InputError, "steps"),
+    ('MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=3, bath="hot", **TWO)', InputError, "bath"),
+    ("MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=3, auxiliary=2, **TWO)", InputError, "auxiliary"),
+    ('ConstrainedDynamics(ATOMS.copy(), "fast")', InputError, "timestep"),
+    ("ConstrainedDynamics(ATOMS.copy(), 0.1, time=nan)", InputError, "time"),
+    ('ConstrainedDynamics(ATOMS.copy(), 0.1, constraints="hbonds")', InputError, "constraints"),
+    ("Constraints(None)", InputError, "constraints"),
+    ('Constraints("hbonds")', InputError, "constraints"),
+    ("rigid_water(ATOMS, (1.0, 200.0))", InputError, "water_geometry"),
+    ("rigid_water(ATOMS, 1.0)", InputError, "water_geometry"),
+    ("rigid_water(ATOMS[:2])", InputError, "atoms"),
+    ("constraints_of([ATOMS])", InputError, "atoms"),
+    ("constraints_of(ATOMS, water_geometry=(-1, 100))", InputError, "water_geometry"),
+    ("draw_velocities([ATOMS], 300)", InputError, "atoms"),
+    ("PressureReporter(None)", InputError, "dynamics"),
+    ('PressureReporter(None, virial="mol")', InputError, "virial"),
+    ('PressureReporter(None, virial="atomic", temperature_K=300)', InputError, "thermal_energy"),
 ]
 
 

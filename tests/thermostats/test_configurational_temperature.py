@@ -10,7 +10,7 @@ import pytest
 from thermostat_systems import dumbbells, quartic, system, waves
 
 from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
-from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.errors import InputError
 from kcons.steppers import State, run
 from kcons.thermostats import (
     Estimate,
@@ -382,31 +382,6 @@ def test_molecules_across_the_border_of_a_box():
 # -- bad input --------------------------------------------------------------------------------------
 
 
-def test_bad_input():
-    held, x = dumbbells(2)
-    split = TemperatureSplit(held)
-    with pytest.raises(InputError, match="positions must have shape"):
-        split.add(x[:2])
-    with pytest.raises(InputError, match="forces must have shape"):
-        split.add(x, np.zeros((2, 3)))
-    broken = x.copy()
-    broken[1, 2] = np.nan
-    with pytest.raises(InputError, match="positions of atom 1"):
-        split.add(broken)
-    with pytest.raises(NonFiniteError):
-        split.add(x, broken)
-    assert len(split) == 0
-    with pytest.raises(InputError, match="0 samples are too few"):
-        split.result()
-    with pytest.raises(InputError, match="group 'ends' has no first atom of a cluster"):
-        TemperatureSplit(held, groups={"all": [0, 1, 2, 3], "ends": [1, 3]}).add(x)
-    with pytest.raises(InputError, match="one atom only"):
-        TemperatureSplit(system([], [[0.0, 0, 0]], [1.0], quartic)).add([[0.1, 0, 0]])
-    fixed = system([FixedAtoms([0])], [[0.0, 0, 0]], [1.0], quartic)
-    with pytest.raises(InputError, match="all atoms are fixed"):
-        TemperatureSplit(fixed).add([[0.0, 0, 0]])
-
-
 def test_frames_off_the_constraints():
     """As of files in few digits, or of another cell."""
     held, x = dumbbells(2)
@@ -418,10 +393,3 @@ def test_frames_off_the_constraints():
         split.add(off)
     assert len(split) == 1 and tuple(caught.value.atoms) == (2, 3)
     split.add(held.motion.restore_positions(off))
-
-
-def test_refused():
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    moving = system([Distance([[0, 1]], lambda t: np.array([1.0 + t]))], x, [1.0, 1.0], quartic)
-    with pytest.raises(UnsupportedError, match="targets rest"):
-        TemperatureSplit(moving)

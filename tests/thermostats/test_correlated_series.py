@@ -10,7 +10,6 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 from thermostat_systems import system
 
-from kcons.errors import InputError
 from kcons.free_energy import weighted_mean
 from kcons.thermostats import TemperatureSplit, mean
 from kcons.thermostats.configurational_temperature import temperature
@@ -124,12 +123,12 @@ def test_errors_of_ratios():
 @pytest.mark.filterwarnings("ignore:temperature of")
 def test_errors_of_temperatures_by_kind_of_motion():
     """Pairs of atoms in traps, which forget where they were in 4 samples: each pair is a run of its own."""
-    kT, pairs, samples = 0.8, 50, 640
+    kT, pairs, samples = 0.8, 250, 640
     stiff = np.tile([[1.0, 2.0, 3.0], [2.0, 1.0, 0.5]], (pairs, 1))
     held = system([], np.zeros((2 * pairs, 3)), np.tile([1.0, 2.0], pairs), lambda x, t: -stiff * x)
     groups = {f"pair {k}": [2 * k, 2 * k + 1] for k in range(pairs)}
     rng, found = np.random.default_rng(4), []
-    for _ in range(20):
+    for _ in range(4):
         split = TemperatureSplit(held, displacement=1e-3, groups=groups)
         for x in fading(rng, samples, 4.0, 6 * pairs).reshape(-1, 2 * pairs, 3) * np.sqrt(kT / stiff):
             split.add(x, -stiff * x)
@@ -186,8 +185,3 @@ def test_units_and_offsets_do_not_matter():
 def test_series_of_any_length_have_an_error(count):
     values = np.random.default_rng(count).standard_normal(count)
     assert 0.3 < spread(values).error * math.sqrt(count) < 3.0
-
-
-def test_what_is_no_number_is_refused():
-    with pytest.raises(InputError, match="number 3 of values is not finite"):
-        mean([1.0, 2.0, 3.0, math.nan] * 10)

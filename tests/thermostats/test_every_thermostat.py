@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from thermostat_systems import distance, molecules, quartic, quartic_potential, waves, waves_potential
 
-from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State, System, run
 from kcons.thermostats import (
@@ -115,22 +114,6 @@ def test_steps_and_systems_that_cannot_be(name):
     after = stepper.step(held, state, 0.1)
     still = stepper.step(held, after, 0.0)
     assert np.array_equal(still.positions, after.positions) and np.array_equal(still.velocities, after.velocities)
-
-
-def test_targets_that_move_are_refused_where_they_have_no_place():
-    _, state = begun()
-    moving = molecules("bent", 3, ions=1)[0].motion
-    rows = [Distance([[0, 1]], lambda t: 1 + 0.1 * t)]
-    driven = System(
-        type(moving)(type(moving.constraint_set)(rows, state.positions, np.ones(10)), state.positions), waves
-    )
-    for stepper, words in (
-        (NoseHooverChain(0.5, 1.0), "targets move"),
-        (Isokinetic(0.5), "targets move"),
-        (IsokineticSpheres(0.5, 1.0, 3), "Distance has a target that moves"),
-    ):
-        with pytest.raises(UnsupportedError, match=words):
-            stepper.check(driven)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Energies and forces of a test system, the same for every method that runs it.
 
-A `Potential` remembers its last point, so that an MD engine asking twice pays once, and counts and times what
-it evaluates. `PotentialCalculator` hands it to ASE.
+A `Potential` remembers its last point, so that an MD engine asking twice pays once, and counts what it evaluates.
+`PotentialCalculator` hands it to ASE.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 from ase import Atoms
 from ase.calculators import calculator as of_ase
 
-from kcons.constraints.compilation import clock
 from kcons.constraints.target import FloatArray
 from kcons.errors import CalculatorError
 
@@ -36,15 +35,12 @@ class Potential:
     ----------
     evaluations : int
         Points evaluated so far.
-    seconds : float
-        Wall time they took.
     """
 
     def __init__(self, evaluate: Evaluate, name: str) -> None:
         self._evaluate = evaluate
         self.name = name
         self.evaluations = 0
-        self.seconds = 0.0
         self._last: FloatArray | None = None
         self._energy = 0.0
         self._forces: FloatArray | None = None
@@ -67,22 +63,15 @@ class Potential:
         energy, forces = self._evaluate(x)
         return float(energy), np.asarray(forces, float)
 
-    def watched_energy(self, x: FloatArray) -> float:
-        """The energy of `watched`."""
-        return self.watched(x)[0]
-
     def forget(self) -> None:
         """Start counting anew; the next point is evaluated whatever it is."""
         self._last = None
         self.evaluations = 0
-        self.seconds = 0.0
 
     def _update(self, x: FloatArray) -> None:
         if self._last is not None and np.array_equal(self._last, x):
             return
-        start = clock()
         energy, forces = self._evaluate(x)
-        self.seconds += clock() - start
         self.evaluations += 1
         self._last, self._energy, self._forces = np.array(x, dtype=float), float(energy), np.asarray(forces, float)
 

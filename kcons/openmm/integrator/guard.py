@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import warnings
 import weakref
 from collections.abc import Iterable
 from time import perf_counter
@@ -36,6 +37,8 @@ logger = logging.getLogger("kcons.openmm")
 
 #: With a note in the log, unless it is what a looser tolerance or single precision leaves.
 TIDY = 1e-4
+#: Spacing of coordinates, of the length of a row, beyond which a warning is given.
+COARSE = 1e-11
 #: Speed of light, nm/ps: a System whose particles are faster on average has exploded.
 _LIGHT = 299792.458
 #: How often OpenMM's solver is asked for positions: that of OpenCL may need a second call from starts that are off.
@@ -257,6 +260,7 @@ class Guard:
                 else:
                     part.check(context)
             if not self.started:
+                self._tell_of_rounding(positions_of(context))
                 warn_of_barostat(context, getattr(integrator.ensemble, "temperature", None), stacklevel=5)
                 integrator.ensemble.begin(integrator, context)
         except Exception:
@@ -265,6 +269,19 @@ class Guard:
             raise
         self.started = True
         self._remember(context.getState(positions=True, velocities=True))
+
+    def _tell_of_rounding(self, x: FloatArray) -> None:
+        """Warn of coordinates so large that their rounding adds noise to the velocities."""
+        for motion in (part.motion for part in self.integrator.parts if hasattr(part, "motion")):
+            held = motion.constraint_set
+            reach = float(np.abs(x[held.touched]).max(initial=0.0))
+            grain = 2 * self.precision.place * reach
+            if self.precision.name != "single" and held.n_rows and grain > COARSE * held.scale.min():
+                warnings.warn(
+                    f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} "
+                    "nm; each step turns this into velocity, and the energy wanders. Move the origin nearer",
+                    stacklevel=5,
+                )
 
     def _put_right(self, x: FloatArray) -> None:
         """Bring positions that are near the constraints onto them."""

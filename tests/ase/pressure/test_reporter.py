@@ -9,7 +9,6 @@ from ase.build import bulk, fcc111
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
 from ase.constraints import FixAtoms, Hookean
-from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, TEMPERATURE, dumbbells, pressure
 
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, PressureReporter, constrain, draw_velocities
@@ -89,18 +88,6 @@ def test_beside_fixed_atoms_the_pressure_is_the_atomic_one():
     with pytest.raises(UnsupportedError, match=r"holds atom 0 in space.*only a pressure is asked for, virial='atomic'"):
         PressureReporter(dynamics)()
     PressureReporter(dynamics, virial="atomic")()
-
-
-def test_what_is_no_way_to_the_pressure():
-    with pytest.raises(InputError, match="virial is 'mol'; choose 'molecular', 'atomic' or 'difference'"):
-        PressureReporter(None, virial="mol")
-    with pytest.raises(InputError, match=r"not of those of atoms.*leave it out, or take virial='molecular'"):
-        PressureReporter(None, virial="atomic", temperature_K=300)
-
-
-def test_dynamics_of_ase_are_refused():
-    with pytest.raises(InputError, match=r"dynamics is <ase\.md\.verlet.*; give a dynamics object of kcons\.ase"):
-        PressureReporter(VelocityVerlet(copper(), FS))
 
 
 @pytest.mark.parametrize("virial", ["molecular", "difference"])

@@ -194,22 +194,6 @@ def test_acceleration_on_the_sphere_is_the_projected_one():
     assert flow.acceleration(x, v) == pytest.approx(wanted, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: DampedOscillator(0.0),
-        lambda: DampedOscillator(1.0, -0.1),
-        lambda: HarmonicOscillator(np.nan),
-        lambda: Pendulum(-1.0),
-        lambda: ParticleOnSphere(0.0),
-        lambda: ParticleOnSphere(1.0, -1.0),
-    ],
-)
-def test_bad_parameters_are_refused(make):
-    with pytest.raises(InputError):
-        make()
-
-
 @pytest.mark.parametrize("start", [[0.0, 2.0 * (1 - 5e-13)], [0.0, 2.0 * (1 + 5e-13)], [np.pi, 1e-9]])
 def test_a_pendulum_next_to_its_separatrix_is_refused(start) -> None:
     """Far beyond the first turn elliptic functions gave 1e32; at the top it stayed where it was for ever."""
@@ -230,6 +214,10 @@ def test_a_pendulum_next_to_its_separatrix_is_refused(start) -> None:
         (lambda: Pendulum("1"), "omega"),
         (lambda: DampedOscillator(None), "omega"),
         (lambda: DampedOscillator(1.0, "a"), "eta"),
+        (lambda: DampedOscillator(0.0), "omega"),
+        (lambda: DampedOscillator(1.0, -0.1), "eta"),
+        (lambda: HarmonicOscillator(np.nan), "omega"),
+        (lambda: ParticleOnSphere(1.0, -1.0), "mass"),
     ],
 )
 def test_what_is_no_known_flow(make, item: str) -> None:
@@ -271,7 +259,7 @@ def test_compression_is_minus_g_minus_one_times_alpha(force, removed):
     assert g == 6 - removed
     assert abs(flow.friction(X)) > 0.1
     assert flow.surface_divergence(X) == pytest.approx(-(g - 1) * flow.friction(X), rel=1e-8)
-    found = flow.compression(X, [0.0, 0.2, 0.5])
+    found = flow.compression(X, [0.0, 0.3])
     assert abs(found.predicted[-1]) > 0.1
     assert found.log_volume == pytest.approx(found.predicted, abs=1e-8)
     # With g, or g - 2, in place of g - 1 it would not be.
@@ -302,22 +290,18 @@ def test_reference_of_constant_force():
         assert abs(speed - np.ravel(given["reference"]["velocities"][k])).max() < 1e-10
 
 
-def test_bad_thermostats_are_refused():
-    with pytest.raises(InputError, match="masses"):
-        Thermostat([1.0, 0.0], quartic)
-    with pytest.raises(InputError, match="divide"):
-        Thermostat([1.0, 1.0, 1.0], quartic, momentum_removed=2)
-    with pytest.raises(InputError, match="non-zero kinetic energy"):
-        Thermostat(MASSES, quartic).state(np.zeros(6), np.zeros(6))
-    with pytest.raises(InputError, match="momentum is not zero"):
-        Thermostat(MASSES, springs, momentum_removed=2).state(np.zeros(6), np.ones(6))
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [
         (lambda: Thermostat(np.ones(4), lambda x: -x, momentum_removed=-2), "momentum_removed is -2"),
         (lambda: Thermostat(np.ones(5), lambda x: -x, momentum_removed=2.5), "momentum_removed is 2.5"),
+        (lambda: Thermostat([1.0, 0.0], quartic), "masses"),
+        (lambda: Thermostat([1.0, 1.0, 1.0], quartic, momentum_removed=2), "divide"),
+        (lambda: Thermostat(MASSES, quartic).state(np.zeros(6), np.zeros(6)), "non-zero kinetic energy"),
+        (
+            lambda: Thermostat(MASSES, springs, momentum_removed=2).state(np.zeros(6), np.ones(6)),
+            "momentum is not zero",
+        ),
         (lambda: Thermostat(np.ones(2), lambda x: -x).state([1.0, 2.0, 0.3], [0.4]), "2 components each"),
         (lambda: Thermostat(np.ones(2), lambda x: [1.0, 2.0, 3.0]).friction(np.ones(4)), "force returned shape"),
         (

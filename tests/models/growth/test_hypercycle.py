@@ -112,7 +112,7 @@ def test_arrives_at_equilibrium():
 def test_settled_motion_continues_the_integrated_one():
     system, x0 = Hypercycle(5, 3.0, [0.1, 0.5, 0.2, 0.9, 0.3]).with_entropy_production(1.0), [0.3, 0.2, 0.1, 0.15, 0.25]
     coarse = solve(system, (0.0, 16.0), x0, t_eval=[15.0, 16.0], rtol=1e-6, atol=1e-6)
-    fine = solve(system, (0.0, 16.0), x0, t_eval=[15.0, 16.0], rtol=1e-11, atol=1e-12)
+    fine = solve(system, (0.0, 16.0), x0, t_eval=[15.0, 16.0], rtol=1e-9, atol=1e-10)
     assert coarse.settled_time < 13.0
     assert fine.settled_time is None or fine.settled_time > coarse.settled_time
     assert coarse.y == pytest.approx(fine.y, rel=1e-6)
@@ -151,7 +151,7 @@ def test_start_at_equilibrium():
     assert found.success
     assert found.y == pytest.approx(np.repeat(x_eq[:, None], len(found.t), axis=1), rel=1e-12)
     # A run that has all but arrived can be gone on with.
-    near = solve(model.with_entropy_production(30.0), (0.0, 900.0), X0).y[:, -1]
+    near = solve(model.with_entropy_production(30.0), (0.0, 900.0), X0, rtol=1e-6, atol=1e-7).y[:, -1]
     assert solve(model.with_entropy_production(30.0), (0.0, 50.0), near).success
 
 
@@ -201,7 +201,7 @@ def random_system(rng, n, kind):
 @pytest.mark.parametrize(("n", "kind"), [(2, "c"), (3, "b"), (3, "c"), (5, "b"), (5, "c"), (8, "b")])
 def test_random_systems_run_to_their_end_and_hold_their_rows(n, kind):
     rng = np.random.default_rng([7, n, ord(kind)])
-    for _ in range(3):
+    for _ in range(2):
         held, log_x = random_system(rng, n, kind)
         k_h, mixture = held.model.k_h, held.model.mixture
         found = solve(held, (0.0, 10 / k_h), log_x0=log_x, rtol=1e-6, atol=1e-8)

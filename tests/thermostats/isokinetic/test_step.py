@@ -63,27 +63,6 @@ def test_a_part_of_the_atoms(order) -> None:
     assert inside == pytest.approx(before, rel=1e-14)
 
 
-@EVERY
-def test_a_turn_is_along_the_exact_solution(name) -> None:
-    """Projected forces, length, and alpha = v.f/2K at the middle, against the engine and the closed form."""
-    system, state = molecules(name, ions=3)
-    thermostat = Isokinetic(momentum="free")
-    state = thermostat.start(system, state)
-    end = thermostat.step(system, state, 1e-3)
-    held, twice = system.motion.constraint_set, state.thermostat[0]
-    f = springs(end.positions, 0.0)
-    pace = system.motion.project_velocities(end.positions, f * system.weights)
-    assert end.thermostat[2] == pytest.approx((f * pace).sum(), rel=1e-13)
-    assert 2 * system.kinetic_energy(end.velocities) == pytest.approx(twice, rel=1e-14)
-    assert np.abs(held.jacobian(end.positions) @ end.velocities.ravel()).max() <= 1e-14
-    middle = compiled_middle(thermostat, system, state)
-    assert end.thermostat[1] == pytest.approx(1e-3 * middle, rel=1e-3)
-
-
-def compiled_middle(thermostat, system, state) -> float:
-    return thermostat.friction(system, thermostat.step(system, state, 0.5e-3))
-
-
 # -- where a kernel cannot go on --------------------------------------------------------------------
 
 

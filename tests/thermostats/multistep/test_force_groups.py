@@ -57,15 +57,6 @@ def test_a_method_is_one_function_however_often_it_is_looked_up():
     ForceGroups({"fast": field.force, "slow": Field().force})  # of another object
 
 
-def test_forces_of_different_systems():
-    with pytest.raises(InputError, match="the same function"):
-        ForceGroups.difference(springs, springs)
-    with pytest.raises(InputError, match="different systems"):
-        ForceGroups.difference(lambda x, t: x[:2], springs)(X, 0.0)
-    with pytest.raises(InputError, match="group 'slow' gives forces of shape"):
-        ForceGroups({"fast": springs, "slow": lambda x, t: x[:2]})(X, 0.0)
-
-
 def test_groups_have_steps_and_steps_have_groups():
     groups = ForceGroups({"fast": springs, "slow": quartic})
     group_names(groups, ("slow", "fast"))

@@ -61,20 +61,6 @@ def test_the_kick_solves_its_equation(kind, strength):
         np.testing.assert_allclose(np.append(u, own), y, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_kick_is_taken_back_and_two_make_one(kind):
-    _, _, tables, squares, v, w, draw = made(kind)
-    a, start = draw(0.5), (v.copy(), w.copy())
-    kernels.turn(v, w, a, 0.4, squares, *tables)
-    once = v.copy()
-    kernels.turn(v, w, a, -0.4, squares, *tables)
-    np.testing.assert_allclose(v, start[0], rtol=0, atol=1e-13)
-    np.testing.assert_allclose(w, start[1], rtol=0, atol=1e-13)
-    kernels.turn(v, w, a, 0.1, squares, *tables)
-    kernels.turn(v, w, a, 0.3, squares, *tables)
-    np.testing.assert_allclose(v, once, rtol=0, atol=1e-13)
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("strength", [1e4, 1e150])
 def test_forces_of_any_strength(strength, sign):

@@ -9,7 +9,7 @@ import pytest
 from thermostat_systems import METHANE, TEN, dumbbells, molecules, quartic, quartic_potential, springs, system, waves
 
 from kcons.constraints import CenterOfMass, Distance, FixedAtoms, LinearRelation, Plane, Sphere
-from kcons.errors import InputError, OverdeterminedError
+from kcons.errors import InputError
 from kcons.steppers import State, System, run
 from kcons.thermostats import (
     ForceGroups,
@@ -219,11 +219,6 @@ def test_rows_that_join_clusters_make_them_one():
 def test_the_motion_about_the_center_may_be_held_whole():
     """Without a degree of freedom about it a cluster has the sphere of its center only."""
     assert freedom([LinearRelation(0, [1], [1.0], None)]) == [3, 3, 3, 3]
-
-
-def test_nothing_moves():
-    with pytest.raises(OverdeterminedError, match="no degree of freedom is left"):
-        freedom([FixedAtoms(range(5))])
 
 
 def test_radii_and_the_sphere_without_one():
