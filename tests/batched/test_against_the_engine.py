@@ -17,9 +17,9 @@ STEP = 0.01
 DIFFERENCED = {name for name in CASES if name.startswith(("Custom", "ImplicitSurface"))}
 
 
-@pytest.fixture(params=["written out", "by levels"])
+@pytest.fixture(params=["lanes", "levels"])
 def elimination(request, monkeypatch):
-    if request.param == "by levels":
+    if request.param == "levels":
         monkeypatch.setattr(clusters, "LANES_ROWS", 0)
 
 
