@@ -12,7 +12,7 @@ MUTANTS = {
             GRADIENTS + "derivatives_are_those_of_the_solution",
         ),
         ("way=of.way «-→+» moved)", GRADIENTS + "derivatives_are_those_of_the_solution[lanes-blade]"),
-        ("(d * lam).sum(1).T«→*2».unsqueeze(-1)", ENGINE + "chains_and_rows_that_depend_on_others"),
+        ("d, rest), «rest.T→0 * rest.T»])", ENGINE + "chains_and_rows_that_depend_on_others"),
     ],
     "batched/levels.py": [
         (
