@@ -441,8 +441,8 @@ def test_which_steps_are_made_on_the_device(monkeypatch):
     monkeypatch.setattr(build, "accelerated", lambda: ["CUDA"])
     assert type(ProjectedIntegrator(0.001)) is DeviceIntegrator
     monkeypatch.undo()
-    with pytest.raises(UnsupportedError, match=r"getNumPerDofVariables is about the program .* device=False"):
-        ProjectedIntegrator(0.001).getNumPerDofVariables()
+    with pytest.raises(UnsupportedError, match=r"addComputeSum is about the program .* device=False"):
+        ProjectedIntegrator(0.001).addComputeSum("s", "v")
 
 
 def test_files_say_which_kind_of_integrator_they_have():

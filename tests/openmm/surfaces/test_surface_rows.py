@@ -74,7 +74,7 @@ def test_a_landing_where_the_surface_looks_the_other_way_is_none():
     torus = Torus([0], [0, 0, 0], [0, 0, 1], 1.0, 0.2)
     integrator = SurfaceIntegrator(0.1 * unit.picosecond, surfaces=torus, system=system, device=False)
     context = started(system, integrator, [[0.8, 0, 0]], [[0, 0, 0]])
-    integrator.check()
+    integrator.check(context)
     with pytest.raises(ConvergenceError, match="finds no position"):
         integrator.step(1)
 
