@@ -691,6 +691,7 @@ class CarriedConstraints(Part):
 
     def land_alone(self, program: Program, u: str, h: str) -> None:
         """The drift with velocity u and its impulse, where nothing else acts on x: x and v change."""
+        self.remember(program)
         group = self._groups["land"]
         program.each("x", f"x+{h}*{u}", "move freely (drift)")
         self._guard(program, "land", "carried rows: solve for positions")

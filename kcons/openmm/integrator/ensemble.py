@@ -321,14 +321,17 @@ class Step:
 
     def __init__(self, program: Program, scheme: Splitting, parts: Sequence[Part], ensemble: Ensemble) -> None:
         self.program, self.scheme, self.parts, self.ensemble = program, scheme, tuple(parts), ensemble
-        self.operations = ensemble.operations(scheme)
-        self.drifts, self.kicks = stages_of(self.operations)
-        self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
-        self.one_drift = len(self.drifts) == 1 or self.halves
-        self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
+        verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
         self.sited = any(part.sited for part in self.parts)
         self.single = len(self.parts) == 1 and self.parts[0].alone and not self.sited
-        verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
+        exact = self.single and plain and scheme.exact_flight and self.parts[0].flies_exactly
+        for part in self.parts:
+            part.exact = exact
+        self.operations = ensemble.operations(Splitting(scheme.kicks, scheme.drifts) if exact else scheme)
+        self.drifts, self.kicks = stages_of(self.operations)
+        self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
+        self.one_drift = (len(self.drifts) == 1 and not exact) or self.halves
+        self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
         self.lean = plain and bool(self.parts) and verlet and not self.sited
         #: Without parts: the kick that ends a step is made with that which begins the next.
         self.joined = ensemble.adds_up and not self.parts and verlet

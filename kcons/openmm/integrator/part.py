@@ -124,6 +124,10 @@ class Part(ABC):
         Force groups that carry rows, not forces.
     lean : bool
         Set by the integrator.
+    exact : bool
+        Whether `land_alone` flies exactly; set by the integrator where `flies_exactly` and the scheme asks for it.
+    flies_exactly : bool
+        Whether `land_alone` can do so.
     alone : bool
         Whether it is known that the System has no constraints. Where there is no other part, `land_alone` is the
         whole drift then.
@@ -139,6 +143,8 @@ class Part(ABC):
     lands_last: bool = False
     groups: frozenset[int] = frozenset()
     lean: bool = False
+    exact: bool = False
+    flies_exactly: bool = False
     alone: bool = False
     stays_finite: bool = False
     sited: bool = False
@@ -180,7 +186,7 @@ class Part(ABC):
         """Make v tangent to the rows at x."""
 
     def land_alone(self, program: Program, u: str, h: str) -> None:
-        """For parts that may be `alone`: the whole drift with velocity u, after `remember`; v gets its impulse, too."""
+        """For parts that may be `alone`: the whole drift with velocity u, `remember` included; v gets its impulse."""
         raise NotImplementedError
 
     def take_precision(self, program: Program, precision: Precision) -> None:

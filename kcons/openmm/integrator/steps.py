@@ -226,7 +226,6 @@ def _all_drifts(step: Step) -> None:
         p.let("h", "dt*drift_share(stage)", "length of this drift")
         if step.single:
             # From (x-xu)/h, the shortest of many drifts would have most of the digits of v.
-            step.parts[0].remember(p)
             step.parts[0].land_alone(p, "v", "h")
         else:
             p.each("v", f"v+{step.drift('h')}", "the constraint forces act on v as well")
@@ -310,11 +309,11 @@ def _lean_step(step: Step) -> None:
         p.let("per_h", "0", "no drift yet")
         with p.when("failed = 0", "rows are independent"):
             p.let("h", "dt*drift_share(stage)", "length of the drift")
-            for part in step.parts:
-                part.remember(p)
             if step.single:
                 step.parts[0].land_alone(p, "u", "h")
             else:
+                for part in step.parts:
+                    part.remember(p)
                 step.land("u", "h")
             p.let("per_h", "1/h", "the constraint forces act on v as well")
             p.let("stage", "stage+1", "what follows")

@@ -2,7 +2,8 @@
 
 The value of a row, less its target, is an expression of OpenMM, which differentiates it. Two force groups carry s and
 s^2/2 as energies of each particle. With f1 = -grad s and f2 = -s grad s, and G0 the gradient where the drift began, a
-Newton step of s(xu + l G0) = 0 is l += (f2.G0)/(f1.G0)^2.
+Newton step of s(xu + l G0) = 0 is l += (f2.G0)/(f1.G0)^2. Where all surfaces are spheres, nothing else is held
+and the scheme has exact flights, drifts are great circles, which need neither.
 """
 
 from __future__ import annotations
@@ -66,6 +67,7 @@ class SurfaceRows(Part):
         self.atoms: IntArray = np.concatenate([item.atoms[:, 0] for item in self.given])
         self.n_particles = system.getNumParticles()
         self.alone = system.getNumConstraints() == 0
+        self.flies_exactly = all(item.family == "Sphere" for item in self.given)
         pairs = [_forces(item) for item in self.given]
         self._pair = tuple(free_groups(system, 2, "these surfaces")[-2:])
         self.groups = frozenset(self._pair)
@@ -91,6 +93,12 @@ class SurfaceRows(Part):
         p.number("i_count", "Newton steps done")
         p.number("i_miss", "sum of squares of the last Newton steps, in nm^2")
         p.number("unsolved", "how many degrees of freedom found no solution")
+        if self.flies_exactly:
+            center, square = np.zeros((2, self.n_particles, 3))
+            center[self.atoms] = np.concatenate([item.parameters() for item in self.given])
+            square[self.atoms] = np.concatenate([item.target_at(0.0) ** 2 for item in self.given])[:, None]
+            p.vector_setting("i_center", "centers of spheres", center)
+            p.vector_setting("i_square", "squares of their radii", square)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Rows are Forces, whose gradients are of the size of 1 kJ/mol/nm."""
@@ -130,9 +138,32 @@ class SurfaceRows(Part):
 
     def land_alone(self, program: Program, u: str, h: str) -> None:
         """No velocity is a difference of positions, whose rounding grows as 1/h."""
+        if self.exact:
+            self._turn(program, u, h)
+            return
+        self.remember(program)
         program.each("x", f"x+{h}*{u}", "fly; not on the surface")
         self.land(program, h)
         program.each("v", f"select(failed, v, {u}+i_push/{h})", "impulse of the surface")
+
+    def _turn(self, p: Program, u: str, h: str) -> None:
+        """Along great circles, exact for any h.
+
+        d = x - c turns in the plane of d and the tangent velocity u: with w = |u|/R, x = c + d cos(wh) + u sin(wh)/w
+        and v = u cos(wh) - d w sin(wh). d is brought to the length R on the way, so that rounding does not add up.
+        """
+        p.each("i_step", "x-i_center", "from the center")
+        p.each("v", f"{u}-i_on*i_step*dot(i_step, {u})/(dot(i_step, i_step)+(1-i_on))", "along the sphere")
+        p.each("i_push", "1e-30+i_on*sqrt(dot(v, v)/(i_square+(1-i_on)))", "w = |v|/R, never quite 0")
+        p.each("i_step", "i_step*(1-i_on+i_on*sqrt(i_square/(dot(i_step, i_step)+(1-i_on))))", "of the length R")
+        p.sum("unsolved", f"1-step({_FAR}-i_push)*step({_FAR}-abs(v))", "velocities are finite")
+        p.let("failed", f"select(unsolved, {self.code}, failed)", "which part has no solution")
+        p.each(
+            "x",
+            f"select(failed, x, i_center+i_step*cos(i_push*{h})+v*sin(i_push*{h})/i_push)",
+            "turn the position",
+        )
+        p.each("v", f"select(failed, v, v*cos(i_push*{h})-i_on*i_step*i_push*sin(i_push*{h}))", "turn the velocity")
 
     def project(self, program: Program) -> None:
         p = program
