@@ -570,9 +570,7 @@ class Kernels:
             free = f"{loop} EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
             start = f"{loop} {{ROOM const mixed h = {h}, per_h = 1/h;\n"
             aim = " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
-            moved = (
-                " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }\n"
-            )
+            moved = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }\n"
             solve = f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {time}, x, d, w);\n if (failure[0] == 0)\n"
             self._add(free, start + aim + solve + moved)
             self._moves = True

@@ -31,7 +31,7 @@ MUTANTS = {
             "test_surface_rows.py::test_formulas_are_read_by_openmm",
         ),
     ],
-    "openmm/device/large_clusters.py": [
+    "plan/clusters_alike.py": [
         (
             "key=lambda k: («k in last, →»k)",
             "test_rows.py::test_levels_have_rows_that_share_no_entry",
