@@ -78,10 +78,10 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.fixture
 def without_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where there is no compiler: a test of what the CustomIntegrator does, unless it gives device=True."""
+    """As where there is no compiler: a test of what the CustomIntegrator does."""
     from kcons.openmm.device import build
 
-    monkeypatch.setattr(build, "reluctance", lambda: "there is no C++ compiler")
+    monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
 
 
 @pytest.fixture(autouse=True)

@@ -35,7 +35,7 @@ class Batch:
     """Constrained motion of many systems at once, on PyTorch tensors, differentiable.
 
     Clusters of equal shape are solved side by side, whichever systems they belong to. Classes, names, rank,
-    conversions and refusals are those of the engines. All methods leave what they are given as it was.
+    conversions, cells and refusals are those of the engines. All methods leave what they are given as it was.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ class Batch:
         return self._joined(lambda each: each.constraint_set.target_rates(time, order))
 
     def _task(self, of_positions: bool, time: float, start: float, flight: float = 0.0) -> Task:
-        t, t_start = (torch.tensor(each, dtype=self.dtype, device=self.device) for each in (time, start))
+        t, t_start = (torch.full((), each, dtype=self.dtype, device=self.device) for each in (time, start))
         groups = self._groups if flight or not of_positions else self._position_groups
         own = self._inverse_masses, self.targets if of_positions else self._still
         return Task(of_positions, flight != 0, groups, t, t_start, self._lattice, self._tree_cells, own)
@@ -387,7 +387,7 @@ class Batch:
                 continue
             for each in groups:
                 each.worst = torch.zeros_like(each.worst)
-            k, lane = (~(off <= limit)).nonzero()[0].tolist()
+            k, lane = divmod(int(torch.nan_to_num(off, nan=torch.inf).argmax()), off.shape[1])
             residual, copy = float(off[k, lane]), int(group.systems[lane])
             row, held = int(group.rows[k, lane]) - int(self.row_starts[copy]), self.systems[copy].constraint_set
             said = f"is off by {residual:.3g} of its scale" if np.isfinite(residual) else "has turned or is not finite"

@@ -17,7 +17,7 @@ from kcons.batched.groups import Group
 #: Newton iterations after which there is no solution near, and those that are made where nobody looks.
 MAX_ITERATIONS, UNWATCHED = 30, 5
 #: Roundings that a row may be off by for the iterations to end.
-ROUNDINGS = 10
+ROUNDINGS = 2
 
 
 class Task(NamedTuple):

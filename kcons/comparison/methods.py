@@ -552,13 +552,14 @@ def in_openmm(
 ) -> None:
     """Register an integrator as `_in_openmm` takes it."""
     each = evaluations(given[0]) if given and isinstance(given[0], str) else 1
+    more: dict[str, Any] = {"refuses": _bonds_in_openmm, "force_evaluations": each} | options
     add_method(
         name,
         partial(_in_openmm, integrator, given, tolerance, how),
         title=f"OpenMM {title}",
         engine="OpenMM",
         code=partial(_lines_in_openmm, integrator, given, tolerance, how),
-        **({"refuses": _bonds_in_openmm, "force_evaluations": each} | options),
+        **more,
     )
 
 

@@ -19,9 +19,9 @@ HELD = {
 }
 
 
-@pytest.fixture(params=["written out", "by levels"])
+@pytest.fixture(params=["lanes", "levels"])
 def elimination(request, monkeypatch):
-    if request.param == "by levels":
+    if request.param == "levels":
         monkeypatch.setattr(clusters, "LANES_ROWS", 0)
 
 

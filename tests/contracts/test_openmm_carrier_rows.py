@@ -60,6 +60,7 @@ def test_a_box_too_small_stops_the_step():
 # -- multipliers ----------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("without_device")
 def test_multipliers_of_a_hanging_weight():
     """The rod of a weight at rest pulls with m g."""
     part = hold(system := free([0.0, 2.0], pull(-19.6, 2)), Distance([[0, 1]]), [[0, 0, 0], [0, 0, -0.5]])
@@ -73,6 +74,7 @@ def test_multipliers_of_a_hanging_weight():
     assert part.step_multipliers[0] == pytest.approx(-19.6, abs=1e-9)
 
 
+@pytest.mark.usefixtures("without_device")
 def test_multipliers_of_a_step_are_of_second_order():
     errors = []
     steps = (8, 16, 32)

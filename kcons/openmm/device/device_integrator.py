@@ -5,15 +5,15 @@ from __future__ import annotations
 import ctypes
 import json
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
-from uuid import uuid4
 from xml.etree import ElementTree
 
 import numpy as np
 import openmm
 
+from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -52,6 +52,7 @@ class _Given(ctypes.Structure):
     """What the plugin tells of a Context, as plugin/program_integrator.h has it."""
 
     _fields_ = (
+        ("integrator", ctypes.c_void_p),
         *((name, ctypes.c_char_p) for name in ("description", "platform")),
         *((name, ctypes.c_int) for name in ("groups", "particles", "constraints")),
         ("masses", ctypes.POINTER(ctypes.c_double)),
@@ -62,8 +63,8 @@ class _Given(ctypes.Structure):
 
 
 _PLANNER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_Given))
-#: Integrators by the key in their description, for parts, which no text describes.
-_ALIVE: weakref.WeakValueDictionary[str, DeviceIntegrator] = weakref.WeakValueDictionary()
+#: Integrators by their address, for parts, which no text describes.
+_ALIVE: weakref.WeakValueDictionary[int, DeviceIntegrator] = weakref.WeakValueDictionary()
 
 
 #: Why the last plan could not be made.
@@ -193,8 +194,7 @@ class DeviceIntegrator(ProjectedIntegrator):
         made = openmm.XmlSerializer.deserialize(_EMPTY.decode())
         self.this = made.this  # the proxy of this class owns what XmlSerializer has made
         openmm.Integrator.setStepSize(self, dt)
-        self._key = uuid4().hex
-        _ALIVE[self._key] = self
+        _ALIVE[int(made.this)] = self
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
         return as_parts(parts)
@@ -218,7 +218,6 @@ class DeviceIntegrator(ProjectedIntegrator):
                 "seed": self._seed,
                 "noisy": self.ensemble.noisy,
                 "spheres": [getattr(self.ensemble, name, None) for name in ("spheres", "auxiliary")],
-                "integrator": self._key,
                 "parts": bool(self.parts),
                 "recorded": self._recorded,
             }
@@ -372,6 +371,25 @@ class DeviceIntegrator(ProjectedIntegrator):
             return float(self.read("memory")[program.kept.index(name)])
         return {**program.numbers, **program.settings}[program.known(name)]
 
+    def getNumGlobalVariables(self) -> int:
+        return len(self.program.numbers)
+
+    def getGlobalVariableName(self, index: int) -> str:
+        return list(self.program.numbers)[index]
+
+    def getGlobalVariable(self, index: int) -> float:
+        return self.getGlobalVariableByName(self.getGlobalVariableName(index))
+
+    def setGlobalVariable(self, index: int, value: float) -> None:
+        """As for a CustomIntegrator, settings have their own value again in the next step."""
+        self.program.write(self.getGlobalVariableName(index), value)
+
+    def getNumPerDofVariables(self) -> int:
+        """None, and there are no tables and computations either."""
+        return 0
+
+    getNumComputations = getNumTabulatedFunctions = getNumPerDofVariables
+
     def setRandomNumberSeed(self, seed: int) -> None:
         """The seed of noise, before the Context is made; 0 for one that nobody knows."""
         self._seed = whole_number(seed, "seed", -(2**31), 2**31 - 1)
@@ -426,7 +444,7 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     n, described = given.constraints, json.loads(given.description)
     pairs = np.array(given.pairs[: 2 * n], dtype=np.int64).reshape(n, 2)
     lengths = np.array(given.lengths[:n], dtype=np.float64)
-    integrator = _ALIVE.get(described["integrator"])
+    integrator = _ALIVE.get(given.integrator)
     if described["parts"] and integrator is None:
         raise UnsupportedError("no text has the parts of an integrator: read it by from_xml(xml, parts=...)")
     part = integrator.parts[0] if integrator is not None and integrator.parts else None
@@ -487,7 +505,9 @@ def choose(
         `device` is True, and there is no plugin or it has no kernels for this step.
     """
     why = refusal(to_scheme(scheme), parts, ConstantEnergy() if ensemble is None else ensemble) or build.refusal()
-    if not why and device is None:
+    listed = parts if isinstance(parts, Iterable) else (parts,)
+    nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in listed)
+    if not why and device is None and not nowhere_else:
         why = build.reluctance()
     if not why:
         try:

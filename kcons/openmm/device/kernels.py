@@ -481,56 +481,38 @@ class _Place(NamedTuple):
 
 
 class Kernels:
-    """The kernels of a step.
+    """The kernels of a step, for what `plan` is given; all atoms are in clusters, those that are free in one each."""
 
-    Parameters
-    ----------
-    shapes : sequence of Shape
-        All atoms, each in one cluster.
-    groups : mapping of str to int
-        Bit masks of the groups of forces, by the name that operations have.
-    tidy : bool
-        Whether noise is made tangent, so that multipliers are those of forces.
-    spheres : Spheres, optional
-        Velocities of clusters stay on spheres.
-    moving : ndarray of bool, optional
-        Particles that move, where there are spheres.
-    fixed : ndarray of int
-        Particles with a mass that rest.
-    placed : ndarray of int
-        Particles whose rows have a place in space: what cells OpenMM has moved them by is taken back for them.
-    """
-
-    def __init__(
-        self,
-        shapes: Sequence[Shape],
-        groups: Mapping[str, int],
-        *,
-        tidy: bool = False,
-        fixed: IntArray = _NONE,
-        placed: IntArray = _NONE,
-        spheres: Spheres | None = None,
-        moving: Any = None,
-    ) -> None:
-        self.groups, self.tidy, self.resting = dict(groups), tidy, len(fixed) > 0
-        self.placed, self.spheres, self.sphere_of, self.auxiliary = placed, spheres, list[Any](), 0
+    def __init__(self, described: Mapping[str, Any], masses: FloatArray, groups: Mapping[str, int], held: Any) -> None:
+        #: Bit masks of the groups of forces, by the name that operations have.
+        self.groups = dict(groups)
+        #: Whether noise is made tangent, so that multipliers are those of forces.
+        self.tidy = described["parts"]
+        #: Particles whose rows have a place in space: what cells OpenMM has moved them by is taken back for them.
+        self.placed = held.placed
+        self.resting = len(held.fixed) > 0  # particles with a mass
+        self.spheres = Spheres(*described["spheres"]) if described["spheres"][0] else None
+        self.sphere_of: list[Any] = []
+        self.auxiliary = self.items = self.crowds = self.work = self.particles = 0
         self.places: list[_Place] = []
         self.order: list[IntArray] = []
-        counts, at, work = {True: 0, False: 0}, 0, 0
-        for shape in shapes:
+        everything = np.arange(len(masses))
+        moving = (masses > 0) & ~np.isin(everything, held.fixed)
+        free = np.setdiff1d(everything, np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
+        for shape in [*held.shapes, *([Shape("", free[:, None])] if len(free) else [])]:
             clusters = len(shape.atoms)
-            self.places.append(_Place(shape, counts[shape.together], at, work))
+            self.places.append(_Place(shape, self.crowds if shape.together else self.items, self.particles, self.work))
             atoms = (shape.atoms if shape.together else shape.atoms.T).ravel()
-            self.order.append(np.where(np.isin(atoms, fixed), -1 - atoms, atoms))
-            counts[shape.together] += clusters
-            at += shape.atoms.size
-            work += 10 * shape.atoms.size * shape.together
-            if spheres is not None:
-                found = spheres.of(shape, moving[shape.atoms[0]], bool(np.isin(shape.atoms, placed).any()))
+            self.order.append(np.where(np.isin(atoms, held.fixed), -1 - atoms, atoms))
+            self.crowds += clusters * shape.together
+            self.items += clusters * (not shape.together)
+            self.particles += shape.atoms.size
+            self.work += 10 * shape.atoms.size * shape.together
+            if self.spheres is not None:
+                placed = bool(np.isin(shape.atoms, held.placed).any())
+                found = self.spheres.of(shape, moving[shape.atoms[0]], placed)
                 self.sphere_of.append((*found, self.auxiliary))
-                self.auxiliary += clusters * len(found[1]) * spheres.auxiliary
-        self.items, self.crowds, self.work = counts[False], counts[True], work
-        self.particles = at
+                self.auxiliary += clusters * len(found[1]) * self.spheres.auxiliary
         self.source: list[str] = []
         self._reset()
         self._bank = 0
@@ -570,7 +552,8 @@ class Kernels:
             free = f"{loop} EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
             start = f"{loop} {{ROOM const mixed h = {h}, per_h = 1/h;\n"
             aim = " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
-            moved = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }\n"
+            moved = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++)"
+            moved += " {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }\n"
             solve = f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {time}, x, d, w);\n if (failure[0] == 0)\n"
             self._add(free, start + aim + solve + moved)
             self._moves = True
@@ -802,27 +785,16 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     names_of_groups = dict.fromkeys(op.group for op in operations if op.verb == "evaluate")
     masks = {name: 1 << int(name) if name else groups for name in names_of_groups}
     seed = described["seed"] or int(np.random.default_rng().integers(1, 2**31 - 1))
-    spheres = Spheres(*described["spheres"]) if described["spheres"][0] else None
     parameters, memory, particles = described["settings"], described["memory"], len(masses)
-    loose = np.setdiff1d(np.arange(particles), np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
-    shapes = [*held.shapes, *([Shape("", loose[:, None])] if len(loose) else [])]
-    moving = (masses > 0) & ~np.isin(np.arange(particles), held.fixed)
-    made = {
-        "tidy": described["parts"],
-        "fixed": held.fixed,
-        "placed": held.placed,
-        "spheres": spheres,
-        "moving": moving,
-    }
-    kernels = Kernels(shapes, masks, **made)
+    kernels = Kernels(described, masses, masks, held)
     parts = divided(operations, described["noisy"])
     actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
     recorded, room = described["recorded"], room_for(len(described["recorded"]))
     order = np.concatenate([*kernels.order, np.array(recorded, dtype=np.int64)])
     arrays = standard_arrays([*parameters.values()], len(memory), seed, particles)
     arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
-    if spheres is not None:
-        if any(g + spheres.auxiliary < 2 for _, freedom, _ in kernels.sphere_of for g in freedom):
+    if kernels.spheres is not None:
+        if any(g + kernels.spheres.auxiliary < 2 for _, freedom, _ in kernels.sphere_of for g in freedom):
             raise InputError("a sphere of one degree of freedom has the radius 0; give auxiliary=1", item="auxiliary")
         first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
         arrays.append(Array("auxiliary", "mixed", first, saved=True))

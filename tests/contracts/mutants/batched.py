@@ -11,8 +11,8 @@ MUTANTS = {
             "back = [«-each→each» for each in self.spread(slope, a)]",
             GRADIENTS + "derivatives_are_those_of_the_solution",
         ),
-        ("way=of.way «-→+» moved)", GRADIENTS + "derivatives_are_those_of_the_solution[blade]"),
-        ("(d * lam).sum(1).T«→*2».unsqueeze(-1)", ENGINE + "chains_and_rows_that_depend_on_others"),
+        ("way=of.way «-→+» moved)", GRADIENTS + "derivatives_are_those_of_the_solution[lanes-blade]"),
+        ("d, rest), «rest.T→0 * rest.T»])", ENGINE + "chains_and_rows_that_depend_on_others"),
     ],
     "batched/levels.py": [
         (
@@ -33,12 +33,15 @@ MUTANTS = {
         ),
     ],
     "batched/row_functions.py": [
-        ("[«0.5→1.0» * middle + way", ENGINE + "families_are_held_as_the_engine_holds_them[CustomVelocity]"),
+        (
+            "(found * places[«self.width :→: self.width»]).sum()",
+            ENGINE + "families_are_held_as_the_engine_holds_them[lanes-CustomVelocity]",
+        ),
     ],
     "batched/batch.py": [
         (
             "torch.where(self._is_position, held, «flight→1.0» * middle)",
-            ENGINE + "families_are_held_as_the_engine_holds_them",
+            ENGINE + "families_are_held_as_the_engine_holds_them[lanes-LinearVelocity]",
         ),
         ("made._lattice = self._lattice[«numbers→:1»]", BATCH + "systems_are_selected_with_their_cells"),
     ],

@@ -49,7 +49,7 @@ Plan ProgramIntegrator::planned(bool whole) const {
         if (!system.usesPeriodicBoundaryConditions()) box.assign(3, Vec3());
     }
     Plan plan;
-    Given given = {description.c_str(), platform.getName().c_str(), getIntegrationForceGroups(),
+    Given given = {static_cast<const Integrator*>(this), description.c_str(), platform.getName().c_str(), getIntegrationForceGroups(),
                    (int) masses.size(), (int) lengths.size(), masses.data(), pairs.data(), lengths.data(),
                    whole ? &positions[0][0] : nullptr, &box[0][0], whole ? context->getTime() : 0};
     if (!planner(&plan, &given)) throw OpenMMException(failure);

@@ -41,6 +41,7 @@ struct Plan {
 
 // Python's part in the making: fills the plan, or returns 0. Without positions only the clusters are asked for.
 struct Given {
+    const void* integrator;        // an OpenMM::Integrator*, as Python has it
     const char *description, *platform;
     int groups, particles, constraints;
     const double* masses;
