@@ -57,6 +57,8 @@ class PlainRows:
         }
         head = preamble("Reference", arrays, rows.scratch)
         head = head.replace("typedef double real, mixed;", _TYPES[precision])
+        if precision != "double":
+            head = head.replace("#define USE_DOUBLE_PRECISION\n", "")
         head = head.replace("struct real4 {double x, y, z, w;};", "struct real4 {mixed x, y, z, w;};")
         needed = [a for a in arrays if f" {a.name}," in head.split("#define ROWS ")[1].split("\n")[0] + ","]
         arguments = ", ".join(f"{a.kind}* {a.name}" for a in needed)

@@ -125,10 +125,8 @@ DEVICE int rows_measure(ROWS int cluster, mixed h, mixed time, GLOBAL const mixe
         if (period > 0) off -= period*rint(off/period);
         rows_off[k] = off;
         for (int q = 3*begin+k+1; q < 3*ROW(k+1, 1)+k+1; q++) along += rows_now[q]*rows_there[q];
-#ifdef SINGLE
         if (!ROW(k, 3)) for (int p = begin; p < ROW(k+1, 1); p++) for (int c = 0; c < 3; c++) reach += fabs(rows_there[3*p+k+1+c]*x[PLACE(p)+c]);
-#endif
-        mixed allowed = tolerance*rows_number[3*k+1]*(rolls ? (mixed) 0.0625 : (mixed) 1)+(mixed) 5e-7*reach;
+        mixed allowed = tolerance*rows_number[3*k+1]*(rolls ? (mixed) 0.0625 : (mixed) 1)+ROWS_ROUNDING*reach;
         if (!(fabs(off) <= allowed && along > 0)) scratch[0] = k+1;
         if (!(fabs(off) < ROWS_FAR)) scratch[1] = k+1;
     }

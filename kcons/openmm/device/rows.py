@@ -37,8 +37,10 @@ _COMMON = f"""
 #define ROWS_FAR ((mixed) 1e30)
 #ifdef SINGLE
 #define ROWS_PIVOT ((mixed) {PIVOT_SINGLE})
+#define ROWS_ROUNDING ((mixed) 5e-7)
 #else
 #define ROWS_PIVOT ((mixed) {PIVOT})
+#define ROWS_ROUNDING ((mixed) 4e-16)
 #endif
 /* The shortest image of a vector. */
 #define ROWS_NEAR(a, b, c) {{mixed n_ = rint(c/box2.z); a -= n_*box2.x; b -= n_*box2.y; c -= n_*box2.z; \\

@@ -219,7 +219,7 @@ class ItemWriter:
             rounded = ""
             if row.how == STORED:
                 size = "+".join(f"fabs(o{k}[{1 + c}]*r{k}[{c}])" for c in range(3 * len(row.atoms)))
-                rounded = f"\n#ifdef SINGLE\n a{k} += (mixed) 5e-7*({size});\n#endif\n"
+                rounded = f" a{k} += ROWS_ROUNDING*({size});"
             return (
                 f" mixed t{k} = {'h*' if row.rolls else ''}{goal}, "
                 f"a{k} = tolerance*{self.record.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''};{rounded}\n"

@@ -151,10 +151,6 @@ class Part(ABC):
     #: The program that the part serves: that of the integrator which made steps last.
     program: Program | None = None
 
-    def begin_program(self, code: int) -> None:
-        """A program is written anew, in which the part has this number."""
-        self.code, self.lean = code, False
-
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "program"}
 

@@ -185,7 +185,7 @@ class ProjectedIntegrator(Integrator):
     def _write(self, program: Program) -> Step:
         """Write the program; parts keep what they need to know of it, and that it is the one they serve."""
         for k, part in enumerate(self.parts, start=1):
-            part.begin_program(k)
+            part.code = k
         step = Step(program, self.scheme, self.parts, self._ensemble)
         write_step(step)
         for part in self.parts:

@@ -44,7 +44,7 @@ MUTANTS = {
     "openmm/device/small_clusters.py": [
         (
             '"there« && last→»"',
-            "test_surface_steps.py::test_the_device_holds_the_same_surfaces",
+            "test_surfaces_on_the_device.py::test_the_device_holds_the_same_surfaces",
         ),
     ],
     "openmm/device/device_integrator.py": [

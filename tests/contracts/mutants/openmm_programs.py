@@ -162,13 +162,6 @@ MUTANTS = {
             "test_nose_hoover_ensemble.py::test_a_step_that_fails_leaves_the_chain_where_it_was",
         ),
     ],
-    "openmm/surfaces/surface_integrator.py": [
-        ('"0.5«+0.5*behind→»"', "test_surface_steps.py"),
-        (
-            '"«select(failed, 0.5*behind, 0.5)→0.5»"',
-            "test_surface_integrator.py::test_a_first_step_without_solution_leaves_velocities_without_a_kick",
-        ),
-    ],
     "openmm/integrator/schemes.py": [
         ("            kicks[«-1→0»] += operation.fraction", "test_programs.py"),
     ],
@@ -176,10 +169,6 @@ MUTANTS = {
         (
             "        «→# »self._write(self._program_type(self))",
             "test_part.py::test_integrators_in_turn_hold_the_same_part",
-        ),
-        (
-            "            part.«begin_program(k)→code = k»\n",
-            "test_surface_rows.py::test_parts_that_are_compiled_go_where_the_others_go",
         ),
     ],
     "openmm/collective/collective_rows.py": [
