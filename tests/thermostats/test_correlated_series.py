@@ -99,17 +99,6 @@ def test_errors_of_many_runs(name):
 
 
 @pytest.mark.filterwarnings("ignore:.*independent ones")
-def test_errors_with_weights():
-    """The slow motion is in values and weights: a mean with the weights exp(b y) of normal y is that of y + b."""
-    rng, found = np.random.default_rng(2), []
-    for _ in range(400):
-        y = fading(rng, 600, 15.0)[:, 0]
-        mean_of = weighted_mean(y + rng.standard_normal(600), log_weights=0.5 * y)
-        found.append((mean_of.value[0], mean_of.error[0]))
-    assert 0.9 <= scatter(found, 0.5) <= 1.15
-
-
-@pytest.mark.filterwarnings("ignore:.*independent ones")
 def test_errors_of_ratios():
     """Above and below the line depend on each other, and both on something slow."""
     rng, found = np.random.default_rng(3), []

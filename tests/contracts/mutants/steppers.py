@@ -124,10 +124,6 @@ MUTANTS = {
     ],
     "thermostats/langevin.py": [
         ("«numbers[PART] += 1.0→pass»", "test_respa.py::test_each_exchange_of_a_step_has_noise_of_its_own"),
-        (
-            "noise += «(1.0 - math.exp(-self.thermostat.friction * dt)) * →»kept",
-            "test_langevin.py::test_moving_targets_are_followed_and_friction_knows_their_speed",
-        ),
     ],
     "steppers/stages/compiled_operations.py": [
         ("room[FAR] = «1.0 if far else →»0.0", "test_interpreter.py::test_a_march_ends_where_remainders_begin"),
