@@ -35,7 +35,7 @@ print("\ntime   energy - start   force of the bowl, the rod, the egg")
 
 
 def show(state):
-    forces = "".join(f"{recorder.series.multipliers[name]:10.4f}" for name in ("bowl", "rod", "egg"))
+    forces = "".join(f"{force:10.4f}" for force in recorder.series.multiplier[-1])
     print(f"{state.time:4.1f} {energy(state) - energy(start):16.1e} {forces}")
 
 

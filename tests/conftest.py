@@ -78,16 +78,17 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.fixture
 def without_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where there is no compiler: a test of what the CustomIntegrator does, unless it gives device=True."""
+    """As where there is no compiler: a test of what the CustomIntegrator does."""
     from kcons.openmm.device import build
 
-    monkeypatch.setattr(build, "reluctance", lambda: "there is no C++ compiler")
+    monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
 
 
 @pytest.fixture(autouse=True)
 def custom_integrators(request: pytest.FixtureRequest) -> None:
-    """Whether the plugin for OpenMM was compiled on this machine makes no difference but to tests of the device."""
-    if "kcons.openmm.device.build" in sys.modules and "device" not in f"{request.path.parent.name} {request.path.name}":
+    """Whether the plugin for OpenMM was compiled here makes no difference but to pages and tests of the device."""
+    where = {request.path.parent.name, request.path.stem}
+    if "kcons.openmm.device.build" in sys.modules and not (where & {"pages", "studies"} or "device" in " ".join(where)):
         request.getfixturevalue("without_device")
 
 

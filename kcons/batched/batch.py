@@ -387,7 +387,7 @@ class Batch:
                 continue
             for each in groups:
                 each.worst = torch.zeros_like(each.worst)
-            k, lane = (~(off <= limit)).nonzero()[0].tolist()
+            k, lane = divmod(int(torch.nan_to_num(off, nan=torch.inf).argmax()), off.shape[1])
             residual, copy = float(off[k, lane]), int(group.systems[lane])
             row, held = int(group.rows[k, lane]) - int(self.row_starts[copy]), self.systems[copy].constraint_set
             said = f"is off by {residual:.3g} of its scale" if np.isfinite(residual) else "has turned or is not finite"

@@ -115,7 +115,7 @@ class Levels(Clusters):
         self.order = torch.tensor(order, device=device).argsort()
         self.slots = torch.tensor([i for k in order for i in slots[k]], device=device).argsort()
         self.atom, self.row = _table(((a, k) for k, row in enumerate(rows) for a in row.atoms), 2, device)
-        self.period = torch.tensor([[row.period or torch.inf] for row in rows], device=device)
+        self.period = torch.tensor([[row.period or torch.inf] for row in rows], dtype=torch.float64, device=device)
         products = [
             (entry, slots[k][i], slots[other][j], atom)
             for (k, other), entry in numbers.items()

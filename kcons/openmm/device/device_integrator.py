@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 from xml.etree import ElementTree
@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import openmm
 
+from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -504,7 +505,9 @@ def choose(
         `device` is True, and there is no plugin or it has no kernels for this step.
     """
     why = refusal(to_scheme(scheme), parts, ConstantEnergy() if ensemble is None else ensemble) or build.refusal()
-    if not why and device is None:
+    listed = parts if isinstance(parts, Iterable) else (parts,)
+    nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in listed)
+    if not why and device is None and not nowhere_else:
         why = build.reluctance()
     if not why:
         try:

@@ -91,7 +91,7 @@ class ProjectedIntegrator(Integrator):
     device : bool, optional
         Whether a compiled plugin makes the steps, see `kcons.openmm.device`: True demands it, False is the program of a
         CustomIntegrator. None takes the plugin if it has this step, and OpenMM has a platform for GPUs here (CUDA, HIP,
-        OpenCL) or the plugin was compiled already; `listing` says why not.
+        OpenCL), the plugin was compiled already, or nothing else makes such a step; `listing` says why not.
 
     Attributes
     ----------

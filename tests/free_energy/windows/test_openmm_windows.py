@@ -51,7 +51,7 @@ def test_windows_on_the_device_are_those_of_the_program(tmp_path, monkeypatch):
     settings = Settings(timestep=1.0, friction=1e-30, **steps)  # noise of 1e-14: each has its own
     found = []
     for why in ("", "there is no compiler"):
-        monkeypatch.setattr(build, "reluctance", lambda why=why: why)
+        monkeypatch.setattr(build, "refusal", lambda why=why: why)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # few samples
             window = Window(0, "up", (3.0, 3.1), (3.05, 3.1), 7)

@@ -10,6 +10,7 @@ import pytest
 from device_systems import waters
 from openmm_systems import GPUS, LONG, dumbbell, masses_of, residuals, started, state_of
 
+from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import (
     DeviceIntegrator,
@@ -438,6 +439,8 @@ def test_which_steps_are_made_on_the_device(monkeypatch):
     integrator = ProjectedIntegrator(0.001)
     assert type(integrator) is type(copy.copy(integrator)) is ProjectedIntegrator
     assert "not on the device: the plugin is not compiled" in integrator.listing()
+    only_there = ProjectedIntegrator(0.001, parts=Distance([[0, 1]], 0.1))
+    assert type(only_there) is DeviceIntegrator
     monkeypatch.setattr(build, "accelerated", lambda: ["CUDA"])
     assert type(ProjectedIntegrator(0.001)) is DeviceIntegrator
     monkeypatch.undo()

@@ -33,7 +33,7 @@ def started(barostat, ensemble):
     return integrator, context
 
 
-@pytest.mark.parametrize(("ensemble", "barostat"), zip(ENSEMBLES, BAROSTATS, strict=True))
+@pytest.mark.parametrize(("ensemble", "barostat"), list(zip(ENSEMBLES, BAROSTATS, strict=True)))
 def test_a_barostat_of_another_temperature(ensemble, barostat):
     integrator, context = started(barostat(310), ensemble)
     with pytest.warns(UserWarning, match=r"temperature of 310 K, and the integrator one of 300 K") as told:

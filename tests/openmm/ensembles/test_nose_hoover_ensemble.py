@@ -204,6 +204,7 @@ def test_a_step_that_fails_leaves_the_chain_where_it_was():
     assert np.array_equal(positions_of(context), r)
 
 
+@pytest.mark.usefixtures("without_device")
 def test_a_nan_leaves_the_chain_of_the_last_check():
     system, x, v = alanine()
     mine = copy.deepcopy(system)
@@ -356,6 +357,7 @@ def test_step_sizes_that_the_chain_cannot_follow_are_refused_in_a_run():
     assert context.getStepCount() == 2
 
 
+@pytest.mark.usefixtures("without_device")
 def test_the_chain_belongs_to_the_state_and_temperature_to_the_integrator():
     system, x, v = alanine()
     first = ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 20.0))

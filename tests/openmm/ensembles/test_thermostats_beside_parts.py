@@ -42,13 +42,11 @@ def test_rows_that_are_carried_move_as_those_of_the_system(bath):
     assert ends[0][2] == pytest.approx(ends[1][2], rel=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("bath", "scheme"), [("Isokinetic", "rattle"), ("Isokinetic", "isokinetic4"), ("NoseHoover", "rattle")]
-)
-def test_parts_keep_their_rows(bath, scheme):
+@pytest.mark.parametrize("bath", ["Isokinetic", "NoseHoover"])
+def test_parts_keep_their_rows(bath):
     system, x, parts = three_parts()
     ensemble = ENSEMBLES[bath](300.0)
-    integrator = ProjectedIntegrator(1e-3, scheme, parts=parts, ensemble=ensemble)
+    integrator = ProjectedIntegrator(1e-3, parts=parts, ensemble=ensemble)
     context = warm(system, integrator, x, 4)
     values = []
     for block in range(20):
