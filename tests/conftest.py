@@ -86,7 +86,7 @@ def without_device(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def custom_integrators(request: pytest.FixtureRequest) -> None:
-    """Whether the plugin for OpenMM was compiled here makes no difference but to tests that have device in their name."""
+    """Whether the plugin for OpenMM was compiled here makes no difference, but to tests with device in their names."""
     if "kcons.openmm.device.build" in sys.modules and "device" not in request.node.nodeid:
         request.getfixturevalue("without_device")
 
