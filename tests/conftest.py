@@ -86,8 +86,9 @@ def without_device(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def custom_integrators(request: pytest.FixtureRequest) -> None:
-    """Whether the plugin for OpenMM was compiled here makes no difference, but to tests with device in their names."""
-    if "kcons.openmm.device.build" in sys.modules and "device" not in request.node.nodeid:
+    """Whether the plugin was compiled here makes no difference, but to pages and tests with device in their names."""
+    asked = "device" in request.node.nodeid or request.path.parent.name in ("pages", "studies")
+    if "kcons.openmm.device.build" in sys.modules and not asked:
         request.getfixturevalue("without_device")
 
 

@@ -40,7 +40,6 @@ for _ in range(int(frames)):
     seen.append(state.positions.reshape(9, -1, 3).numpy())
 path = np.array(seen)
 ends = np.linalg.norm(path[:, :, 0] - path[:, :, 3], axis=-1)  # fixed by bonds, angles and the torsion
-print(f"ends of the chains are kept to {np.ptp(ends, axis=0).max():.1e} angstrom")
 assert np.ptp(ends, axis=0).max() < 1e-10
 path -= path[:, :, 1:3].mean(2, keepdims=True)
 

@@ -76,7 +76,7 @@ def test_pulls_beside_windows(tmp_path, capsys, monkeypatch):
     assert "5 pulls both ways of 40 steps each" in capsys.readouterr().out
     assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
     shown = capsys.readouterr().out
-    assert "pulls give " in shown and "(BAR;" in shown and " standard errors" in shown and "input/pulls.json" in shown
+    assert "pulls give " in shown and "(BAR)" in shown and " standard errors" in shown and "input/pulls.json" in shown
     assert len(list((tmp_path / "input" / "pulls").glob("pull-*.npz"))) == 10
     known = json.loads((tmp_path / "input" / "pulls.json").read_text())
     assert np.degrees([known["from"][0], known["to"][0]]) == pytest.approx([60, 200])

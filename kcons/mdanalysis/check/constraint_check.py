@@ -108,12 +108,12 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         rank: bool = True,
         worst: int = 10,
         names: tuple[str, str] | None = None,
-        **options: Any,
+        verbose: bool = False,
     ) -> None:
         universe = atoms.universe
         n_atoms = len(universe.atoms)
         require_angstrom(universe.trajectory)
-        super().__init__(universe.trajectory, **options)
+        super().__init__(universe.trajectory, verbose=verbose)
         if isinstance(constraints, HeldRows):
             constraints.require_atoms(n_atoms, universe.atoms.indices, host_of(universe))
         held = constraints.constraints if isinstance(constraints, ConstraintSet) else constraints

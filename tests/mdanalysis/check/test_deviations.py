@@ -330,8 +330,6 @@ def test_transformed_coordinates_are_taken_as_they_are(water):
         (ROWS, {"precision": 0.0}, "precision"),
         (ROWS, {"targets": "nowhere.toml"}, "nowhere.toml"),
         (ROWS, {"target_error": -1.0}, "target_error is -1.0; give a length"),
-        (ROWS, {"removed": -3}, "removed is -3"),
-        (ROWS, {"removed": 2.5}, "removed is 2.5"),
         (ROWS, {"worst": -1}, "worst is -1"),
         (ROWS, {"run": {"start": 30}}, "no frames"),
         (ROWS, {"run": {"step": 0}}, "step is 0"),
@@ -348,6 +346,11 @@ def test_transformed_coordinates_are_taken_as_they_are(water):
 def test_what_cannot_be_is_refused(water, rows, options, match):
     with pytest.raises(InputError, match=match):
         checked(water["dcd"], rows, **options)
+
+
+def test_options_that_do_not_exist_are_refused(water):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'tolerence'"):
+        checked(water["dcd"], ROWS, tolerence=1e-3)
 
 
 def test_rows_that_were_made_for_a_part_are_refused(water):
