@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import logging
 import math
 import os
 import re
@@ -30,6 +31,8 @@ import numba
 import numpy as np
 
 from kcons.errors import InputError, UnsupportedError
+
+logger = logging.getLogger("kcons")
 
 #: Characters of a formula, levels of its tree (a sum of n terms has n), and parts of its second derivatives.
 MAX_LENGTH, MAX_DEPTH, MAX_PARTS = 10_000, 200, 20_000
@@ -321,17 +324,16 @@ _NUMPY: dict[str, Any] = {**FUNCTIONS, "copysign": np.copysign, "__builtins__": 
 
 
 def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], speeds: bool) -> ModuleType:
-    """The module of a formula, from its file if there is one."""
+    """The module of a formula, from its file if there is one that is whole."""
     meant = repr((formula.strip(), width, parameters, speeds)).encode()
     key = hashlib.sha256(Path(__file__).read_bytes() + meant).hexdigest()[:24]  # other code writes other files
     path = _folder() / f"formula_{key}.py"
-    if path.is_file():
-        text = path.read_text(encoding="utf-8")
-    else:
-        text = _written(formula, tree, width, parameters, speeds)
+    text = _whole(path)
+    if text is None:
+        text = _written(formula, tree, width, parameters, speeds).encode()
         unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
         try:
-            unfinished.write_text(text, encoding="utf-8")
+            unfinished.write_bytes(_digest(text) + text)
             os.replace(unfinished, path)
         except OSError as error:
             unfinished.unlink(missing_ok=True)
@@ -341,8 +343,23 @@ def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...
             ) from error
     # Numba looks for what it has kept by the names of modules.
     module = sys.modules[f"kcons_{path.stem}"] = ModuleType(f"kcons_{path.stem}")
-    exec(compile(text, path, "exec"), module.__dict__)
+    exec(compile(b"\n" + text, path, "exec"), module.__dict__)  # the digest is the first line
     return module
+
+
+def _digest(text: bytes) -> bytes:
+    return f"# {hashlib.sha256(text).hexdigest()}\n".encode()
+
+
+def _whole(path: Path) -> bytes | None:
+    """The code in a file, None where there is none or where it is not what its first line is the digest of."""
+    if not path.is_file():
+        return None
+    head, newline, text = path.read_bytes().partition(b"\n")
+    if head + newline == _digest(text):
+        return text
+    logger.warning("the kept code of a formula is damaged (%s); it is written anew", path)
+    return None
 
 
 def _folder() -> Path:

@@ -194,3 +194,23 @@ def test_another_process_needs_neither_sympy_nor_the_compiler(tmp_path):
     assert {path.suffix for path in files} == {".py", ".nbi", ".nbc"}
     assert projected(tmp_path, "sympy") == (first, "")
     assert files == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "\n".join(text.rstrip().splitlines()[:-1]) + "\n",
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: text.replace("2", "3"),
+    ],
+    ids=["a line", "half", "empty", "other numbers"],
+)
+def test_a_file_that_is_damaged_is_written_anew_and_that_is_said(tmp_path, damage):
+    first, _ = projected(tmp_path)
+    (file,) = tmp_path.rglob("formula_*.py")
+    whole = file.read_text()
+    file.write_text(damage(whole))
+    again, said = projected(tmp_path)
+    assert again == first and file.read_text() == whole
+    assert said.count("is damaged") == 1 and file.name in said
