@@ -71,7 +71,10 @@ MUTANTS = {
             "«        for name, value in self.settings.items():\n            self.write(name, value)\n→»",
             "test_settings.py::test_a_setting_has_a_method_of_its_own",
         ),
-        ("if «found != self.settings[_SUM_OF_VECTORS]→False»:", "test_settings.py::test_targets_stay"),
+        (
+            "if «found != self.settings[_SUM_OF_VECTORS]→False»:",
+            "test_surface_integrator.py::test_a_checkpoint_of_other_surfaces_does_not_bring_them_along",
+        ),
     ],
     "openmm/integrator/system_checks.py": [
         (

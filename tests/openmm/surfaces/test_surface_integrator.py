@@ -283,3 +283,22 @@ def test_a_simulation_is_no_context():
     for call in (integrator.applyConstraints, integrator.multipliers):
         with pytest.raises(InputError, match="give the Context"):
             call("a Simulation")
+
+
+def test_a_checkpoint_of_other_surfaces_does_not_bring_them_along():
+    """It holds which particles are on spheres, and where these are."""
+    made = []
+    for atom in (0, 1):
+        system = system_of([1.0, 1.0], "0", 0)
+        integrator = SurfaceIntegrator(
+            0.01, "geodesic", surfaces=Sphere([atom], [0, 0, 0], 1.0), system=system, device=False
+        )
+        context = started(system, integrator, [[1.0, 0, 0], [0, 1.0, 0]], [[0, 0.5, 0], [0.5, 0, 0]])
+        integrator.step(1)
+        made.append((integrator, context))
+    made[1][1].loadCheckpoint(made[0][1].createCheckpoint())
+    made[1][1].setPositions([[1.0, 0, 0], [0, 1.0, 0]])
+    made[1][1].setVelocities([[0, 0.5, 0], [0.5, 0, 0]])
+    made[1][0].step(50)
+    x = state_of(made[1][1])[0]
+    assert np.linalg.norm(x, axis=1) == pytest.approx([np.sqrt(1 + 0.25**2), 1.0], abs=1e-12)
