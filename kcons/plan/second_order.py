@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet, whole_bodies
 from kcons.constraints.internal import Distance
 from kcons.constraints.linear import LinearRelation
 from kcons.constraints.periodic.one_piece import BoolArray
@@ -127,7 +127,7 @@ class _Stack:
 
     def suspects(self, constraint_set: ConstraintSet, x: FloatArray, time: float) -> BoolArray:
         """Blocks that are singular at second order at `x`, shape (n_blocks,)."""
-        unit, curvature = self._dense(constraint_set, x, time)
+        unit, _, curvature = self.dense(constraint_set, x, time)
         doubtful: BoolArray = np.asarray(np.isfinite(unit).all(axis=(1, 2)))
         doubtful[doubtful] = _deficient(unit[doubtful])
         if doubtful.any() and not doubtful.all():
@@ -139,10 +139,10 @@ class _Stack:
             doubtful = unsolvable(unit, curvature, np.where(extent > 0, extent, 1.0))
         return doubtful
 
-    def _dense(
-        self, constraint_set: ConstraintSet, x: FloatArray, time: float
-    ) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
-        """Row-normalized A of each block, fixed atoms' columns zero, and the curvatures of the same rows."""
+    def dense(
+        self, constraint_set: ConstraintSet, x: FloatArray, time: float, pinned: IntArray | None = None
+    ) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
+        """Row-normalized A of each block, fixed atoms' columns zero, its norms, and the curvatures of the same rows."""
         n_blocks, n_rows = self.rows.shape
         n_atoms = self.atoms.shape[1]
         a = np.zeros((n_blocks, n_rows, n_atoms, 3))
@@ -157,7 +157,7 @@ class _Stack:
             with np.errstate(divide="ignore", invalid="ignore"):
                 a[block[:, None], row[:, None], slots] = part.gradient(r, time)
             pieces.append((part, r, block, row, slots))
-        free = ~np.isin(self.atoms, fixed_atoms(constraint_set))
+        free = ~np.isin(self.atoms, fixed_atoms(constraint_set) if pinned is None else pinned)
         a *= free[:, None, :, None]
         unit = a.reshape(n_blocks, n_rows, -1)
         norms = np.linalg.norm(unit, axis=2)
@@ -170,7 +170,7 @@ class _Stack:
                 bent[block, row] = part.curvature(r, field[block[:, None], slots], time)
             return bent / norms
 
-        return unit / norms[:, :, None], curvature
+        return unit / norms[:, :, None], norms, curvature
 
     def straight_triangles(
         self, constraint_set: ConstraintSet, suspects: BoolArray, time: float
@@ -220,7 +220,7 @@ class _Stack:
         if self.rows.shape[1] <= 3 or not result.any():
             return np.zeros_like(result)
         far = np.flatnonzero(result)
-        unit, _ = self.chosen(far)._dense(constraint_set, x, time)
+        unit = self.chosen(far).dense(constraint_set, x, time)[0]
         if unit.shape[1] <= unit.shape[2]:
             # At a distance s from a flat geometry the smallest singular value is s, and the rows are off by s^2.
             smallest = np.linalg.svd(unit, compute_uv=False)[:, -1]
@@ -382,16 +382,15 @@ class LocalRows:
             dtype=np.int64,
         )
 
-    def unit_jacobian(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Row-normalized A without the columns' part of fixed atoms, and the norms."""
-        a = self.part.jacobian(x, self.time).toarray()
-        a[:, np.repeat(self.pinned, 3)] = 0.0
-        norms = np.linalg.norm(a, axis=1)
-        return a / np.where(norms > 0, norms, 1.0)[:, None], norms
+    def linear(self, x: FloatArray) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
+        """Row-normalized A without the columns of fixed atoms, its norms, and the curvatures of the same rows."""
+        stack = _Stack(np.arange(self.part.n_rows)[None], np.arange(len(self.atoms))[None])
+        unit, norms, curvature = stack.dense(self.part, x, self.time, np.flatnonzero(self.pinned))
+        return unit[0], norms[0], lambda v: curvature(v[None])[0]
 
     def decomposed(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, int]:
         """u, s and v^T of these rows, all singular vectors, and their rank."""
-        u, s, vt = np.linalg.svd(self.unit_jacobian(x)[0], full_matrices=True)
+        u, s, vt = np.linalg.svd(self.linear(x)[0], full_matrices=True)
         return u, s, vt, int(np.sum(s > LOST * s[0]))
 
     def singular(self, x: FloatArray, rows: IntArray | None = None) -> bool:
@@ -399,19 +398,8 @@ class LocalRows:
         rows = np.arange(self.part.n_rows) if rows is None else rows
         if len(rows) < 2:
             return False
-        unit, _ = self.unit_jacobian(x)
-
-        def curvature(v: FloatArray) -> FloatArray:
-            return self.unit_curvature(x, v)[None, rows]
-
-        return bool(unsolvable(unit[None, rows], curvature, np.array([extent_of(x)]))[0])
-
-    def unit_curvature(self, x: FloatArray, v: FloatArray) -> FloatArray:
-        """v^T (d2sigma/dx2) v of the rows that `unit_jacobian` scales, shape (n_rows,)."""
-        _, norms = self.unit_jacobian(x)
-        field = np.where(self.pinned[:, None], 0.0, v.reshape(-1, 3))
-        bent = [c.curvature(self.part.gather(c, x), field[c.atoms], self.time) for c in self.part.constraints]
-        return np.asarray(np.concatenate(bent) / np.where(norms > 0, norms, 1.0))
+        unit, _, curvature = self.linear(x)
+        return bool(unsolvable(unit[None, rows], lambda v: curvature(v[0])[None, rows], np.array([extent_of(x)]))[0])
 
     def stressed(self, x: FloatArray) -> IntArray:
         """Rows (block numbering) that take part in a dependence omega^T A = 0."""
@@ -419,7 +407,7 @@ class LocalRows:
         return np.flatnonzero(np.einsum("rk,rk->r", u[:, rank:], u[:, rank:]) > 1e-10)
 
     def rank(self, x: FloatArray, rows: IntArray | None = None) -> int:
-        unit, _ = self.unit_jacobian(x)
+        unit = self.linear(x)[0]
         s = np.linalg.svd(unit if rows is None else unit[rows], compute_uv=False)
         return int(np.sum(s > LOST * s[0])) if len(s) else 0
 
@@ -432,8 +420,8 @@ class LocalRows:
             # Towards a flat geometry the singular value is the square root of this, 1e-7: lost by any measure.
             if np.max(np.abs(sigma) / self.part.scale) < 1e-14:
                 break
-            unit, norms = self.unit_jacobian(x)
-            step = np.linalg.lstsq(unit[held], -(sigma / np.where(norms > 0, norms, 1.0))[held], rcond=STEP_CUT)[0]
+            unit, norms, _ = self.linear(x)
+            step = np.linalg.lstsq(unit[held], -(sigma / norms)[held], rcond=STEP_CUT)[0]
             x = x + step.reshape(x.shape)
         other = copy.copy(self)
         other.x = x
@@ -468,22 +456,8 @@ class LocalRows:
 
     def unwrapped(self, x: FloatArray) -> FloatArray:
         """Positions made whole across the boundary, following the rows."""
-        if self.part.lattice is None:
-            return x
-        whole = x.copy()
-        placed = np.zeros(len(x), bool)
-        placed[0] = True
-        rows = [r for item in self.part.constraints for r in self.part.gather(item, x)]
-        for _ in range(len(x)):
-            if placed.all():
-                break
-            for members, r in zip(self.row_atoms, rows, strict=True):
-                known = placed[members]
-                if known.any() and not known.all():
-                    base = int(np.argmax(known))
-                    whole[members[~known]] = whole[members[base]] + r[~known] - r[base]
-                    placed[members] = True
-        return whole
+        found = [item.with_target(None) for item in self.part.constraints]
+        return whole_bodies(found, self.part.whole(x), self.part.lattice)
 
     def _shortest(self) -> float:
         lengths = [
@@ -658,7 +632,7 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
             atoms=block.atoms[atoms],
         )
     plane = _fitted(block, atoms, inside, x, flat, linearized)
-    bases, weights = _bases(block, atoms, inside, plane)
+    bases, weights = _bases(plane, block.pinned[atoms])
     others = np.setdiff1d(np.arange(len(atoms)), bases)
     held = np.array(list(combinations(bases, 2)))
     lengths = np.linalg.norm(plane[held[:, 0]] - plane[held[:, 1]], axis=1)
@@ -672,7 +646,7 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
     return FlatBody(
         atoms=atoms,
         rows=inside,
-        bases=atoms[list(bases)],
+        bases=atoms[bases],
         pairs=pairs,
         lengths=lengths,
         tied=atoms[others],
@@ -723,38 +697,21 @@ def _fitted(
     return best
 
 
-def _bases(
-    block: LocalRows, atoms: IntArray, inside: IntArray, plane: FloatArray
-) -> tuple[tuple[int, ...], FloatArray]:
-    """Two or three bases far apart (fixed atoms and pairs already held preferred), and all atoms' weights."""
-    n, flat = plane.shape
-    held = {tuple(sorted(block.row_atoms[k])) for k in inside if len(block.row_atoms[k]) == 2}
-    fixed = block.pinned[atoms]
-    candidates = list(range(n))
-    if flat == 2 and n > 40:
-        # The outermost atoms in a few directions; all triples of a large sheet would be too many.
-        angles = np.linspace(0, np.pi, 16, endpoint=False)
-        reach = plane @ np.stack([np.cos(angles), np.sin(angles)])
-        outer = np.concatenate([np.argmax(reach, 0), np.argmin(reach, 0), np.flatnonzero(fixed)[:8]])
-        candidates = np.unique(outer).tolist()
-    choices = list(combinations(candidates, flat + 1))
-    corners = plane[np.array(choices)]
-    edges = corners[:, 1:] - corners[:, :1]
-    size = np.abs(edges[:, 0, 0]) if flat == 1 else np.abs(np.linalg.det(edges))
-    good = np.flatnonzero(size >= 0.5 * size.max()) if flat == 2 else np.flatnonzero(size >= 0.999 * size.max())
-
-    def merit(k: int) -> tuple[int, int, float]:
-        pairs = combinations(choices[k], 2)
-        kept = sum(tuple(sorted((atoms[i], atoms[j]))) in held for i, j in pairs)
-        return int(fixed[list(choices[k])].sum()), kept, float(size[k])
-
-    bases = choices[max(good.tolist(), key=merit)]
-    corner = plane[list(bases)]
-    system = np.vstack([corner.T, np.ones(flat + 1)])
-    weights = np.linalg.solve(system, np.vstack([plane.T, np.ones(n)])).T
+def _bases(plane: FloatArray, fixed: BoolArray) -> tuple[IntArray, FloatArray]:
+    """Two or three bases far apart, fixed atoms before others not twice as far; and all atoms' weights."""
+    away, bases = plane - plane.mean(axis=0), list[int]()
+    for k in range(plane.shape[1] + 1):
+        far = np.linalg.norm(away, axis=1) * np.where(fixed, 2.0, 1.0)
+        bases.append(int(np.argmax(far > (1 - 1e-6) * far.max())))  # so that rounding does not choose
+        away = plane - plane[bases[0]]
+        if k == 1:
+            axis = away[bases[1]] / np.linalg.norm(away[bases[1]])
+            away = away - np.outer(away @ axis, axis)
+    system = np.vstack([plane[bases].T, np.ones(len(bases))])
+    weights = np.linalg.solve(system, np.vstack([plane.T, np.ones(len(plane))])).T
     # Round so that the weights sum to one: the relation then does not depend on the origin.
     weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
-    return bases, weights
+    return np.array(bases), weights
 
 
 def _without_repeats(block: LocalRows, bodies: list[FlatBody]) -> list[FlatBody]:
@@ -784,14 +741,15 @@ def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> Non
     """
     new = _rebuilt(block, bodies)
     u, s, vt, rank = new.decomposed(block.x)
-    old, _ = block.unit_jacobian(block.x)
+    old, _, bend = block.linear(block.x)
+    curvature = new.linear(block.x)[2]
     if np.abs(old @ vt[rank:].T).max(initial=0.0) > 1e-4 or new.singular(block.x):
         raise _unresolved(block, generic)
     rng = np.random.default_rng(20060921)
     for _ in range(3):
         v = rng.standard_normal(len(vt) - rank) @ vt[rank:]
-        a = -((u[:, :rank].T @ new.unit_curvature(block.x, v)) / s[:rank]) @ vt[:rank]
-        bent = block.unit_curvature(block.x, v)
+        a = -((u[:, :rank].T @ curvature(v)) / s[:rank]) @ vt[:rank]
+        bent = bend(v)
         miss = old @ a + bent
         # Rigid motion has no curvature but rounding.
         size = np.linalg.norm(bent) + 1e-5 * (v @ v) / extent_of(block.x)
