@@ -24,7 +24,7 @@ from itertools import combinations
 import numpy as np
 import scipy.sparse as sp
 
-from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet, whole_bodies
 from kcons.constraints.internal import Distance
 from kcons.constraints.linear import LinearRelation
@@ -44,10 +44,9 @@ _FLAT_TARGETS = 1e-12
 #: Blocks of one shape that start off their targets are analyzed where they belong, until this many in a
 #: row turn out regular.
 _REGULAR_SAMPLES = 100
-_INTERNAL = frozenset({"Distance", "Angle", "Dihedral", "LinearRelation", "LinearCombination"})
 _LEVELS: tuple[Callable[[Constraint], bool], ...] = (
     lambda item: True,
-    lambda item: item.family in _INTERNAL and item.translation_invariant,
+    lambda item: item.translation_invariant and (item.reversible or item.kind is RowKind.LINEAR),
     lambda item: item.holds_length,
 )
 #: Directions that a step of Gauss-Newton leaves out. Towards a flat geometry singular values go with the square root of
@@ -58,8 +57,6 @@ DISPLACEMENT = 1e-2
 #: Part of the curvature outside the range of A that is more than rounding (or than the differences of a
 #: user's gradient).
 UNSOLVABLE = 1e-4
-#: Families whose rows a linear or planar group makes superfluous.
-_CONVERTIBLE = frozenset({"Distance", "Angle", "Dihedral"})
 #: Extent across a line or plane, relative to the extent along it, that still counts as flat.
 FLAT = 1e-6
 #: Relative misfit between the targets and a flat geometry above which the conversion is refused.
@@ -370,17 +367,9 @@ class LocalRows:
         self.row_atoms = [self.part.row_atoms(k) for k in range(self.part.n_rows)]
 
     def inside(self, atoms: IntArray) -> IntArray:
-        """Rows (block numbering) of convertible families with all their atoms among `atoms` (block numbering)."""
-        chosen = np.zeros(len(self.atoms), bool)
-        chosen[atoms] = True
-        return np.array(
-            [
-                k
-                for k, members in enumerate(self.row_atoms)
-                if chosen[members].all() and self.part.locate(k)[0].family in _CONVERTIBLE
-            ],
-            dtype=np.int64,
-        )
+        """Rows (block numbering) that a rigid group of `atoms` (block numbering) makes superfluous."""
+        rows = [np.isin(item.atoms, atoms).all(axis=1) & item.reversible for item in self.part.constraints]
+        return np.flatnonzero(np.concatenate(rows))
 
     def linear(self, x: FloatArray) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
         """Row-normalized A without the columns of fixed atoms, its norms, and the curvatures of the same rows."""

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import minimum_image
+from kcons.constraints.periodic.one_piece import connected, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
+from kcons.topology.topology import BoolArray, Snapshot, bond_angles, sorted_pairs
 
 #: Covalent radii in angstrom of elements that form bonds that could be held. Cordero et al., Dalton Trans. 2832 (2008).
 RADII: dict[str, float] = {

@@ -18,8 +18,8 @@ import numpy as np
 from kcons.constraints import Constraint, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, SingularGeometryError
-from kcons.topology.topology import BoolArray, Snapshot, listed, near_misses
+from kcons.errors import InputError, SingularGeometryError, did_you_mean
+from kcons.topology.topology import BoolArray, Snapshot, listed
 from kcons.topology.virtual_sites import VirtualSites, fitted
 from kcons.topology.whole_molecules import whole_groups
 
@@ -219,7 +219,7 @@ def residue_bodies(snapshot: Snapshot, names: Sequence[str]) -> list[IntArray]:
         same = present == str(name).strip().upper()
         if not same.any():
             raise InputError(
-                f"no residue is called {name}{near_misses(str(name), present)}; there are "
+                f"no residue is called {name}{did_you_mean(str(name), present.tolist())}; there are "
                 + listed(topology.residue_names),
                 item="rigid_residues",
             )

@@ -6,7 +6,6 @@ where virtual sites go) is derived once, for MDAnalysis, ASE and OpenMM alike.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import BoolArray, lattice_of, neighbor_lists
+from kcons.constraints.periodic.one_piece import BoolArray, connected, lattice_of, neighbor_lists
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -222,18 +221,6 @@ def sorted_pairs(pairs: ArrayLike) -> IntArray:
     return np.stack(np.divmod(code, int(table.max()) + 1), axis=1)
 
 
-def connected(pairs: IntArray, n: int) -> tuple[IntArray, int]:
-    """Number of the component of each atom, counted from 0 in the order of their first atoms, and how many."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, label = connected_components(links, directed=False)
-    _, first, number = np.unique(label, return_index=True, return_inverse=True)
-    order = np.argsort(np.argsort(first))
-    return order[number].astype(np.int64), int(count)
-
-
 def bond_angles(bonds: IntArray, n_atoms: int) -> IntArray:
     """All i-j-k with bonds i-j and j-k, i < k, sorted by (j, i, k), shape (n, 3)."""
     starts, ends = neighbor_lists(bonds, n_atoms)
@@ -430,12 +417,6 @@ def require_kind(given: Any, kind: type | UnionType, item: str, wanted: str) -> 
     if not isinstance(given, kind):
         each = "; of several, give one at a time" if isinstance(given, list | tuple) else ""
         raise InputError(f"{item} must be {wanted}, not {type(given).__name__}{each}", item=item)
-
-
-def near_misses(name: str, known: Iterable[str]) -> str:
-    """' (did you mean A or B?)', or nothing."""
-    close = difflib.get_close_matches(name.upper(), sorted({str(k).upper() for k in known}), n=3, cutoff=0.5)
-    return f" (did you mean {' or '.join(close)}?)" if close else ""
 
 
 def listed(names: Iterable[str], most: int = 12) -> str:

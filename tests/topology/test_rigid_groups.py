@@ -105,7 +105,7 @@ def test_impossible_bodies_are_named(bodies, said):
 
 
 def test_unknown_residue_is_named_with_near_misses():
-    with pytest.raises(InputError, match=r"no residue is called BNZZ \(did you mean BNZ\?\); there are ALA, BNZ"):
+    with pytest.raises(InputError, match=r"no residue is called BNZZ \(did you mean 'BNZ'\?\); there are ALA, BNZ"):
         residue_bodies(snapshot(["C", "C"], WATER[:2], residues=[0, 1], residue_names=["BNZ", "ALA"]), ["BNZZ"])
 
 

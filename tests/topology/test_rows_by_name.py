@@ -140,7 +140,7 @@ def test_a_straight_angle_is_a_linear_row():
 def test_named_water_geometry():
     rows = held_rows(solution(), "none", water_geometry="SPC/E")
     np.testing.assert_allclose(rows[0].target, [1.0, 1.0, np.sqrt(8 / 3)])
-    with pytest.raises(InputError, match=r"no water model 'tip3' \(did you mean TIP3P"):
+    with pytest.raises(InputError, match=r"no water model 'tip3' \(did you mean 'tip3p'"):
         held_rows(solution(), "none", water_geometry="tip3")
 
 
