@@ -179,18 +179,9 @@ TAKES_TIME = "; say time_dependent=True for functions that take the time t as we
 
 
 def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str = "", needed: bool = False) -> None:
-    """Refuse what is no function, or cannot be called with as many arguments; None, where none is needed, passes.
+    """Refuse what is no function, or cannot be called with `arguments`; None, where none is needed, passes.
 
-    Parameters
-    ----------
-    item : str
-        What it is, for messages.
-    function : callable or None
-    arguments : tuple of str
-        Names of what it is called with.
-    hint : str
-        Ends the sentence.
-    needed : bool
+    `item` is what it is called in messages, `hint` ends their sentence.
     """
     if not callable(function) and (needed or function is not None):
         raise InputError(
@@ -384,15 +375,10 @@ def has_units(values: Any) -> bool:
 
 
 def without_units(values: Any, item: str, kind: Kind) -> tuple[Any, bool]:
-    """Numbers in nm, ps, dalton, radian, and whether they would be others in other units.
+    """Numbers of Quantities, or of nested lists of them, in nm, ps, dalton, radian; anything else stays as it is.
 
-    Parameters
-    ----------
-    values : Quantity, nested lists of them, or anything else, which stays as it is
-    item : str
-        For messages.
-    kind : Kind
-        What they must be; plain numbers may be angles, too.
+    The second result is whether they would be others in other units. `kind` is what they must be; plain numbers may be
+    angles, too.
     """
     if not has_units(values):
         return values, False

@@ -331,20 +331,7 @@ class Constraint:
         return self.singular.format(row=row, atoms=" and ".join(str(a) for a in self.atoms[k, :6]))
 
     def refuse_singular(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int, str], str]) -> None:
-        """Raise where rows are undefined.
-
-        Parameters
-        ----------
-        bad : ndarray of bool, shape (n_rows,)
-        first_row : int
-            As for `check`.
-        say : callable
-            Gets the first bad row and what to call it, gives the message.
-
-        Raises
-        ------
-        SingularGeometryError
-        """
+        """Raise `SingularGeometryError` for the first row that is marked; `say` gets it and its name, and tells why."""
         k = first_true(bad)
         if k is not None:
             row = first_row + k

@@ -18,26 +18,10 @@ _CHUNK = 2_000_000
 
 
 def refuse_contradictions(items: Sequence[Constraint], starts: IntArray, time: float) -> None:
-    """Raise if targets contradict each other.
+    """Raise if targets of `items`, which have them, contradict each other at a time; `starts` are their first rows.
 
-    Looks for the same distance, angle or dihedral held at two values, and for triangles of distances
-    that violate the triangle inequality: about 0.1 s for 10^5 distances.
-
-    Parameters
-    ----------
-    items : sequence of Constraint
-        With their targets resolved.
-    starts : ndarray of int
-        Number of the first row of each item.
-    time : float
-        When moving targets are compared.
-
-    Raises
-    ------
-    ContradictionError
-        Two targets for one coordinate.
-    InfeasibleError
-        A triangle with one side longer than the two others together.
+    Looks for the same distance, angle or dihedral held at two values (`ContradictionError`), and for triangles of
+    distances that violate the triangle inequality (`InfeasibleError`): about 0.1 s for 10^5 distances.
     """
     for family in {type(item): None for item in items if item.reversible}:
         chosen = [(item, start) for item, start in zip(items, starts, strict=False) if type(item) is family]
@@ -54,17 +38,10 @@ def refuse_contradictions(items: Sequence[Constraint], starts: IntArray, time: f
 
 
 def found_as_given(items: Sequence[Constraint], found: Sequence[bool], time: float) -> list[Constraint]:
-    """Lengths that were found from positions, as given where another row gives the same one.
+    """Lengths that were found from positions (as `found` says of each item) as given where another row gives the same
+    one.
 
     They differ by the rounding of positions, by which both could not be held.
-
-    Parameters
-    ----------
-    items : sequence of Constraint
-        With their targets resolved, and free of contradictions.
-    found : sequence of bool
-        Whose targets come from positions.
-    time : float
     """
     result = list(items)
     numbers = [n for n, item in enumerate(items) if item.holds_length and not item.moving]

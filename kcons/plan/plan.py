@@ -222,13 +222,7 @@ def make_plan(
 ) -> Plan:
     """Find the clusters, their rank, and a solver for each.
 
-    Parameters
-    ----------
-    constraint_set : ConstraintSet
-    positions : ndarray, shape (n_atoms, 3)
-    time : float
-    named : ConstraintSet, optional
-        The same rows on the atom numbers of the whole system, for messages.
+    `named` has the same rows on the atom numbers of the whole system, for messages.
     """
     named = constraint_set if named is None else named
     pinned, pinned_rows = _pinned(constraint_set)

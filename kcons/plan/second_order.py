@@ -64,19 +64,7 @@ MISFIT = 1e-6
 
 
 def without_second_order_rows(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> ConstraintSet:
-    """The same set with second-order-singular rows replaced by linear ones.
-
-    Parameters
-    ----------
-    constraint_set : ConstraintSet
-    positions : ndarray, shape (n_atoms, 3)
-        Positions on or near the surface.
-    time : float
-
-    Returns
-    -------
-    ConstraintSet
-        The given object itself if it is regular.
+    """The same set with second-order-singular rows replaced by linear ones; the given object itself if it is regular.
 
     Raises
     ------
@@ -205,7 +193,6 @@ class _Stack:
                     lengths=length[k, 2:],
                     tied=np.array([middle]),
                     weights=np.array([[1.0 - c, c]]),
-                    linearized=7,
                 )
             )
         return bodies, done
@@ -301,20 +288,11 @@ def _lost_rows(part: ConstraintSet, x: FloatArray, free: BoolArray, time: float)
 
 
 def unsolvable(unit: FloatArray, curvature: Callable[[FloatArray], FloatArray], extent: FloatArray) -> BoolArray:
-    """Whether A a = -v^T (d2sigma/dx2) v has no solution for some v with A v = 0.
+    """Whether A a = -v^T (d2sigma/dx2) v has no solution for some v with A v = 0 (notes eqs. 92, 95), of several
+    blocks.
 
-    Parameters
-    ----------
-    unit : ndarray, shape (n_blocks, n_rows, n_coordinates)
-        A of several blocks, rows scaled to unit norm.
-    curvature : callable
-        Maps v, shape (n_blocks, n_coordinates), to the curvatures, shape (n_blocks, n_rows), of the scaled rows.
-    extent : ndarray, shape (n_blocks,)
-        Length scale of each block.
-
-    References
-    ----------
-    Notes, eqs. 92 and 95.
+    `unit` is A with rows of unit norm, shape (n_blocks, n_rows, n_coordinates), `curvature` maps v, shape (n_blocks,
+    n_coordinates), to the curvatures of these rows, and `extent` is the length scale of each block.
     """
     u, s, vt = np.linalg.svd(unit, full_matrices=True)
     cut = LOST * s[:, :1]
@@ -481,8 +459,6 @@ class FlatBody:
         The other atoms.
     weights : ndarray, shape (n, n_bases)
         x_tied = weights @ x_bases.
-    linearized : int
-        Degrees of freedom that the replaced rows leave at first order; the body itself has 5 or 6.
     """
 
     atoms: IntArray
@@ -492,7 +468,6 @@ class FlatBody:
     lengths: FloatArray
     tied: IntArray
     weights: FloatArray
-    linearized: int
 
     def __str__(self) -> str:
         """For example 'atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows'."""
@@ -610,79 +585,51 @@ def _merged(found: list[IntArray], x: FloatArray) -> list[IntArray]:
 def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
     """What holds a flat group: bases, their distances, and the weights of the other atoms."""
     inside = block.inside(atoms)
-    moving = [k for k in inside if isinstance(block.part.locate(int(k))[0].target, MovingTarget)]
-    linearized = 3 * len(atoms) - int(block.pinned[atoms].sum()) * 3 - block.rank(block.x, inside)
-    flat = affine_dimension(x[atoms])
-    if moving:
-        raise SingularGeometryError(
-            _sentence(linearized, flat, block.atoms[atoms])
-            + "; it cannot be converted, since a target among these atoms is a function of time",
-            rows=block.rows[inside],
-            atoms=block.atoms[atoms],
-        )
-    plane = _fitted(block, atoms, inside, x, flat, linearized)
+    located = [block.part.locate(int(k)) for k in inside]
+    if any(isinstance(item.target, MovingTarget) for item, _ in located):
+        raise _refused(block, atoms, inside, x, "since a target among these atoms is a function of time")
+    plane = _fitted(block, atoms, inside, x)
     bases, weights = _bases(plane, block.pinned[atoms])
-    others = np.setdiff1d(np.arange(len(atoms)), bases)
     held = np.array(list(combinations(bases, 2)))
     lengths = np.linalg.norm(plane[held[:, 0]] - plane[held[:, 1]], axis=1)
-    pairs = atoms[held]
-    for k in inside:
-        item, row = block.part.locate(int(k))
+    pairs, others = atoms[held], np.setdiff1d(np.arange(len(atoms)), bases)
+    for item, row in located:
         if item.holds_length:
             same = np.flatnonzero((np.sort(pairs, axis=1) == np.sort(item.atoms[row])).all(axis=1))
             # A base distance that was held stays at its own target, to the last bit.
             lengths[same] = np.asarray(item.target)[row]
-    return FlatBody(
-        atoms=atoms,
-        rows=inside,
-        bases=atoms[bases],
-        pairs=pairs,
-        lengths=lengths,
-        tied=atoms[others],
-        weights=weights[others],
-        linearized=linearized,
-    )
+    return FlatBody(atoms, inside, atoms[bases], pairs, lengths, atoms[others], weights[others])
 
 
-def _fitted(
-    block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, flat: int, linearized: int
-) -> FloatArray:
+def _fitted(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray) -> FloatArray:
     """Coordinates along the line or in the plane that fulfil the targets, shape (n, 1) or (n, 2).
 
     Gauss-Newton within the plane, where the rows are regular; starts from the present positions.
     """
-    y = x[atoms]
-    center = y.mean(axis=0)
-    axes = np.linalg.svd(y - center)[2][:flat]
-    plane = (y - center) @ axes.T
+    center, flat = x[atoms].mean(axis=0), affine_dimension(x[atoms])
+    axes = np.linalg.svd(x[atoms] - center)[2][:flat]
+    plane = (x[atoms] - center) @ axes.T
     columns = (3 * atoms[:, None] + np.arange(3)).ravel()
     scale = block.part.scale[inside]
     whole = x.copy()
-    best, miss = plane, np.inf
+    best, miss, worst = plane, np.inf, 0
     for _ in range(30):
         whole[atoms] = center + plane @ axes
-        sigma = block.part.value(whole, block.time)[inside]
-        size = float(np.max(np.abs(sigma) / scale))
-        if not size < miss:
+        sigma = block.part.value(whole, block.time)[inside] / scale
+        if not np.abs(sigma).max() < miss:
             break
-        best, miss = plane, size
-        if size < 1e-16:
+        best, worst, miss = plane, int(np.argmax(np.abs(sigma))), float(np.abs(sigma).max())
+        if miss < 1e-16:
             break
         a = block.part.jacobian(whole, block.time)[inside][:, columns].toarray()
         a = np.einsum("rnc,fc->rnf", a.reshape(len(inside), len(atoms), 3), axes).reshape(len(inside), -1)
-        step = np.linalg.lstsq(a / scale[:, None], -sigma / scale, rcond=STEP_CUT)[0]
-        plane = plane + step.reshape(plane.shape)
+        plane = plane + np.linalg.lstsq(a / scale[:, None], -sigma, rcond=STEP_CUT)[0].reshape(plane.shape)
     if not miss <= MISFIT:
-        whole[atoms] = center + best @ axes
-        worst = int(np.argmax(np.abs(block.part.value(whole, block.time)[inside]) / scale))
-        row = int(block.rows[inside[worst]])
-        raise SingularGeometryError(
-            _sentence(linearized, flat, block.atoms[atoms])
-            + f"; it cannot be converted, since the targets do not fit a {('linear', 'planar')[flat - 1]} group: "
-            f"row {block.set.row_name(row)} stays off by {miss:.2g} (relative)",
-            rows=block.rows[inside],
-            atoms=block.atoms[atoms],
+        name = block.set.row_name(int(block.rows[inside[worst]]))
+        why = (
+            f"since the targets do not fit a {('linear', 'planar')[flat - 1]} group: row {name} stays off by {miss:.2g}"
         )
+        raise _refused(block, atoms, inside, x, f"{why} (relative)")
     return best
 
 
@@ -784,20 +731,24 @@ def _listed(atoms: IntArray) -> str:
     return ", ".join(str(a) for a in atoms[:8]) + (", ..." if len(atoms) > 8 else "")
 
 
-def _sentence(linearized: int, flat: int, atoms: IntArray) -> str:
-    shown = _listed(atoms)
+def _refused(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, why: str) -> SingularGeometryError:
+    """The error for a flat group that cannot be converted."""
+    linearized = 3 * int(np.sum(~block.pinned[atoms])) - block.rank(block.x, inside)
     freedom, shape, remedy = (
         (5, "collinear", "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead")
-        if flat == 1
+        if affine_dimension(x[atoms]) == 1
         else (
             6,
             "coplanar",
             "hold three distances and x_a = c_i x_i + c_j x_j + c_k x_k (LinearRelation) for the other atoms instead",
         )
     )
-    return (
+    named = block.atoms[atoms]
+    return SingularGeometryError(
         f"constraint set singular at this geometry: {linearized} linearized degrees of freedom but the rigid body "
-        f"has {freedom} (atoms {shown} are {shape}); {remedy}"
+        f"has {freedom} (atoms {_listed(named)} are {shape}); {remedy}; it cannot be converted, {why}",
+        rows=block.rows[inside],
+        atoms=named,
     )
 
 

@@ -116,18 +116,8 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     """Bonds that the distances alone suggest, where neither elements nor the unit of length are known, shape (n, 2).
 
     Two atoms are bonded if they are closer than `NEAREST` times the geometric mean of the distances of each to its
-    nearest neighbor. Nothing is guessed where the molecules of `atoms` then do not look like molecules.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n_atoms, 3)
-        In any unit; atoms that are not finite get no bonds.
-    lattice : ndarray, shape (2, 3, 3), or None
-        A periodic cell and its inverse, as `ConstraintSet.lattice`.
-    atoms : ndarray of int
-        Whose molecules are looked at.
-    able : ndarray of bool, shape (n_atoms,)
-        Only these atoms form bonds.
+    nearest neighbor. Nothing is guessed where the molecules of `atoms` then do not look like molecules. Only atoms that
+    are `able` and finite form bonds.
     """
     from scipy.spatial import cKDTree
 

@@ -416,17 +416,7 @@ def _first_four(x: FloatArray, order: IntArray) -> IntArray:
 
 
 def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:
-    """For each atom the three of four bases that are farthest from being seen in one plane.
-
-    Parameters
-    ----------
-    rest : ndarray, shape (n_bodies, n_atoms, 3)
-    corners : ndarray, shape (n_bodies, 4, 3)
-
-    Returns
-    -------
-    ndarray of int, shape (n_bodies, n_atoms, 3)
-    """
+    """For each atom the three of four bases that are farthest from being seen in one plane."""
     triples = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
     sight = corners[:, None] - rest[:, :, None]
     sight = sight / np.linalg.norm(sight, axis=3, keepdims=True)

@@ -72,12 +72,6 @@ def test_kept_in_a_folder_and_announced_once(tmp_path):
     assert second == ("1 0", "")
 
 
-def test_two_processes_at_once(tmp_path):
-    both = [started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
-    assert {ended(process)[0] for process in both} <= {"0 1", "1 0"}
-    assert ended(started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path)))[0] == "1 0"
-
-
 #: A few hundred steps with kernels of several kinds: a digest of the last bits of each.
 BITS = """
 import hashlib

@@ -14,7 +14,7 @@ import kcons.mdanalysis
 import kcons.openmm
 from kcons.errors import InputError
 from kcons.topology import Holding, held_rows
-from kcons.topology.holding import CONSTRAIN, Options
+from kcons.topology.holding import Options
 
 ENGINES = [kcons.ase.constraints_of, kcons.mdanalysis.constraints_of, kcons.openmm.constraints_of]
 
@@ -48,11 +48,6 @@ def test_iterables_are_read_once():
     assert Holding("none", rigid_residues="HOH").residues == ("HOH",)
 
 
-@pytest.mark.parametrize("name", [*CONSTRAIN, None, "HBonds"])
-def test_names_of_what_is_held(name):
-    assert Holding(name).kind == ("none" if name is None else name.lower())
-
-
 def test_own_rows_are_a_mapping_or_pairs():
     assert (
         Holding("none", on={(0, 1): len}).own_rows == Holding("none", on=[((0, 1), len)]).own_rows == (((0, 1), len),)
@@ -68,10 +63,6 @@ def test_geometry_of_water():
         Holding(water_geometry=(np.nan, 109)).geometry()
     assert Holding(rigid_water=False).waters == frozenset()
     assert "MINE" in Holding(water_names=[" mine "]).waters
-
-
-def test_one_body_in_words_is_one_body():
-    assert Holding(rigid_bodies="protein and resid 45").bodies == ("protein and resid 45",)
 
 
 @pytest.mark.parametrize("on", [{"protein": "CenterOfMass"}, [("protein", None)], ["protein"], [1]])

@@ -139,25 +139,9 @@ def find_images(
 ) -> tuple[list[Constraint], Images | None]:
     """Sort rows into plain and whole ones and find the tree.
 
-    Parameters
-    ----------
-    constraints : sequence of Constraint
-        Targets may still be missing.
-    starts : ndarray of int
-        First row of each.
-    x : ndarray, shape (n_atoms, 3)
-    lattice : ndarray, shape (2, 3, 3), or None
-    half_width : float
-    time : float
-    ties : sequence of Constraint
-        What the constraints replace: rows that are held still and tie atoms together.
-
-    Returns
-    -------
-    constraints : list of Constraint
-        Copies that know which of their rows are whole, and the cell_offsets of these.
-    images : Images or None
-        None if all rows are plain.
+    Targets may still be missing; `starts` are the first rows, `ties` what the constraints replace: rows that are held
+    still and tie atoms together. Gives copies that know which of their rows are whole, with their cell_offsets, and the
+    tree, None if all rows are plain.
 
     Raises
     ------
