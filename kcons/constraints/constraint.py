@@ -224,13 +224,13 @@ class Constraint:
         r : ndarray, shape (n_rows, width, 3)
         time : float
         """
-        out = self._evaluated(r, time)
+        with np.errstate(all="ignore"):  # either may be undefined where the other is not
+            out = self._evaluated(r, time)
         return out[0], np.ascontiguousarray(out[1:].T).reshape(r.shape)
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         """Natural coordinate q, shape (n_rows,), from positions `r` of shape (n_rows, width, 3)."""
-        with np.errstate(all="ignore"):  # a gradient may be undefined where the value is not
-            return self.value_and_gradient(r, time)[0]
+        return self.value_and_gradient(r, time)[0]
 
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         """dq/dr (position rows) or the coefficients of v (velocity rows), shape (n_rows, width, 3)."""

@@ -328,7 +328,7 @@ def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bo
 
     def looked(places: Any) -> Any:
         some = iter(signs)
-        known: dict[str, Any] = {name: getattr(np, name) for name in ELEMENTARY}
+        known: dict[str, Any] = {name: getattr(np, name) for name in (*ELEMENTARY, "inf", "nan")}
         made: dict[str, Any] = {}
         exec(text, known | {"copysign": lambda _, x: next(some)}, made)
         out = np.empty((len(tape.results) - 1, 40), complex)
@@ -339,7 +339,7 @@ def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bo
         value, *slopes = looked(r)
         steep, slope = np.array(slopes[:n]), np.array(slopes[n:] or slopes)
         seen = np.isfinite(slopes).all(axis=0)
-        if seen.any() and not slope[:, seen].any():
+        if seen.all() and not slope.any():
             what = "velocities: it has none of them" if speeds else "positions: its gradient is zero"
             raise InputError(
                 f"Formula: {formula!r} does not change with the {what}; write one that does", item="formula"
