@@ -43,7 +43,7 @@ IntArray = NDArray[np.int64]
 #: A step along which derivatives are imaginary parts: its square vanishes beside 1, and a power of two does not round.
 _COMPLEX_STEP = 2.0**-100
 
-#: Rows of more atoms are compiled where others are taken at once, since loops over atoms are then long.
+#: Rows that loop over more atoms are compiled, where others are taken at once.
 WIDE = 6
 
 #: All families by name.
@@ -198,7 +198,7 @@ class Constraint:
     @property
     def moving(self) -> bool:
         """Whether value or gradient depend on time explicitly."""
-        return isinstance(self.target, MovingTarget)
+        return isinstance(self.target, MovingTarget) or self.rate is not None
 
     def _evaluated(self, r: NDArray[Any], time: complex, row: Any = None) -> NDArray[Any]:
         """What `row` puts out, shape (1 + 3 width, n_rows): for all rows at once, or compiled where loops are long."""

@@ -277,12 +277,7 @@ def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: Boo
     lacking = ~bonded & (topology.elements != "")
     if topology.residues_known:
         lacking &= size > 1
-    if guess is True:
-        known = topology.bonds[settled[topology.bonds].any(axis=1)]
-        found = guess_bonds(snapshot, ~settled, ~settled)
-        both = sorted_pairs(np.concatenate([known, found]))
-        return replace(snapshot, topology=topology.with_bonds(both)), len(found)
-    if not lacking.any():
+    if guess is not True and not lacking.any():
         return snapshot, 0
     if guess is False:
         atom = int(np.argmax(lacking))
@@ -294,9 +289,10 @@ def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: Boo
             item="bonds",
             atoms=[atom],
         )
-    found = guess_bonds(snapshot, lacking, ~settled)
-    both = sorted_pairs(np.concatenate([topology.bonds, found]))
-    return replace(snapshot, topology=topology.with_bonds(both)), len(both) - len(topology.bonds)
+    known = topology.bonds[settled[topology.bonds].any(axis=1)] if guess is True else topology.bonds
+    found = guess_bonds(snapshot, ~settled if guess is True else lacking, ~settled)
+    both = sorted_pairs(np.concatenate([known, found]))
+    return replace(snapshot, topology=replace(topology, bonds=both)), len(both) - len(known)
 
 
 def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray | None) -> IntArray:

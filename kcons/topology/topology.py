@@ -425,7 +425,7 @@ def listed(names: Iterable[str], most: int = 12) -> str:
     return ", ".join(distinct[:most]) + (f", ... ({len(distinct)} in all)" if len(distinct) > most else "")
 
 
-def selected_numbers(select: Any, n: int) -> IntArray:
+def selected_numbers(select: Any, n: int, item: str = "select", name: str = "the selection") -> IntArray:
     """Numbers of the atoms that a mask or a list of numbers names.
 
     Raises
@@ -438,12 +438,13 @@ def selected_numbers(select: Any, n: int) -> IntArray:
         given = np.flatnonzero(given)
     if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
         raise InputError(
-            f"select {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
+            f"{item} {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
             "for kcons.mdanalysis",
-            item="select",
+            item=item,
         )
     if not given.size:
-        raise InputError("the selection has no atoms; widen it", item="select")
+        raise InputError(f"{name} has no atoms; widen it", item=item)
     if given.min() < 0 or given.max() >= n:
-        raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
+        beyond = int(given.min() if given.min() < 0 else given.max())
+        raise InputError(f"{name} names atom {beyond}; there are atoms 0 to {n - 1}", item=item)
     return given.astype(np.int64)

@@ -125,10 +125,6 @@ class Formula(Constraint):
         return code_of(self.formula, self.width, tuple(self.names), self.of_speeds)
 
     @property
-    def moving(self) -> bool:
-        return super().moving or self.rate is not None
-
-    @property
     def row(self) -> Any:  # type: ignore[override]
         return self.code().row
 

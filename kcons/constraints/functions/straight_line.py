@@ -208,4 +208,4 @@ def function_of(item: Constraint) -> Function | None:
     if item.row is None:
         return Function(_linear(3 * item.width))
     known = [float(item.width)] if item.uses_masses else item.parameters()[:1, : item.alike].ravel().tolist()
-    return Function(item.row, tuple(known), item.rate, item.holds_length)
+    return Function(item.row, tuple(known), item.rate if item.holonomic else None, item.holds_length)
