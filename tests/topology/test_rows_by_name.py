@@ -164,7 +164,7 @@ def test_virtual_sites_are_no_degrees_of_freedom():
     [
         ({"constrain": "hbond"}, r"cannot constrain 'hbond' \(did you mean 'hbonds'\?"),
         ({"constrain": "none", "rigid_water": False}, "nothing is to be held"),
-        ({"angles": "cosines"}, "angles must be"),
+        ({"angles": "cosines"}, "choose .angles. or .distances."),
         ({"water_geometry": (1.0, 190.0)}, "give a positive length"),
         ({"selected": np.zeros(12, bool)}, "nothing to hold within the selection of 0 atoms"),
     ],
