@@ -7,13 +7,12 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from snapshots import WATER, snapshot
 
 import kcons.ase
 import kcons.mdanalysis
 import kcons.openmm
 from kcons.errors import InputError
-from kcons.topology import Holding, held_rows
+from kcons.topology import Holding
 from kcons.topology.holding import Options
 
 ENGINES = [kcons.ase.constraints_of, kcons.mdanalysis.constraints_of, kcons.openmm.constraints_of]
@@ -34,11 +33,6 @@ def test_help_shows_every_option_with_its_default(function):
     # The parameters of the function itself come first, what it returns and raises last.
     assert page.index("rigid_water :") > page.index("Parameters\n")
     assert page.index("guess_bonds :") < page.index("Returns\n") < page.index("Raises\n")
-
-
-def test_an_unknown_option_is_refused_by_its_name():
-    with pytest.raises(TypeError, match="rigid_watr"):
-        held_rows(snapshot(["O", "H", "H"], WATER), rigid_watr=False)
 
 
 def test_iterables_are_read_once():
