@@ -1,4 +1,4 @@
-"""Functions of rows as lists of operations, from which engines in other languages are written.
+"""Functions of rows as lists of operations: these are differentiated, and written in other languages.
 
 The function `row` of a declaration is straight arithmetic with elementary functions, and loops over numbers that are
 known. Run on symbols it writes down what it does.
