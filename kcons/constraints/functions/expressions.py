@@ -274,7 +274,8 @@ class Code:
             known = {name: r[k] for k, name in enumerate(names)} | {name: p[k] for k, name in enumerate(parameters)}
             return _value(tree, {**known, "t": t, "pi": math.pi}, float)
 
-        tape = differentiated(value, n + n * speeds)
+        with np.errstate(all="ignore"):  # of constants
+            tape = differentiated(value, n + n * speeds)
         found, *slopes, moves = (_text(each) for each in tape.results)
         steep, slope = slopes[:n], slopes[n:] or slopes
         self.invariant = _look(formula, tape, n, speeds, len(parameters)) and width > 1
