@@ -164,37 +164,23 @@ class _Stack:
         done = np.zeros(len(self.rows), bool)
         if self.rows.shape[1] != 3 or self.atoms.shape[1] != 3:
             return [], done
-        pairs = np.full((constraint_set.n_rows, 2), -1)
-        for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
-            if item.holds_length and not isinstance(item.target, MovingTarget):
-                pairs[start : start + item.n_rows] = item.atoms
-        sides = pairs[self.rows]
-        plain = (sides >= 0).all(axis=(1, 2)) & ~np.isin(self.atoms, fixed_atoms(constraint_set)).any(axis=1)
+        lengths = [np.full(c.n_rows, c.holds_length and not c.moving) for c in constraint_set.constraints]
+        plain = np.concatenate(lengths)[self.rows].all(axis=1)
+        plain &= ~np.isin(self.atoms, fixed_atoms(constraint_set)).any(axis=1)
         if not plain.any():
             return [], done
         length = constraint_set.target(time)[self.rows]
         order = np.argsort(length, axis=1)
         length = np.take_along_axis(length, order, axis=1)
-        sides = np.take_along_axis(sides, order[:, :, None], axis=1)
-        excess = np.abs(length[:, 0] + length[:, 1] - length[:, 2]) / length[:, 2]
-        done = plain & ((suspects & (excess <= MISFIT)) | (excess <= _FLAT_TARGETS))
+        rows = np.take_along_axis(self.rows, order, axis=1)
+        excess = np.abs(length[:, 0] + length[:, 1] - length[:, 2])
+        done = plain & (excess <= length[:, 2] * np.where(suspects, MISFIT, _FLAT_TARGETS))
         bodies = []
         for k in np.flatnonzero(done):
-            i, j = sides[k, 2]
-            middle = self.atoms[k].sum() - i - j
-            from_i = length[k, 0] if i in sides[k, 0] else length[k, 1]
-            c = from_i / (length[k, 0] + length[k, 1])
-            bodies.append(
-                FlatBody(
-                    atoms=self.atoms[k],
-                    rows=self.rows[k],
-                    bases=sides[k, 2],
-                    pairs=sides[k, 2:],
-                    lengths=length[k, 2:],
-                    tied=np.array([middle]),
-                    weights=np.array([[1.0 - c, c]]),
-                )
-            )
+            ends, side = constraint_set.row_atoms(int(rows[k, 2])), constraint_set.row_atoms(int(rows[k, 0]))
+            c = length[k, 0 if ends[0] in side else 1] / (length[k, 0] + length[k, 1])
+            middle, weights = self.atoms[k].sum(keepdims=True) - ends.sum(), np.array([[1.0 - c, c]])
+            bodies.append(FlatBody(self.atoms[k], self.rows[k], ends, ends[None], length[k, 2:], middle, weights))
         return bodies, done
 
     def off_target(self, constraint_set: ConstraintSet, x: FloatArray, sigma: FloatArray, time: float) -> BoolArray:
