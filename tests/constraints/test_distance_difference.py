@@ -147,3 +147,15 @@ def test_replicas_each_have_their_own():
     assert rows.target() == pytest.approx(np.repeat(value, 2), abs=1e-12)
     lengths = lengths_in(twice.cell.array, twice.positions, rows.constraints[0].atoms[:, :2].tolist())
     assert lengths == pytest.approx(2 * [proton().get_distance(0, 1)], abs=1e-12)
+
+
+def test_a_proton_goes_over_within_a_molecule_that_stays_as_it_is():
+    """Malonaldehyde, halfway between its two enols: no atom but the proton moves by more than 0.03."""
+    places = [[-1.29, 0.55, 0], [-0.60, 1.27, 0], [1.27, 0.75, 0], [-1.16, -0.74, 0], [0.05, -1.40, 0]]
+    atoms = Atoms("OHOCCCHHH", [*places, [1.20, -0.48, 0], [-2.12, -1.26, 0], [0.10, -2.48, 0], [2.17, -1.02, 0]])
+    atoms.info["bonds"] = [[0, 1], [0, 3], [3, 4], [4, 5], [5, 2], [3, 6], [4, 7], [5, 8]]
+    before = atoms.positions.copy()
+    constrain(atoms, DistanceDifference(TRANSFER, 0.0), project=True)
+    assert atoms.get_distance(0, 1) == pytest.approx(atoms.get_distance(1, 2), abs=1e-12)
+    moved = np.linalg.norm(atoms.positions - before, axis=1)
+    assert moved[1] > 0.3 and np.delete(moved, 1).max() < 0.03
