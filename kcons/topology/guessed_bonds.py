@@ -7,8 +7,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from kcons.constraints import Angle
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import connected, minimum_image
+from kcons.constraints.periodic.one_piece import connected, lined_up, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.topology import BoolArray, Snapshot, bond_angles, sorted_pairs
@@ -154,10 +155,9 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     if torn.any() or crowded.any():
         return nothing
     kept = bonds[seen[bonds[:, 0]]]
-    i, j, k = bond_angles(kept, len(y)).T
-    u, w = minimum_image(y[i] - y[j], lattice), minimum_image(y[k] - y[j], lattice)
-    angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
-    return nothing if np.any(angle < SHARPEST) else finite[kept]
+    angles = bond_angles(kept, len(y))
+    sharp = Angle(angles).measure(lined_up(y[angles], lattice), 0.0) < SHARPEST
+    return nothing if np.any(sharp) else finite[kept]
 
 
 def across(pairs: IntArray, lengths: FloatArray) -> BoolArray:
