@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from kcons.constraints.functions.straight_line import Function, Operand, Tape
+from kcons.constraints.functions.straight_line import Function, Operand, Tape, record
 from kcons.errors import UnsupportedError
 
 #: Operations that are operators in C, and functions that have another name there.
@@ -65,8 +65,8 @@ def c_functions(name: str, function: Function, space: str = "") -> str:
     results = "".join(f" out[{k}] = {_text(each)};\n" for k, each in enumerate(tape.results))
     places = f"{space}const mixed* r, GLOBAL const mixed* p, mixed t"
     text = f"DEVICE void {name}({places}, {space}mixed* out) {{\n{_lines(tape)}{results}}}\n"
-    if function.second is not None:
-        rate = function.rate_tape(REMEDY)
+    if function.rate is not None:
+        rate = record(function.rate, function.known, REMEDY)
         text += f"DEVICE mixed {name}_rate({places}) {{\n{_lines(rate)} return {_text(rate.results[0])};\n}}\n"
     return text
 
@@ -86,7 +86,7 @@ def openmm_expression(function: Function) -> str:
             needed |= set(tape.steps[k][1])
             name, text = line.removeprefix(" mixed ").removesuffix(";").split(" = ")
             found.append(f"{name}=" + re.sub(r"pow\((.*), (.*)\)", r"(\1)^(\2)", text))
-    text = "; ".join(found)
+    text = re.sub(r"copysign\(\(\(mixed\) 1\.0\), (\w+)\)", r"(2*step(\1)-1)", "; ".join(found))
     for old, new in ((r"\bk(?=\d)", "row_k"), (r"\(mixed\) ", ""), (r"\bfabs\b", "abs"), (r"p\[(\d+)\]", r"row_p\1")):
         text = re.sub(old, new, text)
     text = re.sub(r"r\[(\d)\]", lambda place: "xyz"[int(place[1])], text)
