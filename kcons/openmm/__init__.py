@@ -9,7 +9,7 @@ collective variables, surfaces and the constraint objects of kcons.
 - `ensembles`: Langevin, isokinetic, Nosé-Hoover
 - `collective`: collective variables
 - `callback_rows`: constraint objects of kcons
-- `surfaces`: particles on surfaces
+- `surface_integrator`: particles on surfaces
 - `device`: steps as kernels of a plugin
 """
 
@@ -32,7 +32,7 @@ try:
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
     from kcons.openmm.states import positions_of, velocities_of
-    from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
+    from kcons.openmm.surface_integrator import SurfaceIntegrator
     from kcons.openmm.topology import constraints_of
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.openmm") from error
@@ -59,7 +59,6 @@ __all__ = [
     "masses_of",
     "move_constraints",
     "positions_of",
-    "surface_parts",
     "velocities_of",
     "worst_length",
 ]

@@ -30,7 +30,6 @@ from kcons.openmm import (
     Row,
     constraints_of,
     hold,
-    surface_parts,
 )
 from kcons.openmm.quantities import accepted, array, number
 
@@ -118,7 +117,7 @@ def test_surfaces():
         lambda length: Torus([1], [0, 0, 0] * nm, [0, 0, 1], 5 * length, 2.5 * length),
     ):
         system = atoms(2)
-        (part,) = surface_parts(make(angstrom), system=system, positions=x * nm)
+        part = hold(system, make(angstrom), x * nm)
         context = started(system, ProjectedIntegrator(1e-3, parts=[part]), x, 0 * x)
         part.check(context)
     with pytest.raises(InputError, match="Sphere: radius is 5 K; give it in nm"):
@@ -176,7 +175,6 @@ def test_arguments_of_methods():
 def test_positions_of_the_wrong_kind():
     for call in (
         lambda: hold(atoms(), [Distance([[0, 1]])], positions=X * kelvin),
-        lambda: surface_parts(Sphere([0], [1, 0, 0]), system=atoms(), positions=X * kelvin),
         lambda: constraints_of(openmm.app.Topology(), X[:0] * kelvin),
     ):
         with pytest.raises(InputError, match=r"positions .*give it in nm"):

@@ -6,7 +6,7 @@ import pytest
 from openmm_systems import alanine, context_of, masses_of, started, state_of
 
 from kcons.constraints import Angle, Sphere
-from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold, surface_parts
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold
 
 
 def twice_kinetic(system, v):
@@ -65,7 +65,7 @@ def three_parts():
     distance = openmm.CustomBondForce("r")
     distance.addBond(3, 4)
     rows = CollectiveRows(system, [Row(distance, 0.5)])
-    (sphere,) = surface_parts(Sphere([5], center=[0, 0, 0], radius=0.6), system=system)
+    sphere = hold(system, Sphere([5], center=[0, 0, 0], radius=0.6), x)
     return system, x, (carried, rows, sphere)
 
 
@@ -75,8 +75,3 @@ def on_their_rows(r, u):
     assert abs(np.linalg.norm(r[5]) - 0.6) < 1e-13
     assert abs((r[3] - r[4]) @ (u[3] - u[4])) < 1e-11 and abs(r[5] @ u[5]) < 1e-11
     return r, u
-
-
-def three_on_a_sphere():
-    system, x = tied([20.0] * 3, "100*(r-0.5)^2", [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]])
-    return system, x, Sphere([0, 1, 2], center=[0, 0, 0], radius=0.5)

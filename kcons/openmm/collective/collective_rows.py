@@ -56,7 +56,6 @@ from kcons.openmm.integrator.system_checks import (
 from kcons.openmm.quantities import masses_of, with_massless_atoms
 from kcons.openmm.states import box_of, energy_of, forces_at, motion_of, positions_of, velocities_of, width_of
 from kcons.openmm.topology import bonds_of
-from kcons.steppers.splitting import Composition, Rattle
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
@@ -415,7 +414,7 @@ class CollectiveRows(GroupRows):
         ranks = [Motion(ConstraintSet(part, x, solver.motion.masses), x).rank for part in parts]
         return [k for k in range(n) if ranks[k + 1] > ranks[k]]
 
-    def multipliers_at(self, context: openmm.Context) -> FloatArray:
+    def multipliers(self, context: openmm.Context) -> FloatArray:
         """lambda at the positions and velocities of the context, as accurate as these; shape (n_rows,).
 
         (A M_par^+ A^T) lambda = target'' - d(A v)/dt - A M_par^+ f (notes, eq. 104), M_par^+ that of the System's
@@ -452,38 +451,6 @@ class CollectiveRows(GroupRows):
         return np.array(targets) + np.array(rates) * self._clock(holder), np.array(rates)
 
     # -- of an integrator, after its last step --------------------------------------------------
-
-    def multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
-        """lambda at the positions where the last step began, to second order in the step; shape (n_rows,).
-
-        In kJ/mol per unit of q, z = A^T lambda. It is the mean of 2 L/h^2 of the first drift and 2 mu/h of the
-        velocity projection before it, at the same positions; after a start, or when somebody moved x, only the former,
-        to first order. NaN before the first step.
-
-        Raises
-        ------
-        UnsupportedError
-            Schemes in which these are not impulses of the same force; see `mean_multipliers`, `multipliers_at`.
-        """
-        scheme = getattr(integrator, "scheme", None)
-        if getattr(integrator, "thermostatted", False):
-            raise UnsupportedError(
-                "with a thermostat the impulses of a step are not those of the forces alone; read "
-                "multipliers_at(context)"
-            )
-        if scheme is not None and not isinstance(scheme, Rattle | Composition):
-            raise UnsupportedError(
-                f"{scheme!r} has no multipliers at a single point of the step; read mean_multipliers(integrator), the "
-                "mean over the last step, or multipliers_at(context), those at the state of a context"
-            )
-        return self._read(integrator, "lambda")
-
-    def mean_multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
-        """Impulses of the last step over its length, shape (n_rows,): lambda averaged over it, every scheme.
-
-        NaN before the first step.
-        """
-        return self._read(integrator, "mean")
 
     def work(self, integrator: openmm.CustomIntegrator) -> FloatArray:
         """What moving each target has added to the energy, in kJ/mol, shape (n_rows,): sum of lambda rate dt."""

@@ -10,7 +10,6 @@ is good enough for sure is not measured: numbers are what the host of a GPU wait
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -45,7 +44,7 @@ class GroupRows(Part):
         One entry a row.
     """
 
-    evaluates = stays_finite = True
+    stays_finite = True
     code = 1
     names: tuple[str, ...]
     atoms: tuple[tuple[int, ...], ...]
@@ -84,7 +83,11 @@ class GroupRows(Part):
     @property
     def driven(self) -> bool:
         """Whether targets move."""
-        return any(self._rates)
+        return bool(self._driven_rows)
+
+    @property
+    def _driven_rows(self) -> list[int]:
+        return [k for k, rate in enumerate(self._rates) if rate != 0.0]
 
     @property
     def _pushes(self) -> str:
@@ -102,27 +105,24 @@ class GroupRows(Part):
         alone = len(integrator.parts) == 1
         self._single = len(scheme.drifts) * len(scheme.flight) == 1
         numbers = [
-            ("push", "L: x moves by L times the row", 0.0),
-            ("more", "change of L", 0.0),
-            ("sigma", "coordinate less target", 0.0),
-            ("now", "the same, after the last push", 0.0),
-            ("change", "what the push changed", 0.0),
-            ("expected", "push that the inverse at hand expects for that", 0.0),
-            ("left", "last push times the inverse", 0.0),
-            ("own", "size of the row alone, for its pivot", 0.0),
-            ("slope", "rate of the coordinate less that of the target", 0.0),
-            ("impulse", "multiplier times time, over this step", 0.0),
-            ("mean", "multiplier, mean over the last step", math.nan),  # none before it
-            ("lambda", "multiplier at the start of the last step, to second order", math.nan),
-            ("end", "multiplier of the last velocity projection", 0.0),
-            ("work", "work done by moving the target", 0.0),
+            ("push", "L: x moves by L times the row"),
+            ("more", "change of L"),
+            ("sigma", "coordinate less target"),
+            ("now", "the same, after the last push"),
+            ("change", "what the push changed"),
+            ("expected", "push that the inverse at hand expects for that"),
+            ("left", "last push times the inverse"),
+            ("own", "size of the row alone, for its pivot"),
+            ("slope", "rate of the coordinate less that of the target"),
+            ("impulse", "multiplier times time, over this step"),
+            ("work", "work done by moving the target"),
         ]
         for k, name in enumerate(self.names):
             p.vector(self._of("row", k), f"M_par^+ gradient of row {k}, {name}")
             p.setting(self._of("target", k), f"target of row {k}", self._targets[k])
             p.setting(self._of("rate", k), "change of this target in a ps", self._rates[k])
-            for what, words, value in numbers:
-                p.number(self._of(what, k), words, value)
+            for what, words in numbers:
+                p.number(self._of(what, k), words)
         for block in self._blocks:
             for i in block:
                 for j in block:
@@ -136,7 +136,6 @@ class GroupRows(Part):
         p.number(f"pivot{c}", "what is left of a row beside those before it")
         p.number(f"weight{c}", "denominator of the update")
         p.number(f"length{c}", "square of the last push")
-        p.number(f"known{c}", "whether the last velocity projection was at the start of this step")
         p.number(f"singular{c}", "1 + number of the first row that vanishes or depends on others")
         p.number(f"residual{c}", "size of sigma relative to the scales")
         p.number(f"iterations{c}", "quasi-Newton iterations of the last drift")
@@ -165,7 +164,6 @@ class GroupRows(Part):
     def begin(self, p: Program) -> None:
         """Gradients where x is not where the last step ended."""
         self._gradients(p)
-        p.let(f"known{self.code}", "0", "no projection was here")
 
     def renew(self, p: Program) -> None:
         """Gradients after a step without `project`. Their sizes, which tell what a small pivot is, may be old."""
@@ -173,7 +171,6 @@ class GroupRows(Part):
         with p.when(f"renew{self.code} != 0", "G is old"):
             self._invert(p)
         self._refuse_dependent(p)
-        p.let(f"known{self.code}", "0", "no projection was here")
 
     def remember(self, p: Program) -> None:
         c = self.code
@@ -279,7 +276,9 @@ class GroupRows(Part):
                 self._push(p)
             p.let(f"held{c}", f"max(held{c}, delta(state{c}-3))", "it does what it did before")
         p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")
-        self._note_multipliers(p, h)
+        self._note_impulses(p, h)
+        if self.lean:
+            p.let(f"renew{c}", f"max(step(iterations{c}-2.5), 1-behind)", "has it become slow?")
         if not self._single:
             self._gradients(p)
 
@@ -352,21 +351,11 @@ class GroupRows(Part):
                     new = f"{self._inverse(i, j)}+weight{c}*({of('more', i)}-{of('expected', i)})*{of('left', j)}"
                     p.let(self._inverse(i, j), new, "Broyden's update")
 
-    def _note_multipliers(self, p: Program, h: str) -> None:
-        c, begins = self.code, "delta(stage)"
-        for k in range(self.n_rows):
-            push, impulse, multiplier, end = (self._of(name, k) for name in ("push", "impulse", "lambda", "end"))
-            before = f"select({begins}, 0, {impulse})"
-            if self.lean:  # a drift of velocities that were not made tangent pushes for that as well
-                before = f"-select(behind*looked, 0.5*dt*{end}, 0)"
+    def _note_impulses(self, p: Program, h: str) -> None:
+        for k in self._driven_rows:
+            push, impulse = self._of("push", k), self._of("impulse", k)
+            before = "0" if self.lean else f"select(delta(stage), 0, {impulse})"
             p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
-            at = f"select(known{c}, 0.5*({end}+2*{push}/({h}*{h})), 2*{push}/({h}*{h}))"
-            if self.lean:
-                at = f"select(behind, {push}/({h}*{h}), {at})"
-            p.let(multiplier, f"select({begins}, {at}, {multiplier})", "multiplier where the step began")
-        if self.lean:
-            p.let(f"renew{c}", f"max(step(iterations{c}-2.5), 1-led)", "has it become slow?")
-        p.let(f"known{c}", "0", "further drifts begin elsewhere")
 
     # -- velocities -----------------------------------------------------------------------------
 
@@ -392,25 +381,15 @@ class GroupRows(Part):
         v = f"v_kept{c}" if self.meets_system and self._single else "v"
         pushes = _sum(f"{self._of('more', k)}*{self._of('row', k)}" for k in rows)
         p.each("v", f"{v}+{pushes}", "tangent to the rows")
-        share = _last_share(p.integrator)
-        for k in rows:
-            p.let(self._of("end", k), f"2*{self._of('more', k)}/(dt*{share!r})", "multiplier at the end of the step")
+        for k in self._driven_rows:
             p.let(self._of("impulse", k), f"{self._of('impulse', k)}+{self._of('more', k)}", "all of this step")
-        p.let(f"known{c}", "1", "the next step begins here")
-        self._end_step(p)
+        self.passed(p)
 
     def passed(self, p: Program) -> None:
-        """At the end of a step without `project`."""
-        if self.driven:
-            self._end_step(p)
-
-    def _end_step(self, p: Program) -> None:
-        for k in range(self.n_rows):
-            mean, impulse, work = self._of("mean", k), self._of("impulse", k), self._of("work", k)
-            p.let(mean, f"{impulse}/dt", "mean multiplier")
-            if self._rates[k] != 0.0:
-                done = f"{work}+select(failed, 0, {self._rate(k)}*{impulse})"
-                p.let(work, done, "force times speed of the target")
+        """At the end of a step: the work of targets that move."""
+        for k in self._driven_rows:
+            done = f"{self._of('work', k)}+select(failed, 0, {self._rate(k)}*{self._of('impulse', k)})"
+            p.let(self._of("work", k), done, "force times speed of the target")
 
     # -- seen from Python -----------------------------------------------------------------------
 
@@ -446,12 +425,6 @@ def _halved(integrator: Any, scheme: Any) -> bool:
     """Whether a bath acts between two halves of the drift: the second one does not begin where the step does."""
     ensemble = getattr(integrator, "ensemble", None)
     return ensemble is not None and any(isinstance(each, Exchange) for each in ensemble.operations(scheme))
-
-
-def _last_share(integrator: openmm.CustomIntegrator) -> float:
-    """Length of the last drift as a fraction of the step."""
-    scheme = integrator.scheme
-    return float(scheme.drifts[-1] * scheme.flight[-1])
 
 
 def _sum(terms: Iterable[str]) -> str:

@@ -16,6 +16,7 @@ import openmm
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
@@ -34,8 +35,9 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.steps import write_step
+from kcons.openmm.quantities import nanometers
 from kcons.openmm.states import box_of, positions_of
-from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, listed
+from kcons.openmm.surface_integrator import SurfaceIntegrator
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import chain_fractions
@@ -484,7 +486,10 @@ class DeviceSurfaceIntegrator(SurfaceIntegrator, DeviceIntegrator):
     """`SurfaceIntegrator` whose steps are kernels of a plugin."""
 
     def _surface_parts(self, surfaces: Any, system: openmm.System | None, positions: Any) -> Sequence[Any]:
-        return listed(surfaces, positions, 2**31 if positions is None else len(positions))
+        if positions is None:
+            return list(surfaces)
+        x = nanometers(positions, len(positions))
+        return ConstraintSet(surfaces, x, np.ones(len(x))).constraints
 
 
 def choose(
@@ -493,6 +498,7 @@ def choose(
     scheme: str | Splitting = "rattle",
     *,
     parts: Sequence[Any] = (),
+    surfaces: Any = (),
     ensemble: Ensemble | None = None,
     classes: tuple[type[ProjectedIntegrator], type[DeviceIntegrator]] = (ProjectedIntegrator, DeviceIntegrator),
     **others: Any,
@@ -504,9 +510,12 @@ def choose(
     UnsupportedError
         `device` is True, and there is no plugin or it has no kernels for this step.
     """
-    why = refusal(to_scheme(scheme), parts, ConstantEnergy() if ensemble is None else ensemble) or build.refusal()
-    listed = parts if isinstance(parts, Iterable) else (parts,)
-    nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in listed)
+    parts, surfaces = (given if isinstance(given, Iterable) else (given,) for given in (parts, surfaces))
+    why = (
+        refusal(to_scheme(scheme), [*surfaces, *parts], ConstantEnergy() if ensemble is None else ensemble)
+        or build.refusal()
+    )
+    nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in parts)
     if not why and device is None and not nowhere_else:
         why = build.reluctance()
     if not why:

@@ -16,7 +16,7 @@ from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
 from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
-from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step
+from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context
 from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
@@ -58,7 +58,7 @@ class _OfEnsembles(Generic[_Given, _Found]):
         return MethodType(self.method, integrator)
 
 
-class ProjectedIntegrator(Integrator):
+class ProjectedIntegrator(openmm.CustomIntegrator):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -321,7 +321,7 @@ class ProjectedIntegrator(Integrator):
 
     def _run_block(self, guard: Guard, steps: int, ends: bool) -> None:
         """Make steps, with the shorter program for those after which the state is not read."""
-        unseen = steps - self._step.observed if self._step.lazy and not guard.in_parts else 0
+        unseen = steps - 1 if self._step.lazy and not guard.in_parts else 0
         if unseen > 0 and guard.undisturbed and not (self._step.joined and guard.moving):
             with self._control("between"):
                 self._run(guard, unseen, False)
@@ -829,7 +829,7 @@ def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
         if not isinstance(part, Part):
             raise InputError(
                 f"parts has {part!r:.80}, which is no part of an integrator; kcons.openmm.hold(system, constraints, "
-                "positions) makes one of constraints, CollectiveRows of Forces, surface_parts of surfaces",
+                "positions) makes one of constraints, CollectiveRows of Forces",
                 item="parts",
             )
     return given

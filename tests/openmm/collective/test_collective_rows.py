@@ -88,13 +88,7 @@ def test_same_trajectory_and_multipliers_as_the_core(kind, scheme):
     assert np.abs(state_of(context)[0] - state.positions).max() < 2e-12
     x, v = state_of(context)
     expected = motion.multipliers(x, v, spring_forces(x))
-    assert part.multipliers_at(context) == pytest.approx(expected, rel=1e-8, abs=1e-8)
-    if scheme == "blanes-moan4":  # none at a point of its step
-        return
-    # The integrator's own, at the start of its last step.
-    integrator.step(1)
-    errors = abs(part.multipliers(integrator)[0] - expected[0])
-    assert errors < 2e-3 * abs(expected[0]) + 1e-2
+    assert part.multipliers(context) == pytest.approx(expected, rel=1e-8, abs=1e-8)
 
 
 # -- periodic coordinates -------------------------------------------------------------------------------
@@ -214,9 +208,7 @@ def test_two_parts_of_rows_in_one_integrator():
         assert np.abs(part.residuals(context)).max() <= 1e-12
         assert np.abs(part.rates(context)).max() <= 1e-12
     # Each is asked in the integrator that is named: in one made later it has the number of the other here.
-    asked = [part.mean_multipliers(integrator) for part in (one, two)]
     ProjectedIntegrator(0.002, parts=[two, one])
-    assert [part.mean_multipliers(integrator) for part in (one, two)] == asked
     before = two.targets(context)
     one.set_target(integrator, 0, 0.31)
     assert one.targets(context) == 0.31 and two.targets(context) == before
@@ -271,10 +263,10 @@ def test_what_is_no_context_and_no_integrator():
     assert rows.n_rows == 1
     integrator = ProjectedIntegrator(0.001, parts=[rows])
     context = context_of(system, integrator, CHAIN)
-    for call in (rows.values, rows.targets, rows.rank, rows.multipliers_at, rows.check, rows.restore):
+    for call in (rows.values, rows.targets, rows.rank, rows.multipliers, rows.check, rows.restore):
         with pytest.raises(InputError, match=r"context is a ProjectedIntegrator; give the Context"):
             call(integrator)
-    for call in (rows.multipliers, rows.mean_multipliers, rows.work, lambda given: rows.set_target(given, 0, 0.3)):
+    for call in (rows.work, lambda given: rows.set_target(given, 0, 0.3)):
         with pytest.raises(InputError, match="integrator is a Context; give the integrator that holds the rows"):
             call(context)
     for row in (1, -1):

@@ -92,28 +92,6 @@ def test_unit_of_a_coordinate(force, of):
     assert unit_of(force()) == of
 
 
-@pytest.mark.parametrize(
-    ("value", "of"),
-    [
-        (3 * unit.kelvin, None),
-        (3 * unit.picosecond, None),
-        (3 * unit.kelvin, unit.nanometer),
-        (90 * unit.degree, unit.nanometer),
-        (3 * unit.angstrom, unit.radian),
-        (3 * unit.angstrom / unit.picosecond, unit.nanometer),
-    ],
-)
-def test_a_target_of_another_kind_is_refused(value, of):
-    with pytest.raises(InputError, match=r"target is .* another kind"):
-        number(value, "target", of)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, "three", None, math.inf * unit.nanometer])
-def test_what_is_no_finite_number_is_refused(value):
-    with pytest.raises(InputError, match="target"):
-        number(value, "target")
-
-
 def test_rows_are_in_units_of_openmm():
     system = particles(2)
     rows = CollectiveRows(system, [Row(bond(0, 1), 3 * unit.angstrom, rate=1 * unit.nanometer / unit.nanosecond)])

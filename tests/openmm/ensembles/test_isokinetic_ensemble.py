@@ -65,8 +65,9 @@ def test_one_bond_as_the_core_stepper(scheme):
         assert np.abs(u - state.velocities).max() <= 100 * limit
 
 
-@pytest.mark.parametrize("platform", ["Reference", "CPU"])
-@pytest.mark.parametrize("scheme", [*ORDERS, "geodesic"])
+@pytest.mark.parametrize(
+    ("scheme", "platform"), [("rattle", "CPU"), ("geodesic", "Reference"), ("isokinetic4", "Reference")]
+)
 def test_kinetic_energy_stays(scheme, platform):
     system, x = water_box()
     ensemble = Isokinetic(300 * unit.kelvin)
@@ -85,19 +86,6 @@ def test_kinetic_energy_stays(scheme, platform):
     assert ensemble.count(integrator) == 6 * 27 - 3
     kelvin = integrator.computeSystemTemperature().value_in_unit(unit.kelvin)
     assert kelvin == pytest.approx(300, rel=1e-12)
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("scheme", ["rattle", "isokinetic4"])
-def test_kinetic_energy_stays_for_a_million_steps(scheme):
-    system, x, v = dumbbell()
-    integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-12, ensemble=Isokinetic())
-    context = started(system, integrator, x, v)
-    integrator.step(1)
-    first = twice_kinetic(system, state_of(context)[1])
-    for _ in range(1000):
-        integrator.step(1000)
-        assert abs(twice_kinetic(system, state_of(context)[1]) / first - 1) <= 1e-13
 
 
 def test_calls_of_any_length_make_the_same_motion():

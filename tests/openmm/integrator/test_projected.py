@@ -82,7 +82,7 @@ class Witness(HeldCoordinates):
     """Holds nothing; sees whether the forces that were kept are those at x."""
 
     def __init__(self, n):
-        super().__init__([], 0, 0.0, n, evaluates=True)
+        super().__init__([], 0, 0.0, n)
 
     def declare(self, program):
         super().declare(program)
@@ -216,7 +216,7 @@ def test_row_group_does_not_move_anything():
         row.addParticle(3)
         row.setForceGroup(9)
         heavy.addForce(row)
-        integrator = ProjectedIntegrator(1e-3, "suzuki4", parts=[holding(evaluates=True, groups={9})])
+        integrator = ProjectedIntegrator(1e-3, "suzuki4", parts=[holding(groups={9})])
         context = started(heavy, integrator, x, v)
         integrator.step(5)
         positions.append(state_of(context))
