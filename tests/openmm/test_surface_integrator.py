@@ -181,6 +181,7 @@ def test_small_and_large_radii(radius, scheme):
 
 @pytest.mark.parametrize("scheme", ["rattle", "geodesic"])
 @pytest.mark.parametrize("far", [1e3, 1e6])
+@pytest.mark.filterwarnings("ignore:held particles are")
 def test_far_from_the_origin(far, scheme):
     integrator, context = free_on_sphere(scheme, 0.05, center=(far, -far, far))
     integrator.step(200)

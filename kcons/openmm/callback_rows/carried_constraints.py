@@ -249,8 +249,6 @@ class Engine:
         self._begun = False
         if self.exact:
             change, self._turned = great_circles(self._x, read, cast(FloatArray, self.spheres))
-            if not np.isfinite(change).all():
-                raise NonFiniteError("velocities are not finite", item="velocity")
         else:
             there[self._held] = read
             then, now, h = self._times(self._stage)
@@ -351,6 +349,14 @@ class Engine:
         self._error = None
         if error is None:
             return ConvergenceError(f"step {step}: the carried rows failed without saying why", step=step)
+        finite = np.isfinite(self._read).all(axis=1)
+        if isinstance(error, InputError) and not finite.all():
+            atom = int(self.atoms[np.argmin(finite)])
+            error = NonFiniteError(
+                f"forces or velocities of atom {atom} are not finite; the time step is too large",
+                item="velocity",
+                atom=atom,
+            )
         cause = "time step too large, or a state off the rows. " if isinstance(error, ConvergenceError) else ""
         if isinstance(error, KconsError):
             error.args = (f"step {step}: {cause}{error}", *error.args[1:])
@@ -560,7 +566,11 @@ class CarriedConstraints(Part):
         """sigma and A v of the constraints that were given, from the positions and velocities of the context."""
         x, v, time = self._state(context)
         held = self.motion.sources[0]
-        found = held.residuals(x, v if velocities else None, time)
+        with np.errstate(all="ignore"):
+            found = held.residuals(x, v if velocities else None, time)
+        if not np.isfinite(found.norms).all():  # rows that have no gradient here have a name
+            for item, start in zip(held.constraints, held.starts, strict=False):
+                item.check(held.gather(item, x), time, int(start))
         near, slow = self._engine.precision.limits
         allowed = np.maximum(near * held.scale, found.allowed)
         reach = np.abs(x[held.touched]).max(initial=0.0)
