@@ -510,12 +510,10 @@ def choose(
     UnsupportedError
         `device` is True, and there is no plugin or it has no kernels for this step.
     """
-    parts, surfaces = (given if isinstance(given, Iterable) else (given,) for given in (parts, surfaces))
-    why = (
-        refusal(to_scheme(scheme), [*surfaces, *parts], ConstantEnergy() if ensemble is None else ensemble)
-        or build.refusal()
-    )
-    nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in parts)
+    given, around = (tuple(some) if isinstance(some, Iterable) else (some,) for some in (parts, surfaces))
+    kind = ConstantEnergy() if ensemble is None else ensemble
+    why = refusal(to_scheme(scheme), [*around, *given], kind) or build.refusal()
+    nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in given)
     if not why and device is None and not nowhere_else:
         why = build.reluctance()
     if not why:

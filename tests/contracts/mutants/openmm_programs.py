@@ -175,8 +175,6 @@ MUTANTS = {
             "(*held[:k], *«held[n:]→()») for k",
             "test_rows_in_context.py::test_row_that_repeats_a_constraint_of_the_system_is_named",
         ),
-    ],
-    "openmm/collective/row_program.py": [
         (
             "weight{c}*({of('more', i)}«-→+»{of('expected', i)})",
             "test_row_program.py::test_the_iteration_learns_from_each_push",

@@ -17,7 +17,6 @@ from openmm_systems import (
     dumbbell,
     loose_alanine,
     masses_of,
-    on_gpus,
     residuals,
     started,
     state_of,
@@ -97,14 +96,13 @@ def test_calls_of_any_length_make_the_same_motion():
 # -- the chain in the middle of a step -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("platform", ["CPU", *on_gpus("mixed")])
-def test_a_chain_in_the_middle_conserves_energy_to_order_two(platform):
+def test_a_chain_in_the_middle_conserves_energy_to_order_two():
     system, x, v = alanine("HBonds")
     spans = []
     for n in (1, 2, 4):
         ensemble = NoseHooverMiddle(300.0, 20.0)
         integrator = ProjectedIntegrator(1e-3 / n, ensemble=ensemble, tolerance=1e-12)
-        context = started(system, integrator, x, v, platform)
+        context = started(system, integrator, x, v, "CPU")
         values = []
         for _ in range(100):
             integrator.step(n)

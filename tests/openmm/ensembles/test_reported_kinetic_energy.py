@@ -97,12 +97,16 @@ BATHS = {
 }
 
 
-@pytest.mark.parametrize("platform", [*PLATFORMS, *on_gpus("mixed")])
-@pytest.mark.parametrize("name", BATHS)
+@pytest.mark.parametrize(
+    ("name", "platform"),
+    [
+        *((name, "Reference") for name in BATHS),
+        ("Langevin", "CPU"),
+        *(pytest.param("Langevin", *p.values, id=p.id, marks=p.marks) for p in on_gpus("mixed")),
+    ],
+)
 def test_with_noise_the_temperature_of_the_bath_is_reported(name, platform):
     """Velocities at the ends of steps, which the State has, are colder; temperatures within four standard errors."""
-    if name == "carried" and " " in platform:
-        pytest.skip("the program is that of the other parts")
     integrator, context = BATHS[name](platform)
     integrator.setVelocitiesToTemperature(context, 300, 5)
     integrator.step(150)

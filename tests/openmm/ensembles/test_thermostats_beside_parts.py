@@ -6,7 +6,7 @@ import copy
 
 import numpy as np
 import pytest
-from ensemble_runs import on_their_rows, run, three_parts, twice_kinetic, warm
+from ensemble_runs import on_their_rows, run, twice_kinetic, two_parts, warm
 from openmm_ensembles import ENSEMBLES
 from openmm_systems import loose_alanine, state_of
 
@@ -43,7 +43,7 @@ def test_rows_that_are_carried_move_as_those_of_the_system(bath):
 
 @pytest.mark.parametrize("bath", ["Isokinetic", "NoseHoover"])
 def test_parts_keep_their_rows(bath):
-    system, x, parts = three_parts()
+    system, x, parts = two_parts()
     ensemble = ENSEMBLES[bath](300.0)
     integrator = ProjectedIntegrator(1e-3, parts=parts, ensemble=ensemble)
     context = warm(system, integrator, x, 4)

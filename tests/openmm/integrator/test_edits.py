@@ -137,11 +137,9 @@ def _chain():
     return topology, chain, np.cumsum(np.random.default_rng(1).normal(size=(10, 3)) * 0.09, axis=0)
 
 
-@pytest.mark.parametrize("how", ["collective", "carried"])
-def test_the_minimizer_of_openmm_does_not_know_rows(how):
+def test_the_minimizer_of_openmm_does_not_know_rows():
     topology, chain, x = _chain()
-    part = CollectiveRows(chain, [bond(0, 9)], positions=x) if how == "collective" else None
-    part = part or hold(chain, [Distance([[0, 9]])], x)
+    part = hold(chain, [Distance([[0, 9]])], x)
     integrator = ProjectedIntegrator(0.001, parts=[part])
     made = app.Simulation(topology, chain, integrator, openmm.Platform.getPlatformByName("Reference"))
     made.context.setPositions(x)

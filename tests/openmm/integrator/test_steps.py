@@ -212,7 +212,6 @@ def test_an_ensemble_writes_the_kicks(parts):
 
 LEAN = [
     "part",
-    "row",
     "moving row",
     "carried",
     "carried beside bonds",
