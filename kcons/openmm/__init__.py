@@ -19,7 +19,7 @@ try:
     from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
     from kcons.openmm.callback_rows.hold import hold, move_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
-    from kcons.openmm.collective.coordinates import Row, forces_by_term
+    from kcons.openmm.collective.coordinates import Row
     from kcons.openmm.device.device_integrator import DeviceIntegrator
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
     from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
@@ -54,7 +54,6 @@ __all__ = [
     "Row",
     "SurfaceIntegrator",
     "constraints_of",
-    "forces_by_term",
     "hold",
     "masses_of",
     "move_constraints",

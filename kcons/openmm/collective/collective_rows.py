@@ -100,8 +100,8 @@ class CollectiveRows(Part):
     system : openmm.System
         The Forces that are not part of it are added, each in a free group. Make the Simulation or Context afterwards.
     rows : Row, openmm.Force or Formula, or a sequence of them
-        What to hold. A Force alone is held at the value found at `positions`; `forces_by_term` makes one Force of each
-        term or variable of a larger one; a `kcons.constraints.Formula` is one of each of its rows.
+        What to hold. A Force alone is held at the value found at `positions`; a `kcons.constraints.Formula` is one
+        for each of its rows.
     positions : array_like or Quantity, shape (n_particles, 3), optional
         In nm if without unit. Needed where a target is to be found.
     tolerance : float, optional

@@ -8,7 +8,6 @@ import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import openmm
@@ -400,12 +399,6 @@ class DeviceIntegrator(ProjectedIntegrator):
     def getRandomNumberSeed(self) -> int:
         return self._seed
 
-    def _has_written(self, xml: str) -> bool:
-        found = json.loads(ElementTree.fromstring(xml).attrib["description"])
-        mine = json.loads(self._described)
-        self.setRandomNumberSeed(found["seed"])
-        return all(found[name] == mine[name] for name in ("operations", "memory", "noisy", "spheres", "parts"))
-
 
 def _refuse_of_programs(name: str) -> Any:
     def refuse(self: DeviceIntegrator, *args: Any, **options: Any) -> None:
@@ -448,7 +441,7 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     lengths = np.array(given.lengths[:n], dtype=np.float64)
     integrator = _ALIVE.get(given.integrator)
     if described["parts"] and integrator is None:
-        raise UnsupportedError("no text has the parts of an integrator: read it by from_xml(xml, parts=...)")
+        raise UnsupportedError("no text has the parts of an integrator: make it again, with parts=")
     part = integrator.parts[0] if integrator is not None and integrator.parts else None
     assert part is None or isinstance(part, KernelRows)
     if not given.positions:

@@ -724,42 +724,6 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
 
     # -- copies ---------------------------------------------------------------------------------
 
-    @classmethod
-    def from_xml(cls, xml: str, scheme: str | Splitting = "rattle", **arguments: Any) -> Self:
-        """The integrator whose program XmlSerializer has written, with the time step, tolerance and seed of the file.
-
-        Parameters
-        ----------
-        xml : str
-            The text of the file.
-        scheme, **arguments
-            With which it was made: no file contains parts and ensembles.
-
-        Raises
-        ------
-        InputError
-            The file has another program.
-        """
-        device = 'type="KconsProgram"' in xml
-        if device and "_on_device" in vars(cls):
-            cls = cls._on_device(True, 0.0, scheme, **arguments)[0]  # loads what the file is read by
-        plain = openmm.XmlSerializer.deserialize(xml)
-        given = {"tolerance": plain.getConstraintTolerance(), "device": False, **arguments}
-        made = cls(plain.getStepSize(), scheme, **given)
-        if not (made._has_written(xml) if device else _computations(plain) == _computations(made)):
-            raise InputError(
-                f"the file has another program than {made!r}; give the scheme, ensemble and parts it was made with",
-                item="integrator",
-            )
-        if not device:
-            made.setRandomNumberSeed(plain.getRandomNumberSeed())
-        openmm.Integrator.setIntegrationForceGroups(made, plain.getIntegrationForceGroups())
-        return made
-
-    def _has_written(self, xml: str) -> bool:
-        """Whether a file of steps on the device has the step of this integrator; takes the seed of it."""
-        return False
-
     def _making(self) -> tuple[Any, ...]:
         every = None if self.spare else self.check_every
         made_with = (self.getStepSize(), self.scheme, self.parts, self.asked_tolerance, every, self.ensemble)
@@ -797,12 +761,6 @@ def _remade(
         made.program.set(name, value)
     made.program.recall(run)
     return made
-
-
-def _computations(integrator: openmm.Integrator) -> list[tuple[Any, ...]]:
-    if not isinstance(integrator, openmm.CustomIntegrator):
-        return []
-    return [tuple(integrator.getComputationStep(k)) for k in range(integrator.getNumComputations())]
 
 
 def picoseconds(timestep: Any) -> float:

@@ -21,7 +21,6 @@ from collective_cases import (
     some_velocities,
     spring_forces,
     state_of,
-    with_variable,
 )
 from openmm import unit
 from openmm_systems import PLATFORMS
@@ -38,7 +37,7 @@ from kcons.errors import (
 from kcons.motion import Motion
 from kcons.openmm import SCHEMES, ProjectedIntegrator
 from kcons.openmm.collective import CollectiveRows
-from kcons.openmm.collective.coordinates import Row, forces_by_term
+from kcons.openmm.collective.coordinates import Row
 from kcons.steppers import System, run
 
 # -- held to rounding -----------------------------------------------------------------------------------
@@ -157,21 +156,9 @@ def test_velocities_that_are_no_numbers_are_refused():
 PAIRS = list(itertools.combinations(range(6), 2))
 
 
-def terms():
-    several = openmm.CustomBondForce("r")
-    for pair in ((0, 3), (1, 4), (2, 5)):
-        several.addBond(*pair)
-    return [*forces_by_term(several), forces_by_term(with_variable("a+b", a=bond(0, 3), b=dihedral(0, 1, 2, 3)))[1]]
-
-
-@pytest.mark.parametrize(
-    ("rows", "rank"),
-    [(lambda: [bond(i, j) for i, j in PAIRS[:8]], 8), (terms, 4)],
-    ids=["eight", "terms"],
-)
-def test_rows_that_share_particles(rows, rank):
-    context, integrator, part = held_chain(rows(), dt=0.001)
-    assert part.rank(context) == part.n_rows == rank
+def test_rows_that_share_particles():
+    context, integrator, part = held_chain([bond(i, j) for i, j in PAIRS[:8]], dt=0.001)
+    assert part.rank(context) == part.n_rows == 8
     integrator.step(20)
     assert np.abs(part.residuals(context)).max() <= 1e-12
     assert np.abs(part.rates(context)).max() <= 1e-12
