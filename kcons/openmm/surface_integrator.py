@@ -10,7 +10,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
-from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
@@ -90,11 +90,6 @@ class SurfaceIntegrator(ProjectedIntegrator):
         return tuple(item for part in self.parts for item in getattr(part, "given", ()) if _is_surface(item))
 
     # -- the state of a context -----------------------------------------------------------------
-
-    @property
-    def surface_atoms(self) -> IntArray:
-        """Particles on surfaces, in the order of `multipliers`, shape (n_rows,)."""
-        return np.concatenate([item.atoms[:, 0] for item in self.surfaces])
 
     def multipliers(self, context: openmm.Context) -> FloatArray:
         """lambda of each row, exact at the present state; kJ/mol/nm where the coordinate is a length in nm.

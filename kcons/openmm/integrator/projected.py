@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from types import MethodType
-from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import openmm
@@ -34,28 +32,6 @@ from kcons.steppers.splitting import Splitting
 _LONG = 0.02
 #: What `failed` is where others have moved x between two calls.
 _MOVED = -1
-
-_Given = ParamSpec("_Given")
-_Found = TypeVar("_Found")
-
-
-class _OfEnsembles(Generic[_Given, _Found]):
-    """A method that an integrator has where its ensemble has what it is about, as integrators of OpenMM do.
-
-    So programs can ask by `hasattr` whether there is a thermostat.
-    """
-
-    def __init__(self, method: Callable[Concatenate[Any, _Given], _Found]) -> None:
-        self.method = method
-        functools.update_wrapper(cast(Any, self), method)
-
-    def __get__(self, integrator: ProjectedIntegrator | None, owner: type | None = None) -> Callable[_Given, _Found]:
-        if integrator is None:
-            return self.method  # type: ignore[return-value]
-        what = self.method.__name__[3:].lower()
-        if self.method.__name__ != "setTemperature" or not integrator.thermostatted:
-            integrator._given(what)
-        return MethodType(self.method, integrator)
 
 
 class ProjectedIntegrator(openmm.CustomIntegrator):
@@ -573,56 +549,44 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """Whether velocities change by more than forces and constraints."""
         return not isinstance(self.ensemble, ConstantEnergy)
 
-    @_OfEnsembles
-    def setTemperature(self, temperature: unit.Quantity | float) -> None:
-        """Change the temperature (K if a float) of the ensemble.
+    # As integrators of OpenMM do, this one has such a method where there is what it is about: programs ask by hasattr.
 
-        Raises
-        ------
-        InputError
-            It is below zero; with `Isokinetic`, zero.
-        MissingSettingError
-            At constant energy.
+    @property
+    def setTemperature(self) -> Callable[[unit.Quantity | float], None]:
+        """Method that changes the temperature (K if a float) of the ensemble; `MissingSettingError` at constant energy.
+
+        The method raises `InputError` if it is below zero; with `Isokinetic`, zero.
         """
+        if not self.thermostatted:
+            self._given("temperature")
+        return self._set_temperature
+
+    def _set_temperature(self, temperature: unit.Quantity | float) -> None:
         self._take(self.ensemble.at(kelvins(temperature)))
         guard = self._guard
         if guard is not None and guard.alive is not None and guard.started:
             warn_of_barostat(guard.context, self._given("temperature"), stacklevel=3)
 
-    @_OfEnsembles
-    def getTemperature(self) -> unit.Quantity:
-        """The temperature of the ensemble.
+    @property
+    def getTemperature(self) -> Callable[[], unit.Quantity]:
+        """Method that returns the temperature of the ensemble; `MissingSettingError` where it has none."""
+        value = self._given("temperature")
+        return lambda: value * unit.kelvin
 
-        Raises
-        ------
-        MissingSettingError
-            It has none; so `hasattr` is False.
+    @property
+    def setFriction(self) -> Callable[[unit.Quantity | float], None]:
+        """Method that changes the friction (1/ps if a float) of the ensemble; `MissingSettingError` where it has none.
+
+        The method raises `InputError` if it is below zero.
         """
-        return self._given("temperature") * unit.kelvin
+        self._given("friction")
+        return lambda friction: self._take(self.ensemble.with_friction(friction))
 
-    @_OfEnsembles
-    def setFriction(self, friction: unit.Quantity | float) -> None:
-        """Change the friction (1/ps if a float) of the ensemble.
-
-        Raises
-        ------
-        InputError
-            It is below zero.
-        MissingSettingError
-            The ensemble has none.
-        """
-        self._take(self.ensemble.with_friction(friction))
-
-    @_OfEnsembles
-    def getFriction(self) -> unit.Quantity:
-        """The friction of the ensemble.
-
-        Raises
-        ------
-        MissingSettingError
-            It has none; so `hasattr` is False.
-        """
-        return self._given("friction") / unit.picosecond
+    @property
+    def getFriction(self) -> Callable[[], unit.Quantity]:
+        """Method that returns the friction of the ensemble; `MissingSettingError` where it has none."""
+        value = self._given("friction")
+        return lambda: value / unit.picosecond
 
     def _given(self, what: str) -> float:
         value = getattr(self.ensemble, what, None)

@@ -19,7 +19,6 @@ from openmm_systems import (
     masses_of,
     started,
     state_of,
-    volumes_under_pressure,
     water_box,
 )
 
@@ -66,16 +65,6 @@ def test_units_and_arguments():
 
 
 # -- barostats, thermostats, center of mass ----------------------------------------------------------
-
-
-@platforms
-@pytest.mark.parametrize("scheme", ["rattle", "geodesic"])
-def test_barostat(scheme, platform):
-    system, x = water_box(64)
-    system.addForce(openmm.MonteCarloBarostat(1.0, 300.0, 2))
-    integrator = ProjectedIntegrator(1e-3, scheme)
-    context = started(system, integrator, x, platform=platform)
-    assert len(volumes_under_pressure(system, integrator, context)) > 5
 
 
 class Witness(HeldCoordinates):

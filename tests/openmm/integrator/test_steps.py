@@ -22,7 +22,6 @@ from openmm_systems import (
     residuals,
     started,
     state_of,
-    total_energy,
     water_box,
 )
 from tied_cluster import KINDS, bond
@@ -47,24 +46,6 @@ PS = unit.picosecond
 
 
 # -- parts ------------------------------------------------------------------------------------------
-
-
-@platforms
-@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "suzuki4"])
-def test_part_is_held(scheme, platform):
-    system, x, v = loose_alanine()
-    integrator = ProjectedIntegrator(5e-4, scheme, parts=[holding()])
-    context = started(system, integrator, x, v, platform)
-    energy = None
-    for _ in range(20):
-        integrator.step(5)
-        now, speed = state_of(context)
-        assert abs(now[0, 2] - x[0, 2]) < 1e-14
-        assert speed[0, 2] == 0
-        energy = total_energy(context) if energy is None else energy
-        assert total_energy(context) == pytest.approx(energy, abs=0.5)
-    assert integrator.degrees_of_freedom() == 3 * 22 - system.getNumConstraints() - 1
-    assert context.getStepCount() == 100
 
 
 class Reluctant(HeldCoordinates):
@@ -261,20 +242,6 @@ def test_calls_of_any_length_make_the_same_motion(kind):
     if kind.endswith("row"):
         np.testing.assert_allclose(ours.work(one), theirs.work(other), rtol=1e-7, atol=1e-6)
         assert np.abs(ours.rates(there)).max() <= 1e-12
-
-
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if "Langevin" not in kind])
-def test_steps_in_tens_are_those_of_one_call(kind):
-    """As an app.Simulation asks for them; noise aside, which Reference and CPU draw with each computation."""
-    ends = []
-    for calls in ([60], [10] * 6):
-        made = KINDS[kind]()
-        for steps in calls:
-            made.integrator.step(steps)
-        ends.append(state_of(made.context))
-        assert made.context.getStepCount() == 60
-        assert made.context.getTime()._value == pytest.approx(0.12, rel=1e-12)
-    np.testing.assert_allclose(*ends, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
