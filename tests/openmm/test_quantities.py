@@ -17,7 +17,6 @@ from kcons.constraints import (
     KnifeEdge,
     MovingTarget,
     Sphere,
-    Torus,
 )
 from kcons.constraints.arguments import ANY, LENGTH, Unitless
 from kcons.errors import InputError
@@ -108,20 +107,6 @@ def test_functions_may_return_quantities_and_can_be_pickled():
     both = Unitless(lambda r: (1 * angstrom, 2 * nm), "both", ANY)
     assert both(None) == (pytest.approx(0.1), 2)
     assert Unitless(float, "x", LENGTH)("3") == 3.0
-
-
-def test_surfaces():
-    x = np.array([[0.5, 0, 0], [0.75, 0, 0]])
-    for make in (
-        lambda length: Sphere([0], [0, 0, 0] * nm, 5 * length),
-        lambda length: Torus([1], [0, 0, 0] * nm, [0, 0, 1], 5 * length, 2.5 * length),
-    ):
-        system = atoms(2)
-        part = hold(system, make(angstrom), x * nm)
-        context = started(system, ProjectedIntegrator(1e-3, parts=[part]), x, 0 * x)
-        part.check(context)
-    with pytest.raises(InputError, match="Sphere: radius is 5 K; give it in nm"):
-        Sphere([0], [0, 0, 0], 5 * kelvin)
 
 
 def test_collective_variables_of_composite_units():

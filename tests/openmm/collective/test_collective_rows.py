@@ -164,20 +164,6 @@ def test_rows_that_share_particles():
     assert np.abs(part.rates(context)).max() <= 1e-12
 
 
-def test_thirty_one_rows_fit_into_the_force_groups():
-    system = openmm.System()
-    for _ in range(64):
-        system.addParticle(1.0)
-    x = np.array([[0.5 * (k // 2), 0.1 * (k % 2), 0.0] for k in range(64)])
-    part = CollectiveRows(system, [bond(2 * k, 2 * k + 1) for k in range(31)], positions=x)
-    assert part.groups == frozenset(range(1, 32))
-    integrator = ProjectedIntegrator(0.002, "suzuki4", parts=[part])
-    context = context_of(system, integrator, x, np.random.default_rng(0).normal(size=x.shape))
-    part.restore(context)
-    integrator.step(5)
-    assert np.abs(part.residuals(context)).max() <= 1e-12
-
-
 def test_two_parts_of_rows_in_one_integrator():
     system = chain_system()
     system.addConstraint(0, 1, float(np.linalg.norm(CHAIN[0] - CHAIN[1])))

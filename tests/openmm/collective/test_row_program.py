@@ -163,14 +163,6 @@ def test_the_second_half_of_a_drift_begins_in_the_middle(ensemble):
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-7)
 
 
-def test_langevin_beside_constraints_of_the_system_goes_on():
-    """Three picoseconds at 2 fs with a coordinate of atoms that the System constrains."""
-    context, integrator, rows = held_peptide(Langevin(300, 5), 0.002)
-    integrator.setVelocitiesToTemperature(context, 300, 1)
-    integrator.step(1500)
-    assert abs(rows.residuals(context)[0]) < 1e-12
-
-
 def molecule():
     """A System of three particles, and a Force that is the distance of two of them."""
     system, springs = openmm.System(), openmm.HarmonicBondForce()

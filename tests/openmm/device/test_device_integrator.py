@@ -93,20 +93,6 @@ def test_trajectories_are_those_of_the_custom_integrator(name, platform):
     assert contexts[0].getTime()._value == pytest.approx(sum(calls) * 0.001)
 
 
-def test_what_thermostats_keep():
-    system, x, v = waters()
-    for ensemble in (NoseHoover(300.0, 10.0), Isokinetic(300.0)):
-        made = [ProjectedIntegrator(0.0005, ensemble=ensemble, device=d) for d in (True, False)]
-        contexts = [run(integrator, system, x, v, calls=(20,)) for integrator in made]
-        before = [ensemble.conserved_energy(integrator) for integrator in made]
-        for integrator in made:
-            integrator.step(80)
-        after = [ensemble.conserved_energy(integrator) for integrator in made]
-        assert before[0] == pytest.approx(before[1], abs=1e-4) and after[0] == pytest.approx(after[1], abs=1e-4)
-        assert made[0].listing().split("variables")[0].splitlines()[:4] == made[1].listing().splitlines()[:4]
-        del contexts
-
-
 @pytest.mark.parametrize("platform", PLAIN)
 def test_langevin_has_the_temperature_of_its_bath(platform):
     """Also in a strong field at high friction, from a start that is in equilibrium."""

@@ -7,7 +7,7 @@ import numpy as np
 import openmm as mm
 import pytest
 from openmm import app, unit
-from openmm_systems import GPUS, alanine, started
+from openmm_systems import GPUS, started
 
 from kcons import ConstraintSet, Motion, State, System
 from kcons.constraints import Angle, Custom, Dihedral, Distance, Formula, LinearRelation, Plane, Sphere
@@ -151,16 +151,6 @@ def test_a_protein_goes_the_way_of_the_engine_on_arrays():
     assert [len(array.values) - 1 for array in levels] == [12]
     assert np.abs(found - state.positions).max() < 1e-10
     assert np.abs(held.value(found) / held.scale).max() < 2e-12
-
-
-def test_a_peptide_with_dihedrals_held():
-    """Alanine dipeptide: hydrogens by the System, phi and psi by rows, as the callbacks of the host do it."""
-    torsions = Dihedral([[4, 6, 8, 14], [6, 8, 14, 16]])
-    system, x, v = alanine("HBonds")
-    part = hold(system, torsions, x, take="all")
-    host = run(system, x, v, "Reference", 50, [part], device=False)[0]
-    system, x, v = alanine("HBonds")
-    assert np.abs(run(system, x, v, "Reference", 50, torsions)[0] - host).max() < 1e-9
 
 
 # -- targets, places, images ------------------------------------------------------------------------

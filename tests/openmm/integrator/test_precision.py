@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 
 import numpy as np
 import openmm
@@ -178,20 +177,6 @@ def test_the_listing_says_what_is_held(platform):
     integrator.step(1)
     precision = Precision(*platform.split())
     assert integrator.listing().splitlines()[0].endswith(f"{precision.tolerance:g} (relative), {precision}")
-    del context
-
-
-@pytest.mark.parametrize("platform", on_gpus("single"))
-def test_a_start_that_is_off_is_put_right_on_any_platform(platform, caplog):
-    """OpenCL's solver may need a second call for it."""
-    system, x, v = hydrogens() if ccma_ends_early(platform) else bonds()
-    x = x + 0.003 * np.random.default_rng(5).normal(size=x.shape)
-    integrator = ProjectedIntegrator(STEP)
-    context = started(system, integrator, x, v, platform)
-    with caplog.at_level(logging.WARNING, logger="kcons.openmm"):
-        integrator.step(1)
-    assert "the start was put right" in caplog.text
-    integrator.check()
     del context
 
 

@@ -89,41 +89,6 @@ def test_a_failed_step_is_taken_back_and_not_counted(scheme, how):
     np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("change", ["parameter", "box", "positions", "force"])
-def test_changes_from_outside_reach_the_next_step(change):
-    """Also where a part makes the integrator keep forces from one step to the next within a call."""
-    system, x, v = dumbbell()
-    system.removeConstraint(0)
-    system.setDefaultPeriodicBoxVectors(*(3 * np.eye(3)))
-    pair = openmm.CustomNonbondedForce("q/r")
-    pair.addGlobalParameter("q", 20.0)
-    pair.setNonbondedMethod(openmm.CustomNonbondedForce.CutoffPeriodic)
-    for _ in range(2):
-        pair.addParticle([])
-    system.addForce(pair)
-    spring = openmm.HarmonicBondForce()
-    spring.addBond(0, 1, 0.2, 100.0)
-    system.addForce(spring)
-    contexts = []
-    for parts in ((), (HeldCoordinates([], 0, 0.0, 2),)):
-        integrator = ProjectedIntegrator(1e-3, parts=parts)
-        context = started(system, integrator, x, v)
-        integrator.step(5)
-        if change == "parameter":
-            context.setParameter("q", -80.0)
-        elif change == "box":
-            context.setPeriodicBoxVectors(*(2.1 * np.eye(3)))
-        elif change == "positions":
-            context.setPositions(x)
-        else:
-            context.getSystem().getForce(2).setBondParameters(0, 0, 1, 0.5, 3000.0)
-            context.getSystem().getForce(2).updateParametersInContext(context)
-        integrator.step(1)
-        contexts.append(state_of(context))
-        spring.setBondParameters(0, 0, 1, 0.2, 100.0)
-    np.testing.assert_allclose(contexts[0], contexts[1], rtol=1e-12)
-
-
 def test_change_of_the_box():
     """OpenMM keeps the forces of a CustomIntegrator when the box is changed; `step` sees that."""
     system, x = water_box(27)
