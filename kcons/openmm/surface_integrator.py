@@ -14,7 +14,7 @@ from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
-from kcons.openmm.callback_rows.hold import hold
+from kcons.openmm.callback_rows.hold import constraints_about, hold
 from kcons.openmm.integrator.projected import ProjectedIntegrator, picoseconds
 from kcons.openmm.quantities import accepted
 from kcons.openmm.states import positions_of
@@ -35,7 +35,8 @@ class SurfaceIntegrator(ProjectedIntegrator):
     system : openmm.System, optional
         Gets the forces that carry the rows, see `hold`; the device does not need it.
     positions : array_like or Quantity, shape (n_particles, 3), optional
-        Needed for targets that are left open: each such particle keeps the radius or plane it has there.
+        Needed for targets that are left open, each such particle keeps the radius or plane it has there, and where the
+        System constrains particles on surfaces.
     parts : sequence of Part
         What else to hold, on other particles.
     scheme, **arguments
@@ -76,10 +77,10 @@ class SurfaceIntegrator(ProjectedIntegrator):
             raise InputError("surfaces add forces to the System: give system=, or device=True", item="system")
         if positions is None:
             for item in surfaces:
-                if item.target is None:
+                if item.target is None or constraints_about(system, item.atoms.ravel()):
                     raise InputError(
-                        f"{item!r} has no radius or offset: give it, or give positions= to take it from them",
-                        item="target",
+                        f"{item!r} has no radius or offset, or the System constrains its particles: give positions=",
+                        item="positions",
                     )
             # Ranks are those of a place that is nothing special.
             positions = np.random.default_rng(0).normal(size=(system.getNumParticles(), 3))

@@ -53,6 +53,14 @@ def test_refused(surfaces, error, words):
     assert system.getNumForces() == forces
 
 
+def test_constraints_beside_surfaces_need_positions():
+    system = system_of()
+    system.addConstraint(0, 1, 1.0)
+    with pytest.raises(InputError, match="constrains its particles: give positions="):
+        SurfaceIntegrator(0.001, surfaces=Sphere([0], [0, 0, 0], 1.0), system=system, device=False)
+    assert system.getNumConstraints() == 1
+
+
 def test_needs_the_system():
     with pytest.raises(InputError, match="give system="):
         SurfaceIntegrator(0.001, surfaces=Sphere([0], [0, 0, 0], 1.0), device=False)

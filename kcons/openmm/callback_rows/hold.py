@@ -108,11 +108,10 @@ def hold(
     """
     given = constraints_in(constraints, "constraints")
     table = _table(system)
-    n = system.getNumParticles()
     if take not in ("touched", "all"):
         raise InputError(f"take is {take!r}; give 'touched' or 'all'", item="take")
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
-    chosen = _sharing(table, touched[touched < n])
+    chosen = _sharing(table, touched)
     if take == "all":
         chosen |= table.all_but_water if keep_water else table.all
     taken = _as_rows(table, chosen)
@@ -180,8 +179,8 @@ def _table(system: openmm.System) -> _Table:
 
 
 def _sharing(table: _Table, atoms: IntArray) -> NDArray[np.bool_]:
-    """Constraints of the clusters that these atoms belong to."""
-    return np.asarray(np.isin(table.cluster, table.clusters[atoms]))
+    """Constraints of the clusters that these atoms belong to; what is no particle is told later."""
+    return np.asarray(np.isin(table.cluster, table.clusters[atoms[atoms < len(table.clusters)]]))
 
 
 def _as_rows(table: _Table, chosen: NDArray[np.bool_]) -> list[Constraint]:
