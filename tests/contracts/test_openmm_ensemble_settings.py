@@ -94,8 +94,6 @@ def test_copies_files_and_temperatures(ensemble):
     integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
     integrator.setRandomNumberSeed(5)
     twins = [copy.copy(integrator), pickle.loads(pickle.dumps(integrator))]
-    text = openmm.XmlSerializer.serialize(integrator)
-    twins.append(ProjectedIntegrator.from_xml(text, ensemble=copy.copy(ensemble)))
     context = run(system, integrator, x, v, 20)
     first = state_of(context)
     for twin in twins:
