@@ -28,7 +28,7 @@ _NAMES = {
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
     "profiles.plots": ("plot_profile",),
-    "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
+    "profiles.pulls": ("Pulled", "pull_free_energy"),
     "scans.relaxed_scan": ("scan",),
     "scans.scan_result": ("Scan",),
     "scans.system_calculator": ("SystemCalculator",),

@@ -37,9 +37,8 @@ def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "ener
     above.legend(fontsize=8)
     slope = np.gradient(profile.F, profile.x)
     below.plot(profile.x, slope, color=_BLUE, linewidth=1.0, label="slope of F")
-    forces = profile.mean_forces + profile.added_slope(profile.windows)
     how: dict[str, Any] = {"color": _RED, "fmt": "o", "markersize": 4, "capsize": 2, "label": "windows"}
-    below.errorbar(profile.windows, forces, _BAND * profile.mean_force_errors, **how)
+    below.errorbar(profile.windows, profile.mean_forces, _BAND * profile.mean_force_errors, **how)
     below.axhline(0.0, color=_GREY, linewidth=0.8)
     below.set(xlabel=coordinate, ylabel=f"dF/dx / ({energy}/unit of x)")
     below.legend(fontsize=8)

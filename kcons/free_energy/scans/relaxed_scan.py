@@ -35,7 +35,7 @@ from kcons.errors import (
     KconsError,
     NonFiniteError,
 )
-from kcons.free_energy.scans.relaxation import FIRST, Internals, relax
+from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals
 from kcons.free_energy.scans.scan_result import Attempt, Attempts, Grid, Point, Scan
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.minimization import minimize
@@ -191,23 +191,17 @@ class _Surface:
             # In rings, other angles have to change, which the relaxation puts right.
             x = motion.restore_positions(before, bonds=[])
         if len(x) > MOST_ATOMS:
-            calls = 0
-
-            def force(y: FloatArray, _: float) -> FloatArray:
-                nonlocal calls
-                calls += 1
-                return self.evaluate(y)[1]
-
-            found = minimize(motion, force, x, tolerance=fmax, longest=FIRST, steps=evaluations)
-            energy, _ = self.evaluate(found.positions)
-            attempt.positions, attempt.energy, attempt.largest = found.positions, energy, found.largest
-            attempt.evaluations = calls
+            found = minimize(
+                motion, lambda y, _: self.evaluate(y)[1], x, tolerance=fmax, longest=FIRST, steps=evaluations
+            )
+            attempt.positions, attempt.largest = found.positions, found.largest
+            attempt.evaluations, attempt.energy = found.evaluations, self.evaluate(found.positions)[0]
             return
         internals = Internals(self.atoms.numbers, x, motion.lattice)
         memory = None
         if source is not None and len(source.memory):
             memory = internals.remapped(source.memory, source.terms)
-        done = relax(motion, self.evaluate, internals, x, fmax=fmax, memory=memory, evaluations=evaluations)
+        done = Descent(motion, self.evaluate, internals, memory).relaxed(x, fmax, evaluations)
         for name in ("positions", "energy", "largest", "evaluations", "memory"):
             setattr(attempt, name, getattr(done, name))
         attempt.terms = internals.terms
@@ -220,8 +214,7 @@ class _Wavefront:
         self, surface: _Surface, grid: Grid, attempts: Attempts, settings: dict[str, float], progress: Progress | None
     ) -> None:
         self.surface, self.grid, self.attempts, self.progress = surface, grid, attempts, progress
-        self.fmax, self.evaluations = settings["fmax"], int(settings["evaluations"])
-        self.both_ways = bool(settings["both_ways"])
+        self.settings = settings
         bare = surface.atoms.copy()
         bare.set_constraint()
         self.scan = Scan(grid, bare, surface.held)
@@ -252,7 +245,7 @@ class _Wavefront:
                 continue
             if source is not None and self._handed[self.scan.attempts[source].point] != source:
                 continue  # a lower one is on its way
-            if not self.both_ways and point in self.scan.best:
+            if not self.settings["both_ways"] and point in self.scan.best:
                 continue
             self._tried.add((point, source))
             self._settle(self._made(point, source))
@@ -263,8 +256,9 @@ class _Wavefront:
         if attempt is None:
             self._tried_now.add(point)
             attempt = Attempt(len(attempts), point, source)
+            how = self.settings["fmax"], int(self.settings["evaluations"])
             try:
-                self.surface.relaxed(attempt, None if source is None else attempts[source], self.fmax, self.evaluations)
+                self.surface.relaxed(attempt, None if source is None else attempts[source], *how)
             except KconsError as error:
                 attempt.error = f"{self.grid.said(point)}: {type(error).__name__}: {error}"
                 self._first = self._first or error

@@ -48,14 +48,8 @@ BOLTZMANN = 0.00831446261815324
 RETRIES = 3
 #: Files of a folder of windows, those of `FreeEnergy` and of the command line included.
 FILES = (
-    "window-*.npz",
-    "window-*.txt",
-    "pull-*.npz",
-    "pull-*.txt",
-    "free_energy.json",
-    "profile.csv",
-    "profile.png",
-    "pulls.json",
+    *(f"{kind}-*.{ending}" for kind in ("window", "pull") for ending in ("npz", "txt")),
+    *("free_energy.json", "profile.csv", "profile.png", "pulls.json"),
 )
 #: Differences of the two sides that are less probable than this are marked, and widen errors.
 UNLIKELY = 0.01
@@ -135,8 +129,8 @@ class FreeEnergy:
         if len(self.names) != 1:
             raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
         f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("force", "error"))
-        x, periods = self._places()
-        return integrate(x[:, 0], f, e, period=periods[0])
+        x, (period,) = self._places()
+        return integrate(x[:, 0], f, e, period=period)
 
     @cached_property
     def surface(self) -> Surface:
@@ -147,20 +141,20 @@ class FreeEnergy:
 
     def between(self, a: float, b: float) -> Estimate | None:
         """F(b) - F(a) of the profile, in whichever turn the places are given; None where it does not reach both."""
-        profile, period = self.profile, float(self.periods[0])
-        ends = np.array([a, b])
+        profile, period, ends = self.profile, float(self.periods[0]), np.array([a, b])
+        low, high = profile.x[[0, -1]]
         if period:
-            ends += period * np.ceil((profile.x[0] - ends) / period - 1e-9)
-        slack = 1e-9 * np.ptp(profile.x)
-        if ends.min() < profile.x[0] - slack or ends.max() > profile.x[-1] + slack:
+            ends += period * np.ceil((low - ends) / period - 1e-9)
+        slack = 1e-9 * (high - low)
+        if ends.min() < low - slack or ends.max() > high + slack:
             return None
         return profile.difference(*ends.tolist())
 
     def _places(self) -> tuple[FloatArray, list[float | None]]:
         """Where the windows are, shape (n, d), and the period of each coordinate that they go all around."""
         x = np.array([w.value for w in self.windows]).reshape(-1, len(self.names))
-        around = [self._in_one_turn(column, period) for column, period in zip(x.T, self.periods.tolist(), strict=True)]
-        return x, [period if whole else None for whole, period in zip(around, self.periods.tolist(), strict=True)]
+        columns = zip(x.T, self.periods.tolist(), strict=True)
+        return x, [period if self._in_one_turn(column, period) else None for column, period in columns]
 
     @staticmethod
     def _in_one_turn(x: FloatArray, period: float) -> bool:
@@ -182,14 +176,12 @@ class FreeEnergy:
 
     # -- shown ----------------------------------------------------------------------------------
 
-    def _profile(self) -> tuple[Profile | None, str]:
-        """The profile along the only coordinate; otherwise None, and where there could be one, why there is none."""
-        if len(self.names) != 1:
-            return None, ""
+    def _profile(self) -> Profile | str:
+        """The profile along the only coordinate; otherwise, where there could be one, why there is none."""
         try:
-            return self.profile, ""
+            return self.profile if len(self.names) == 1 else ""
         except InputError as error:
-            return None, f"no profile: {error}"
+            return f"no profile: {error}"
 
     def table(self) -> Table:
         """The windows, one in a line; print it by rich."""
@@ -225,25 +217,23 @@ class FreeEnergy:
                 f"fewer than {FEW_INDEPENDENT} independent samples in window {poor}: errors there are not to be relied "
                 "on; sample longer"
             )
-        profile, why = self._profile()
-        if why:
-            lines.append(why)
-        if profile is not None:
-            low, high = int(np.argmin(profile.F)), int(np.argmax(profile.F))
-            gap = profile.difference(float(profile.x[low]), float(profile.x[high]))
+        profile = self._profile()
+        if isinstance(profile, Profile):
+            gap = profile.difference(*(float(profile.x[pick(profile.F)]) for pick in (np.argmin, np.argmax)))
             lines.append(f"from the lowest to the highest point {gap.value:.2f} ± {gap.error:.2f} kJ/mol")
+        elif profile:
+            lines.append(profile)
         lines += [f"{name} failed: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
 
     def beside(self, pulled: Pulled, start: FloatArray, end: FloatArray) -> tuple[dict[str, Any], str]:
         """What pulls gave, as plain data and in a sentence; of one coordinate with the windows between the ends."""
         best, name = pulled.best, "Jarzynski" if pulled.bar is None else "BAR"
-        numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist()}
-        estimates = {key: getattr(pulled, key) for key in ("bar", "jarzynski")}
+        numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist(), "overlap": pulled.overlap}
+        estimates = {"bar": pulled.bar, "jarzynski": pulled.jarzynski}
         numbers |= {key: [*estimate] for key, estimate in estimates.items() if estimate is not None}
-        numbers["overlap"] = pulled.overlap
         said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name})"
-        if self._profile()[0] is not None:
+        if isinstance(self._profile(), Profile):
             windows = self.between(float(start[0]), float(end[0]))
             if windows is None:
                 return numbers, f"{said}; the windows do not reach both ends"
@@ -278,8 +268,8 @@ class FreeEnergy:
         written = [folder / "free_energy.json"]
         with in_one_piece(written[0]) as opened:
             opened.write(text(self.numbers()).encode())
-        profile, _ = self._profile()
-        if profile is not None:
+        profile = self._profile()
+        if isinstance(profile, Profile):
             from kcons.free_energy.profiles.plots import plot_profile
 
             (name,), (angle,) = self.names, self.angles
@@ -298,16 +288,15 @@ def combine_sides(
 ) -> WindowResult:
     """The mean of both sides, and how probable their difference is."""
     per = sampler.kJ / sampler.scales
-    forces = np.array([side.force * per for side in sides.values()])
-    covariances = np.array([side.covariance * np.outer(per, per) for side in sides.values()])
-    covariance, chance = covariances.sum(axis=0) / len(sides) ** 2, math.nan
+    forces, raws = (np.array([getattr(side, name) * per for side in sides.values()]) for name in ("force", "raw"))
+    together = sum(side.covariance for side in sides.values()) * np.outer(per, per)
+    covariance, chance = together / len(sides) ** 2, math.nan
     if len(sides) == 2:
-        chance = agreement(forces[0], covariances[0], forces[1], covariances[1])
+        chance = agreement(forces[0], forces[1], together)
         if chance < UNLIKELY:
             half = (forces[0] - forces[1]) / 2
             covariance = covariance + np.outer(half, half)
-    raw = np.mean([side.raw * per for side in sides.values()], axis=0)
-    return WindowResult(number, target, forces.mean(axis=0), covariance, sides, chance, raw, seconds)
+    return WindowResult(number, target, forces.mean(axis=0), covariance, sides, chance, raws.mean(axis=0), seconds)
 
 
 class Windows:
@@ -413,14 +402,7 @@ class Windows:
         self._failed |= failed
         return self.result()
 
-    def improve(
-        self,
-        error: float,
-        most: int,
-        *,
-        below: float | None = None,
-        at_once: int = 1,
-    ) -> FreeEnergy:
+    def improve(self, error: float, most: int, *, below: float | None = None, at_once: int = 1) -> FreeEnergy:
         """Add windows where they help most until the profile's largest standard error is below `error` (kJ/mol).
 
         Parameters

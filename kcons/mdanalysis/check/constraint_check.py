@@ -17,6 +17,7 @@ from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -130,8 +131,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             raise InputError(
                 f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
             )
-        if worst < 0:
-            raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         described = topology_of(universe)
         labels = AtomNames(universe, described.elements)
         self._used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
@@ -148,7 +147,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         self._path = str(getattr(reader, "filename", None) or "")
         names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         remarks = [f"no temperature: {reason}"] if reason else []
-        self.asked = Asked(names, labels, mode, text, int(worst), remarks + _remarks_on(reader))
+        self.asked = Asked(names, labels, mode, text, whole_number(worst, "worst"), remarks + _remarks_on(reader))
         self._given, self._tolerance, self._wants_rank = given, float(tolerance), rank
         self._target_error = np.broadcast_to(errors, n_atoms)
         self._precision = precision_of_reader(reader, precision)

@@ -25,11 +25,3 @@ def test_a_profile_with_its_band_and_windows(tmp_path):
     assert np.abs(np.interp(x, slope.get_xdata(), slope.get_ydata()) - profile.mean_forces)[1:-1].max() < 0.1
     figure.savefig(tmp_path / "profile.png")
     assert (tmp_path / "profile.png").stat().st_size > 10000
-
-
-def test_windows_of_a_profile_without_its_jacobian_lie_on_its_slope():
-    r = np.linspace(1.0, 3.0, 12)
-    free = integrate(r, -2.0 / r, np.full(12, 1e-4)).without_jacobian("distance", 1.0)
-    below = plot_profile(free).axes[1]
-    windows = next(each for each in below.containers if each.get_label() == "windows")
-    assert np.abs(windows.lines[0].get_ydata()).max() < 0.01  # two particles that do not interact
