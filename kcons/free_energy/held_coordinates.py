@@ -144,8 +144,8 @@ class HeldCoordinates:
             for k, row in enumerate(found):
                 label = name if len(found) == 1 else f"{name}[{k}]"
                 if row in rows:
-                    first = names[rows.index(row)]
-                    raise InputError(f"{first} and {label} are the same row {row} of the set", item=first)
+                    same = names[rows.index(row)]
+                    raise InputError(f"{same} and {label} are the same row {row} of the set", item=same)
                 if label in names:
                     raise InputError(f"two coordinates have the name {label!r}; give each its own", item=label)
                 names.append(label)

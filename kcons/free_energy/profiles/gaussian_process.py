@@ -32,6 +32,8 @@ _ROUNDING = 1e-10
 _WIDE, _LOCAL = 1.5, 0.5
 #: Prior standard deviation of a constant gradient, in units of the largest gradient seen.
 _TREND = 10.0
+#: Step along the imaginary axis, exact but for rounding.
+_TINY = 1e-30
 #: Step of differences of logarithms of hyperparameters, least curvature of the likelihood that is believed, and the
 #: logarithm of the largest weight of a place against that of a normal distribution.
 _STEP, _FLATTEST, _HEAVIEST = 0.05, 0.5, 2.0
@@ -152,12 +154,12 @@ class GradientProcess:
     def slope(self, directions: FloatArray) -> FloatArray:
         """Derivatives of the log likelihood along directions in the space of parameters, shape (k, parameters).
 
-        Those of the covariance are complex steps, exact but for rounding.
+        Those of the covariance are complex steps.
         """
         inverse = cho_solve((self._root, True), np.eye(len(self._weights)), check_finite=False)
         kernel = 0.5 * (np.outer(self._weights, self._weights) - inverse)
-        steps = (self._prior(self.parameters + 1e-30j * direction) for direction in directions)
-        return np.array([float((kernel * step.imag).sum()) / 1e-30 for step in steps])
+        steps = (self._prior(self.parameters + _TINY * 1j * direction) for direction in directions)
+        return np.array([float((kernel * step.imag).sum()) / _TINY for step in steps])
 
     def _prior(self, parameters: FloatArray) -> FloatArray:
         """Covariance of the gradients seen, without their errors; complex where the parameters are."""
@@ -267,20 +269,17 @@ def learn(
     def process(p: FloatArray) -> GradientProcess:
         return GradientProcess(points, gradients, covariances, axes, p, trends)
 
-    def prior(p: FloatArray) -> tuple[float, FloatArray]:
-        """Of the parameters: minus the logarithm of its density, and the slope of that."""
-        value, slope = 0.5 * (p[0] / _WIDE) ** 2, np.zeros_like(p)
-        slope[0] = p[0] / _WIDE**2
-        ends = np.cumsum([1, *counts])
-        for own, out in zip(np.split(p[1:], ends[1:-1] - 1), np.split(slope[1:], ends[1:-1] - 1), strict=True):
+    def prior(p: FloatArray) -> Any:
+        """Minus the logarithm of the density of parameters, complex where these are."""
+        value = 0.5 * (p[0] / _WIDE) ** 2
+        for own in np.split(p[1:], np.cumsum(counts)[:-1]):
             level, bends = (own.mean() + math.log(_STARTS[0])) / _WIDE, np.diff(own) / _LOCAL
-            value += 0.5 * level**2 + 0.5 * float(bends @ bends)
-            out += level / (_WIDE * len(own)) - np.diff(bends, prepend=0.0, append=0.0) / _LOCAL
-        return value, slope
+            value += 0.5 * (level**2 + bends @ bends)
+        return value
 
     def unlikely(p: FloatArray) -> float:
         try:
-            return prior(p)[0] - process(p).log_likelihood()
+            return float(prior(p)) - process(p).log_likelihood()
         except np.linalg.LinAlgError:
             return _IMPOSSIBLE
 
@@ -293,8 +292,8 @@ def learn(
                 here = process(p)
             except np.linalg.LinAlgError:
                 return _IMPOSSIBLE, np.zeros_like(q)
-            value, slope = prior(p)
-            return value - here.log_likelihood(), slope @ directions - here.slope(directions.T)
+            slope = np.array([prior(p + _TINY * 1j * direction).imag / _TINY for direction in directions.T])
+            return float(prior(p)) - here.log_likelihood(), slope - here.slope(directions.T)
 
         options = {"ftol": 1e-12, "gtol": 1e-7, "maxiter": 200}
         bounds = [(-_FURTHEST, _FURTHEST)] * len(start)

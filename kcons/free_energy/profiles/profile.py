@@ -178,9 +178,7 @@ def integrate(
     return Profile(grid, F[:-1] - F[-1], error, less, zero, places, forces, errors, period, closure, process)
 
 
-def _windows(
-    x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> list[FloatArray]:
     """Windows in order; those at one place are one, with the weights that their errors give them."""
     arrays = [finite(values, name, "window") for values, name in ((x, "x"), (f, "f"), (e, "e"))]
     for array, name in zip(arrays, "xfe", strict=True):
@@ -220,7 +218,7 @@ def _windows(
     weights = 1.0 / np.maximum(error, 1e-12 * float(error.max()) or 1.0) ** 2
     total = np.bincount(which, weights)
     together = np.bincount(which, weights * force) / total
-    return places, together, np.sqrt(np.bincount(which, (weights * error) ** 2)) / total
+    return [places, together, np.sqrt(np.bincount(which, (weights * error) ** 2)) / total]
 
 
 def _places(at: ArrayLike, grid: FloatArray, period: float | None, item: str) -> FloatArray:

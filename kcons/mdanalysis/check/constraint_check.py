@@ -17,7 +17,7 @@ from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import whole_number
+from kcons.constraints.arguments import not_negative, whole_number
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -124,8 +124,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
                 "there are no constraints to check; select others, or look at the bonds of the topology",
                 item="constraints",
             )
-        if not (np.isfinite(tolerance) and tolerance >= 0):
-            raise InputError(f"the tolerance is {tolerance}; give a number such as 1e-4, or 0", item="tolerance")
         errors = np.asarray(target_error, dtype=np.float64)
         if errors.shape not in ((), (n_atoms,)) or not (errors >= 0).all() or not np.isfinite(errors).all():
             raise InputError(
@@ -148,7 +146,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         remarks = [f"no temperature: {reason}"] if reason else []
         self.asked = Asked(names, labels, mode, text, whole_number(worst, "worst"), remarks + _remarks_on(reader))
-        self._given, self._tolerance, self._wants_rank = given, float(tolerance), rank
+        self._given, self._tolerance, self._wants_rank = given, not_negative(tolerance, "tolerance"), rank
         self._target_error = np.broadcast_to(errors, n_atoms)
         self._precision = precision_of_reader(reader, precision)
         self._by_frame = None
@@ -211,23 +209,16 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
     def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
         """Frames to look at, at least one, counted from the beginning."""
         count, name, given = self._trajectory.n_frames, self.asked.names[0], chosen["frames"]
-        if given is None:
-            if chosen["step"] == 0:
-                raise InputError("step is 0; give another whole number", item="step")
-            given = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
-        asked = np.asarray(given)
-        if asked.dtype == bool and asked.shape == (count,):
-            asked = np.flatnonzero(asked)
-        if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
+        part = slice(*(chosen[end] for end in ("start", "stop", "step"))) if given is None else np.asarray(given)
+        try:
+            numbers: list[int] = np.arange(count)[part].tolist()
+        except (IndexError, ValueError, TypeError) as error:
             raise InputError(
-                f"frames are {given!r:.60}; give whole numbers, or True and False for each of the {count} frames; for "
-                "a slice start, stop and step",
+                f"{name}: its {count} frames have no {part!r:.60} ({error}); give start, stop and step, or as frames "
+                f"whole numbers, or True and False for each of the {count} frames",
                 item="frames",
-            )
-        for frame in asked[(asked < -count) | (asked >= count)]:
-            raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
-        numbers: list[int] = (asked % max(count, 1)).tolist()
-        if not len(numbers):
+            ) from None
+        if not numbers:
             raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
         return numbers
 
@@ -263,11 +254,11 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         precision = self._precision_at(frame)
         self._rows = RowTable(self._given, masses, ts, precision, self._target_error, self._tolerance)
         self._rank: int | None = None
-        if self._wants_rank:
-            try:
+        try:
+            if self._wants_rank:
                 self._rank = Motion(self._rows.set, precision.stored(ts.positions)).rank
-            except KconsError as error:
-                self.asked.remarks.append(f"no rank: {error}")
+        except KconsError as error:
+            self.asked.remarks.append(f"no rank: {error}")
 
     def _precision_at(self, frame: int) -> Any:
         return self._precision if self._by_frame is None else self._by_frame[frame]

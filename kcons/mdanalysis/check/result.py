@@ -26,7 +26,6 @@ class Drift:
 
     slope: float
     error: float
-    change: float
 
     @property
     def significant(self) -> bool:
@@ -41,7 +40,7 @@ def fitted(times: FloatArray, values: FloatArray) -> Drift | None:
     if len(t) < 3 or not np.ptp(t) > 0:
         return None
     found = slope(t, y)
-    return Drift(found.value, found.error, found.value * float(np.ptp(t)))
+    return Drift(found.value, found.error)
 
 
 @dataclass(frozen=True)
@@ -175,9 +174,9 @@ class CheckResult:
             "tolerated": f"kept to the tolerance of {self.tolerance:g}: largest deviation {most}",
             "incomplete": f"incomplete: {'; '.join(self.gaps)}; no violation otherwise in {n_frames} frames: largest "
             f"deviation {most}",
-            "violated": f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed): "
-            f"{row.name} in frame {row.frame}; {self.violated_rows} of {self.n_rows} rows; {self.violated_frames} of "
-            f"{n_frames} frames, from frame {self.first_violated_frame}",
+            "violated": f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed)"
+            f": {row.name} in frame {row.frame}; {self.violated_rows} of {self.n_rows} rows; {self.violated_frames} "
+            f"of {n_frames} frames, from frame {self.first_violated_frame}",
         }[self.status]
 
     @property
