@@ -19,11 +19,13 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve, cholesky
 from scipy.optimize import OptimizeResult, minimize, root
 
-from kcons.constraints.arguments import FloatArray
+from kcons.constraints.arguments import FloatArray, as_float_array
+from kcons.errors import InputError
 from kcons.thermostats import Estimate
 
 #: Of the diagonal, added to the covariance: rounding of a matrix of that size.
@@ -39,6 +41,8 @@ _TINY = 1e-30
 _STEP, _FLATTEST, _HEAVIEST = 0.05, 0.5, 2.0
 #: By how much more the last parameter counts than the first where directions of the cubature are chosen.
 _TILT = 1e-3
+#: Part of the range of the windows below which places are the same.
+_SAME = 1e-9
 #: Largest logarithm of a parameter, and minus the log likelihood of those that are too smooth for double precision.
 _FURTHEST, _IMPOSSIBLE = 7.0, 1e30
 #: Lengths from which the search for the most likely ones starts, as parts of the range.
@@ -79,6 +83,30 @@ def difference(values: FloatArray, covariance: FloatArray) -> Estimate:
     """Of the second value from the first."""
     variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
     return Estimate(float(values[1] - values[0]), math.sqrt(max(float(variance), 0.0)))
+
+
+def inside(x: ArrayLike, low: FloatArray, high: FloatArray, periods: Sequence[float | None], item: str) -> FloatArray:
+    """Places (m, d) within the range of the windows; into it by periods where there is one.
+
+    Raises
+    ------
+    InputError
+        A wrong shape; a NaN or infinity; a place beyond the windows.
+    """
+    places = np.array(as_float_array(x, item))
+    if places.ndim != 2 or places.shape[1] != len(low) or not np.isfinite(places).all():
+        raise InputError(f"{item} must be finite numbers of shape (m, {len(low)})", item=item)
+    for column, a, b, period in zip(places.T, low, high, periods, strict=True):
+        outside = (column < a - _SAME * (b - a)) | (column > b + _SAME * (b - a))
+        if period is not None:
+            column[outside] = a + (column[outside] - a) % period
+        elif outside.any():
+            raise InputError(
+                f"{item} {column[outside][0]:g} is beyond the windows, which are between {a:g} and {b:g}; add a window "
+                "there",
+                item=item,
+            )
+    return np.clip(places, low, high)
 
 
 def _matern(square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -10,15 +10,19 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import FloatArray, as_float_array, checked, positive, whole_number
+from kcons.constraints.arguments import FloatArray, checked, positive, whole_number
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
-from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, inside, learn
 from kcons.thermostats import Estimate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Points of a profile, and points at which a window may be proposed.
 _POINTS = 201
@@ -26,6 +30,8 @@ _POINTS = 201
 _MANY, _COEFFICIENTS = 7, 6
 #: Standard errors by which a closed profile may miss its beginning before that is warned of.
 _CLOSES = 4.0
+#: Colors of figures, color-blind safe (Okabe and Ito), and standard errors of their bands.
+_BLUE, _RED, _GREY, _BAND = "#0072B2", "#D55E00", "0.35", 2.0
 #: Part of the largest variance of a mean force that is rounding.
 _KNOWN = 1e-9
 #: Part of the range of the windows below which places are the same.
@@ -80,8 +86,8 @@ class Profile:
 
     def difference(self, a: float, b: float) -> Estimate:
         """F(b) - F(a) with its standard error."""
-        ends = _places([a, b], self.x, self.period, "ends of the difference")
-        return difference(*self._process.posterior((ends[:, None], [-1])))
+        ends = inside([[a], [b]], self.x[:1], self.x[-1:], [self.period], "ends of the difference")
+        return difference(*self._process.posterior((ends, [-1])))
 
     def lower_than(self, energy: float) -> NDArray[np.bool_]:
         """At which places of the profile F is at most so much above its lowest value."""
@@ -171,8 +177,8 @@ def integrate(
     grid = np.linspace(low, high, _POINTS)
     if zero is None:
         zero = float(grid[np.argmin(process.mean(grid[:, None], [-1])[0])])
-    at = np.append(grid, _places([zero], grid, period, "zero"))
-    F, covariance = process.posterior((at[:, None], [-1]))
+    at = np.append(grid[:, None], inside([[zero]], grid[:1], grid[-1:], [period], "zero"), axis=0)
+    F, covariance = process.posterior((at, [-1]))
     less = covariance[:-1, :-1] - covariance[:-1, -1:] - covariance[-1:, :-1] + covariance[-1, -1]
     error = np.sqrt(np.maximum(np.diag(less), 0.0))
     return Profile(grid, F[:-1] - F[-1], error, less, zero, places, forces, errors, period, closure, process)
@@ -221,18 +227,29 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
     return [places, together, np.sqrt(np.bincount(which, (weights * error) ** 2)) / total]
 
 
-def _places(at: ArrayLike, grid: FloatArray, period: float | None, item: str) -> FloatArray:
-    """Places within the range of the windows; into it by periods where there is one."""
-    points = as_float_array(at, item)
-    if points.ndim != 1 or not np.isfinite(points).all():
-        raise InputError(f"{item} must be finite numbers", item=item)
-    low, high = float(grid[0]), float(grid[-1])
-    slack = _SAME * (high - low)
-    outside = (points < low - slack) | (points > high + slack)
-    if period is not None:
-        points = np.where(outside, low + (points - low) % period, points)
-    elif outside.any():
-        raise InputError(
-            f"{item} goes beyond the windows, which are between {low:g} and {high:g}; add a window there", item=item
-        )
-    return np.clip(points, low, high)
+def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "energy") -> Figure:
+    """The free energy with two standard errors above; below, what it was made of: mean forces of the windows.
+
+    `coordinate` and `energy` are what the axes say.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 6.0), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    for each in (above, below):
+        each.grid(True, alpha=0.3)
+    low, high = profile.F - _BAND * profile.error, profile.F + _BAND * profile.error
+    above.fill_between(profile.x, low, high, color=_BLUE, alpha=0.25, linewidth=0, label=f"± {_BAND:g} standard errors")
+    above.plot(profile.x, profile.F, color=_BLUE, label="F")
+    places = profile.windows[:, None] * np.ones((1, 2))
+    above.plot(places.T, np.tile([[0.0], [0.04]], len(places)), color=_GREY, transform=above.get_xaxis_transform())
+    above.set_ylabel(f"F / {energy}")
+    above.legend(fontsize=8)
+    slope = np.gradient(profile.F, profile.x)
+    below.plot(profile.x, slope, color=_BLUE, linewidth=1.0, label="slope of F")
+    how: dict[str, Any] = {"color": _RED, "fmt": "o", "markersize": 4, "capsize": 2, "label": "windows"}
+    below.errorbar(profile.windows, profile.mean_forces, _BAND * profile.mean_force_errors, **how)
+    below.axhline(0.0, color=_GREY, linewidth=0.8)
+    below.set(xlabel=coordinate, ylabel=f"dF/dx / ({energy}/unit of x)")
+    below.legend(fontsize=8)
+    return figure

@@ -31,7 +31,7 @@ from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
-from kcons.free_energy.profiles.profile import Profile, integrate
+from kcons.free_energy.profiles.profile import Profile, integrate, plot_profile
 from kcons.free_energy.profiles.pulls import MIN_PULLS, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
@@ -270,8 +270,6 @@ class FreeEnergy:
             opened.write(text(self.numbers()).encode())
         profile = self._profile()
         if isinstance(profile, Profile):
-            from kcons.free_energy.profiles.plots import plot_profile
-
             (name,), (angle,) = self.names, self.angles
             written += [folder / "profile.csv", folder / "profile.png"]
             with in_one_piece(written[1]) as opened:

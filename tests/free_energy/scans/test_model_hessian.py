@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
 from ase.build import molecule
@@ -83,24 +81,3 @@ def test_a_dihedral_changes_by_the_shorter_way():
 def test_single_atoms_have_no_terms():
     apart = Internals([2, 2], np.array([[0.0, 0, 0], [0, 0, 30.0]]))
     assert apart.terms == [] and len(apart.constants) == 0
-
-
-@pytest.mark.skipif(find_spec("tblite") is None, reason="tblite is an extra")
-def test_it_is_near_the_hessian_of_gfn2():
-    """Stiff directions within a factor of two."""
-    from tblite.ase import TBLite
-
-    atoms = molecule("CH3OH")
-    atoms.calc = TBLite(method="GFN2-xTB", verbosity=0)
-    x = atoms.positions.copy()
-    h, true = 1e-3, []
-    for k in range(x.size):
-        ends = []
-        for sign in (1, -1):
-            atoms.positions[:] = x
-            atoms.positions.flat[k] += sign * h
-            ends.append(-atoms.get_forces().ravel())
-        true.append((ends[0] - ends[1]) / (2 * h))
-    model = np.linalg.eigvalsh(hessian(Internals(atoms.numbers, x), x))[8:]
-    found = np.linalg.eigvalsh(0.5 * (np.array(true) + np.array(true).T))[8:]
-    assert np.all((model / found > 0.5) & (model / found < 2.0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -187,31 +186,6 @@ def test_a_killed_worker_changes_nothing(tmp_path):
     _, result = run(broken, kills=("window-0003-up",), how={"workers": 2})
     assert diary(broken).count("window-0003-up") >= 2
     assert result.failed == {} and json.dumps(result.numbers()) == json.dumps(expected.numbers())
-
-
-def killed_again_and_again(folder: Path, kills: int) -> None:
-    """Run in a process that is killed with all its children after random times, until it ends by itself."""
-    rng = np.random.default_rng(3)
-    finished: set[str] = set()
-    for attempt in range(kills + 1):
-        process = started(folder, 0.3)
-        if attempt < kills:
-            time.sleep(rng.uniform(0.5, 6.0))
-            os.killpg(process.pid, signal.SIGKILL)
-        assert process.wait(timeout=120) in (0, -signal.SIGKILL)
-        present = {file.name for file in (folder / "out").glob("window-*.npz")}
-        assert finished <= present
-        finished = present
-
-
-@pytest.mark.parametrize("kills", [1, pytest.param(30, marks=pytest.mark.validation)])
-def test_killed_runs_go_on(tmp_path, kills):
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    whole.mkdir(), broken.mkdir()
-    _, expected = run(whole)
-    killed_again_and_again(broken, kills)
-    _, result = run(broken)
-    assert json.dumps(result.numbers()) == json.dumps(expected.numbers())
 
 
 def test_a_cluster_of_dask_that_loses_a_worker(tmp_path, monkeypatch):
