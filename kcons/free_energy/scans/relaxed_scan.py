@@ -129,13 +129,16 @@ class _Surface:
         held = [*translated(atoms, [item for item in atoms.constraints if item not in forces_only]), *held]
         self.atoms.set_constraint(forces_only)
         self.start = self.atoms.get_positions()
+        #: At the start, without calculator and constraints.
+        self.bare = self.atoms.copy()
+        self.bare.set_constraint()
         kept = Constraints(held)
-        rank = self._engine(kept).rank
+        rank = kept.engine(self.bare).rank
         #: With the targets that were left open.
         self.held = list(kept.constraints)
         for n, item in enumerate(grid.coordinates):
             # Says what is undefined at the start, and which atoms there are not.
-            with_it = self._engine(Constraints([*self.held, *(c.with_target(None) for c in grid.coordinates[: n + 1])]))
+            with_it = self._engine([*self.held, *(c.with_target(None) for c in grid.coordinates[: n + 1])])
             if with_it.rank != rank + n + 1:
                 raise ConstraintError(
                     f"{item.row_name(0)} depends on what else is held; it cannot take other values. Leave out "
@@ -145,23 +148,19 @@ class _Surface:
             r = self.start[item.atoms]
             for v in grid.values[n]:
                 item.with_target(float(v)).check(r, 0.0, 0)
-        measured = self._engine(Constraints([c.with_target(None) for c in grid.coordinates])).constraint_set
+        measured = self._engine([c.with_target(None) for c in grid.coordinates]).constraint_set
         self.place = [float(v) for v in measured.measure(self.start)]
         self._bonds = bonds_of(self.atoms)
         warn_of_gaps({item.row_name(0): item for item in grid.coordinates}, self._bonds)
 
-    def _engine(self, constraints: Constraints) -> Motion:
-        bare = self.atoms.copy()
-        bare.set_constraint()
-        bare.positions[:] = self.start
-        return constraints.engine(bare)
+    def _engine(self, rows: list[Constraint]) -> Motion:
+        return Constraints(rows).engine(self.bare)
 
     def evaluate(self, x: FloatArray) -> tuple[float, FloatArray]:
         """Energy and forces."""
         self.atoms.set_positions(x, apply_constraint=False)
         try:
-            energy = float(self.atoms.get_potential_energy())
-            forces = applied_forces(self.atoms)
+            energy, forces = float(self.atoms.get_potential_energy()), applied_forces(self.atoms)
         except InputError:
             raise
         except Exception as error:
@@ -183,8 +182,7 @@ class _Surface:
         if reset is not None:
             # What a calculator remembers, such as a density, would make the bits depend on what was done before.
             reset()
-        constraints = [*self.held, *self.grid.held_at(attempt.point)]
-        motion = self._engine(Constraints(constraints))
+        motion = self._engine([*self.held, *self.grid.held_at(attempt.point)])
         try:
             x = motion.restore_positions(before, bonds=self._bonds)
         except InfeasibleError:
@@ -215,9 +213,7 @@ class _Wavefront:
     ) -> None:
         self.surface, self.grid, self.attempts, self.progress = surface, grid, attempts, progress
         self.settings = settings
-        bare = surface.atoms.copy()
-        bare.set_constraint()
-        self.scan = Scan(grid, bare, surface.held)
+        self.scan = Scan(grid, surface.bare, surface.held)
         #: The attempt whose structure a point has handed on to its neighbors.
         self._handed: dict[Point, int] = {}
         self._queue: deque[tuple[Point, int | None]] = deque()

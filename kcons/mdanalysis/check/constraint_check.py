@@ -48,6 +48,8 @@ from kcons.topology.rows_by_name import HeldRows
 
 #: Frames, and atoms in each, that a grid of coordinates is looked for in.
 GRID_FRAMES, GRID_ATOMS = 5, 1000
+#: Where targets come from, in words.
+_MODES = {"given": "as given", "first": "the first frame", "mean": "the mean of the frames"}
 #: Positions, of all frames together, up to which one process is quickest: of files that need no unpacking, of others.
 ALONE = {"DCD": 5_000_000, "": 500_000}
 
@@ -61,7 +63,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         With the trajectory; of a group, its Universe.
     constraints : Constraint, iterable of Constraint, or ConstraintSet
         What should be held, in angstrom, on the atoms of the Universe.
-    targets : {'given', 'first', 'mean'}, path or TargetFile
+    targets : {'given', 'first', 'mean'} or path
         Where the lengths come from. 'given': what the constraints say, and the first frame for those that do not
         say. 'first': the first frame looked at. 'mean': the mean over the frames, which are read twice. A path: a
         parameter file, see `kcons.mdanalysis.check.targets`.
@@ -70,15 +72,10 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         1 rad for angles).
     precision : float, optional
         Step of the coordinates in the file, in angstrom, for formats where it cannot be known.
-    target_error : float or ndarray, shape (n_atoms,)
-        Rounding of the targets, in angstrom a coordinate, of each atom or of all; for 'given' targets that were
-        measured in another file.
     rank : bool
         Whether to find the rank, which takes longer than the frames of a short trajectory.
     worst : int
         Number of rows to name.
-    names : tuple of str, optional
-        What to call trajectory and topology.
 
     Raises
     ------
@@ -102,13 +99,11 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         atoms: Any,
         constraints: Constraint | Iterable[Constraint] | ConstraintSet,
         *,
-        targets: Literal["given", "first", "mean"] | str | Path | TargetFile = "given",
+        targets: Literal["given", "first", "mean"] | str | Path = "given",
         tolerance: float = 1e-4,
         precision: float | None = None,
-        target_error: float | FloatArray = 0.0,
         rank: bool = True,
         worst: int = 10,
-        names: tuple[str, str] | None = None,
         verbose: bool = False,
     ) -> None:
         universe = atoms.universe
@@ -124,30 +119,23 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
                 "there are no constraints to check; select others, or look at the bonds of the topology",
                 item="constraints",
             )
-        errors = np.asarray(target_error, dtype=np.float64)
-        if errors.shape not in ((), (n_atoms,)) or not (errors >= 0).all() or not np.isfinite(errors).all():
-            raise InputError(
-                f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
-            )
         described = topology_of(universe)
         labels = AtomNames(universe, described.elements)
         self._used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
         self._masses, reason = _masses(universe, described.masses, given, self._used, labels)
-        if targets not in ("given", "first", "mean"):
-            file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
-            given, mode, text = tuple(file.apply(given, labels)), "given", str(file.path)
-        else:
-            mode = str(targets)
-            text = {"first": "the first frame", "mean": "the mean of the frames"}.get(mode, "as given")
-        if mode != "given":
+        mode, text = str(targets), _MODES.get(str(targets), "")
+        if not text:
+            given, mode, text = tuple(TargetFile(targets).apply(given, labels)), "given", str(targets)
+        elif mode != "given":
             given = tuple(item if item.moving or not item.holonomic else item.with_target(None) for item in given)
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
-        names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
+        names = self._path or "memory", str(getattr(universe, "filename", None) or "topology")
         remarks = [f"no temperature: {reason}"] if reason else []
         self.asked = Asked(names, labels, mode, text, whole_number(worst, "worst"), remarks + _remarks_on(reader))
         self._given, self._tolerance, self._wants_rank = given, not_negative(tolerance, "tolerance"), rank
-        self._target_error = np.broadcast_to(errors, n_atoms)
+        #: Rounding of given targets that were measured in another file, in angstrom a coordinate, by atom.
+        self.target_error: FloatArray = np.zeros(n_atoms)
         self._precision = precision_of_reader(reader, precision)
         self._by_frame = None
         if self._precision.exact and precision is None:
@@ -248,11 +236,11 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             if ts.dimensions is not None and not np.isfinite(ts.dimensions).all():
                 raise NonFiniteError(f"the cell is {ts.dimensions}")
         except (*READ_ERRORS, NonFiniteError) as error:
-            raise self._nothing(frame, str(error)) from None
+            raise self._nothing(Break(frame, str(error))) from None
         self._largest = float(np.abs(ts.positions[self._used]).max())
         masses = np.ones(ts.n_atoms) if self._masses is None else self._masses
         precision = self._precision_at(frame)
-        self._rows = RowTable(self._given, masses, ts, precision, self._target_error, self._tolerance)
+        self._rows = RowTable(self._given, masses, ts, precision, self.target_error, self._tolerance)
         self._rank: int | None = None
         try:
             if self._wants_rank:
@@ -263,11 +251,11 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
     def _precision_at(self, frame: int) -> Any:
         return self._precision if self._by_frame is None else self._by_frame[frame]
 
-    def _nothing(self, frame: int, reason: str) -> UnreadableError:
+    def _nothing(self, broken: Break) -> UnreadableError:
         """Of a trajectory of which nothing can be told."""
         return UnreadableError(
-            f"{self.asked.names[0]}: frame {frame}, the first to be checked, cannot be read ({reason}); start at "
-            "another frame, or write the file again",
+            f"{self.asked.names[0]}: frame {broken.frame}, the first to be checked, cannot be read ({broken.reason}); "
+            "start at another frame, or write the file again",
             item="trajectory",
         )
 
@@ -280,13 +268,12 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             return
         if not len(found.frames):
             assert found.broken is not None
-            raise self._nothing(found.broken.frame, found.broken.reason)
+            raise self._nothing(found.broken)
         if found.broken is None and self._to_the_end:
             found.broken = self._damage or ending_of(self._trajectory)
         text = described([self._precision_at(frame) for frame in self.frames.tolist()], self._largest)
-        masses = self._rows.set.masses
         n_in_file = int(self._trajectory.n_frames)
-        self.results.check = result_of(found, self._rows, self.asked, text, self._rank, masses, n_in_file)
+        self.results.check = result_of(found, self._rows, self.asked, text, self._rank, n_in_file)
 
     @property
     def check(self) -> CheckResult:
@@ -437,8 +424,8 @@ def check_trajectory(
     if workers < 1:
         raise InputError(f"{workers} workers; give 1 or more", item="workers")
     of_topology = str(targets) == "topology"
-    # Complain about the parameter file before anything long.
-    given = "given" if of_topology else targets if str(targets) in ("first", "mean") else TargetFile(targets)
+    if str(targets) not in ("topology", "first", "mean"):
+        TargetFile(targets)  # complain of it before anything long
     held = {name: options.pop(name) for name in Options.__annotations__ if name in options}
     if of_topology:
         universe = open_universe(topology, topology_format=topology_format)
@@ -449,7 +436,7 @@ def check_trajectory(
             )
         with quiet():
             precision = precision_of(topology, format_of(universe.trajectory))
-            options["target_error"] = precision.half_step(universe.atoms.positions)
+            errors = precision.half_step(universe.atoms.positions)
         constraints = _held(universe, constrain, held)
         load_trajectory(universe, trajectory, topology, format=format)
     else:
@@ -458,9 +445,10 @@ def check_trajectory(
         with quiet(), suppress(*READ_ERRORS):
             _ = universe.trajectory[chosen.get("start") or 0]
         constraints = _held(universe, constrain, held)
-    check = ConstraintCheck(universe, constraints, targets=given, names=(str(trajectory), str(topology)), **options)
+    check = ConstraintCheck(universe, constraints, targets="given" if of_topology else targets, **options)
+    check.asked.names = str(trajectory), str(topology)
     if of_topology:
-        check.asked.targets = f"coordinates of {topology}"
+        check.asked.targets, check.target_error = f"coordinates of {topology}", errors
     if guessed := constraints.bonds_guessed:
         check.asked.remarks.append(
             f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "

@@ -206,7 +206,7 @@ class Asked:
 
 
 def result_of(
-    found: Found, table: RowTable, asked: Asked, precision: str, rank: int | None, masses: FloatArray, n_in_file: int
+    found: Found, table: RowTable, asked: Asked, precision: str, rank: int | None, n_in_file: int
 ) -> CheckResult:
     """All that there is to say of what was found, of a file of `n_in_file` frames and of a `precision` in words."""
     margins, held, numbers = found.rows["margin"], table.set, found.frames["frame"]
@@ -237,7 +237,7 @@ def result_of(
     }
     freedom, temperature = None, None
     if rank is not None:
-        freedom, kelvin = _temperatures(found, rank, masses, remarks)
+        freedom, kelvin = _temperatures(found, rank, held.masses, remarks)
         if kelvin is not None:
             series["temperature K"] = kelvin.tolist()
             line = fitted(times, kelvin)

@@ -329,7 +329,6 @@ def test_transformed_coordinates_are_taken_as_they_are(water):
         (ROWS, {"tolerance": -1.0}, "tolerance"),
         (ROWS, {"precision": 0.0}, "precision"),
         (ROWS, {"targets": "nowhere.toml"}, "nowhere.toml"),
-        (ROWS, {"target_error": -1.0}, "target_error is -1.0; give a length"),
         (ROWS, {"worst": -1}, "worst is -1"),
         (ROWS, {"run": {"start": 30}}, "no frames"),
         (ROWS, {"run": {"step": 0}}, "step cannot be zero"),
