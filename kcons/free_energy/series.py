@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from os import PathLike
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -144,12 +143,9 @@ class Series:
                 data = stored_arrays(opened)
             g, seconds = int(data["isokinetic_degrees_of_freedom"]), float(data["seconds"])
             series = cls([str(name) for name in data["names"]], data["periods"], g, seconds)
-            d = len(series.names)
-            columns: list[Any] = [
-                data[f].reshape(-1).tolist() if f in _NUMBERS else data[f].reshape(-1, d) for f in Sample._fields
-            ]
-            for row in zip(*columns, strict=True):
-                series.append(Sample(*row))
+            shapes = {name: (-1,) if name in _NUMBERS else (-1, len(series.names)) for name in Sample._fields}
+            columns = [data[name].reshape(shape) for name, shape in shapes.items()]
+            series._samples = [Sample(*row) for row in zip(*columns, strict=True)]
         except FileNotFoundError:
             raise
         except Exception as error:  # a damaged archive raises whatever its bytes lead to

@@ -7,6 +7,7 @@ import os
 import time
 import traceback
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED as FIRST
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
@@ -504,15 +505,14 @@ class Windows:
     def _sample(self, jobs: Sequence[Window], total: int) -> dict[str, str]:
         """Run windows or pulls, again where a process was killed; why those failed that did."""
         failed: dict[str, str] = {}
-        tries: dict[str, int] = dict.fromkeys((job.name for job in jobs), 0)
+        tries = Counter[str]()
         left, began, done = list(jobs), time.monotonic(), 0
         while left:
             again: list[Window] = []
             try:
                 with nullcontext(self.executor) if self.executor else _processes(self.workers, len(left)) as pool:
-                    running: dict[Future[None], Window] = {}
-                    for job in left:
-                        running[pool.submit(_sampled, self.sampler, job, self.settings, self.file(job))] = job
+                    how = self.sampler, self.settings
+                    running = {pool.submit(_sampled, *how, job, self.file(job)): job for job in left}
                     while running:
                         for future in wait(running, return_when=FIRST).done:
                             job = running.pop(future)
@@ -523,9 +523,8 @@ class Windows:
                                 continue
                             done += 1
                             note = self.folder / f"{job.name}.failed.txt"
-                            if problem is None:
-                                note.unlink(missing_ok=True)
-                            else:
+                            note.unlink(missing_ok=True)
+                            if problem is not None:
                                 failed[job.name] = problem
                                 note.write_text(problem, encoding="utf-8")
                             if self.progress is not None:
@@ -543,8 +542,7 @@ class Windows:
     def result(self) -> FreeEnergy:
         """Mean forces of the windows that are finished."""
         kT = BOLTZMANN * self.settings.temperature / self.sampler.kJ
-        found = []
-        problems = dict(self._failed)
+        found, problems = [], dict(self._failed)
         for number, target in enumerate(self._targets):
             sides, seconds = dict[str, MeanForce](), 0.0
             for job in self._jobs(number):
@@ -578,7 +576,7 @@ def _problem(future: Future[None]) -> str | None:
     return "".join(traceback.format_exception_only(error)).strip()
 
 
-def _sampled(sampler: Sampler, window: Window, settings: Settings, file: Path) -> None:
+def _sampled(sampler: Sampler, settings: Settings, window: Window, file: Path) -> None:
     """In a worker: one window, unless another run has finished it meanwhile."""
     if not file.exists():
         (sampler.sample if window.side in SIDES else sampler.pull)(window, settings, file)
