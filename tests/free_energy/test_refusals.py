@@ -230,7 +230,6 @@ PROFILES = [
         (lambda kT=kT: pull_free_energy([1.0] * 5, thermal_energy=kT), "thermal_energy", "positive")
         for kT in (-1.0, "x", "1")
     ),
-    (lambda: pull_free_energy([1.0] * 5, thermal_energy=1.0, rng="x"), "rng", "rng is 'x'"),
 ]
 
 # -- scans --

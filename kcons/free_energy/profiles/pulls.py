@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, logsumexp
 
-from kcons.constraints.arguments import FloatArray, Rng, generator_of, positive
+from kcons.constraints.arguments import FloatArray, positive
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite, pymbar
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
@@ -60,9 +60,7 @@ class Pulled:
         return self.jarzynski if self.bar is None else self.bar
 
 
-def pull_free_energy(
-    forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float, rng: Rng = 0
-) -> Pulled:
+def pull_free_energy(forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float) -> Pulled:
     """Difference of free energy from the works of pulls.
 
     Errors are those of a bootstrap over pulls; that of BAR is its asymptotic one.
@@ -75,8 +73,6 @@ def pull_free_energy(
         Work done on the system by pulls from end to start, each from equilibrium at the end.
     thermal_energy : float
         kT in the unit of the works.
-    rng : int, numpy.random.Generator or None
-        Of the bootstrap.
 
     Raises
     ------
@@ -92,8 +88,8 @@ def pull_free_energy(
         or gain work, as those of the wrong sign do.
     """
     kT = positive(thermal_energy, "thermal_energy")
-    ahead, generator = _works(forward, "forward") / kT, generator_of(rng)
-    drawn = ahead[generator.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
+    ahead = _works(forward, "forward") / kT
+    drawn = ahead[np.random.default_rng(0).integers(len(ahead), size=(_SAMPLES, len(ahead)))]
     jarzynski = Estimate(kT * float(_jarzynski(ahead)), kT * float(_jarzynski(drawn).std(ddof=1)))
     effective = math.exp(2 * logsumexp(-ahead) - logsumexp(-2 * ahead))
     if backward is None:

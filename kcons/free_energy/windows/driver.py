@@ -441,8 +441,8 @@ class Windows:
             jobs.append(Window(number, side, begin, end, seed))
         return jobs
 
-    def pull(self, start: ArrayLike, end: ArrayLike, count: int = 20, *, both_ways: bool = True) -> Pulled:
-        """F(end) - F(start) from the works of pulls, kJ/mol: Jarzynski, and BAR with pulls both ways.
+    def pull(self, start: ArrayLike, end: ArrayLike, count: int = 20) -> Pulled:
+        """F(end) - F(start) from the works of pulls both ways, kJ/mol, by BAR; and by Jarzynski.
 
         Each pull begins in equilibrium (`Settings.equilibration`), takes `Settings.pull` steps at a constant rate, and
         is recorded at every step. Finished ones are kept.
@@ -453,7 +453,6 @@ class Windows:
             In angstrom and radian.
         count : int
             Pulls in each direction, 5 or more.
-        both_ways : bool
 
         Raises
         ------
@@ -468,7 +467,7 @@ class Windows:
             raise InputError("start and end of the pulls are the same; give two places", item="end")
         ends = ends / self.sampler.scales
         jobs: list[list[Window]] = []
-        for k, direction in enumerate(DIRECTIONS[: 1 + both_ways]):
+        for k, direction in enumerate(DIRECTIONS):
             begin, target = (tuple(place.tolist()) for place in (ends if k == 0 else ends[::-1]))
             seeds = (np.random.SeedSequence([self.seed, number, 2 + k]).generate_state(1)[0] for number in range(count))
             jobs.append([Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)])
@@ -583,18 +582,14 @@ def _sampled(sampler: Sampler, settings: Settings, window: Window, file: Path) -
 
 
 def _pulled(pulls: Sequence[Sequence[Series]], kJ: float, kT: float) -> Pulled:
-    """What the pulls of one or both directions say, with kT in kJ/mol."""
-    works = [
+    """What pulls forward and backward say, with kT in kJ/mol."""
+    forward, backward = (
         np.array([series.work_of(thermal_multipliers(series, kT / kJ))[-1] * kJ for series in each]) for each in pulls
-    ]
-    starts, ends = ([np.array([-0.5 * s.log_det_z[k] for s in each]) for each in pulls] for k in (0, -1))
+    )
     # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
-    if len(pulls) == 2:
-        shift = kT * (_log_mean(starts[0]) - _log_mean(starts[1]))
-        return pull_free_energy(works[0] + shift, works[1] - shift, thermal_energy=kT)
-    counts = -works[0] / kT  # what was pulled here counts as in equilibrium with these weights
-    shift = kT * (_log_mean(starts[0]) - _log_mean(ends[0] + counts) + _log_mean(counts))
-    return pull_free_energy(works[0] + shift, thermal_energy=kT)
+    start, end = (_log_mean(np.array([-0.5 * series.log_det_z[0] for series in each])) for each in pulls)
+    shift = kT * (start - end)
+    return pull_free_energy(forward + shift, backward - shift, thermal_energy=kT)
 
 
 def _log_mean(logarithms: FloatArray) -> float:

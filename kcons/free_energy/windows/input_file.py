@@ -186,7 +186,6 @@ class Pulls:
     to: NumberOrNumbers | None = None
     count: Single = 20
     steps: Single = 20_000
-    both_ways: Truth = True
 
 
 @dataclass(kw_only=True)
@@ -226,7 +225,7 @@ class InputFile:
     improve : dict or None
         Of `Windows.improve`.
     pulls : dict or None
-        Of `Windows.pull`: start and end in angstrom and radian, count, both_ways.
+        Of `Windows.pull`: start and end in angstrom and radian, count.
     pull_steps : int
         Steps of each of these.
     processes : int or None
@@ -399,7 +398,7 @@ def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatAr
     )
     if np.array_equal(start, end):
         raise InputError("[pulls] begin where they end; give from and to", item="pulls")
-    return {"start": start, "end": end, "count": entry.count, "both_ways": entry.both_ways}
+    return {"start": start, "end": end, "count": entry.count}
 
 
 def counted(atoms: Sequence[int], first: int) -> list[int]:
