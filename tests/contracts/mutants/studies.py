@@ -86,6 +86,6 @@ MUTANTS = {
         ),
     ],
     "free_energy/profiles/profile.py": [
-        ("aims = grid[«→~»self.lower_than(below, grid)]", "test_profile.py::test_windows_that_help_what_is_low"),
+        ("aims = grid[«→~»self.lower_than(below)]", "test_profile.py::test_windows_that_help_what_is_low"),
     ],
 }
