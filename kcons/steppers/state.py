@@ -136,19 +136,6 @@ class State:
             return False
         return self.is_of(system) and (there is here or np.array_equal(there, here))
 
-    def reversed(self, stepper: Any = None) -> State:
-        """The same point with opposite velocities; `stepper` is the thermostat whose variables it carries, if any.
-
-        Raises
-        ------
-        InputError
-            It carries some, and no stepper is given: they may be velocities, too.
-        """
-        if self.thermostat is not None and not hasattr(stepper, "step"):
-            raise InputError("the state carries variables of a thermostat; give it: reversed(stepper)", item="stepper")
-        back = replace(self, velocities=-self.velocities, forces=None)  # these may depend on velocities
-        return stepper.time_reversed(back) if hasattr(stepper, "time_reversed") else back
-
     def save(self, file: str | PathLike[str] | BinaryIO) -> None:
         """Write everything the state holds in NumPy's .npz format: a run continued from it is the same to the last bit.
 

@@ -45,24 +45,6 @@ def test_steps_are_those_made_operation_by_operation(name, options, order) -> No
         state = following
 
 
-@ORDERS
-def test_a_part_of_the_atoms(order) -> None:
-    """The others, held ones too, are only pushed."""
-    system, state = molecules("triangles", ions=5)
-    compiled, calls = isokinetics(system, order=order, atoms=np.arange(15))
-    state = compiled.start(system, state)
-    before = system.masses[:15] @ np.einsum("ij,ij->i", state.velocities[:15], state.velocities[:15])
-    for _ in range(3):
-        following, expected = compiled.step(system, state, 0.05), calls.step(system, state, 0.05)
-        assert distance(following, expected) <= 2e-14
-        if order == 2:  # free atoms that are not thermostatted feel their forces, and nothing else
-            push = 0.025 * (state.forces + following.forces)[-5:] / 23.0
-            np.testing.assert_allclose(following.velocities[-5:], state.velocities[-5:] + push, rtol=0, atol=1e-15)
-        state = following
-    inside = system.masses[:15] @ np.einsum("ij,ij->i", state.velocities[:15], state.velocities[:15])
-    assert inside == pytest.approx(before, rel=1e-14)
-
-
 # -- where a kernel cannot go on --------------------------------------------------------------------
 
 
