@@ -151,39 +151,6 @@ def test_curvatures_of_a_fluid():
     assert rest.value == 0
 
 
-def test_what_is_left_is_what_a_free_angle_does():
-    """Two arms about a hub, an angle spring: no shift or turn changes U, and U'' of the angle is known."""
-    k, wanted = 2.0, 0.2
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [math.cos(1.9), math.sin(1.9), 0.0]])
-    masses = np.array([5.0, 1.0, 2.0])
-
-    def force(x: np.ndarray, t: float) -> np.ndarray:
-        a, b = x[1] - x[0], x[2] - x[0]
-        cosine = (a @ b) / math.sqrt((a @ a) * (b @ b))
-        pull = -k * (cosine - wanted)
-        ga = (b / math.sqrt((a @ a) * (b @ b))) - cosine * a / (a @ a)
-        gb = (a / math.sqrt((a @ a) * (b @ b))) - cosine * b / (b @ b)
-        return pull * np.array([-ga - gb, ga, gb])
-
-    split = TemperatureSplit(system([Distance([[0, 1], [0, 2]])], x, masses, force))
-    for _ in range(1200):
-        split.add(x)
-    above = np.array(split._series)[0, 0]
-    assert np.abs(above[:2]).max() < 1e-20 * above[2] + 1e-25
-    # Laplacian by the metric g of the angle alone: shape space, with the volume of the turns; by differences.
-    g = _inverse_metric(1.9, masses)
-    slope = -k * (math.cos(1.9) - wanted) * math.sin(1.9)
-    assert above[2] == pytest.approx(g * slope**2, rel=1e-9)
-
-    def flux(t: float) -> float:
-        return _density(t, masses) * _inverse_metric(t, masses) * (-k * (math.cos(t) - wanted) * math.sin(t))
-
-    h = 1e-4
-    laplacian = (flux(1.9 + h) - flux(1.9 - h)) / (2 * h) / _density(1.9, masses)
-    rest = curvatures(split)[2]
-    assert abs(rest.off(laplacian)) <= 3.5 and rest.error < 0.1 * abs(rest.value)
-
-
 def _determinant(angle: np.ndarray | float, masses: np.ndarray) -> np.ndarray | float:
     """det Z of the two bonds."""
     w = 1.0 / masses
@@ -193,15 +160,6 @@ def _determinant(angle: np.ndarray | float, masses: np.ndarray) -> np.ndarray | 
 def _density(angle: np.ndarray | float, masses: np.ndarray) -> np.ndarray | float:
     """Volume of the constraint surface, of an angle."""
     return np.sin(angle) * np.sqrt(_determinant(angle, masses))
-
-
-def _inverse_metric(angle: float, masses: np.ndarray) -> float:
-    """|grad angle|^2 in the mass metric with the bonds held (Z of all three rows against Z of the bonds)."""
-    w, c, s = 1.0 / masses, math.cos(angle), math.sin(angle)
-    bonds = np.array([[w[0] + w[1], w[0] * c], [w[0] * c, w[0] + w[2]]])
-    cross = np.array([-w[0] * s, -w[0] * s])
-    own = (w[0] + w[1]) + (w[0] + w[2]) - 2 * w[0] * c
-    return float(own - cross @ np.linalg.solve(bonds, cross))
 
 
 # -- against a sampler without forces ---------------------------------------------------------------

@@ -145,16 +145,6 @@ def test_pendulum_exact_from_any_start(X0):
     assert flow.exact(0.0, X0) == pytest.approx(X0, abs=1e-14)
 
 
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_pendulum_on_its_separatrix(direction):
-    flow, times = Pendulum(1.3), np.array([-1.0, 0.0, 2.5])
-    theta = 2 * np.arctan(np.sinh(1.3 * times * direction))
-    expected = np.stack([theta, 2 * direction / np.cosh(1.3 * times)], axis=-1)
-    assert flow.exact(times, [0.0, 2.0 * direction]) == pytest.approx(expected, abs=1e-13)
-    assert flow.exact(times, [3 * np.pi, 0.0]) == pytest.approx(np.tile([3 * np.pi, 0.0], (3, 1)), abs=1e-13)
-    assert flow.exact(1.0, [direction * np.pi, 0.0]) == pytest.approx([direction * np.pi, 0.0], abs=1e-13)
-
-
 def test_free_particle_on_a_sphere():
     given = case("A01_sphere_free")
     x0, v0 = (np.array(given["initial"][key])[0] for key in ("positions", "velocities"))
@@ -189,7 +179,9 @@ def test_acceleration_on_the_sphere_is_the_projected_one():
     assert flow.acceleration(x, v) == pytest.approx(wanted, rel=1e-12)
 
 
-@pytest.mark.parametrize("start", [[0.0, 2.0 * (1 - 5e-13)], [0.0, 2.0 * (1 + 5e-13)], [np.pi, 1e-9]])
+@pytest.mark.parametrize(
+    "start", [[0.0, 2.0], [0.0, 2.0 * (1 - 5e-13)], [0.0, 2.0 * (1 + 5e-13)], [np.pi, 1e-9], [np.pi, 0.0]]
+)
 def test_a_pendulum_next_to_its_separatrix_is_refused(start) -> None:
     """Far beyond the first turn elliptic functions gave 1e32; at the top it stayed where it was for ever."""
     with pytest.raises(InputError, match="near the separatrix"):

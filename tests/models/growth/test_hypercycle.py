@@ -131,15 +131,6 @@ def test_events_are_found_wherever_a_settled_motion_passes_them(part):
     assert found.t[-1] == found.t_events[0][0]
 
 
-def test_events_of_a_motion_that_has_settled():
-    model = Hypercycle()
-    nearly = lambda t, x: float(model.mixture.excess(Populations.from_values(t, x), 1.0)) * 1e12 - 1.0  # noqa: E731
-    nearly.terminal = True
-    found = solve(model.with_entropy_production(30.0), (0.0, 5000.0), X0, events=nearly, rtol=1e-7, atol=1e-8)
-    assert found.status == 1 and found.settled_time < found.t[-1]
-    assert found.t[-1] == pytest.approx(30.0 * np.log(BUDGET * 1e12), abs=1e-3)
-
-
 def test_start_at_equilibrium():
     """H36: with nothing to produce it is refused; with no production asked for, or the total alone, it stays."""
     model = Hypercycle()
