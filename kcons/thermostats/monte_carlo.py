@@ -264,7 +264,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         goes_on = self._left is not None and all(map(is_, self._left, (state.thermostat, state.positions)))
         strange = not goes_on and (state.origin is None or state.origin[0] is None)
         if strange or not state.has_forces_of(system) or math.isnan(held[POTENTIAL]):
-            known, held[POTENTIAL] = held[POTENTIAL], energy_at(system, state)
+            known, held[POTENTIAL] = held[POTENTIAL], system.potential_energy(state.positions, state.time)
             if not math.isnan(known) and known != held[POTENTIAL]:
                 state = replace(state, forces=None)
             if not math.isfinite(held[POTENTIAL]):
@@ -310,7 +310,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
             return begin, UNSOLVED, math.nan, potential
         except NonFiniteError:
             return begin, NOT_FINITE, math.nan, potential
-        there = energy_at(system, end)
+        there = system.potential_energy(end.positions, end.time)
         change = (system.kinetic_energy(end.velocities) - kinetic + (there - potential)) / self.thermal_energy
         if not math.isfinite(change):
             return begin, NOT_FINITE, math.nan, potential
@@ -322,21 +322,6 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         noise = random.standard_normal(v.shape)
         noise *= np.sqrt((1 - self.keep**2) * self.thermal_energy * system.inverse_masses)
         return system.motion.project_velocities(x, self.keep * v + noise, time=state.time)
-
-
-def energy_at(system: System, state: State) -> float:
-    """The potential energy, 0 without forces; `InputError` if it is not one real number."""
-    if system.potential is None:
-        return 0.0
-    x = state.positions.view()
-    x.setflags(write=False)
-    found = system.potential(x, state.time)
-    if np.ndim(found) or not np.issubdtype(np.asarray(found).dtype, np.number) or np.iscomplexobj(found):
-        raise InputError(
-            f"the potential returned {found!r}; it must return one real number, the energy of all atoms",
-            item="potential",
-        )
-    return float(found)
 
 
 def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:

@@ -16,7 +16,7 @@ import zlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
-from weakref import WeakKeyDictionary, ref
+from weakref import ref
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +38,7 @@ from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.steppers.stepper import DropsSystemCaches
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import (
@@ -176,7 +177,7 @@ class Place:
         self.area = float(np.linalg.norm(np.cross(self.cell[0], self.cell[1])))
 
 
-class Barostat:
+class Barostat(DropsSystemCaches):
     """Base of the barostats: pieces, trial cells, acceptance. Give one to `ConstantPressure`, or to dynamics of ASE.
 
     Pieces - clusters tied by constraints, molecules where bonds are given, free atoms - move by their centers, with
@@ -241,13 +242,7 @@ class Barostat:
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
         self.cutoff = cutoff
-        self._pieces: WeakKeyDictionary[CellSystem, BarostatBodies] = WeakKeyDictionary()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_pieces"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _pieces=WeakKeyDictionary())  # found anew by a copy
+        self._known: tuple[CellSystem, BarostatBodies] | None = None
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.pressure!r}, every={self.every}, kind={self.strains.kind!r})"
@@ -258,15 +253,15 @@ class Barostat:
 
     def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> BarostatBodies:
         """What moves as one; errors as of `find_pieces`."""
-        known = self._pieces.get(system)
-        if known is None:
+        known = self._known
+        if known is None or known[0] is not system:
             require_periodic(system, self.strains.axes, self.strains.kind)
             self._check_width(system, system.cell)
-            known = find_pieces(system, positions, self.strains.axes, self.molecules, self.held, time)
-            if self.strains.flexible and not known.open.all():
+            found = find_pieces(system, positions, self.strains.axes, self.molecules, self.held, time)
+            if self.strains.flexible and not found.open.all():
                 raise UnsupportedError("a cell that changes its angles turns what is held in space; use another kind")
-            self._pieces[system] = known
-        return known
+            known = self._known = system, found
+        return known[1]
 
     @cached_property
     def _owner(self) -> float:
