@@ -25,7 +25,7 @@ from kcons.openmm.device.kernel_rows import KernelRows, as_parts
 from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
-from kcons.openmm.ensembles.nose_hoover_ensemble import CHAIN_ORDER, NoseHoover, NoseHooverMiddle
+from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
@@ -39,7 +39,7 @@ from kcons.openmm.states import box_of, positions_of
 from kcons.openmm.surface_integrator import SurfaceIntegrator
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.nose_hoover import chain_fractions
+from kcons.thermostats.nose_hoover import FRACTIONS
 
 #: Ensembles whose operations kernels have.
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
@@ -104,7 +104,7 @@ def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> lis
             now = ends[-1]
         elif isinstance(operation, Chain):
             assert isinstance(ensemble, NoseHoover)
-            flights = tuple(operation.fraction * f for f in chain_fractions(CHAIN_ORDER, 1))
+            flights = tuple(operation.fraction * f for f in FRACTIONS)
         done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
         if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
             done.append(Op("rescale"))
