@@ -335,14 +335,6 @@ class Dense:
             last = length
         raise NoSolution("the nearest point")
 
-    def amplification(self, x: Array, x_ref: Array) -> Array:
-        """By how much each coordinate moves, at most, where each sigma is off by one: shape (3 n, rows)."""
-        spread = (self.basis(x_ref)[0] * self.root).T
-        a = self.jacobian(x)
-        size = np.linalg.norm(a, axis=1)
-        size[size == 0] = 1.0
-        return np.abs(spread @ np.linalg.pinv((a @ spread) / size[:, None], rcond=1e-10)) / size
-
     def rounding(self, x: Array, stored: float) -> Array:
         """What double precision leaves of each sigma where coordinates are as large as `stored`."""
         reach = np.abs(self.jacobian(x)).sum(axis=1) * stored
