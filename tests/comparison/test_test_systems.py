@@ -190,9 +190,10 @@ def test_chain_shapes(shape, angle):
 def test_ethanol():
     system = small("ethanol")
     symbols = np.array(system.symbols)
-    bonds = sorted("".join(sorted(symbols[pair])) for pair in system.angle_bonds)
+    lengths, angles = system.constraint_set.constraints
+    bonds = sorted("".join(sorted(symbols[pair])) for pair in lengths.atoms)
     assert bonds == ["CC"] + ["CH"] * 5 + ["CO"] + ["HO"]
-    assert (len(system.angles), system.motion.rank, system.motion.degrees_of_freedom) == (13, 19, 8)
+    assert (angles.n_rows, system.motion.rank, system.motion.degrees_of_freedom) == (13, 19, 8)
     assert len(system.bonds) == 21  # the same set by distances alone
     if find_spec("tblite") is not None:
         assert "xTB" in test_systems.build("ethanol").potential.name

@@ -60,7 +60,7 @@ def by_methods() -> Iterator[tuple[str, Trail]]:
         system = test_systems.build(name, SIZES.get(name), **options)
         for method in METHODS.values():
             if method.refuses(system) is None:
-                setting = 1e-5 if method.adaptive else method.settings(system)[-1]
+                setting = 1e-11 if method.adaptive else method.settings(system)[-1]
                 moving = method.start(system, setting)
                 moving.advance()
                 seen = [moving.observe()]

@@ -51,8 +51,6 @@ def build(size: int, rng: int) -> TestSystem:
         units=BARE,
         # Between held arms, an angle is the distance of its ends.
         bonds=np.concatenate([BONDS, TRIPLES[:, [0, 2]]]),
-        angles=TRIPLES,
-        angle_bonds=BONDS,
     )
 
 
