@@ -76,21 +76,6 @@ def test_far_fewer_force_evaluations_than_rattle(truth):
 # -- constraints ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(  # on the CPU, programs are run by the code of Reference
-    ("scheme", "platform"),
-    [*((scheme, "Reference") for scheme in SCHEMES), ("rattle", "CPU")],
-)
-def test_constraints_to_the_last_digits(scheme, platform):
-    system, x, v = alanine()
-    integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-13)
-    context = started(system, integrator, x, v, platform)
-    for _ in range(10):
-        integrator.step(3)
-        distance, along = residuals(system, context)
-        assert distance <= 1e-12
-        assert along <= 1e-12
-
-
 @pytest.mark.parametrize("platform", PLATFORMS)
 @pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6"])
 def test_constraints_of_water(scheme, platform):

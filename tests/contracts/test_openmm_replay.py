@@ -9,14 +9,12 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from openmm import unit
 from openmm_ensembles import ENSEMBLES
 from openmm_systems import GPUS, PLATFORMS, context_of, masses_of, rows_of, started, state_of, total_energy
 
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import SCHEMES
 
-GAS = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 T = 300.0
 #: 1/ps. <K> of 12 ps then has a standard deviation of 1.8 % over seeds.
 RATE = 20.0
