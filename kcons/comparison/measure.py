@@ -279,21 +279,7 @@ def measure(
     left: float | None = None,
     watcher: Watcher | None = None,
 ) -> dict[str, Any]:
-    """The row of one method at one setting.
-
-    Parameters
-    ----------
-    system : TestSystem
-    method : Method
-    setting : float
-        A time step in internal units, or a tolerance.
-    reference : Reference
-    budget : float
-        Seconds for the method.
-    left : float, optional
-        Seconds that are left of them.
-    watcher : Watcher, optional
-    """
+    """The row of one method at one setting (internal units), with what is `left` of the budget for the method."""
     row, watching = about_row(system, method, setting), watcher or Watcher()
     what = f"{method.title}, {'rtol' if method.adaptive else 'dt'} {row['setting']:g}"
     log, begun = _Log(system), clock()
@@ -423,18 +409,8 @@ def rewind(system: TestSystem, run: Run) -> None:
 class Rounds:
     """Times of steps without observation, in rounds: every run once, then all again.
 
-    What slows the machine down for a while affects all methods alike.
-
-    Parameters
-    ----------
-    system : TestSystem
-    least : int
-        Rounds of one run at least.
-    limit : float
-        Seconds of the longest run that is timed.
-    patience : float
-        Seconds after which a round is interrupted.
-    watcher : Watcher
+    What slows the machine down for a while affects all methods alike. Runs of at most `limit` seconds are timed in
+    `least` rounds and more; one that takes longer than `patience` is interrupted.
     """
 
     def __init__(self, system: TestSystem, least: int, limit: float, patience: float, watcher: Watcher) -> None:

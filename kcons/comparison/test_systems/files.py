@@ -60,19 +60,7 @@ def is_file(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is held in a file, before any forces.
-
-    Attributes
-    ----------
-    title : str
-    rows : HeldRows
-        In angstrom.
-    positions : ndarray, shape (n_atoms, 3)
-        On the constraints.
-    motion : Motion
-    notes : tuple of str
-        What was guessed.
-    """
+    """What is held in a file, before any forces: rows in angstrom, positions on them, and what was guessed."""
 
     title: str
     rows: HeldRows
