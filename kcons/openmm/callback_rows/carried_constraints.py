@@ -180,6 +180,8 @@ class Engine:
         #: Whether drifts are great circles on these, and what the last one has done to v times its length.
         self.exact, self._turned = False, np.zeros(local)
         self._integrator: Callable[[], Integrator | None] = lambda: None
+        #: Whether an integrator of kcons knows of the rows; where none does, the step count at the last evaluation.
+        self.served, self._count = False, -1
         self._fractions: tuple[float, ...] = (1.0,)
         self._nodes: tuple[float, ...] = (0.0, 1.0)
         #: Whether velocities are projected between the drifts of a step, too.
@@ -198,7 +200,7 @@ class Engine:
     def follow(self, integrator: Integrator, exact: bool) -> None:
         """Take times and step sizes from this integrator; `exact` as for parts."""
         self.exact = exact
-        self._integrator = weakref.ref(integrator)
+        self._integrator, self.served = weakref.ref(integrator), True
         self.carries_rest = not integrator.thermostatted
         operations = integrator.ensemble.operations(integrator.scheme)
         self._within = any(isinstance(operation, Exchange) for operation in operations)
@@ -216,6 +218,18 @@ class Engine:
         self._between_steps, self._rest_to_come, self._ran = True, False, None
 
     # -- callbacks ------------------------------------------------------------------------------
+
+    def refuse_strangers(self, state: openmm.State) -> None:
+        """Raise where steps are made by what does not hold the rows, or cannot be asked for its time step."""
+        if not self.served:
+            count, self._count = self._count, state.getStepCount()
+            if self._count == count + 1 > 0:
+                raise UnsupportedError(
+                    "the integrator of this Context does not hold the rows of hold, nor the constraints that moved to "
+                    "them; make it with ProjectedIntegrator(..., parts=[rows])"
+                )
+        elif self.timed and self._integrator() is None:
+            raise UnsupportedError("the integrator of rows that need the time is gone from Python; keep a reference")
 
     def remember(self, state: openmm.State) -> None:
         began = self._time(state), state.getStepCount()
@@ -373,6 +387,7 @@ class Callback:
         self.engine, self.phase = engine, phase
 
     def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
+        self.engine.refuse_strangers(state)
         return self.engine.answer(self.phase, state)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -527,7 +542,8 @@ class CarriedConstraints(Part):
         miss = self.worst_violation(context)
         if miss is not None:
             raise InputError(
-                f"{miss}; bring them onto the rows by apply_{miss.what}(context), or correct them",
+                f"{miss}; bring them onto the rows by apply_{miss.what}(context), or correct them. OpenMM's minimizer "
+                "does not know the rows: take integrator.minimizeEnergy()",
                 item=miss.what,
                 atoms=miss.atoms,
             )
@@ -540,10 +556,8 @@ class CarriedConstraints(Part):
                 "the System has no forces that carry these rows; call hold(system, ...) before the Context is made",
                 item="system",
             )
-        now = masses_of(system)
-        if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
-            raise InputError("masses have changed since the rows were built; build them again", item="masses")
-        refuse_virtual_sites(system, engine.atoms, now)
+        self.check_masses(system)
+        refuse_virtual_sites(system, engine.atoms, masses_of(system))
         if self.alone and system.getNumConstraints():
             raise InputError(
                 "the System got constraints after the rows were added to it; add the rows, by hold, last",
@@ -557,6 +571,13 @@ class CarriedConstraints(Part):
                     f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
                     "kcons hold it too: hold(system, ...) moves such constraints, or add move_constraints(system)"
                 )
+
+    def check_masses(self, system: openmm.System) -> None:
+        """Raise where masses are not those that the rows were built for."""
+        engine, n = self._engine, system.getNumParticles()
+        now = [system.getParticleMass(k)._value for k in engine.atoms.tolist()] if n == len(engine.masses) else []
+        if not np.array_equal(now, engine.masses[engine.atoms]):
+            raise InputError("masses have changed since the rows were built; build them again", item="masses")
 
     def attach(self, program: Program, context: openmm.Context) -> None:
         """A State or checkpoint that was loaded is where its own steps ended, the engine is not."""

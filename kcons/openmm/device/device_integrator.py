@@ -270,6 +270,9 @@ class DeviceIntegrator(ProjectedIntegrator):
         if guard.in_run and build.library().kcons_was_moved(self._address):
             guard.begin()
         first = guard.context.getStepCount()
+        for part in self.parts:
+            if part.left != guard.context.getTime()._value:  # type: ignore[attr-defined]
+                part.reset_multipliers(self)  # type: ignore[attr-defined]
         try:
             self._advance(guard.context, steps)
         except openmm.OpenMMException as error:
@@ -280,6 +283,9 @@ class DeviceIntegrator(ProjectedIntegrator):
             if "NaN" in str(error):
                 raise guard.explosion(str(error), first) from error
             raise
+        finally:
+            for part in self.parts:
+                part.left = guard.context.getTime()._value  # type: ignore[attr-defined]
         if ends:
             guard.look()
 
@@ -441,7 +447,10 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     lengths = np.array(given.lengths[:n], dtype=np.float64)
     integrator = _ALIVE.get(given.integrator)
     if described["parts"] and integrator is None:
-        raise UnsupportedError("no text has the parts of an integrator: make it again, with parts=")
+        raise UnsupportedError(
+            "the parts of an integrator are those of its Python object: keep a reference to it, and read text by "
+            "from_xml(xml, parts=...)"
+        )
     part = integrator.parts[0] if integrator is not None and integrator.parts else None
     assert part is None or isinstance(part, KernelRows)
     if not given.positions:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -59,6 +60,8 @@ class KernelRows(CarriedConstraints):
         carried = [part for part in parts if isinstance(part, CarriedConstraints)]
         self.given = list(accepted(constraints_of(parts)))
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
+        for part in carried:
+            part._engine.served = True
         #: The engine of what `hold` made, until the Context is known.
         self._carried = carried[0]._engine if len(carried) == len(parts) == 1 else None
         #: Whether rows take periodic images: as `hold` was told, else as the System.
@@ -67,8 +70,8 @@ class KernelRows(CarriedConstraints):
         self._of: tuple[Any, ...] = ()
         self._context: Callable[[], openmm.Context | None] = lambda: None
         self.code = 0
-        #: Time at which sums of multipliers began, ps.
-        self._since = 0.0
+        #: Time at which sums of multipliers began, and where the last call of `step` left it, ps.
+        self._since = self.left = math.nan
 
     # -- a Context ------------------------------------------------------------------------------
 
@@ -159,6 +162,9 @@ class KernelRows(CarriedConstraints):
     def _check_system(self, system: openmm.System, precision: Precision) -> None:
         self._engine.precision = precision
 
+    def check_masses(self, system: openmm.System) -> None:
+        """Kernels are made for the masses of a Context."""
+
     def rank(self, context: openmm.Context | None = None) -> int:
         """Degrees of freedom that the rows take, beyond the constraints of the System."""
         assert context is not None
@@ -170,6 +176,8 @@ class KernelRows(CarriedConstraints):
 
     def mean_multipliers(self, integrator: Any) -> FloatArray:
         """Multipliers averaged over all steps since they were reset, by row of ``motion.constraint_set``.
+
+        Where the time was set, or a State or checkpoint of another time loaded, they begin anew.
 
         Impulses that the kernels have summed over the time: kJ/mol over the unit of the row; NaN for constraints of the
         System, and before the first step. The weights of `Series.weights`, which blue-moon averages over
@@ -185,9 +193,9 @@ class KernelRows(CarriedConstraints):
         return rows.multipliers(sums, time) if time > 0 else np.full(rows.set.n_rows, np.nan)
 
     def reset_multipliers(self, integrator: Any) -> None:
-        """Begin the sums of `mean_multipliers` anew."""
+        """Begin the sums of `mean_multipliers` anew, as the first step does, and one after the time was set."""
         integrator.write("rows_sums", np.zeros(len(integrator.read("rows_sums"))))
-        self._since = float(integrator.context.getTime()._value)
+        self._since = self.left = float(integrator.context.getTime()._value)
 
     def __deepcopy__(self, memo: dict[int, object]) -> KernelRows:
         return KernelRows(self._parts)

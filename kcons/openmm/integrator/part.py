@@ -204,6 +204,9 @@ class Part(ABC):
 
     # -- in a Context ---------------------------------------------------------------------------
 
+    def check_masses(self, system: openmm.System) -> None:
+        """Raise where masses are not those that the rows were built for; most take them from OpenMM."""
+
     @abstractmethod
     def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""

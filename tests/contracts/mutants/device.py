@@ -51,6 +51,10 @@ MUTANTS = {
             "test_device_integrator.py::test_records_are_the_states_after_steps",
         ),
         (
+            "if part.left «!=→is None and» guard.context.getTime()._value:",
+            "test_kernel_rows.py::test_multipliers_are_summed_where_the_rows_are",
+        ),
+        (
             "if told[_FAILED]«→ and False»:",
             "test_device_integrator.py::test_rows_without_solution_are_told_and_taken_back",
         ),

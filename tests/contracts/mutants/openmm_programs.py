@@ -3,6 +3,10 @@
 MUTANTS = {
     "openmm/integrator/guard.py": [
         (
+            "for part in integrator.parts:\n                «part.check_masses(self.system)→pass»",
+            "test_callbacks.py::test_masses_that_change_in_a_run_are_noticed_at_the_next_check",
+        ),
+        (
             "if «squares <= self._explosive→not squares > 1e300»:",
             "test_steps.py::test_an_explosion_is_told_where_its_call_ends",
         ),
@@ -73,6 +77,10 @@ MUTANTS = {
         ),
     ],
     "openmm/integrator/system_checks.py": [
+        (
+            "rows = replace(rows, «lengths=given, others=given→others=given»)",
+            "test_system_checks.py::test_lengths_of_rigid_water_are_compared_with_those_of_the_system",
+        ),
         (
             "«context.setParameter(name, parameters[name])→pass»",
             "test_conserved_momenta.py::test_forces_are_looked_at_with_the_parameters_of_the_context",
@@ -195,6 +203,14 @@ MUTANTS = {
         ),
     ],
     "openmm/callback_rows/carried_constraints.py": [
+        (
+            "if self._count == count + «1 > 0→2 > 0»:",
+            "test_callbacks.py::test_an_integrator_that_does_not_hold_the_rows_is_refused",
+        ),
+        (
+            "elif self.timed and «self._integrator() is None→False»:",
+            "test_callbacks.py::test_rows_that_need_the_time_are_not_held_without_their_integrator",
+        ),
         (
             "self.carries_rest = «not integrator.thermostatted→False»",
             "test_carried_constraints.py::test_velocities_are_those_of_the_core",

@@ -253,6 +253,10 @@ def test_multipliers_are_summed_where_the_rows_are(platform):
     integrator.step(10)
     assert part.mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-5)
     assert part.multipliers(context) == pytest.approx([-100.0], abs=1e-5)
+    for time in (5.0, 0.0):  # set by a person or a State: the mean begins anew
+        context.setTime(time)
+        integrator.step(10)
+        assert part.mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-5)
 
 
 def test_noise_is_in_no_multiplier():

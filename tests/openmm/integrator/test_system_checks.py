@@ -65,6 +65,21 @@ def test_the_length_that_is_off_most(kind):
         worst_length(system)
 
 
+def test_lengths_of_rigid_water_are_compared_with_those_of_the_system():
+    """Not with those in single precision that OpenMM makes of them."""
+    system, lengths = openmm.System(), [0.09572, 0.09572, 0.15139]
+    for mass in (16.0, 1.0, 1.0):
+        system.addParticle(mass)
+    for (i, j), length in zip([(0, 1), (0, 2), (1, 2)], lengths, strict=True):
+        system.addConstraint(i, j, length)
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[0.0, 0.05858, 0.0], [-0.0757, 0.0, 0.0], [0.0757, 0.0, 0.0]])
+    context.applyConstraints(1e-12)
+    assert worst_length(context)[1] == pytest.approx(
+        np.abs(np.float32(lengths) / np.array(lengths) - 1).max(), rel=1e-6
+    )
+
+
 def test_without_constraints_no_length_is_off():
     system = openmm.System()
     system.addParticle(1.0)
