@@ -60,7 +60,7 @@ COLUMNS = {
     "status": "ok; baseline (nothing held); partial (stopped for the budget); failed; not run",
     "note": "why",
     "steps": "steps made",
-    "error": "root-mean-square distance an atom from the reference at the horizon",
+    "error": "root-mean-square distance of the atoms from the reference at the horizon",
     "sigma": "largest violation of a held value after the last step",
     "tangency": "largest |A v| over the root mean square of v, rows of unit norm",
     "slope": "of the energy against time, a degree of freedom and long unit of time",

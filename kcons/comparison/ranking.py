@@ -250,7 +250,7 @@ def find_steps(
     table : DataFrame
         Of this test system.
     target : float
-        Root-mean-square distance an atom from the reference.
+        Root-mean-square distance of the atoms from the reference.
     reference : Reference
         The one of the comparison.
     budget : float

@@ -230,7 +230,7 @@ def test_plans_of_files(ethanol, gro, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("alanine.gro --select=resname:ALAX", "alanine.gro.*no resname ALAX \\(did you mean ALA\\?\\)"),
+        ("alanine.gro --select=resname:ALAX", "alanine.gro.*no resname ALAX \\(did you mean 'ALA'\\?\\)"),
         ("alanine.gro --coordinates nowhere.xtc", "there is no file nowhere.xtc"),
         ("alanine.gro --coordinates ethanol.xyz", "ethanol.xyz has 9 atoms.*alanine.gro has 22"),
         ("alanine.gro --forces emt", "a plan needs no forces; leave --forces out"),

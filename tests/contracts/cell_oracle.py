@@ -378,7 +378,8 @@ def _dihedral_along(d: Array, v: Array) -> tuple[list[Array], list[Array]]:
 def stepper_of(name: str) -> Any:
     """A stepper of the package: its fractions of kicks and drifts are the only thing that the oracle takes from it."""
     if name.startswith("Geodesic"):
-        return steppers.Geodesic(int(name[8:]), great_circles=False)
+        substeps = int(name[8:])
+        return steppers.Splitting((0.5, 0.5), (1.0,), (1.0 / substeps,) * substeps)
     if name == "ProjectedVerlet":
         return ProjectedEquation(project=True)
     return getattr(steppers, name)()

@@ -184,7 +184,7 @@ class TestSystem:
         return converged(self, self.reference_pace * min(self.time_steps), progress=progress)
 
     def deviation(self, positions: FloatArray, reference: FloatArray) -> float:
-        """Root-mean-square distance an atom."""
+        """Root-mean-square distance of the atoms."""
         return float(np.sqrt(np.mean(np.sum((positions - reference) ** 2, axis=1))))
 
     def residuals(self, x: FloatArray, v: FloatArray, time: float = 0.0) -> tuple[float, float]:
