@@ -83,7 +83,7 @@ def test_selections_in_words(villin):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("resname HIX", r"matches nothing: no resname HIX \(did you mean HIE"),
+        ("resname HIX", r"matches nothing: no resname HIX \(did you mean 'HI"),
         ("name CAA", "matches nothing: no name CAA"),
         ("resid 9999", "matches nothing; residues are numbered 1 to"),
         ("resname and and", "cannot be read"),
