@@ -21,7 +21,7 @@ from kcons.models.flows import (
     momentum,
     phase_volume,
 )
-from kcons.models.growth import Hypercycle, Logistic, LotkaVolterra
+from kcons.models.growth import Hypercycle, LotkaVolterra
 
 
 def lorenz(t, X):
@@ -184,14 +184,6 @@ def test_lotka_volterra():
     assert sorted(found[0].classification.eigenvalues.real) == pytest.approx([-0.4, 1.1])
     assert found[1].classification.kind is Kind.CENTER
     assert sorted(found[1].classification.eigenvalues.imag) == pytest.approx([-np.sqrt(0.44), np.sqrt(0.44)])
-
-
-def test_logistic():
-    model = Logistic(1.5, 0.75)
-    found = find_equilibria(Flow(model.velocity, 1, model.jacobian), [[-1.0, 5.0]])
-    assert [e.position[0] for e in found] == pytest.approx([0.0, 2.0], abs=1e-10)
-    assert [e.classification.stability for e in found] == [Stability.UNSTABLE, Stability.ASYMPTOTIC]
-    assert [e.classification.eigenvalues[0].real for e in found] == pytest.approx([1.5, -1.5])
 
 
 def test_hypercycle_turns_unstable_with_five_species():
