@@ -314,14 +314,14 @@ def test_the_engine_is_asked_for_nothing_and_forces_are_not_copied() -> None:
         setattr(system.motion, call, made.append)
     step = type(system).accepted
     system.accepted = lambda raw, number, copy: made.append((number, copy)) or step(system, raw, number, copy)
-    after = Rattle().march(system, state, 0.02, 8, check_every=0)
+    after = Rattle().march(system, state, 0.02, 8)
     assert not made
     # Forces of other kinds are taken as they come.
     kinds = (np.ndarray.tolist, np.asfortranarray, lambda f: np.repeat(f, 2, axis=1)[:, ::2], np.float32, np.longdouble)
     for kind in kinds:
         made.clear()
         system.force = lambda x, time, kind=kind: kind(force(x, time))
-        found = Rattle().march(system, state, 0.02, 8, check_every=0)
+        found = Rattle().march(system, state, 0.02, 8)
         assert made == [(number, False) for number in range(1, 9)]
         if kind is not np.float32:
             assert_same(found, after)
@@ -442,7 +442,7 @@ def test_a_cell_that_the_force_function_changes(stepper) -> None:
 
         system.force = press
         if together:
-            ends.append(stepper.march(system, state, 0.02, 6, check_every=0))
+            ends.append(stepper.march(system, state, 0.02, 6))
         else:
             ends.append(one_by_one(stepper, system, state, 0.02, 6))
     assert_same(*ends[:2])
