@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, overload
 
 import numpy as np
 
-from kcons.constraints.arguments import check_call, finite_number, refuse_other, whole_number
+from kcons.constraints.arguments import check_call, finite_array, finite_number, refuse_other, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.motion.certificate import checked_every
 from kcons.steppers.files import refuse_clock
@@ -117,8 +117,9 @@ def run(
     Raises
     ------
     InputError
-        Negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units, or that is no finite number;
-        what is no system, state, stepper or observer; a state whose time is no finite number, or whose step no count.
+        A start off the constraints; negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units,
+        or that is no finite number; what is no system, state, stepper or observer; a state whose time is no finite
+        number, or whose step no count.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
     UnsupportedError
@@ -147,6 +148,9 @@ def run(
     schedule = system.schedule
     if hasattr(stepper, "barostat"):
         state = stepper.start(system, state)  # type: ignore[attr-defined]  # the first state shown has a cell
+    if steps and state is not system.last:
+        x = finite_array(system.kernel_arrays(state)[0], system.n_atoms, "positions")
+        system.require_on_rows(x, state.time)
     kept: list[State] = []
     rhythms = [(observer, every) for observer in observers] + ([(kept.append, record)] if record is not None else [])
     march = getattr(stepper, "march", None)

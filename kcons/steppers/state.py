@@ -283,6 +283,20 @@ class System:
 
     # -- states ---------------------------------------------------------------------------------
 
+    def require_on_rows(self, x: FloatArray, time: float) -> None:
+        """Refuse positions that are off the constraints: the first step would turn the correction into velocity."""
+        held = self.motion.constraint_set
+        miss = np.abs(held.value(x, time))
+        allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
+        if not np.all(miss <= allowed):
+            row = int(np.argmax(miss / allowed))
+            raise InputError(
+                f"initial positions are off row {held.row_name(row)} by {miss[row]:.6g}; "
+                "pass project=True to System.initial_state to bring them onto the constraints, or correct them",
+                item="positions",
+                atoms=held.row_atoms(row),
+            )
+
     def initial_state(
         self,
         positions: ArrayLike,
@@ -323,17 +337,11 @@ class System:
         motion, held = self.motion, self.motion.constraint_set
         if held.n_rows == 0:
             return State(x, v, time)
-        miss = np.abs(held.value(x, time))
-        allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
-        if not np.all(miss <= allowed):
+        try:
+            self.require_on_rows(x, time)
+        except InputError:
             if not project:
-                row = int(np.argmax(miss / allowed))
-                raise InputError(
-                    f"initial positions are off row {held.row_name(row)} by {miss[row]:.6g}; "
-                    "pass project=True to bring them onto the constraints, or correct them",
-                    item="positions",
-                    atoms=held.row_atoms(row),
-                )
+                raise
             x = motion.restore_positions(x, time=time)
         remainder = None
         local = x

@@ -21,6 +21,7 @@ import kcons.openmm
 import kcons.steppers
 import kcons.thermostats
 from kcons.errors import (
+    ConstraintError,
     ContradictionError,
     InfeasibleError,
     InputError,
@@ -140,6 +141,9 @@ REFUSED: list[tuple[str, type[KconsError], str | None]] = [
     ("from_dict({})", InputError, "family"),
     ('from_dict({"family": "Distanz"})', InputError, "family"),
     ("from_dict(3)", InputError, "family"),
+    ('from_dict({"family": ["Distance"]})', InputError, "family"),
+    ("Distance([[0, 1], [2]])", InputError, "atoms"),
+    ("Distance([0, 1]).target_at(0.0)", ConstraintError, None),
     ("ConstraintSet(Distance([0, 1]), X[:1], [1.0])", InputError, "atoms"),
     ("ConstraintSet(Distance([0, 9]), X, M)", InputError, "atoms"),
     ("ConstraintSet(Distance([0, 1]), X[:, :2], M)", InputError, "positions"),

@@ -49,6 +49,8 @@ def test_start_off_the_constraints():
     off = state.positions * 1.2
     with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0\.24; pass project=True"):
         system.initial_state(off)
+    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0\.24; pass project=True"):
+        run(system, State(off, state.velocities), 0.01, 1)
     projected = system.initial_state(off, project=True)
     assert np.linalg.norm(projected.positions[0] - projected.positions[1]) == pytest.approx(1.2, rel=1e-14)
     assert np.abs(system.masses @ (projected.positions - off)).max() <= 1e-14

@@ -159,6 +159,7 @@ MUTANTS = {
         ),
     ],
     "steppers/running.py": [
+        ("if steps and «state is not system.last→False»:", "test_state.py::test_start_off_the_constraints"),
         (
             "    «refuse_clock(state.time, state.step, state.time_remainder)\n    →»if stepper",
             "test_running.py::test_states_made_by_hand_with_impossible_numbers",
@@ -211,7 +212,7 @@ MUTANTS = {
         ("np.array([name == group, «True→name != group»])", "test_slow_share.py::test_springs_of_free_atoms"),
     ],
     "constraints/arguments.py": [
-        ('if «array.dtype.kind == "c"→False»:', "test_arguments.py::test_what_is_no_real_number_is_refused"),
+        ('if «array.dtype.kind == "c"→False»:', "test_arguments.py::test_every_way_in_refuses_them"),
         ("«not 0 <= rng < 2**bits→False»", "test_arguments.py::test_what_is_neither_a_seed_nor_a_generator"),
         ("or «value not in words→False»:", "test_methods.py::test_what_is_wrong_with_a_method_is_said"),
         (

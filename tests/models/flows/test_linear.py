@@ -367,4 +367,4 @@ def test_without_sympy_the_answer_names_the_extra(monkeypatch):
     assert str(classify(R)) == "stable center"
     said = str(classify(scipy.linalg.block_diag(R, 3 * R)))
     assert said.startswith("center whose stability cannot be told: to decide in rational numbers needs sympy")
-    assert "kcons[formulas]" in said
+    assert "kcons[models]" in said
