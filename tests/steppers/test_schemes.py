@@ -28,11 +28,9 @@ from kcons.steppers import (
     BlanesMoan6,
     Composition,
     Geodesic,
-    KahanLi6,
     Rattle,
     Splitting,
     State,
-    Suzuki4,
     run,
 )
 from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
@@ -280,19 +278,6 @@ def test_error_is_that_of_the_splitting_alone() -> None:
 
 
 # -- Runge-Kutta-Nystrom ----------------------------------------------------------------------------
-
-
-def test_fewest_evaluations_of_their_order() -> None:
-    """At the same cost in forces the error is below that of the compositions."""
-    system, state = rotor(omega=1.0, force=lambda x, t: -x + 0.1 * x**3)
-    exact = run(system, state, 0.01, 200, stepper=BlanesMoan6())
-
-    def error(stepper, evaluations: int) -> float:
-        n = evaluations // stepper.force_evaluations
-        return float(np.abs(run(system, state, 2 / n, n, stepper=stepper).positions - exact.positions).max())
-
-    assert 2 * error(BlanesMoan4(), 240) < error(Suzuki4(), 240)
-    assert 10 * error(BlanesMoan6(), 198) < error(KahanLi6(), 198)
 
 
 @SPLITTINGS
