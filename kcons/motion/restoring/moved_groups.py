@@ -29,6 +29,7 @@ from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
 from kcons.motion.certificate import off_row
 from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
+from kcons.motion.restoring.nearest_point import least_squares
 from kcons.motion.restoring.rigid_pieces import Move, bend, stretch, torsion
 from kcons.plan.plan import Plan
 from kcons.solvers import tolerances
@@ -128,8 +129,8 @@ def moved(geometry: Geometry) -> FloatArray | None:
 def eased(geometry: Geometry) -> FloatArray | None:
     """The start with all atoms of its molecules moved, bonds and angles as near to theirs as the rows allow, or None.
 
-    Gauss-Newton steps on the rows, weighed heavily, and on changes of bonds and of the ends of angles, in units of
-    what may change.
+    Least squares of the rows, weighed heavily, and of changes of bonds and of the ends of angles, in units of what may
+    change.
     """
     held, time, start = geometry.held, geometry.time, geometry.start
     if not geometry.checked or not geometry.usable or held.n_rows > MOST_ROWS:
@@ -139,36 +140,23 @@ def eased(geometry: Geometry) -> FloatArray | None:
     if not np.any(weights > 0) or len(atoms) > MOST_EASED or not np.isfinite(start[atoms]).all():
         return None
     atoms = atoms[~geometry.pinned[atoms]]
-    columns = (3 * atoms[:, None] + np.arange(3)).ravel()
-    # Free motions cost nothing: they stay out by a weight far below that of any tie.
-    least = 1e-3 * float(weights[weights > 0].min()) ** 2
     heavy = np.where(held.holonomic, HEAVY / held.scale, 0.0)
     x = geometry.placed()
     reach = 0.3 * float(ties.scale.min())
     with np.errstate(all="ignore"):
-        for _ in range(EASING):
-            off = np.concatenate([heavy * held.value(x, time), weights * ties.value(x)])
-            rows = [sp.diags_array(heavy) @ held.jacobian(x, time), sp.diags_array(weights) @ ties.jacobian(x)]
-            table = sp.csr_array(sp.vstack(rows))[:, columns]
-            if not (np.isfinite(off).all() and np.isfinite(table.data).all()):
-                return None
-            normal = sp.csc_array(table.T @ table + least * sp.eye_array(len(columns)))
-            try:
-                step = -_solve(normal, table.T @ off)
-            except RuntimeError:  # exactly singular: sizes that differ by more than double precision
-                return None
-            longest = float(np.abs(step).max())
-            x.reshape(-1)[columns] += step * min(1.0, reach / longest) if longest > 0 else 0.0
-            if not longest > 1e-9 * reach:
-                break
+        least_squares(
+            x,
+            atoms,
+            lambda y: np.concatenate([heavy * held.value(y, time), weights * ties.value(y)]),
+            lambda y: sp.vstack(
+                [sp.diags_array(heavy) @ held.jacobian(y, time), sp.diags_array(weights) @ ties.jacobian(y)]
+            ),
+            steps=EASING,
+            still=1e-9 * reach,
+            longest=reach,
+        )
         left = np.abs(held.value(x, time)) / held.scale
     return x if np.all(left[held.holonomic] <= NEAR) else None
-
-
-def _solve(normal: sp.csc_array, right: FloatArray) -> FloatArray:
-    from scipy.sparse.linalg import splu  # slow to import, rarely needed
-
-    return np.asarray(splu(normal).solve(right))
 
 
 @dataclass(frozen=True)

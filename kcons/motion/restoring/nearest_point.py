@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import scipy.sparse as sp
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
-from kcons.errors import ConvergenceError, InputError, SingularGeometryError
-from kcons.motion.solver_sequence import FAILED, RESCUE_ROWS, IterationBudget, SolverSequence
-from kcons.solvers.tolerances import EPS, MAX_HALVINGS, STALLED
+from kcons.errors import ConvergenceError, KconsError
+from kcons.motion.solver_sequence import FAILED, IterationBudget, SolverSequence
+from kcons.solvers.tolerances import EPS, MAX_HALVINGS
 
-#: Rounds of the search for the nearest point on the constraints.
+#: Rounds of the search for the nearest point on the constraints, and steps towards any point on them.
 NEAREST_ROUNDS = 200
 #: Moves that get no smaller are rounding below so much of the size of the system, or of the distance from the origin.
 _STILL, _ROUNDING = 1e-12, 16 * EPS
+#: Of least squares: the damping that keeps free motions out, in parts of the largest square of a slope; how often a
+#: step is damped more; and what is no step, in parts of the size of the system.
+LEAST, TRIES, _REACHED = 1e-10, 12, 1e-10
 #: Rounds of the fixed-point iteration in which moves do not halve, after which it is accelerated, from how many rounds.
 SLOW, MIXED = 3, 5
 #: Part of the way to the nearest point that may be left along the constraints without a word.
@@ -82,17 +88,29 @@ class FarStart:
 
     def _reach(self, x: FloatArray) -> None:
         """Some point on the constraints, for starts too far off for one projection, in place."""
-        start = x.copy()
+        start, held, time = x.copy(), self._rows, self._time
         error = self._failures.not_finite(positions=start)
         if error is not None:
             raise error
-        if not self._gauss_newton(x):
-            np.copyto(x, start)
+        rows = np.flatnonzero((self._plan.labels >= 0) & held.holonomic)
+        atoms = np.flatnonzero(self._atom_labels() >= 0)
+        weights = 1.0 / held.scale[rows]
+        with np.errstate(all="ignore"):
             # Any point does: masses of many orders of magnitude would only spoil the condition.
-            general = self._plan.general_for_all(RESCUE_ROWS, equal=True)
-            outcome = general.restore(x, time=self._time)
-            if not outcome.converged:
-                raise self._failures.start(x, start, outcome, general, self._time)
+            steps = least_squares(
+                x,
+                atoms,
+                lambda y: weights * held.value(y, time)[rows],
+                lambda y: sp.diags_array(weights) @ held.jacobian(y, time)[rows],
+                steps=NEAREST_ROUNDS,
+                still=_REACHED * extent(start),
+            )
+            off = np.nan_to_num(np.abs(weights * held.value(x, time)[rows]), nan=np.inf)
+        try:
+            self._positions(x, x.copy())
+        except KconsError as failure:
+            worst = int(np.argmax(off))
+            raise self._failures.start(x, start, int(rows[worst]), float(off[worst]), steps, time) from failure
 
     def _settle(self, start: FloatArray, x: FloatArray, slow: int = 0) -> bool:
         """x <- start + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers, in place.
@@ -196,47 +214,67 @@ class FarStart:
         atom_label[self._plan.inverse_masses == 0] = -1
         return atom_label
 
-    def _gauss_newton(self, x: FloatArray) -> bool:
-        """x <- x - f M^-1 A^T (A M^-1 A^T)^+ sigma in place, f halved cluster by cluster while |sigma| grows."""
-        local, plan, time = self._rows, self._plan, self._time
-        member = plan.labels >= 0
-        labels = plan.labels[member]
-        atom_label = self._atom_labels()
-        weight = 1.0 / local.scale[member] ** 2
 
-        def misfit(sigma: FloatArray) -> FloatArray:
-            return np.bincount(labels, weights=weight * sigma[member] ** 2).astype(np.float64)
+def least_squares(
+    x: FloatArray,
+    atoms: IntArray,
+    residuals: Callable[[FloatArray], FloatArray],
+    slopes: Callable[[FloatArray], sp.csr_array],
+    *,
+    steps: int,
+    still: float,
+    longest: float = np.inf,
+) -> int:
+    """Move some atoms so that a sum of squares becomes least, in place (Levenberg and Marquardt).
 
-        with np.errstate(all="ignore"):
-            sigma = local.value(x, time)
-            error = misfit(sigma)
-            before = np.inf
-            for number in range(NEAREST_ROUNDS):
-                if number % STALLED == STALLED - 1:
-                    if float(error.sum()) > 0.9 * before:
-                        return False
-                    before = float(error.sum())
-                if np.all(np.abs(sigma[member]) <= local.tolerance(x, time)[member]):
-                    return True
-                step = np.zeros_like(x)
-                try:
-                    self._tangents(x, step, np.where(member, -sigma, 0.0))
-                except (ConvergenceError, SingularGeometryError, InputError):
-                    return False
-                factor = np.ones(len(error))
-                for _ in range(MAX_HALVINGS):
-                    trial = x + np.where(atom_label >= 0, factor[atom_label], 0.0)[:, None] * step
-                    trial_sigma = local.value(trial, time)
-                    trial_error = misfit(trial_sigma)
-                    worse = ~(trial_error < error) & (error > 1e-26)
-                    if not worse.any():
-                        break
-                    factor[worse] *= 0.5
-                else:
-                    return False
-                np.copyto(x, trial)
-                sigma, error = trial_sigma, trial_error
-        return False
+    Parameters
+    ----------
+    x : ndarray, shape (n_atoms, 3)
+    atoms : ndarray of int
+        Those that may move.
+    residuals, slopes : callable
+        What is squared, and its sparse Jacobian, at given positions.
+    steps : int
+        The most steps.
+    still, longest : float
+        No coordinate changes by more than the second in a step; where none changes by more than the first, all is done.
+
+    Returns
+    -------
+    int
+        Steps made. Where a number is not finite, or nothing is gained any more, they end where they are.
+    """
+    from scipy.sparse.linalg import splu  # slow to import, rarely needed
+
+    columns = (3 * atoms[:, None] + np.arange(3)).ravel()
+    damping, off = 0.0, residuals(x)
+    for step in range(steps):
+        table = sp.csr_array(slopes(x))[:, columns]
+        error = float(off @ off)
+        if not (0.0 < error < np.inf and np.isfinite(table.data).all()):
+            return step
+        normal, gradient = table.T @ table, table.T @ off
+        size = float(normal.diagonal().max(initial=0.0))
+        for _ in range(TRIES):
+            try:
+                factor = splu(sp.csc_array(normal + (LEAST + damping) * size * sp.eye_array(len(columns))))
+            except RuntimeError:  # exactly singular: sizes that differ by more than double precision
+                return step
+            move = -factor.solve(gradient)
+            largest = float(np.abs(move).max(initial=0.0))
+            trial = x.copy()
+            trial.reshape(-1)[columns] += move * min(1.0, longest / largest if largest > 0 else 1.0)
+            found = residuals(trial)
+            if float(found @ found) < error:
+                break
+            damping = max(4 * damping, 1e-3)
+        else:
+            return step
+        x[...], off = trial, found
+        damping = 0.1 * damping if damping > 1e-7 else 0.0
+        if not largest > still:
+            return step + 1
+    return steps
 
 
 class _Mixed:
