@@ -47,7 +47,7 @@ def test_coincident_atoms_come_before_all_else() -> None:
         told.unusable(0, x_new=WATER, x_ref=same),
         told.tangents(same, WATER, outcome, SOLVER, "velocity"),
         told.undefined(0, velocity=WATER, position=same),
-        told.start(WATER, same, outcome, SOLVER, 0.0),
+        told.start(WATER, same, 0, np.inf, 0, 0.0),
     ):
         assert isinstance(error, SingularGeometryError)
         assert error.rows == (0,) and error.atoms == (0, 1) and "move them apart" in str(error)
@@ -65,7 +65,7 @@ def test_curvature_that_is_undefined() -> None:
 
 def test_a_start_without_solution_quotes_the_sum_of_squares() -> None:
     off = WATER + np.array([[0, 0, 0], [0.5, 0, 0], [0, 0, 0]])
-    error = failures().start(off, WATER, Outcome(False, 0.5, 9, 0), SOLVER, 0.0)
+    error = failures().start(off, WATER, 0, 0.5, 9, 0.0)
     assert isinstance(error, InfeasibleError)
     assert "cannot go below 0.25 (sum of squares)" in str(error) and error.iterations == 9
 

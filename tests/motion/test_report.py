@@ -10,8 +10,9 @@ import pytest
 from kcons import constraints as held
 from kcons.cli.main import main
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.motion import Motion, condition
-from kcons.motion.condition import worst_condition
+from kcons.motion import Motion
+from kcons.motion import report as reports
+from kcons.motion.report import worst_condition
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -137,13 +138,13 @@ def chain(n: int) -> tuple[ConstraintSet, np.ndarray]:
     return ConstraintSet(held.Distance(np.stack([k[:-1], k[1:]], axis=1)), x, np.full(n, 7.0)), x
 
 
-@pytest.mark.parametrize("n", [2, 30, condition.DENSE_ROWS + 1, condition.DENSE_ROWS + 2, 900])
+@pytest.mark.parametrize("n", [2, 30, reports.DENSE_ROWS + 1, reports.DENSE_ROWS + 2, 900])
 def test_one_cluster(n: int) -> None:
     """Straight-ish chains, whose condition grows with their length: the dense and the sparse way."""
     whole, x = chain(n)
     w, rows = 1 / whole.masses, np.arange(n - 1)
     found = worst_condition(whole.jacobian(x), w, rows, np.zeros(n - 1, int), deficiency=0)
-    assert found == pytest.approx(dense(whole, x, w, rows), rel=1e-6 if n - 1 <= condition.DENSE_ROWS else 1e-3)
+    assert found == pytest.approx(dense(whole, x, w, rows), rel=1e-6 if n - 1 <= reports.DENSE_ROWS else 1e-3)
     assert found > min(0.2 * n, 50)
 
 
@@ -161,7 +162,7 @@ def test_worst_of_many_clusters_of_several_sizes(monkeypatch: pytest.MonkeyPatch
     found = worst_condition(whole.jacobian(x), w, np.arange(len(pairs)), labels, deficiency=0)
     assert found == pytest.approx(expected, rel=1e-9)
     # Portions of one cluster each give the same.
-    monkeypatch.setattr(condition, "PORTION", 1)
+    monkeypatch.setattr(reports, "PORTION", 1)
     again = worst_condition(whole.jacobian(x), w, np.arange(len(pairs)), labels, deficiency=0)
     assert again == found
     some = np.flatnonzero(labels == 3)
@@ -179,7 +180,7 @@ def test_dependent_rows_do_not_count() -> None:
 
 
 def test_out_of_reach_is_not_a_number() -> None:
-    n = condition.DENSE_DEPENDENT_ROWS + 3
+    n = reports.DENSE_DEPENDENT_ROWS + 3
     whole, x = chain(n)
     labels = np.zeros(n - 1, int)
     assert np.isnan(worst_condition(whole.jacobian(x), 1 / whole.masses, np.arange(n - 1), labels, deficiency=1))

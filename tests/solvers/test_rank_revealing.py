@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kcons.solvers.rank_revealing import damped, independent, least_norm, rank
+from kcons.solvers.rank_revealing import independent, least_norm, rank
 from kcons.solvers.tolerances import RANK_TOLERANCE
 
 
@@ -33,11 +33,3 @@ def test_dependent_rows_share_what_they_hold():
     x = least_norm(thrice[None], np.full((1, 3), 2.0))[0]
     np.testing.assert_allclose(x, least_norm(once[None], np.full((1, 1), 2.0))[0], rtol=1e-14)
     np.testing.assert_allclose(least_norm(thrice.T[None], np.array([[6.0, 0, 0]]))[0], [2.0, 2.0, 2.0], rtol=1e-14)
-
-
-def test_damping_shortens_and_none_solves():
-    b, right = rows_at(0.5)[None], np.array([[1.0, -2.0]])
-    np.testing.assert_allclose(b[0] @ damped(b, right, np.zeros(1))[0], right[0], rtol=1e-14)
-    s = np.linalg.norm(b[0], 2)
-    expected = np.linalg.solve(b[0].T @ b[0] + 0.1 * s**2 * np.eye(3), b[0].T @ right[0])
-    np.testing.assert_allclose(damped(b, right, np.array([0.1]))[0], expected, rtol=1e-13)
