@@ -10,13 +10,12 @@ import pytest
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.calculator import Calculator, all_changes
-from ase.constraints import ExternalForce, FixAtoms, Hookean
+from ase.constraints import ExternalForce, FixAtoms
 from ase.io import read
 from ase.md.logger import MDLogger
 from ase_systems import equal, state
 
 from kcons.ase import (
-    ConstrainedDynamics,
     ConstrainedLangevin,
     ConstrainedMonteCarlo,
     ConstrainedNoseHoover,
@@ -202,21 +201,6 @@ def test_where_nothing_is_conserved(kind, why):
         made(kind, waters()).get_conserved_energy()
 
 
-def test_springs_of_ase_have_an_energy():
-    atoms, spring = waters(2), Hookean(0, 3, 5.0, rt=0.5)
-    atoms.set_constraint([*atoms.constraints, spring])
-    dyn = ConstrainedLangevin(atoms, 0.5 * FS, 300, 0.0, rng=1)
-    before = dyn.get_conserved_energy()
-    dyn.run(20)
-    assert dyn.get_conserved_energy() == pytest.approx(before, abs=0.02) and before > 10
-    atoms = wells()
-    atoms.set_constraint([*atoms.constraints, spring])
-    dyn = sampler(atoms, keep=0.0, steps=8, timestep=0.5 * FS)
-    dyn.run(2)
-    assert spring.adjust_potential_energy(atoms) > 0.1
-    assert dyn.counts.mean_square < 1e-3
-
-
 def test_the_chain_has_the_constants_of_ase():
     moving = made("nose-hoover", waters(), tchain=4)
     np.testing.assert_allclose(moving.stepper._masses(18)[:2], [18 * KT * (50 * FS) ** 2, KT * (50 * FS) ** 2])
@@ -279,23 +263,6 @@ def test_a_restart_asks_the_calculator_for_forces(kind, tmp_path):
         made(kind, atoms, **given, **({} if kind == "langevin" else {"momentum": "free"})).run(2)
         ends.append(state(atoms))
     assert equal(ends[0], ends[2]) and equal(ends[1], ends[2])
-
-
-def test_a_run_goes_on_from_a_state_of_another_dynamics():
-    """Velocities of the state, scaled to K; the number of the step and the time go on."""
-    moving = ConstrainedDynamics(waters(), FS)
-    moving.run(10)
-    given = moving.state
-    again = waters(momenta=False)
-    resumed = made("isokinetic", again, state=given)
-    assert resumed.nsteps == 10 and resumed.get_time() == 10 * FS
-    scale = again.get_velocities() / given.velocities
-    np.testing.assert_allclose(scale, scale[0, 0], rtol=1e-12)
-    for _ in range(2):
-        assert 2 * again.get_kinetic_energy() == pytest.approx(17 * KT, rel=1e-12)
-        resumed.run(5)
-    with pytest.raises(InputError, match="not both"):
-        made("isokinetic", again, state=given, restart="a.npz")
 
 
 def test_isokinetic_goes_on_from_a_trajectory(tmp_path):
@@ -378,20 +345,6 @@ def test_momenta_set_in_between_are_used(kind):
     else:
         assert 2 * atoms.get_kinetic_energy() / 18 > 1.5 * KT
         assert np.abs(moving.state.thermostat - chain).max() <= 0.5  # the chain and the heat go on
-
-
-def test_who_moves_the_atoms_moves_the_energy():
-    atoms = wells()
-    dyn = sampler(atoms)
-    dyn.run(3)
-    atoms.translate([0.5, 0, 0])
-    moved = atoms.positions.copy()
-    dyn.run(1)
-    fresh = wells()
-    fresh.set_positions(moved, apply_constraint=False)
-    assert dyn.counts.proposals == 4
-    expected = (fresh if np.array_equal(atoms.positions, moved) else atoms).get_potential_energy()
-    assert dyn.state.thermostat[0] == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["langevin", "nose-hoover", "monte carlo", "two steps", "spheres"])

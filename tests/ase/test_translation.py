@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 from ase import Atoms, units
-from ase.build import molecule, sort
+from ase.build import molecule
 from ase.calculators.lj import LennardJones
 from ase.calculators.tip3p import TIP3P
 from ase.constraints import (
@@ -100,12 +100,6 @@ def test_from_fix_linear_triatomic():
     assert atoms.get_angle(1, 0, 2) == pytest.approx(180, abs=1e-5)
     assert np.abs(held.engine(atoms).constraint_set.value(atoms.positions)).max() <= 1e-13
     assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-10)
-
-
-def test_own_object_is_translated_to_its_rows():
-    atoms = molecule("H2O")
-    held = constrain(atoms, rigid_water(atoms))
-    assert from_ase_constraints(atoms) == list(held.constraints)
 
 
 @pytest.mark.parametrize(
@@ -309,13 +303,6 @@ def test_a_restart_from_a_file_that_ase_can_open_is_exact(tmp_path):
     assert np.array_equal(again.get_momenta(), atoms.get_momenta())
 
 
-def test_copies_are_independent():
-    atoms, _ = rigid(2)
-    part = atoms.copy()
-    part.constraints[0].index_shuffle(part, [0, 1, 2])
-    assert len(atoms.constraints[0].constraints[0].atoms) == 6
-
-
 def test_function_rows_are_left_out_of_files_with_a_warning(tmp_path):
     atoms = Atoms("H2", positions=[[1, 0, 0], [3, 0, 0]])
     surface = ImplicitSurface([0], lambda r: (r**2).sum(axis=1) - 1, lambda r: 2 * r)
@@ -336,19 +323,6 @@ def test_slicing_keeps_whole_rows_only():
     assert atoms[[0, 3, 6]].constraints == []
     assert np.array_equal(targets(atoms[np.arange(9) < 3]), targets(atoms)[:3])
     assert np.array_equal(targets(atoms[[2, 1, 0]]), targets(atoms)[:3])
-
-
-def test_sort_renumbers():
-    atoms, held = rigid(2)
-    ordered = sort(atoms)
-    assert off(ordered, ordered.constraints[0]) <= 1e-14
-    assert np.array_equal(np.sort(targets(ordered)), np.sort(held.engine(atoms).constraint_set.target()))
-
-
-def test_slice_of_an_unused_object_is_taken_along():
-    atoms = loose_waters(2)
-    atoms.set_constraint(Constraints(rigid_water(atoms)))
-    assert atoms[3:].get_number_of_degrees_of_freedom() == 6
 
 
 @pytest.mark.parametrize("used", [True, False])
@@ -394,9 +368,3 @@ def test_repeat_of_a_surface_is_refused():
     constrain(atoms, Sphere([0], [0, 0, 0]))
     with pytest.raises(UnsupportedError, match="place in space"):
         atoms.repeat(2)
-
-
-def test_repr():
-    atoms, held = rigid(2)
-    assert repr(held) == "Constraints(6 rows on 6 atoms)"
-    assert "Constraints(" in repr(atoms)

@@ -198,14 +198,6 @@ def test_velocity_rows_move_no_positions() -> None:
     np.testing.assert_allclose(whole.jacobian(WATER) @ v.ravel(), rates, rtol=0, atol=1e-14)
 
 
-def test_only_velocity_rows() -> None:
-    solver, _ = solver_of([held.LinearVelocity([[0, 1]], np.ones((2, 3)), 0.7)], WATER)
-    y, lam = WATER + 0.5, np.empty(1)
-    assert positions(solver, y, WATER, multipliers=lam).converged
-    np.testing.assert_array_equal(y, WATER + 0.5)
-    assert lam[0] == 0.0
-
-
 def test_a_step_too_far_is_refused_and_changes_nothing() -> None:
     """A sphere cannot be reached along a direction that passes it by."""
     x = np.array([[1.0, 0, 0], [5.0, 0, 0]])
@@ -266,14 +258,6 @@ def test_a_gradient_that_vanishes() -> None:
     assert not outcome.converged and outcome.worst_row == 0
     outcome = solver.tangents(Request(x.copy(), x))
     assert not outcome.converged and outcome.worst_row == 0
-
-
-def test_outcome_counts_iterations_even_without_residual() -> None:
-    x = np.array([[1.0, 0, 0]])
-    solver, _ = solver_of([held.Plane([0], [1.0, 0, 0])], x)
-    outcome = positions(solver, x + np.array([[0.5, 0, 0]]), x)
-    assert outcome == (True, 0.0, outcome.iterations, 0)
-    assert outcome.iterations > 0
 
 
 def test_no_rows() -> None:

@@ -9,13 +9,12 @@ import pytest
 from ase import Atoms, units
 from ase.build import bulk
 from ase.calculators.emt import EMT
-from ase.calculators.lj import LennardJones
 from ase.filters import ExpCellFilter, FrechetCellFilter, StrainFilter, UnitCellFilter
 from ase.md.langevin import Langevin
 from ase.md.nptberendsen import Inhomogeneous_NPTBerendsen, NPTBerendsen
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.optimize import BFGS
-from ase_systems import FS, TEMPERATURE, Free, dumbbells, follow, mean_and_error, off, pressure, random, water_gas
+from ase_systems import FS, TEMPERATURE, dumbbells, follow, mean_and_error, off, pressure, random, water_gas
 
 from kcons.ase import ConstrainedCalculator, constrain, rigid_water
 from kcons.constraints import Distance, Plane
@@ -41,22 +40,6 @@ def test_ideal_gas_of_rigid_water():
     error = np.std(seen, ddof=1) / np.sqrt(len(seen))
     assert abs(np.mean(seen) - expected) <= 3 * error
     assert error < 0.02 * expected
-
-
-def test_stress_across_the_boundary_and_with_dependent_rows():
-    atoms = water_gas(2)
-    rows = rigid_water(atoms)
-    constrain(atoms, rows)
-    thermalize_momenta(atoms, TEMPERATURE, rng=random())
-    stress = atoms.get_stress(include_ideal_gas=True)
-    other = atoms.copy()
-    other.calc = Free()
-    other.set_constraint()
-    other.positions += [0.3, -0.2, 0.4]
-    other.wrap()
-    constrain(other, [rows, rows])
-    other.set_momenta(atoms.get_momenta())
-    assert other.get_stress(include_ideal_gas=True) == pytest.approx(stress, rel=1e-10, abs=1e-16)
 
 
 @pytest.mark.parametrize(
@@ -173,17 +156,6 @@ def test_forces_of_a_filter_are_the_derivative_of_its_energy(name):
         assert -(forces * d).sum() == pytest.approx((energies[0] - energies[1]) / 2e-5, rel=1e-4, abs=1e-5)
 
 
-@pytest.mark.parametrize("name", FILTERS)
-def test_a_molecular_crystal_relaxes(name):
-    atoms = crystal()
-    lengths = [atoms.get_distance(2 * k, 2 * k + 1, mic=True) for k in range(4)]
-    begun = atoms.get_potential_energy()
-    BFGS(filtered(FILTERS[name], atoms), logfile=None).run(fmax=0.05, steps=10)
-    assert atoms.get_potential_energy() < begun - 0.1
-    found = [atoms.get_distance(2 * k, 2 * k + 1, mic=True) for k in range(4)]
-    assert found == pytest.approx(lengths, abs=1e-9)
-
-
 def test_what_scales_atoms_past_their_constraints_is_refused():
     atoms = crystal()
     optimizer = BFGS(StrainFilter(atoms), logfile=None)
@@ -219,9 +191,3 @@ def test_filters_beside_atoms_that_stay_are_refused(name, calculator):
         flat.set_positions(y)
         energies.append(flat.get_potential_energy())
     assert -forces[n, 0] == pytest.approx((energies[0] - energies[1]) / 2e-5, rel=1e-4, abs=1e-5)
-
-
-def test_free_atoms_and_the_strain_filter_go_together():
-    atoms = bulk("Ar", "fcc", a=5.6, cubic=True)
-    atoms.calc = LennardJones(sigma=3.4, epsilon=0.01, rc=2.7)
-    BFGS(StrainFilter(atoms), logfile=None).run(fmax=0.01, steps=3)

@@ -168,15 +168,6 @@ def test_bonds_that_are_held_count() -> None:
     kept(atoms, x)
 
 
-def test_at_a_time() -> None:
-    atoms = molecule("CH3CH2OH")
-    motion = engine(atoms, [held.Dihedral([[3, 2, 1, 0]], lambda t: np.pi + t)])
-    for time in (0.1, 1.0, 2.9):
-        x = motion.restore_positions(atoms.positions, time=time)
-        fulfilled(motion, x, time)
-        kept(atoms, x)
-
-
 # -- angles, bonds, distances between groups --------------------------------------------------------
 
 
@@ -253,17 +244,6 @@ def test_without_bonds_the_nearest_point_as_asked() -> None:
     fulfilled(motion, x)
     away = np.linalg.norm(x - ring.positions, axis=1)
     assert set(np.flatnonzero(away > 1e-12).tolist()) == {0, 1}
-
-
-def test_without_bonds_far_starts_go_to_the_nearest_point_too() -> None:
-    """The foot of the perpendicular in the mass metric, where groups would have been moved first."""
-    ring = molecule("C6H6")
-    angle = ring.get_angle(0, 1, 2) * np.pi / 180
-    motion = engine(ring, [held.Angle([[0, 1, 2]], angle + 0.3), held.Distance([[0, 1], [1, 2]])])
-    x = motion.restore_positions(ring.positions, bonds=[])
-    fulfilled(motion, x)
-    way = x - ring.positions
-    assert abs(motion.project_velocities(x, way)).max() < 1e-9 * abs(way).max()
 
 
 def test_what_rounding_leaves_is_no_reason_to_look_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -95,17 +95,6 @@ def test_the_nearest_point_is_the_same_in_any_unit(unit: float) -> None:
     np.testing.assert_allclose(nearest(unit), nearest(1.0), rtol=0, atol=1e-10)
 
 
-def test_a_search_that_uses_up_its_work_keeps_how_far_it_came() -> None:
-    rng = np.random.default_rng(17)
-    x, masses = rng.normal(size=(4, 3)), rng.uniform(1, 16, 4)
-    start = x + 0.25 * rng.normal(size=x.shape)
-    whole = ConstraintSet(held.Distance([(0, 1), (1, 2), (2, 3)]), x, masses)
-    motion = Motion(whole, x)
-    found = motion.restore_positions(start, bonds=[])
-    fulfilled(whole, found)
-    assert off_the_perpendicular(whole, motion, start, found) < 1e-6
-
-
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("factor", [0.8, 1.2, 0.5, 2.0])
 def test_scaled_starts(name: str, factor: float) -> None:
@@ -113,14 +102,6 @@ def test_scaled_starts(name: str, factor: float) -> None:
     motion, whole, x = engine(name)
     start = x.mean(axis=0) + factor * (x - x.mean(axis=0)) + 0.02 * np.random.default_rng(1).normal(size=x.shape)
     fulfilled(whole, motion.restore_positions(start))
-
-
-def test_points_already_there_do_not_move() -> None:
-    for name in SETS:
-        motion, whole, x = engine(name)
-        once = motion.restore_positions(x)
-        np.testing.assert_allclose(once, x, rtol=0, atol=1e-14)
-        fulfilled(whole, once)
 
 
 def test_restored_at_a_time() -> None:
@@ -226,18 +207,6 @@ def test_the_nearest_point_is_found_where_the_surface_is_much_bent() -> None:
         found = motion.restore_positions(start, bonds=[])
         fulfilled(whole, found)
         assert off_the_perpendicular(whole, motion, start, found) < 1e-9
-
-
-def test_each_of_several_molecules_comes_to_its_nearest_point() -> None:
-    one, _, x = _braced(1)
-    several, whole, _ = _braced(6)
-    rng = np.random.default_rng(5)
-    starts = [x + _displaced(rng, 0.15) for _ in range(6)]
-    shift = np.repeat([[0.0, 20.0 * k, 0.0] for k in range(6)], 9, axis=0)
-    found = several.restore_positions(np.concatenate(starts) + shift, bonds=[]) - shift
-    fulfilled(whole, found + shift)
-    alone = np.concatenate([one.restore_positions(start, bonds=[]) for start in starts])
-    np.testing.assert_allclose(found, alone, rtol=0, atol=1e-9)
 
 
 def test_a_search_that_ends_before_the_nearest_point_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

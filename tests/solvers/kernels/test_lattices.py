@@ -9,7 +9,6 @@ from numba import njit
 from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.solvers.kernels.eight_wide import FASTMATH, WIDTH, load_triple, store_triple
 from kcons.solvers.kernels.lattices import (
-    NO_LATTICE,
     OPEN,
     ORTHORHOMBIC,
     TRICLINIC,
@@ -59,9 +58,3 @@ def test_the_nearest_of_all_images(cell):
         nearest = min(around, key=np.linalg.norm)
         np.testing.assert_allclose(found, nearest, atol=1e-12)
         np.testing.assert_allclose(found, short, atol=1e-12)
-
-
-def test_directions_without_periodicity():
-    lattice = lattice_of(np.diag([3.0, 4.0, 5.0]), [True, False, True])
-    assert nearest_image.py_func(2.0, 3.0, 4.0, lattice) == pytest.approx((-1.0, 3.0, -1.0))
-    assert nearest_image.py_func(2.0, 3.0, 4.0, NO_LATTICE) == (2.0, 3.0, 4.0)

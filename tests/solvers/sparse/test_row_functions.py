@@ -12,7 +12,7 @@ import pytest
 from constraint_cases import CASES, MASSES, TIME, scattered
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Custom, CustomVelocity, Distance, RowKind, Sphere
+from kcons.constraints import Custom, CustomVelocity, Distance, RowKind
 from kcons.errors import InputError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -309,16 +309,6 @@ def test_copies_have_addresses_of_their_own(duplicate):
     y = x + 0.01
     assert other.positions(Request(y, x)).converged
     assert np.all(np.abs(whole.value(y)) <= whole.tolerance(y))
-
-
-def test_rows_that_are_alike_share_their_numbers():
-    x = scattered(0)
-    centers = np.zeros((3, 3))
-    sizes = []
-    for shift in (0.0, 0.1):
-        centers[2, 0] = shift
-        sizes.append(len(both([Sphere([1, 4, 2], centers)], x)[0]._given.numbers))
-    assert sizes[1] - sizes[0] == 2 * (2 + 3)
 
 
 def test_rows_that_elimination_takes_for_dependent_go_to_the_dense_solver():
