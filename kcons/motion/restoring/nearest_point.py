@@ -94,8 +94,11 @@ class FarStart:
             raise error
         rows = np.flatnonzero((self._plan.labels >= 0) & held.holonomic)
         atoms = np.flatnonzero(self._atom_labels() >= 0)
-        weights = 1.0 / held.scale[rows]
         with np.errstate(all="ignore"):
+            table = held.jacobian(start, time)[rows]
+            # By how far an atom is off: what rows measure has units of its own.
+            slopes = np.maximum.reduceat(np.linalg.norm(table.data.reshape(-1, 3), axis=1), table.indptr[:-1] // 3)
+            weights = np.where(np.isfinite(slopes) & (slopes > 0), 1.0 / slopes, 1.0)
             # Any point does: masses of many orders of magnitude would only spoil the condition.
             steps = least_squares(
                 x,
@@ -105,11 +108,11 @@ class FarStart:
                 steps=NEAREST_ROUNDS,
                 still=_REACHED * extent(start),
             )
-            off = np.nan_to_num(np.abs(weights * held.value(x, time)[rows]), nan=np.inf)
+            off = np.where(np.isfinite(slopes), np.abs(held.value(x, time) / held.scale)[rows], np.inf)
         try:
             self._positions(x, x.copy())
         except KconsError as failure:
-            worst = int(np.argmax(off))
+            worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
             raise self._failures.start(x, start, int(rows[worst]), float(off[worst]), steps, time) from failure
 
     def _settle(self, start: FloatArray, x: FloatArray, slow: int = 0) -> bool:
@@ -237,7 +240,8 @@ def least_squares(
     steps : int
         The most steps.
     still, longest : float
-        No coordinate changes by more than the second in a step; where none changes by more than the first, all is done.
+        No coordinate changes by more than the second in a step, and steps that would are made whatever they gain; where
+        none changes by more than the first, all is done.
 
     Returns
     -------
@@ -265,7 +269,7 @@ def least_squares(
             trial = x.copy()
             trial.reshape(-1)[columns] += move * min(1.0, longest / largest if largest > 0 else 1.0)
             found = residuals(trial)
-            if float(found @ found) < error:
+            if largest > longest or float(found @ found) < error:
                 break
             damping = max(4 * damping, 1e-3)
         else:
