@@ -28,7 +28,7 @@ from kcons.ase import (
     constrain,
     draw_velocities,
 )
-from kcons.constraints import Distance, KnifeEdge
+from kcons.constraints import Distance
 from kcons.errors import InputError, KconsError
 from kcons.steppers import Rattle
 
@@ -51,22 +51,6 @@ def test_follows_velocity_verlet(case):
     assert np.abs(ours.positions - theirs.positions).max() <= within
     assert np.abs(ours.get_velocities() - theirs.get_velocities()).max() <= within
     assert case == "free" or off(ours, held) <= 1e-13
-
-
-def test_rows_that_ase_has_no_place_for():
-    """A target that moves, whose rate comes into the velocities at the start, and a row that holds velocities."""
-    rate = 0.01 / FS
-    row = Distance([0, 1], lambda t: 1.1 + rate * t)
-    for start in (0.0, 10 * FS):
-        atoms = Atoms("CO", positions=[[0, 0, 0], [1.1 + rate * start, 0, 0]], calculator=Field(0.0))
-        dyn = ConstrainedDynamics(atoms, FS, constraints=[row, KnifeEdge(0, 1, [0, 0, 1])], time=start)
-        assert atoms.get_velocities()[1, 0] - atoms.get_velocities()[0, 0] == pytest.approx(rate, rel=1e-10)
-        dyn.run(20)
-        assert dyn.get_time() == pytest.approx(start + 20 * FS)
-        assert atoms.get_distance(0, 1) == pytest.approx(1.3 + rate * start, abs=1e-13)
-        assert dyn.degrees_of_freedom == 4
-    with pytest.raises(InputError, match="off row"):
-        ConstrainedDynamics(atoms, FS, constraints=[row], time=0.0)
 
 
 @pytest.mark.parametrize("beside_ours", [False, True])

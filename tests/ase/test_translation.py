@@ -24,7 +24,6 @@ from ase.constraints import (
     FixLinearTriatomic,
     Hookean,
     MirrorForce,
-    dict2constraint,
 )
 from ase.db import connect
 from ase.io import read, write
@@ -193,16 +192,6 @@ def test_round_trip_keeps_rows_and_targets(way, tmp_path):
     assert np.array_equal(atoms.get_momenta(), again.get_momenta())
 
 
-def test_extxyz_drops_the_constraints(tmp_path):
-    atoms = sample()
-    with pytest.warns(UserWarning, match="a file does not have them"):
-        again = _through(atoms, tmp_path / "a.extxyz")
-    assert [type(c).__name__ for c in again.constraints] in ([], ["FixAtoms"])
-    # Targets that were explicit can be given again; positions have 8 digits there.
-    constrain(again, Distance([[0, 1], [1, 2]], [1.5, 1.4]), project=True)
-    assert again.get_distance(0, 1) == pytest.approx(1.5, abs=1e-14)
-
-
 @pytest.fixture(scope="module")
 def opened_by_ase(tmp_path_factory):
     """What ASE makes, in a process that never saw kcons, of files with each of `AS_ASE`."""
@@ -253,16 +242,6 @@ def test_files_open_without_kcons_where_ase_can_hold_the_same(opened_by_ase, nam
     if name == "FixBondLengths":
         assert np.array_equal(rows.target(), expected.target())
     assert ours.get_number_of_degrees_of_freedom() == int(freedom)
-
-
-def test_what_no_file_of_ase_tells_is_written_under_the_name_of_kcons():
-    atoms = molecule("CH3CH2OH")
-    for row, name in ((Distance([0, 1], [1.5]), "FixBondLengths"), (Sphere([0], [0, 0, 0], 1.5), "KconsConstraints")):
-        held = Constraints(row)
-        atoms.set_constraint(held)
-        held.engine(molecule("CH3CH2OH"))
-        assert held.todict()["name"] == name
-        assert dict2constraint(held.todict()).todict()["name"] == name
 
 
 def test_rows_that_depend_on_others_are_counted_right_in_files(tmp_path):

@@ -12,7 +12,7 @@ from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain
 from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.constraints import Angle, Distance, Sphere
-from kcons.errors import CertificateError, InputError
+from kcons.errors import CertificateError
 from kcons.solvers.cluster_solver import Outcome
 from kcons.steppers import Suzuki4
 
@@ -73,15 +73,6 @@ def test_a_later_error_comes_with_the_last_certified_state():
     assert (good.step, caught.value.step) == (21, 31)
     expected = run(right, start, 0.05, 21)
     assert np.array_equal(good.positions, expected.positions)
-
-
-def test_only_what_is_asked_for_is_certified():
-    careless, start = system()
-    careless.motion.plan.solvers[0] = Careless(careless.motion.plan.solvers[0], "positions")
-    end = run(careless, start, 0.01, 20, check_every=0)
-    assert np.abs(careless.motion.constraint_set.value(end.positions)).max() > 1e-6
-    with pytest.raises(InputError, match="check_every"):
-        run(careless, start, 0.01, 20, check_every=-1)
 
 
 def test_the_count_goes_on_from_run_to_run():

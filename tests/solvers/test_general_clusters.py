@@ -181,23 +181,6 @@ def test_no_more_is_left_than_rounding(offset: float, apart: float, converged: b
         np.testing.assert_array_equal(moved, before)
 
 
-def test_velocity_rows_move_no_positions() -> None:
-    rows = [held.RadiusOfGyration([[0, 1, 2]]), held.LinearVelocity([[0, 1]], np.ones((2, 3)), 0.7)]
-    solver, whole = solver_of(rows, WATER)
-    new, lam = WATER + 0.05, np.empty(2)
-    new[1] += 0.1
-    alone, _ = solver_of(rows[:1], WATER)
-    y, z = new.copy(), new.copy()
-    assert positions(solver, y, WATER, multipliers=lam).converged
-    assert positions(alone, z, WATER).converged
-    np.testing.assert_allclose(y, z, rtol=0, atol=1e-14)
-    assert lam[1] == 0.0
-    v = np.random.default_rng(0).normal(size=(3, 3))
-    rates = whole.velocity_target(WATER)
-    assert solver.tangents(Request(v, WATER, rates)).converged
-    np.testing.assert_allclose(whole.jacobian(WATER) @ v.ravel(), rates, rtol=0, atol=1e-14)
-
-
 def test_a_step_too_far_is_refused_and_changes_nothing() -> None:
     """A sphere cannot be reached along a direction that passes it by."""
     x = np.array([[1.0, 0, 0], [5.0, 0, 0]])
@@ -258,12 +241,3 @@ def test_a_gradient_that_vanishes() -> None:
     assert not outcome.converged and outcome.worst_row == 0
     outcome = solver.tangents(Request(x.copy(), x))
     assert not outcome.converged and outcome.worst_row == 0
-
-
-def test_no_rows() -> None:
-    solver, _ = solver_of([], WATER)
-    y = WATER.copy()
-    assert positions(solver, y, WATER).converged
-    assert solver.tangents(Request(y, WATER)).converged
-    assert solver.rank(WATER, 0.0) == 0
-    np.testing.assert_array_equal(y, WATER)

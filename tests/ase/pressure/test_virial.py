@@ -10,11 +10,9 @@ from ase import Atoms, units
 from ase.build import bulk
 from ase.calculators.emt import EMT
 from ase.filters import ExpCellFilter, FrechetCellFilter, StrainFilter, UnitCellFilter
-from ase.md.langevin import Langevin
-from ase.md.nptberendsen import Inhomogeneous_NPTBerendsen, NPTBerendsen
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.optimize import BFGS
-from ase_systems import FS, TEMPERATURE, dumbbells, follow, mean_and_error, off, pressure, random, water_gas
+from ase_systems import TEMPERATURE, pressure, random, water_gas
 
 from kcons.ase import ConstrainedCalculator, constrain, rigid_water
 from kcons.constraints import Distance, Plane
@@ -42,36 +40,6 @@ def test_ideal_gas_of_rigid_water():
     assert error < 0.02 * expected
 
 
-@pytest.mark.parametrize(
-    "cls",
-    [NPTBerendsen, pytest.param(Inhomogeneous_NPTBerendsen, marks=pytest.mark.validation)],
-    ids=lambda c: c.__name__,
-)
-def test_berendsen_barostat_reaches_its_pressure(cls, monkeypatch):
-    atoms, held = dumbbells(60, side=40.0)
-    target = 1.2 * 60 * units.kB * TEMPERATURE / atoms.get_volume()
-    engine = held.engine(atoms)
-    dyn = cls(
-        atoms,
-        2 * FS,
-        temperature_K=TEMPERATURE,
-        pressure_au=target,
-        taut=20 * FS,
-        taup=100 * FS,
-        compressibility_au=1 / target,
-        fixcm=False,
-    )
-    seen = follow(dyn, lambda: pressure(atoms), 1200)
-    mean, error = mean_and_error(seen[400:])
-    assert held.engine(atoms) is engine  # the cell changes at every step; the engine stays
-    assert abs(mean - target) <= 3 * error + 0.01 * target
-    # and it is that of the molecules as points
-    momenta = atoms.get_momenta().reshape(60, 2, 3).sum(axis=1)
-    point = (momenta**2).sum() / (3 * atoms.get_masses()[:2].sum() * atoms.get_volume())
-    assert pressure(atoms) == pytest.approx(point, rel=1e-10)
-    assert off(atoms, held) <= 1e-12
-
-
 def test_stress_is_the_derivative_under_a_constrained_strain():
     atoms = bulk("Cu", cubic=True) * 2
     atoms.rattle(0.05, rng=random())
@@ -95,23 +63,6 @@ def test_stress_is_the_derivative_under_a_constrained_strain():
 
 
 # -- long statistics --------------------------------------------------------------------------------
-
-
-@pytest.mark.validation
-def test_gas_of_rigid_water_under_langevin():
-    atoms = water_gas()
-    held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
-    thermalize_momenta(atoms, TEMPERATURE, rng=random())
-    dyn = Langevin(atoms, FS, temperature_K=TEMPERATURE, friction=0.02 / FS, fixcm=False, rng=random(5))
-    seen = []
-    dyn.attach(lambda: seen.append((pressure(atoms), atoms.get_temperature())), 5)
-    dyn.run(60_000)
-    expected = 27 * units.kB * TEMPERATURE / atoms.get_volume()
-    for values, target in zip(np.array(seen)[100:].T, (expected, TEMPERATURE), strict=True):
-        mean, error = mean_and_error(values, blocks=20)
-        assert error < 0.01 * target
-        assert abs(mean - target) <= 3 * error
-    assert off(atoms, held) <= 1e-12
 
 
 # -- cells are relaxed with molecules that stay rigid; what would break them is refused ------------

@@ -104,14 +104,6 @@ def test_scaled_starts(name: str, factor: float) -> None:
     fulfilled(whole, motion.restore_positions(start))
 
 
-def test_restored_at_a_time() -> None:
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0.5, 0]])
-    rows = [held.Distance([0, 1], lambda t: 1.0 + t), held.FixedAtoms([2], lambda t: [2.0, 0.5, t])]
-    motion = Motion(ConstraintSet(rows, x, [1.0, 1.0, 0.0]), x)
-    y = motion.restore_positions(x, time=0.5)
-    np.testing.assert_allclose(y, [[-0.25, 0, 0], [1.25, 0, 0], [2.0, 0.5, 0.5]], rtol=0, atol=1e-15)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_folded_starts(seed: int) -> None:
     """Random positions, nothing near what is held."""

@@ -158,26 +158,6 @@ def test_coefficients_of_numba_are_called_without_python(function):
     assert iterations[0] <= 4 < iterations[1]
 
 
-def test_coefficients_are_found_once_for_a_place():
-    """A step of a bead asks for the middle of each iteration and for where it ends, which is where the next begins."""
-    places = []
-
-    def coefficients(r):
-        places.append(r.tobytes())
-        return np.array([[-r[0, 1], r[0, 0], 0.0]])
-
-    x = np.array([[1.0, 0.2, 0.0]])
-    motion = Motion(ConstraintSet(CustomVelocity(0, coefficients), x, [1.0]), x)
-    system = System(motion, None)
-    state = State(x, motion.project_velocities(x, [[1.0, 0.0, 0.5]]))
-    state = run(system, state, 0.01, 2)
-    places.clear()
-    run(system, state, 0.01, 10)
-    # The first of these begins where the last call ended, or with one place more.
-    assert len(places) - len(set(places)) <= 1
-    assert len(places) <= 10 * 6
-
-
 @pytest.mark.parametrize("known", [True, False], ids=["gradient", "differences"])
 def test_gradients_are_found_once_for_a_place(known):
     """A step asks where it begins, at each iteration, and twice where it ends: three gradients."""
