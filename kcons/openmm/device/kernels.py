@@ -107,7 +107,8 @@ _COMMON = """
 #define FAIL(row, residual) \\
   {if (CLAIM(&failure[0], launch+1) == 0) {failure[1] = step+1; failure[2] = row; failure_residual[0] = residual;}}
 /* Four normal numbers of a particle, a step and a use within it (Philox 4x32, Box and Muller): an angle is a quarter of
-   the circle and what is left of it, from -pi/4 to pi/4, of which sine and cosine are polynomials. */
+   the circle and what is left of it, from -pi/4 to pi/4, of which sine and cosine are polynomials. CUDA's fast
+   logarithm of a number just below 1 may be positive. */
 DEVICE void gaussians(mixed* g, int particle, int step, int use, int seed) {
   unsigned int c0 = particle, c1 = step, c2 = use, c3 = 0, key0 = seed, key1 = 0x6b636f6eu;
   for (int k = 0; k < 10; k++) {
@@ -118,7 +119,8 @@ DEVICE void gaussians(mixed* g, int particle, int step, int use, int seed) {
   }
   for (int k = 0; k < 4; k += 2) {
     unsigned int turn = k ? c3 : c1;
-    float size = sqrt(-2.0f*log(((k ? c2 : c0)+0.5f)*2.3283064e-10f)), t = (int) (turn<<2)*3.6572952e-10f, t2 = t*t;
+    float size = sqrt(max(-2.0f*log(((k ? c2 : c0)+0.5f)*2.3283064e-10f), 0.0f));
+    float t = (int) (turn<<2)*3.6572952e-10f, t2 = t*t;
     float sine = size*t*(1+t2*(-1.6666667e-1f+t2*(8.3333333e-3f-t2*1.9841270e-4f)));
     float cosine = size*(1+t2*(-0.5f+t2*(4.1666667e-2f+t2*(-1.3888889e-3f+t2*2.4801587e-5f))));
     if (turn>>31) cosine = -cosine;
