@@ -21,6 +21,9 @@ _STILL, _ROUNDING = 1e-12, 16 * EPS
 #: Of least squares: the damping that keeps free motions out, in parts of the largest square of a slope; how often a
 #: step is damped more; and what is no step, in parts of the size of the system.
 LEAST, TRIES, _REACHED = 1e-10, 12, 1e-10
+#: Steps towards any point on the constraints are at first no longer than this part of what rows are off by: longer ones
+#: end in more places from which there is no way on.
+SHORT_STEPS = 0.2
 #: Rounds of the fixed-point iteration in which moves do not halve, after which it is accelerated, from how many rounds.
 SLOW, MIXED = 3, 5
 #: Part of the way to the nearest point that may be left along the constraints without a word.
@@ -99,15 +102,25 @@ class FarStart:
             # By how far an atom is off: what rows measure has units of its own.
             slopes = np.maximum.reduceat(np.linalg.norm(table.data.reshape(-1, 3), axis=1), table.indptr[:-1] // 3)
             weights = np.where(np.isfinite(slopes) & (slopes > 0), 1.0 / slopes, 1.0)
-            # Any point does: masses of many orders of magnitude would only spoil the condition.
-            steps = least_squares(
-                x,
-                atoms,
-                lambda y: weights * held.value(y, time)[rows],
-                lambda y: sp.diags_array(weights) @ held.jacobian(y, time)[rows],
-                steps=NEAREST_ROUNDS,
-                still=_REACHED * extent(start),
-            )
+
+            def misses(y: FloatArray) -> FloatArray:
+                return np.asarray(weights * held.value(y, time)[rows])
+
+            far = float(np.abs(misses(start)).max(initial=0.0))
+            for part in SHORT_STEPS, np.inf:
+                np.copyto(x, start)
+                # Any point does: masses of many orders of magnitude would only spoil the condition.
+                steps = least_squares(
+                    x,
+                    atoms,
+                    misses,
+                    lambda y: sp.diags_array(weights) @ held.jacobian(y, time)[rows],
+                    steps=NEAREST_ROUNDS,
+                    still=_REACHED * extent(start),
+                    longest=part * far,
+                )
+                if np.all(np.abs(misses(x)) <= 1e-6 * far):
+                    break
             off = np.where(np.isfinite(slopes), np.abs(held.value(x, time) / held.scale)[rows], np.inf)
         try:
             self._positions(x, x.copy())
