@@ -11,8 +11,9 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, KconsError
+from kcons.motion.restoring.descent import Descent, largest
 from kcons.motion.solver_sequence import FAILED, IterationBudget, SolverSequence
-from kcons.solvers.tolerances import EPS, MAX_HALVINGS
+from kcons.solvers.tolerances import EPS
 
 #: Rounds of the search for the nearest point on the constraints, and steps towards any point on them.
 NEAREST_ROUNDS = 200
@@ -24,8 +25,9 @@ LEAST, TRIES, _REACHED = 1e-10, 12, 1e-10
 #: Steps towards any point on the constraints are at first no longer than this part of what rows are off by: longer ones
 #: end in more places from which there is no way on.
 SHORT_STEPS = 0.2
-#: Rounds of the fixed-point iteration in which moves do not halve, after which it is accelerated, from how many rounds.
-SLOW, MIXED = 3, 5
+#: Rounds of the fixed-point iteration in which moves do not halve, after which it is given up; and what of the way to
+#: the start may be along the constraints where the search ends.
+SLOW, _FOOT = 3, 1e-12
 #: Part of the way to the nearest point that may be left along the constraints without a word.
 LEFT_OVER = 1e-6
 
@@ -78,8 +80,9 @@ class FarStart:
             self._positions(here, start)
         except ConvergenceError:
             self._reach(here)
-        found = self._settle(start, here) or self._descend(start, here)
-        found = found or self._settle(start, here, slow=SLOW)
+        found = self._settle(start, here)
+        if not found:
+            self._descend(start, here)
         np.copyto(x, here)
         if found:
             return 0.0
@@ -128,20 +131,15 @@ class FarStart:
             worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
             raise self._failures.start(x, start, int(rows[worst]), float(off[worst]), steps, time) from failure
 
-    def _settle(self, start: FloatArray, x: FloatArray, slow: int = 0) -> bool:
+    def _settle(self, start: FloatArray, x: FloatArray) -> bool:
         """x <- start + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers, in place.
 
-        Its fixed point is the foot of the mass-weighted perpendicular from the start. False where the iteration
-        does not settle, and `x` as it was, or as near as the work came that was left. `slow` rounds count as slow.
+        Its fixed point is the foot of the mass-weighted perpendicular from the start. False where moves do not halve
+        for long, and `x` as it was, or nearer to that point.
         """
-        here = reached = x
-        mixed: _Mixed | None = None
-        last = np.inf
+        here, first, last, slow = x, np.inf, np.inf, 0
         still = max(_STILL * extent(start), _ROUNDING * float(np.abs(start).max(initial=0.0)))
-        first = np.inf
-        for _ in range(NEAREST_ROUNDS):
-            if self._budget.iterations <= 0:
-                break
+        while self._budget.iterations > 0 and slow < SLOW:
             ahead = start.copy()
             try:
                 self._positions(ahead, here)
@@ -153,73 +151,38 @@ class FarStart:
                 return True
             if move > 2 * last:
                 return False
-            if last == np.inf:
-                first = move
+            first = move if last == np.inf else first
             slow += move > 0.5 * last
-            if slow >= SLOW:
-                mixed = mixed or _Mixed(self._atom_labels())
-                # Gradients are taken there, which need not be on the constraints.
-                here = mixed.after(here, ahead)
-            else:
-                here = ahead
-            reached, last = ahead, move
-        if last < first:  # on its way to the foot, and nearer than where it began
-            np.copyto(x, reached)
+            here, last = ahead, move
+        if last < first:
+            np.copyto(x, here)
         return False
 
-    def _descend(self, start: FloatArray, x: FloatArray) -> bool:
-        """Walk along the constraints towards the start in place, as long as every cluster comes nearer to it.
+    def _descend(self, start: FloatArray, x: FloatArray) -> None:
+        """Walk along the constraints towards the start in place, to the foot of a perpendicular from there."""
+        away = self._atom_labels() < 0
+        inverse = self._plan.inverse_masses
+        mass = np.divide(1.0, inverse, out=np.zeros(len(x)), where=inverse > 0)[:, None]
 
-        Steps are the tangential part of start - x; its end is the foot of a perpendicular from the start. Whether it
-        was reached.
-        """
-        plan = self._plan
-        atom_label = self._atom_labels()
-        inside = atom_label >= 0
-        mass = np.divide(1.0, plan.inverse_masses, out=np.zeros(len(x)), where=plan.inverse_masses > 0)[inside]
-        clusters = int(plan.labels.max(initial=-1)) + 1
+        def along(y: FloatArray, move: FloatArray) -> FloatArray:
+            move = np.where(away[:, None], 0.0, move)
+            self._tangents(y, move)
+            return move
 
-        def distance(y: FloatArray) -> FloatArray:
-            square = mass * np.sum((y - start)[inside] ** 2, axis=1)
-            return np.bincount(atom_label[inside], weights=square, minlength=clusters).astype(np.float64)
+        def onto(y: FloatArray, reference: FloatArray) -> FloatArray:
+            self._positions(y, reference)
+            return y
 
-        away = distance(x)
-        factor, last = np.ones(clusters), np.inf
+        descent = Descent(lambda y: start - y, along, onto, mass)
+        left = descent.downhill(x)
+        longest = largest(left)
         for _ in range(NEAREST_ROUNDS):
-            step = start - x
-            step[~inside] = 0.0
-            size = float(np.max(np.abs(step), initial=0.0))
-            self._tangents(x, step)
-            slope = float(np.max(np.abs(step), initial=0.0))
-            near = slope < 1e-6 * size  # where rounding hides which of two points is nearer
-            if slope <= 1e-13 * size:
-                return True
-            if near and slope > 0.9 * last:  # swings about the foot
-                factor *= 0.5
-                if factor.max() < 0.05:
-                    return False
-            last = slope
-            for _ in range(MAX_HALVINGS):
-                if self._budget.iterations <= 0:
-                    return False
-                ahead = x + np.where(inside, factor[atom_label], 0.0)[:, None] * step
-                try:
-                    self._positions(ahead, x)
-                except ConvergenceError as error:
-                    factor[error.cluster if error.cluster >= 0 else slice(None)] *= 0.5
-                    continue
-                now = distance(ahead)
-                worse = now > away * (1 + 1e-12) if near else now > away
-                if not worse.any():
-                    break
-                factor[worse] *= 0.5
-            else:
-                return False
+            if self._budget.iterations <= 0 or largest(left) <= _FOOT * largest(start - x):
+                return
+            ahead, left, gained = descent.advanced(x, left, longest)
+            if not gained:
+                return
             np.copyto(x, ahead)
-            away = now
-            if not near:
-                factor = np.minimum(1.0, 1.5 * factor)
-        return False
 
     def _atom_labels(self) -> IntArray:
         """Cluster of each local atom, -1 for atoms that belong to none."""
@@ -292,45 +255,3 @@ def least_squares(
         if not largest > still:
             return step + 1
     return steps
-
-
-class _Mixed:
-    """Anderson's mixing of the last rounds of a fixed-point iteration, cluster by cluster.
-
-    The next point is that combination of the last ones whose changes cancel best. D. G. Anderson, J. ACM 12, 547
-    (1965).
-
-    Parameters
-    ----------
-    label : ndarray of int, shape (n_atoms,)
-        Cluster of each atom, -1 for atoms that belong to none.
-    """
-
-    def __init__(self, label: IntArray) -> None:
-        self._inside = np.flatnonzero(label >= 0)
-        self._label = label[self._inside]
-        self._points: list[FloatArray] = []
-        self._changes: list[FloatArray] = []
-
-    def after(self, here: FloatArray, ahead: FloatArray) -> FloatArray:
-        """Where to go on after `here` led to `ahead`."""
-        inside = self._inside
-        self._points = [*self._points[-MIXED:], ahead[inside]]
-        self._changes = [*self._changes[-MIXED:], (ahead - here)[inside]]
-        change, changes = self._changes[-1], np.diff(self._changes, axis=0)
-        if not len(changes):
-            return ahead
-        products = np.array([[self._sums(a, b) for b in changes] for a in changes])
-        with np.errstate(divide="ignore"):
-            size = 1.0 / np.sqrt(np.einsum("aac->ac", products))
-        size[~np.isfinite(size)] = 0.0
-        inverse = np.linalg.pinv(np.einsum("ac,abc,bc->cab", size, products, size), rcond=1e-12, hermitian=True)
-        right = size * np.array([self._sums(a, change) for a in changes])
-        weights = size * np.einsum("cab,bc->ac", inverse, right)
-        found = ahead.copy()
-        found[inside] -= np.einsum("an,ani->ni", weights[:, self._label], np.diff(self._points, axis=0))
-        return found
-
-    def _sums(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Products of two sets of vectors by cluster."""
-        return np.bincount(self._label, weights=np.einsum("ni,ni->n", a, b)).astype(np.float64)

@@ -201,6 +201,18 @@ def test_the_nearest_point_is_found_where_the_surface_is_much_bent() -> None:
         assert off_the_perpendicular(whole, motion, start, found) < 1e-9
 
 
+def test_each_of_several_molecules_comes_to_its_nearest_point() -> None:
+    one, _, x = _braced(1)
+    several, whole, _ = _braced(6)
+    rng = np.random.default_rng(5)
+    starts = [x + _displaced(rng, 0.15) for _ in range(6)]
+    shift = np.repeat([[0.0, 20.0 * k, 0.0] for k in range(6)], 9, axis=0)
+    found = several.restore_positions(np.concatenate(starts) + shift, bonds=[]) - shift
+    fulfilled(whole, found + shift)
+    alone = np.concatenate([one.restore_positions(start, bonds=[]) for start in starts])
+    np.testing.assert_allclose(found, alone, rtol=0, atol=1e-9)
+
+
 def test_a_search_that_ends_before_the_nearest_point_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     motion, whole, x = _braced(1)
     start = x + _displaced(np.random.default_rng(0), 0.15)
