@@ -211,7 +211,7 @@ class Batch:
 
     def _flat(self, x: Tensor, item: str) -> Tensor:
         if not isinstance(x, Tensor) or x.shape[-1:] != (3,) or x.numel() != 3 * self.n_atoms:
-            shape = tuple(getattr(x, "shape", ())) or type(x).__name__
+            shape = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
             wanted = f"a tensor of shape ({self.n_atoms}, 3) or (copies, atoms, 3)"
             raise InputError(f"{item} must be {wanted}, not {shape}", item=item)
         if x.dtype != self.dtype or x.device.type != self.device.type:
@@ -251,6 +251,9 @@ class Batch:
         return self._joined(lambda each: each.constraint_set.target_rates(time, order))
 
     def _task(self, of_positions: bool, time: float, start: float, flight: float = 0.0) -> Task:
+        for item in ("masses", "targets"):
+            if getattr(self, item)._version:  # numbers that follow from them are kept
+                raise InputError(f"{item} of a Batch were written to; give other ones as {item}= of a call", item=item)
         t, t_start = (torch.full((), each, dtype=self.dtype, device=self.device) for each in (time, start))
         groups = self._groups if flight or not of_positions else self._position_groups
         own = self._inverse_masses, self.targets if of_positions else self._still

@@ -9,21 +9,30 @@ import torch
 from torch import Tensor
 
 from kcons.batched.batch import Batch
+from kcons.constraints.arguments import positive
+from kcons.errors import InputError
 
 #: Forces, of the shape of positions.
 Force = Callable[[Tensor], Tensor]
 
 
+def _pushed(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: float, masses: Tensor | None) -> Tensor:
+    """Velocities after forces have acted for a time h."""
+    for item, given in (("v", v), ("forces", forces)):
+        if given.shape != x.shape:  # which torch would spread over copies
+            raise InputError(f"{item} must have shape {tuple(x.shape)}, not {tuple(given.shape)}", item=item)
+    return v + h * batch.weights(masses).reshape(*x.shape[:-1], 1) * forces
+
+
 def _kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: float, time: float, masses: Tensor | None) -> Tensor:
-    """Velocities after forces have acted for a time h, on the rows."""
-    w = batch.weights(masses).reshape(*x.shape[:-1], 1)
-    return batch.project_velocities(x, v + h * w * forces, time=time, masses=masses)
+    """The same, on the rows."""
+    return batch.project_velocities(x, _pushed(batch, x, v, forces, h, masses), time=time, masses=masses)
 
 
 def _drift(batch: Batch, x: Tensor, v: Tensor, h: float, time: float, **held: Any) -> tuple[Tensor, Tensor]:
     """Positions a time h later on the rows, and velocities with the impulse that has kept them there."""
     found = batch.solve_positions(x + h * v, x, time=time + h, reference_time=time, flight=h, **held)
-    return found.positions, v + found.push / h
+    return found.positions, v + found.push / h if h else v
 
 
 def rattle(
@@ -61,8 +70,8 @@ def rattle(
     ----------
     H. C. Andersen, J. Comput. Phys. 52, 24 (1983).
     """
-    half = 0.5 * dt * batch.weights(masses).reshape(*x.shape[:-1], 1)
-    x, v = _drift(batch, x, v + half * forces, dt, time, targets=targets, masses=masses)
+    v = _pushed(batch, x, v, forces, 0.5 * dt, masses)
+    x, v = _drift(batch, x, v, dt, time, targets=targets, masses=masses)
     forces = force(x)
     return x, _kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces
 
@@ -98,6 +107,7 @@ def gbaoab(
     ----------
     B. Leimkuhler and C. Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
+    positive(dt, "dt")  # noise cannot be taken back
     masses = held.get("masses")
     v = _kick(batch, x, v, forces, 0.5 * dt, time, masses)
     x, v = _drift(batch, x, v, 0.5 * dt, time, **held)

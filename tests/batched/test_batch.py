@@ -117,8 +117,21 @@ def test_what_is_refused():
     batch, x = Batch(water(), copies=2), torch.as_tensor(np.concatenate([WATER, WATER]))
     with pytest.raises(InputError, match=r"x_new must be a tensor of shape \(6, 3\)"):
         batch.project_positions(x[:3], x)
+    with pytest.raises(InputError, match=r"x_new must be a tensor .*, not ndarray"):
+        batch.project_positions(x.numpy(), x)
+    v = torch.zeros_like(x)
+    with pytest.raises(InputError, match=r"forces must have shape \(6, 3\), not \(1, 3\)"):
+        rattle(batch, lambda x: x[:1], x, v, v, 0.1)
+    with pytest.raises(InputError, match="dt is -0"):
+        gbaoab(batch, lambda x: -x, x, v, v, -0.1, 1.0, 1.0)
+    assert torch.equal(rattle(batch, lambda x: -x, x, v, v, 0.0)[1], v)
     with pytest.raises(InputError, match=r"x_reference: torch.float32 on cpu.*convert it"):
         batch.project_positions(x, x.float())
+    for item in ("masses", "targets"):
+        other = Batch(water(), copies=2)
+        getattr(other, item)[0] = 1.1
+        with pytest.raises(InputError, match=rf"{item} of a Batch were written to; give other ones as {item}="):
+            other.project_positions(x, x)
     with pytest.raises(InputError, match=r"targets must be a tensor of shape \(6,\)"):
         batch.project_positions(x, x, targets=torch.ones(4, dtype=torch.float64))
     with pytest.raises(InputError, match=r"a kcons.Motion and the number of copies"):

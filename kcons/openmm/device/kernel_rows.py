@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -9,12 +10,11 @@ from typing import Any
 import numpy as np
 import openmm
 
-from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.motion import Motion
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Passage, cell_of, refuse_virtual_sites
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, cell_of, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
 from kcons.openmm.device.rows import DeviceRows, rows_of
 from kcons.openmm.integrator.part import Part, Solver
@@ -31,7 +31,7 @@ class _Engine:
     def __init__(self, motion: Motion, masses: FloatArray, cell: FloatArray | None) -> None:
         self.motion, self.masses, self.cell = motion, masses, cell
         self.atoms: IntArray = motion.sources[0].touched
-        self.passage = Passage(self.atoms, len(masses))
+        self.precision = Precision("", "double")
 
     def follow_cell(self, state: openmm.State) -> None:
         cell = cell_of(state.getPeriodicBoxVectors())
@@ -55,13 +55,13 @@ class KernelRows(CarriedConstraints):
     may read a context parameter.
     """
 
-    evaluates = lands_last = False
-
     def __init__(self, parts: Sequence[Any]) -> None:
         self._parts = parts
         carried = [part for part in parts if isinstance(part, CarriedConstraints)]
-        self.given: list[Constraint] = list(accepted(constraints_of(parts)))
+        self.given = list(accepted(constraints_of(parts)))
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
+        for part in carried:
+            part._engine.served = True
         #: The engine of what `hold` made, until the Context is known.
         self._carried = carried[0]._engine if len(carried) == len(parts) == 1 else None
         #: Whether rows take periodic images: as `hold` was told, else as the System.
@@ -70,8 +70,8 @@ class KernelRows(CarriedConstraints):
         self._of: tuple[Any, ...] = ()
         self._context: Callable[[], openmm.Context | None] = lambda: None
         self.code = 0
-        #: Time at which sums of multipliers began, ps.
-        self._since = 0.0
+        #: Time at which sums of multipliers began, and where the last call of `step` left it, ps.
+        self._since = self.left = math.nan
 
     # -- a Context ------------------------------------------------------------------------------
 
@@ -153,14 +153,17 @@ class KernelRows(CarriedConstraints):
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
         self.bind(context)
-        self._engine.passage.precision = Precision.of(context)
+        self._engine.precision = Precision.of(context)
         return super()._state(context)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Whatever the precision is: residuals are what it can hold."""
 
     def _check_system(self, system: openmm.System, precision: Precision) -> None:
-        self._engine.passage.precision = precision
+        self._engine.precision = precision
+
+    def check_masses(self, system: openmm.System) -> None:
+        """Kernels are made for the masses of a Context."""
 
     def rank(self, context: openmm.Context | None = None) -> int:
         """Degrees of freedom that the rows take, beyond the constraints of the System."""
@@ -173,6 +176,8 @@ class KernelRows(CarriedConstraints):
 
     def mean_multipliers(self, integrator: Any) -> FloatArray:
         """Multipliers averaged over all steps since they were reset, by row of ``motion.constraint_set``.
+
+        Where the time was set, or a State or checkpoint of another time loaded, they begin anew.
 
         Impulses that the kernels have summed over the time: kJ/mol over the unit of the row; NaN for constraints of the
         System, and before the first step. The weights of `Series.weights`, which blue-moon averages over
@@ -188,9 +193,9 @@ class KernelRows(CarriedConstraints):
         return rows.multipliers(sums, time) if time > 0 else np.full(rows.set.n_rows, np.nan)
 
     def reset_multipliers(self, integrator: Any) -> None:
-        """Begin the sums of `mean_multipliers` anew."""
+        """Begin the sums of `mean_multipliers` anew, as the first step does, and one after the time was set."""
         integrator.write("rows_sums", np.zeros(len(integrator.read("rows_sums"))))
-        self._since = float(integrator.context.getTime()._value)
+        self._since = self.left = float(integrator.context.getTime()._value)
 
     def __deepcopy__(self, memo: dict[int, object]) -> KernelRows:
         return KernelRows(self._parts)

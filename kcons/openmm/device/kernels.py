@@ -545,20 +545,23 @@ class Kernels:
         self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] += {_of_dt(op.share)}*{self._force(op)}*w[a];\n")
 
     def _fly(self, op: Op) -> None:
-        flights = [(length, end, 1) for length, end in zip(op.flights, op.ends, strict=True)]
-        if len(set(op.flights)) == 1:
-            flights = [(*flights[0][:2], len(flights))]
-        for length, end, count in flights:
-            h, time = _of_dt(length), f"{_time(op, end)}+flight*h"
-            loop = f" for (int flight = 0; flight < {count}; flight++)"
-            free = f"{loop} EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
-            start = f"{loop} {{ROOM const mixed h = {h}, per_h = 1/h;\n"
-            aim = " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
-            moved = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++)"
-            moved += " {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }\n"
-            solve = f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {time}, x, d, w);\n if (failure[0] == 0)\n"
-            self._add(free, start + aim + solve + moved)
-            self._moves = True
+        lengths, ends = (
+            ", ".join(f"(mixed) {each!r}" for each in some)
+            for some in (op.flights, (end + op.begun for end in op.ends))
+        )
+        count = len(op.flights)
+        loop = f" {{const mixed lengths[{count}] = {{{lengths}}}, ends[{count}] = {{{ends}}};\n"
+        loop += f" for (int flight = 0; flight < {count}; flight++) {{ROOM const mixed h = lengths[flight]*dt;\n"
+        free = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += h*v[3*a+c];\n }}\n"
+        held = (
+            " const mixed per_h = 1/h;\n"
+            " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
+            " SYNC positions_NAME(ROWS_PASS CLUSTER, h, time+ends[flight]*dt, x, d, w);\n"
+            " if (failure[0] == 0) EACH if (w[a] != 0) for (int c = 0; c < 3; c++)"
+            " {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }}\n"
+        )
+        self._add(loop + free, loop + held)
+        self._moves = True
 
     def _project(self, op: Op) -> None:
         self._add("", f" SYNC velocities_NAME(ROWS_PASS CLUSTER, 1, {_time(op, op.ends[0])}, x, v, w);\n")

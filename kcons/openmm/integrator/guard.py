@@ -384,7 +384,7 @@ class Guard:
         begun = perf_counter()
         try:
             self.check()
-        except (CertificateError, ConvergenceError, NonFiniteError) as error:
+        except (CertificateError, ConvergenceError, InputError, NonFiniteError) as error:
             if isinstance(error, CertificateError):
                 error.state = self._good
             self._go_back(error)
@@ -400,6 +400,8 @@ class Guard:
         Raises
         ------
         CertificateError, ConvergenceError, NonFiniteError
+        InputError
+            Masses were changed after the rows of a part were built.
         """
         context, integrator = self.context, self.integrator
         step = context.getStepCount()
@@ -409,6 +411,8 @@ class Guard:
             x = np.asarray(now.getPositions(asNumpy=True)._value)
             v = np.asarray(now.getVelocities(asNumpy=True)._value)
             check_finite(x, v, step, self.rows.n_rows > 0)
+            for part in integrator.parts:
+                part.check_masses(self.system)
             self.check_lengths(x, step)
             for miss in (self.speed_violation(x, v), *(part.worst_violation(context) for part in integrator.parts)):
                 self.certify(miss, f"at step {step} ")

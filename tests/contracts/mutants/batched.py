@@ -39,6 +39,7 @@ MUTANTS = {
         ),
     ],
     "batched/batch.py": [
+        ("if «getattr(self, item)._version→False»:", BATCH + "what_is_refused"),
         (
             "torch.where(self._is_position, held, «flight→1.0» * middle)",
             ENGINE + "families_are_held_as_the_engine_holds_them[lanes-LinearVelocity]",
@@ -46,6 +47,7 @@ MUTANTS = {
         ("made._lattice = self._lattice[«numbers→:1»]", BATCH + "systems_are_selected_with_their_cells"),
     ],
     "batched/steps.py": [
+        ("if «given.shape != x.shape→False»:", BATCH + "what_is_refused"),
         ("v + found.push / «h→(2 * h)»", BATCH + "rattle_is_that_of_the_engine_and_reversible"),
     ],
 }

@@ -25,12 +25,6 @@ MUTANTS = {
             "test_device_integrator.py::test_which_steps_are_made_on_the_device",
         ),
     ],
-    "openmm/device/c_writer.py": [
-        (
-            're.sub(r"pow\\((.*), (.*)\\)", r"(\\«1→2»)^(\\2)", text)',
-            "test_surface_rows.py::test_formulas_are_read_by_openmm",
-        ),
-    ],
     "plan/clusters_alike.py": [
         (
             "key=lambda k: («k in last, →»k)",
@@ -55,6 +49,10 @@ MUTANTS = {
         (
             "yield x, v, f, time + (k «+ 1→+ 0») * every * self._dt",
             "test_device_integrator.py::test_records_are_the_states_after_steps",
+        ),
+        (
+            "if part.left «!=→is None and» guard.context.getTime()._value:",
+            "test_kernel_rows.py::test_multipliers_are_summed_where_the_rows_are",
         ),
         (
             "if told[_FAILED]«→ and False»:",

@@ -3,6 +3,10 @@
 MUTANTS = {
     "openmm/integrator/guard.py": [
         (
+            "for part in integrator.parts:\n                «part.check_masses(self.system)→pass»",
+            "test_callbacks.py::test_masses_that_change_in_a_run_are_noticed_at_the_next_check",
+        ),
+        (
             "if «squares <= self._explosive→not squares > 1e300»:",
             "test_steps.py::test_an_explosion_is_told_where_its_call_ends",
         ),
@@ -71,12 +75,12 @@ MUTANTS = {
             "«        for name, value in self.settings.items():\n            self.write(name, value)\n→»",
             "test_settings.py::test_a_setting_has_a_method_of_its_own",
         ),
-        (
-            "if «found != self.settings[_SUM_OF_VECTORS]→False»:",
-            "test_surface_integrator.py::test_a_checkpoint_of_other_surfaces_does_not_bring_them_along",
-        ),
     ],
     "openmm/integrator/system_checks.py": [
+        (
+            "rows = replace(rows, «lengths=given, others=given→others=given»)",
+            "test_system_checks.py::test_lengths_of_rigid_water_are_compared_with_those_of_the_system",
+        ),
         (
             "«context.setParameter(name, parameters[name])→pass»",
             "test_conserved_momenta.py::test_forces_are_looked_at_with_the_parameters_of_the_context",
@@ -179,8 +183,6 @@ MUTANTS = {
             "(*held[:k], *«held[n:]→()») for k",
             "test_rows_in_context.py::test_row_that_repeats_a_constraint_of_the_system_is_named",
         ),
-    ],
-    "openmm/collective/row_program.py": [
         (
             "weight{c}*({of('more', i)}«-→+»{of('expected', i)})",
             "test_row_program.py::test_the_iteration_learns_from_each_push",
@@ -194,17 +196,21 @@ MUTANTS = {
             "test_row_program.py::test_many_steps_look_less_often",
         ),
     ],
-    "openmm/surfaces/surface_rows.py": [
+    "openmm/surface_integrator.py": [
         (
-            'f"select(failed, v, {u}«+→-»i_push/{h})"',
-            "test_surface_steps.py::test_the_steps_are_those_of_the_core",
-        ),
-        (
-            "«*step(dot(i_slope, i_gradient))→»",
-            "test_surface_rows.py::test_a_landing_where_the_surface_looks_the_other_way_is_none",
+            "«positions is None→False»:",
+            "test_surface_integrator.py::test_great_circles_at_any_time_step",
         ),
     ],
     "openmm/callback_rows/carried_constraints.py": [
+        (
+            "if self._count == count + «1 > 0→2 > 0»:",
+            "test_callbacks.py::test_an_integrator_that_does_not_hold_the_rows_is_refused",
+        ),
+        (
+            "elif self.timed and «self._integrator() is None→False»:",
+            "test_callbacks.py::test_rows_that_need_the_time_are_not_held_without_their_integrator",
+        ),
         (
             "self.carries_rest = «not integrator.thermostatted→False»",
             "test_carried_constraints.py::test_velocities_are_those_of_the_core",
@@ -212,6 +218,14 @@ MUTANTS = {
         (
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "test_part.py::test_integrators_in_turn_hold_the_same_part",
+        ),
+        (
+            "u * np.cos(w) - d * (w * np.sin(w))« - way→»",
+            "test_surface_integrator.py::test_great_circles_at_any_time_step",
+        ),
+        (
+            '«d *= radius / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None]→pass»',
+            "test_surface_integrator.py::test_the_steps_are_those_of_the_core",
         ),
         (
             "return self.motion.rank« - 3 * fixed→»",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import pickle
 import sys
 
@@ -83,11 +84,9 @@ def test_of_some_particles_mixed_precision_hands_over_single_numbers(platform, m
 
 
 def test_the_grain_of_coordinates():
-    passage = Passage(ATOMS, len(X))
-    assert passage.grain(5.0) == np.spacing(5.0)
-    passage.precision = Precision("CUDA", "mixed")
-    assert passage.grain(5.0) == pytest.approx(5 * 2.0**-47)
-    assert passage.limits[0] > 1e-9
+    assert Precision("CPU", "double").grain(5.0) == np.spacing(5.0)
+    assert Precision("CUDA", "mixed").grain(5.0) == pytest.approx(5 * 2.0**-47)
+    assert Precision("CUDA", "mixed").limits[0] > 1e-9
 
 
 def test_positions_come_back_to_the_last_bit():
@@ -258,6 +257,42 @@ def test_a_system_that_does_not_go_with_the_rows_is_refused(made, error, words):
     context = started(context_of(system, ProjectedIntegrator(0.01, parts=[part])), np.eye(3))
     with pytest.raises(error, match=words):
         part.check(context)
+
+
+def test_masses_that_change_in_a_run_are_noticed_at_the_next_check():
+    system = free([12.0] * 2)
+    part = hold(system, Distance([[0, 1]]), np.eye(2, 3))
+    integrator = ProjectedIntegrator(0.01, parts=[part])
+    context = started(context_of(system, integrator), np.eye(2, 3))
+    integrator.step(5)
+    system.setParticleMass(0, 4.0)
+    context.reinitialize(True)
+    with pytest.raises(InputError, match="masses have changed"):
+        integrator.step(100)
+
+
+def test_an_integrator_that_does_not_hold_the_rows_is_refused():
+    """The constraints that moved to the rows would be held by nobody."""
+    system = free([12.0] * 2)
+    hold(system, Distance([[0, 1]]), np.eye(2, 3))
+    verlet = openmm.VerletIntegrator(0.01)
+    context = started(context_of(system, verlet), np.eye(2, 3))
+    with pytest.raises(openmm.OpenMMException, match=r"does not hold the rows of hold.* parts=\[rows\]"):
+        verlet.step(2)
+    del context
+
+
+def test_rows_that_need_the_time_are_not_held_without_their_integrator():
+    """Nobody else knows the time step: a CompoundIntegrator keeps no object of Python."""
+    system = free([12.0] * 2)
+    part = hold(system, Distance([[0, 1]], lambda t: np.sqrt(2) + t), np.eye(2, 3))
+    both = openmm.CompoundIntegrator()
+    both.addIntegrator(ProjectedIntegrator(0.01, parts=[part], device=False))
+    gc.collect()
+    context = started(context_of(system, both), np.eye(2, 3))
+    with pytest.raises(openmm.OpenMMException, match="keep a reference"):
+        both.step(1)
+    del context
 
 
 def _full(system):

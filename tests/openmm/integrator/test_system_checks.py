@@ -6,7 +6,6 @@ import numpy as np
 import openmm
 import pytest
 from openmm_systems import (
-    PLATFORMS,
     context_of,
     dumbbell,
     started,
@@ -16,9 +15,6 @@ from openmm_systems import (
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Langevin, ProjectedIntegrator, worst_length
 from kcons.openmm.integrator.system_checks import SystemRows
-
-platforms = pytest.mark.parametrize("platform", PLATFORMS)
-
 
 # -- what cannot be propagated ----------------------------------------------------------------------
 
@@ -67,6 +63,21 @@ def test_the_length_that_is_off_most(kind):
     assert worst_length(context)[1] < 1e-7
     with pytest.raises(InputError, match=r"context is a System; give the Context, such as simulation\.context"):
         worst_length(system)
+
+
+def test_lengths_of_rigid_water_are_compared_with_those_of_the_system():
+    """Not with those in single precision that OpenMM makes of them."""
+    system, lengths = openmm.System(), [0.09572, 0.09572, 0.15139]
+    for mass in (16.0, 1.0, 1.0):
+        system.addParticle(mass)
+    for (i, j), length in zip([(0, 1), (0, 2), (1, 2)], lengths, strict=True):
+        system.addConstraint(i, j, length)
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[0.0, 0.05858, 0.0], [-0.0757, 0.0, 0.0], [0.0757, 0.0, 0.0]])
+    context.applyConstraints(1e-12)
+    assert worst_length(context)[1] == pytest.approx(
+        np.abs(np.float32(lengths) / np.array(lengths) - 1).max(), rel=1e-6
+    )
 
 
 def test_without_constraints_no_length_is_off():
