@@ -11,7 +11,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import ContradictionError, UnsupportedError
+from kcons.errors import ContradictionError
 from kcons.plan.clusters import Shape, classify, cluster_labels
 from kcons.plan.rank import mark_dependent_rows, rank_of_small, small_enough
 from kcons.solvers.addressable_solvers import AddressableSolver
@@ -165,25 +165,6 @@ class Plan:
     def _broken(self, row: int, said: str) -> ContradictionError:
         name, atoms = self.named.row_name(row), self.named.row_atoms(row)
         return ContradictionError(f"row {name} lies between fixed atoms{said}", rows=[int(row)], atoms=atoms)
-
-    def general_for_all(self, limit: int, *, equal: bool = False) -> GeneralClusters:
-        """The damped solver for every cluster, for positions that are far off; with equal masses if that is enough.
-
-        Raises
-        ------
-        UnsupportedError
-            A cluster has more than `limit` rows, too many for dense algebra.
-        """
-        rows = np.flatnonzero(self.labels >= 0)
-        sizes = np.bincount(self.labels[rows])
-        if len(sizes) and sizes.max() > limit:
-            name = self.named.row_name(int(rows[np.argmax(self.labels[rows] == np.argmax(sizes))]))
-            raise UnsupportedError(
-                f"these positions are too far off for the cluster of {sizes.max()} rows around {name}: start nearer "
-                "to the constraints (minimize with harmonic bonds first), or hold fewer rows"
-            )
-        inverse_masses = (self.inverse_masses > 0).astype(np.float64) if equal else self.inverse_masses
-        return GeneralClusters(self.constraint_set, rows, self.labels[rows], inverse_masses)
 
     def least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:
         """Multipliers of least norm with the same constraint force, where rows depend on each other."""

@@ -19,7 +19,7 @@ MUTANTS = {
             "test_binding.py::test_forces_of_the_same_calculator_that_changed",
         ),
         (
-            "if «now < befor→Fals»e and (self._more",
+            "if «now < before→False» and self._more:",
             "test_binding.py::test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these",
         ),
     ],
