@@ -21,7 +21,6 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.ensemble import Integrator
-from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.quantities import masses_of
 from kcons.plan.plan import make_plan
 

@@ -79,7 +79,9 @@ def test_lengths_of_rigid_water_are_compared_with_those_of_the_system():
     context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
     context.setPositions([[0.0, 0.05858, 0.0], [-0.0757, 0.0, 0.0], [0.0757, 0.0, 0.0]])
     context.applyConstraints(1e-12)
-    assert worst_length(context)[1] == pytest.approx(np.abs(np.float32(lengths) / np.array(lengths) - 1).max(), rel=1e-6)
+    assert worst_length(context)[1] == pytest.approx(
+        np.abs(np.float32(lengths) / np.array(lengths) - 1).max(), rel=1e-6
+    )
 
 
 def test_without_constraints_no_length_is_off():
