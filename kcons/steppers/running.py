@@ -145,8 +145,8 @@ def run(
     Raises
     ------
     InputError
-        A start off the constraints; negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units or
-        that is no finite number; what is no system, state, stepper or observer; a state whose time is no finite number,
+        A start off the constraints; negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units,
+        or that is no finite number; what is no system, state, stepper or observer; a state whose time is no finite number,
         or whose step no count.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
