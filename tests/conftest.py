@@ -32,6 +32,7 @@ LOCALE = locale.setlocale(locale.LC_ALL)
 #: How long comparisons run what is to be timed, less than usual: no test looks at a time. What else they do stays.
 LITTLE = {
     "bare_solvers": {"SAMPLING": 0.01},
+    "kcons.comparison.measure": {"MORE_SECONDS": 0.01, "PASS_SECONDS": 1e-3},
 }
 #: The same of the package, of modules that were imported.
 USUAL: dict[str, dict[str, object]] = {}

@@ -36,4 +36,4 @@ def show(k: int) -> None:
     trace.set_data(path.positions[max(0, k - 40) : k + 1, 2, 0], path.positions[max(0, k - 40) : k + 1, 2, 2])
 
 
-FuncAnimation(figure, show, len(path)).save(f"{folder}/double_pendulum.gif", PillowWriter(fps=20), dpi=60)
+FuncAnimation(figure, show, len(path.frames)).save(f"{folder}/double_pendulum.gif", PillowWriter(fps=20), dpi=60)

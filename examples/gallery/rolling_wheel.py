@@ -49,4 +49,4 @@ def show(k: int) -> None:
     spokes.set_data(at[[1, 0, 2, 0, 3], 0], at[[1, 0, 2, 0, 3], 2])
 
 
-FuncAnimation(figure, show, len(path)).save(f"{folder}/rolling_wheel.gif", PillowWriter(fps=20), dpi=60)
+FuncAnimation(figure, show, len(path.frames)).save(f"{folder}/rolling_wheel.gif", PillowWriter(fps=20), dpi=60)

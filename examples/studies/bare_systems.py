@@ -123,15 +123,14 @@ def chain(bonds: int) -> BareSystem:
 
 
 def protein(constrain: str) -> BareSystem:
-    """Dihydrofolate reductase, 2489 atoms, with createSystem's `constrain`."""
+    """Dihydrofolate reductase, 2489 atoms, with bonds held by name."""
     from kcons.comparison import test_systems
-    from kcons.comparison.test_systems.structure import CONSTRAIN
 
     test_system = test_systems.build("dhfr", constrain=constrain)
     (item,) = test_system.constraint_set.constraints
     md_engine = test_system.openmm
     assert md_engine is not None and test_system.bonds is not None
-    name = f"DHFR, {CONSTRAIN[constrain]}"
+    name = f"DHFR, {constrain}"
     return BareSystem(
         name,
         test_system.positions,

@@ -1,12 +1,11 @@
-"""How far methods can be pushed: largest stable steps, drift of the energy, reversibility, random molecules.
+"""How far methods can be pushed: largest stable steps, drift of the energy, reversibility.
 
     python examples/studies/stability.py --quick --out DIR                  some minutes
     python examples/studies/stability.py --quick --only steps --systems rotor --out DIR
     python examples/studies/stability.py --out DIR                          all, an hour
 
-DIR/stability.csv has a row a measurement; 'part' says of what: steps, drift, reversal, molecules. The exit status is 1
-where a method of kcons was off its rows without an error, or where a random molecule ended in anything but states on
-its rows or a typed error.
+DIR/stability.csv has a row a measurement; 'part' says of what: steps, drift, reversal. The exit status is 1
+where a method of kcons was off its rows without an error.
 """
 
 from __future__ import annotations
@@ -25,12 +24,10 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parents[1] / "tests"), str(HERE)]
 
 import harness  # noqa: E402
-from hard_cases import random_molecules  # noqa: E402
 from hard_cases.contract import CannotExpressError, Frame, NotIntactError, Program  # noqa: E402
 from hard_cases.long_runs import secular_drift  # noqa: E402
 from hard_cases.problem import Array, Problem  # noqa: E402
 from hard_cases.programs import Core, PlainAse, PlainOpenMM  # noqa: E402
-from hard_cases.small_systems import SYSTEMS  # noqa: E402
 
 from kcons import ConstraintSet, Motion, State, System, steppers  # noqa: E402
 from kcons.comparison.projected_equation import ProjectedEquation  # noqa: E402
@@ -45,6 +42,76 @@ STEPPERS: Mapping[str, Callable[[], Stepper]] = {
 }
 PEERS: dict[str, Callable[[], Program]] = {"ASE": PlainAse, "OpenMM": PlainOpenMM}
 METHODS = (*STEPPERS, *PEERS)
+
+# -- test systems: cheap forces, known kinds of motion, the same problem for every program --------------
+
+
+def _moving(problem: Problem, speed: float, seed: int) -> Problem:
+    """With tangent velocities of random direction and the total momentum of rest."""
+    v = speed * np.random.default_rng(seed).standard_normal(problem.x.shape)
+    if not len(problem.fixed):
+        v -= problem.m @ v / problem.m.sum()
+    return problem.but(velocities=problem.tangent(v))
+
+
+def water(seed: int = 1) -> Problem:
+    """Rigid water that tumbles in a field which turns its dipole, on a soft spring."""
+    x = np.array([[0.0, 0, 0], [0.8, 0.6, 0], [-0.8, 0.6, 0]])
+    push = 0.5 * np.array([[0, 0, -2.0], [0, 0, 1], [0, 0, 1]])
+    return _moving(Problem(x, [16.0, 1, 1], [(0, 1), (0, 2), (1, 2)], push=push), 0.5, seed)
+
+
+def chain(seed: int = 1) -> Problem:
+    """Eight atoms, seven bonds, each atom on a spring."""
+    k = np.arange(8)
+    half = np.radians(55)
+    x = np.stack([k * np.sin(half), (k % 2) * np.cos(half), 0.0 * k], axis=1)
+    bonds = [(i, i + 1) for i in range(7)]
+    return _moving(Problem(x, np.full(8, 12.0), bonds, tether=2.0, anchors=0.9 * x), 0.3, seed)
+
+
+def dumbbells(seed: int = 1) -> Problem:
+    """Two dumbbells joined by four springs."""
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [0.1, 1.6, 0.2], [0.4, 1.4, 1.1]])
+    springs = [(i, j, 3.0, 1.5) for i in (0, 1) for j in (2, 3)]
+    return _moving(Problem(x, [1.0, 2, 1.5, 1], [(0, 1), (2, 3)], springs=springs), 0.4, seed)
+
+
+def rotor(seed: int = 1) -> Problem:
+    """One dumbbell in free flight, omega = 1 for the first seed."""
+    x = np.array([[0.75, 0, 0], [-0.45, 0, 0]])
+    turn = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0] if seed > 1 else np.eye(3)
+    v = np.array([[0, 0.75, 0], [0, -0.45, 0]])
+    return Problem(x @ turn, [1.5, 2.5], [(0, 1)], velocities=v @ turn)
+
+
+def pendulum(seed: int = 1) -> Problem:
+    """A spherical pendulum about a fixed atom."""
+    angle = 2.0
+    x = np.array([[0.0, 0, 0], [np.sin(angle), 0, -np.cos(angle)]])
+    push = np.array([[0, 0, 0], [0, 0, -1.0]])
+    return _moving(Problem(x, [1.0, 1], [(0, 1)], [1.0], fixed=[0], push=push), 0.3, seed)
+
+
+def butane(seed: int = 1) -> Problem:
+    """Four united atoms, bonds and 1-3 distances held; a spring between the ends turns the dihedral."""
+    x = np.array([[1.43, 0.55, 0.2], [0, 0, 0], [0.0, 0, 1.53], [-1.2, 0.9, 2.05]])
+    pairs = [(0, 1), (1, 2), (2, 3), (0, 2), (1, 3)]
+    ends = float(np.linalg.norm(x[0] - x[3]))
+    return _moving(Problem(x, [15.0, 14, 14, 15], pairs, springs=[(0, 3, 4.0, 0.9 * ends)]), 0.3, seed)
+
+
+SYSTEMS: dict[str, Callable[[int], Problem]] = {
+    "water": water,
+    "chain": chain,
+    "dumbbells": dumbbells,
+    "rotor": rotor,
+    "pendulum": pendulum,
+    "butane": butane,
+}
+
+
+# -- what is measured -----------------------------------------------------------------------------------
 
 #: Relative residual above which a run that ends without an error has failed silently. (SETTLE of OpenMM keeps lengths
 #: in single precision, 3e-8.)
@@ -277,24 +344,7 @@ def reversal(method: str, test_system: str, steps: int) -> dict[str, Any]:
     return result
 
 
-def molecules(first: int, end: int) -> Iterator[dict[str, Any]]:
-    """Random molecules by number: a row an outcome, with the worst residuals and the molecule that has them."""
-    trials = pd.DataFrame([vars(random_molecules.trial(seed)) for seed in range(first, end)])
-    for outcome, part in trials.groupby("outcome"):
-        worst = part.loc[part[["residual", "velocity_residual"]].max(axis=1).idxmax()]
-        yield {
-            "how": outcome,
-            "count": len(part),
-            "residual": part.residual.max(),
-            "velocity residual": part.velocity_residual.max(),
-            "worst molecule": worst.seed,
-            "words": worst.words if outcome in random_molecules.FAULTS else "",
-        }
-
-
-PARTS = ("steps", "drift", "reversal", "molecules")
-#: Random molecules that make one piece.
-BATCH = 500
+PARTS = ("steps", "drift", "reversal")
 
 
 def pieces(part: str, quick: bool, systems: list[str]) -> dict[str, Callable[[], Iterator[dict[str, Any]]]]:
@@ -303,35 +353,24 @@ def pieces(part: str, quick: bool, systems: list[str]) -> dict[str, Callable[[],
     def row(function: Callable[..., dict[str, Any]], *arguments: Any, **known: Any) -> Iterator[dict[str, Any]]:
         yield {"part": part, **known, **function(*arguments)}
 
-    def counted(first: int, end: int) -> Iterator[dict[str, Any]]:
-        for found in molecules(first, end):
-            yield {"part": part, **found}
-
     both = [(system, method) for system in systems for method in METHODS]
     if part == "steps":
         return {f"steps, {s}, {m}": partial(row, largest_step, m, s, quick, system=s, method=m) for s, m in both}
     if part == "drift":
         steps = 10_000 if quick else 1_000_000
         return {f"drift, {s}": partial(row, drift, s, 8, steps, system=s, method="Rattle") for s in systems}
-    if part == "reversal":
-        steps = {m: (200 if quick else 2000) // (10 if m == "ASE" else 1) for m in METHODS}
-        return {f"reversal, {s}, {m}": partial(row, reversal, m, s, steps[m], system=s, method=m) for s, m in both}
-    trials = 100 if quick else 10_000
-    return {f"molecules, {k}": partial(counted, k, min(k + BATCH, trials)) for k in range(0, trials, BATCH)}
+    steps = {m: (200 if quick else 2000) // (10 if m == "ASE" else 1) for m in METHODS}
+    return {f"reversal, {s}, {m}": partial(row, reversal, m, s, steps[m], system=s, method=m) for s, m in both}
 
 
 def faults(table: pd.DataFrame) -> list[str]:
-    """What must not be: residuals of kcons without an error, and molecules that end in a fault."""
+    """What must not be: residuals of kcons without an error."""
     found = []
     if "silent residual" in table:
         # NaN in the file where there is no number; methods of others have none that counts.
         silent = table[(table["silent residual"] > SILENT) & table.method.isin(STEPPERS)]
         for row in silent.to_dict("records"):
             found.append(f"{row['piece']}: residual {row['silent residual']:.1e} without an error")
-    if "count" in table:
-        bad = table[table.how.isin(random_molecules.FAULTS)]
-        for row in bad.to_dict("records"):
-            found.append(f"{row['count']:.0f} random molecules: {row['how']}, such as {row['worst molecule']:.0f}")
     return found
 
 
@@ -340,7 +379,7 @@ ENDS = {"explosion": "energy", "silent": "SILENT"}
 
 
 def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Largest stable step and what ends it; drift; by how much the start is missed; outcomes of random molecules."""
+    """Largest stable step and what ends it; drift; by how much the start is missed."""
     found = {}
     for part, told in (("steps", _largest), ("reversal", _missed)):
         rows = table[table.part == part]
@@ -362,17 +401,6 @@ def tables(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
                 "residual": f"{row['residual']:.1e}",
             }
             for _, row in drifts.iterrows()
-        )
-    rows = table[table.part == "molecules"]
-    if len(rows):
-        outcomes = rows.groupby("how")
-        found["molecules"] = pd.DataFrame(
-            {
-                "outcome": name,
-                "molecules": f"{outcomes.get_group(name)['count'].sum():,.0f}" if name in outcomes.groups else "0",
-                "largest residual": f"{outcomes.get_group(name).residual.max():.1e}" if name == "solved" else "",
-            }
-            for name in random_molecules.OUTCOMES
         )
     return found
 

@@ -380,10 +380,10 @@ class ConstrainedDynamics(MolecularDynamics):
     def _refuse_fewer(self, now: int) -> None:
         """Refuse fewer atoms than before where something was given by their numbers."""
         before, self._size = self._size, now
-        if now < before and (self._more or getattr(self.stepper, "atoms", None) is not None):
+        if now < before and self._more:
             raise InputError(
-                f"{before - now} of {before} atoms were removed, and constraints or indices that the dynamics was "
-                "given name atoms by their numbers, which are others now; make a new one",
+                f"{before - now} of {before} atoms were removed, and constraints that the dynamics was given name "
+                "atoms by their numbers, which are others now; make a new one",
                 item="atoms",
             )
 

@@ -13,7 +13,6 @@ from typing import Any, Literal, NoReturn, cast
 import numpy as np
 from ase import Atoms, units
 from ase.calculators.mixing import SumCalculator
-from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY, unchanged_on_failure
 from kcons.ase.dynamics import ConstrainedDynamics, in_step
@@ -75,7 +74,9 @@ class ThermostattedDynamics(ConstrainedDynamics):
     ) -> None:
         require_atoms(atoms)
         self._make = make
-        self.barostat = None if barostat is None else require_barostat(barostat)
+        if barostat is not None:
+            require_barostat(barostat)
+        self.barostat = barostat
         stepper = make(None if temperature_K is None else _thermal(temperature_K))
         if restart is not None:
             if "state" in kwargs:
@@ -172,8 +173,6 @@ class IsokineticDynamics(ThermostattedDynamics):
         1, 6 and 10 force evaluations a step.
     convention : {'exact', 'notes'}
         2K = (g - 1) kT, or 3 N kT.
-    indices : array_like of int or bool, optional
-        Thermostat these atoms only. No constraint may couple them to others.
     momentum : {'auto', 'conserved', 'free'}
         Whether total momentum is conserved, and takes degrees of freedom. 'auto' asks the calculator for forces at
         one to three shifted places at the start; with forces that add up to nothing only roughly (plane waves, particle
@@ -193,11 +192,10 @@ class IsokineticDynamics(ThermostattedDynamics):
         *,
         order: Literal[2, 4, 6] = 2,
         convention: Convention = "exact",
-        indices: ArrayLike | None = None,
         momentum: Momentum = "auto",
         **kwargs: Any,
     ) -> None:
-        make = partial(Isokinetic, order=order, convention=convention, atoms=indices, momentum=momentum)
+        make = partial(Isokinetic, order=order, convention=convention, momentum=momentum)
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
     def set_temperature(self, temperature_K: float) -> None:

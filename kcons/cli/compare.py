@@ -15,7 +15,7 @@ from kcons.cli.terminal import names, numbers, show
 from kcons.errors import InputError
 
 #: Options that say nothing beside expensive and cheap forces.
-NOT_WITH_CHEAP_FORCES = ("size", "forces", "forcefield", "add_hydrogens")
+NOT_WITH_CHEAP_FORCES = ("size", "forces", "force_field", "add_hydrogens")
 #: Options that results depend on, beside the system, the budget and what is said about molecules.
 SETTINGS = ("size", "quick", "dt")
 #: Steps of a production run that are looked at, in fs.
@@ -88,7 +88,7 @@ def _asks_for_averages(chosen: argparse.Namespace) -> bool:
         wrong = [name for name in NOT_WITH_CHEAP_FORCES if getattr(chosen, name)]
         wrong += ["criterion"] if chosen.criterion == "error" else []
         for name in wrong:
-            option = f"--{name.replace('_', '-')}"
+            option = {"force_field": "--forcefield"}.get(name, f"--{name.replace('_', '-')}")
             raise InputError(f"{option} does not go with --slow and --fast; leave it out", item=name)
         for name, other, what in (("slow", "fast", "expensive"), ("fast", "slow", "cheap")):
             if getattr(chosen, name) is None:

@@ -40,13 +40,14 @@ def _doctor(chosen: argparse.Namespace) -> int:
 def examine() -> dict[str, Any]:
     """Sections of names and what was found; under 'wrong' sentences on what has to be mended."""
     wrong: list[str] = []
+    openmm = find_spec("openmm")
     return {
         "kcons": {"version": __version__, "Python": platform.python_version(), "at": str(Path(__file__).parents[1])},
         "machine": _machine(),
         "packages": {name: version(name) or "not installed" for name in NEEDED},
         "extras": {name: version(name) or f"pip install 'kcons[{EXTRAS[name]}]'" for name in EXTRAS},
-        "OpenMM platforms": _platforms(wrong) if find_spec("openmm") else {},
-        "steps on the device": _device() if find_spec("openmm") else {},
+        "OpenMM platforms": _platforms(wrong) if openmm else {},
+        "steps on the device": _device() if openmm else {},
         "caches": caches(wrong),
         "wrong": wrong,
     }
@@ -80,11 +81,26 @@ def _machine() -> dict[str, str]:
 
 
 def _platforms(wrong: list[str]) -> dict[str, str]:
-    """Each platform of OpenMM with its device and the precisions that run on it."""
+    """Each platform of OpenMM: the precisions in which a step was made on it, or why none was."""
     import openmm
 
-    names = [openmm.Platform.getPlatform(k).getName() for k in range(openmm.Platform.getNumPlatforms())]
-    found = {name: _tried(name) for name in names}
+    found = {}
+    for k in range(openmm.Platform.getNumPlatforms()):
+        chosen = openmm.Platform.getPlatform(k)
+        running, failure = [], ""
+        for precision in ("single", "mixed", "double") if "Precision" in chosen.getPropertyNames() else ("",):
+            system = openmm.System()
+            system.addParticle(1.0)
+            given = {"Precision": precision} if precision else {}
+            try:
+                context = openmm.Context(system, openmm.VerletIntegrator(0.001), chosen, given)
+                context.setPositions([[0.0, 0.0, 0.0]])
+                context.getIntegrator().step(1)
+                running.append(precision or {"Reference": "double", "CPU": "mixed"}.get(chosen.getName(), "its own"))
+                del context
+            except openmm.OpenMMException as error:
+                failure = " ".join(str(error).split())[:120]
+        found[chosen.getName()] = f"runs: {', '.join(running)}" if running else f"does not run: {failure}"
     for failure in openmm.Platform.getPluginLoadFailures():
         found[f"plugin {len(found)}"] = f"not loaded: {' '.join(failure.split())[:120]}"
     if not any(said.startswith("runs") for said in found.values()):
@@ -92,45 +108,17 @@ def _platforms(wrong: list[str]) -> dict[str, str]:
     return found
 
 
-def _tried(name: str) -> str:
-    import openmm
-
-    chosen = openmm.Platform.getPlatformByName(name)
-    properties = chosen.getPropertyNames()
-    running: list[str] = []
-    device = failure = ""
-    for precision in ("single", "mixed", "double") if "Precision" in properties else ("",):
-        system = openmm.System()
-        system.addParticle(1.0)
-        given = {"Precision": precision} if precision else {}
-        try:
-            context = openmm.Context(system, openmm.VerletIntegrator(0.001), chosen, given)
-            context.setPositions([[0.0, 0.0, 0.0]])
-            context.getIntegrator().step(1)
-        except openmm.OpenMMException as error:
-            failure = " ".join(str(error).split())[:120]
-            continue
-        running.append(precision or {"Reference": "double", "CPU": "mixed"}.get(name, "its own precision"))
-        if "DeviceName" in properties:
-            device = f" ({chosen.getPropertyValue(context, 'DeviceName')})"
-        elif name == "CPU":
-            device = f" ({chosen.getPropertyValue(context, 'Threads')} threads)"
-        del context
-    return f"runs: {', '.join(running)}{device}" if running else f"does not run: {failure}"
-
-
 def _device() -> dict[str, str]:
     """Whether there is the plugin of OpenMM, or why there can be none."""
     from kcons.openmm.device import build
 
-    known = {
+    there = next((path for path in build.places() if (path / "libKcons.so").exists()), None)
+    plugin = f"in {there}" if there else "not compiled yet; kcons warmup device compiles it"
+    return {
         "compiler": " ".join(build.compiler()) or "none",
         "for": ", ".join(["Reference", "CPU", *build.accelerated()]),
+        "plugin": f"none: {why}" if (why := build.refusal()) else plugin,
     }
-    if why := build.refusal():
-        return {**known, "plugin": f"none: {why}"}
-    there = next((path for path in build.places() if (path / "libKcons.so").exists()), None)
-    return {**known, "plugin": f"in {there}" if there else "not compiled yet; kcons warmup device compiles it"}
 
 
 def caches(wrong: list[str]) -> dict[str, str]:
@@ -138,11 +126,11 @@ def caches(wrong: list[str]) -> dict[str, str]:
     from kcons.comparison.machine import kernels_cached
     from kcons.constraints import compilation
 
-    places = {"beside the package": Path(compilation.__file__).parent / "__pycache__"}
-    if "NUMBA_CACHE_DIR" in os.environ:
-        places = {"$NUMBA_CACHE_DIR": Path(os.environ["NUMBA_CACHE_DIR"])}
-    else:
-        places["in your home"] = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    places = {"$NUMBA_CACHE_DIR": Path(given)} if given else {
+        "beside the package": Path(compilation.__file__).parent / "__pycache__",
+        "in your home": Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")),
+    }  # fmt: skip
     can = {name: writable(path) for name, path in places.items()}
     if not any(can.values()):
         wrong.append(
@@ -150,8 +138,7 @@ def caches(wrong: list[str]) -> dict[str, str]:
             "set NUMBA_CACHE_DIR to a folder of yours"
         )
     said = {name: f"{path}, {'can' if can[name] else 'cannot'} be written to" for name, path in places.items()}
-    said["compiled kernels"] = "there are some" if kernels_cached() else "none yet; kcons warmup compiles them"
-    return said
+    return said | {"compiled kernels": "there are some" if kernels_cached() else "none yet; kcons warmup compiles them"}
 
 
 def writable(folder: Path) -> bool:

@@ -73,8 +73,7 @@ def _list(given: InputFile) -> int:
     print(f"{len(given.targets)} windows of {', '.join(given.sampler.names)}, {runs} each")
     print(f"{sum(parts.values()):,} steps a run: {told}; a sample every {given.settings.every}")
     if given.pulls:
-        ways = "both ways" if given.pulls.get("both_ways", True) else "one way"
-        print(f"{given.pulls.get('count', 20)} pulls {ways} of {given.pull_steps:,} steps each")
+        print(f"{given.pulls['count']} pulls both ways of {given.pull_steps:,} steps each")
     return 0
 
 

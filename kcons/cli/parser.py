@@ -10,17 +10,9 @@ from kcons.errors import did_you_mean
 
 
 class Option:
-    """A row of the table of a command.
+    """A row of the table of a command: name ('--out'; without dashes of what is given by its place), help, heading.
 
-    Parameters
-    ----------
-    name : str
-        '--out'; without dashes of what is given by its place.
-    help : str
-    group : str
-        The heading it stands under.
-    more
-        Further arguments of `argparse.ArgumentParser.add_argument`: type, default, nargs, choices, metavar, action.
+    `more` are further arguments of `argparse.ArgumentParser.add_argument`: type, default, nargs, choices, ...
     """
 
     def __init__(self, name: str, help: str, *, group: str = "", **more: Any) -> None:
@@ -30,14 +22,8 @@ class Option:
 class Command(NamedTuple):
     """A command: its table of options, and what runs it.
 
-    Attributes
-    ----------
-    name, help, description : str
-    options : sequence of Option
-    run : callable
-        Is given the options as attributes; returns the exit status.
-    kept : str
-        What of its work stays when it is stopped, and is gone on from.
+    `run` is given the options as attributes and returns the exit status; `kept` is what of its work stays when it is
+    stopped, and is gone on from.
     """
 
     name: str

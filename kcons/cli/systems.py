@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 
 #: Options of `compare` and `plan` about the system.
-_MOLECULES = "molecules in OpenMM: alanine, dhfr, dhfr-water, villin, and files"
-_FILES = "any file that MDAnalysis reads; these options make it read PDB files, too"
+_MOLECULES = "molecules: alanine, dhfr, dhfr-water, villin, and files"
+_FILES = "files"
 SYSTEM = (
     Option(
         "system",
@@ -29,7 +29,7 @@ SYSTEM = (
     Option("--list", "list test systems and methods, and leave", action="store_true"),
     Option(
         "--constrain",
-        "beside rigid water (default hbonds for files; the last two for files that MDAnalysis reads)",
+        "beside rigid water (default hbonds for files)",
         choices=("hbonds", "allbonds", "hangles", "allangles", "none"),
         group=_MOLECULES,
     ),
@@ -37,12 +37,19 @@ SYSTEM = (
         "--forcefield",
         "files of OpenMM (default amber14-all.xml amber14/tip3pfb.xml)",
         nargs="+",
+        dest="force_field",
         metavar="XML",
         group=_MOLECULES,
     ),
-    Option("--add-hydrogens", "add hydrogens that a file lacks, at pH 7", action="store_true", group=_MOLECULES),
     Option("--platform", "of OpenMM (default: Reference up to 200 atoms, CPU above)", group=_MOLECULES),
-    Option("--coordinates", "coordinates, where the topology file has none", type=Path, metavar="FILE", group=_FILES),
+    Option(
+        "--add-hydrogens",
+        "add hydrogens that a PDB or mmCIF file lacks, at pH 7",
+        action="store_const",
+        const=True,
+        group=_FILES,
+    ),
+    Option("--coordinates", "coordinates, where the topology file has none", metavar="FILE", group=_FILES),
     Option(
         "--forces",
         "openmm (default), force fields of OpenMM by name, comma separated (amber14-all,amber14/tip3p), or emt, "
@@ -51,6 +58,9 @@ SYSTEM = (
     ),
     Option("--select", "hold only what is within this selection of MDAnalysis", metavar="WORDS", group=_FILES),
 )
+#: Options that are arguments of `from_file`, by the same names, and those of them that `plan` takes.
+GIVEN = ("constrain", "force_field", "add_hydrogens", "platform", "coordinates", "forces", "select")
+HELD = ("constrain", "coordinates", "select")
 
 
 def check_name(chosen: argparse.Namespace) -> None:
@@ -59,51 +69,35 @@ def check_name(chosen: argparse.Namespace) -> None:
     known = ", ".join(test_systems.SYSTEMS)
     if chosen.system is None:
         raise InputError(f"name a test system: {known}; or a PDB file", item="system")
-    if test_systems.is_file(chosen.system) or test_systems.is_other_file(chosen.system):
+    if test_systems.is_file(chosen.system):
         if not Path(chosen.system).is_file():
             raise InputError(f"there is no file {chosen.system}", item="system")
         if chosen.size is not None:
             raise InputError("a file has the size it has; leave --size out", item="size")
     elif chosen.system not in test_systems.SYSTEMS:
         raise InputError(
-            f"there is no test system {chosen.system!r}"
-            f"{did_you_mean(chosen.system, test_systems.SYSTEMS)}; "
-            f"there are {known}; or give a PDB file",
+            f"there is no test system {chosen.system!r}{did_you_mean(chosen.system, test_systems.SYSTEMS)}; there are "
+            f"{known}; or give a PDB file",
             item="system",
         )
 
 
 def molecules(chosen: argparse.Namespace) -> dict[str, Any]:
-    """What was said about molecules in OpenMM."""
-    said = {
-        "constrain": chosen.constrain,
-        "force_field": chosen.forcefield,
-        "add_hydrogens": chosen.add_hydrogens or None,
-        "platform": chosen.platform,
-        "coordinates": None if chosen.coordinates is None else str(chosen.coordinates),
-        "forces": chosen.forces,
-        "select": chosen.select,
-    }
-    return {name: value for name, value in said.items() if value is not None}
+    """What was said about molecules."""
+    return {name: value for name in GIVEN if (value := getattr(chosen, name)) is not None}
 
 
 def test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSystem:
     from kcons.comparison import test_systems
 
-    if test_systems.is_file(chosen.system) or test_systems.is_other_file(chosen.system):
-        if chosen.add_hydrogens and test_systems.by_mdanalysis(chosen.system, molecules(chosen)):
-            raise InputError("--add-hydrogens is for PDB and mmCIF files with OpenMM", item="add_hydrogens")
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always", UserWarning)
-            found = test_systems.from_file(chosen.system, quick=quick, **molecules(chosen))
-        for text in dict.fromkeys(str(w.message) for w in said if w.category is UserWarning):
-            print(f"kcons: {text}", file=sys.stderr)
-        return found
-    if chosen.add_hydrogens:
-        raise InputError("--add-hydrogens is for files; the built-in molecules have theirs", item="add_hydrogens")
-    for name in sorted(test_systems.FILE_OPTIONS & set(molecules(chosen))):
-        raise InputError(f"--{name.replace('_', '-')} is for files, not for built-in test systems", item=name)
-    return test_systems.build(chosen.system, chosen.size, quick=quick, **molecules(chosen))
+    if not test_systems.is_file(chosen.system):
+        return test_systems.build(chosen.system, chosen.size, quick=quick, **molecules(chosen))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UserWarning)
+        found = test_systems.from_file(chosen.system, quick=quick, **molecules(chosen))
+    for text in dict.fromkeys(str(w.message) for w in said if w.category is UserWarning):
+        print(f"kcons: {text}", file=sys.stderr)
+    return found
 
 
 def list_everything() -> int:
@@ -119,8 +113,7 @@ def list_everything() -> int:
     print("test systems")
     for name, entry in test_systems.SYSTEMS.items():
         print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
-    print(f"  {'FILE.pdb, .cif':<16} your own molecules; OpenMM, --forcefield, --constrain")
-    print(f"  {'FILE':<16} any topology that MDAnalysis reads; --coordinates, --constrain, --select, --forces")
+    print(f"  {'FILE':<16} your own molecules; --constrain, --forces, --forcefield, --coordinates, --select")
     print("methods")
     for name, method in methods.METHODS.items():
         print(f"  {name:<27} {method.title}{when(method)}")
@@ -137,18 +130,15 @@ def _plan(chosen: argparse.Namespace) -> int:
 
     check_name(chosen)
     given = molecules(chosen)
-    if not (test_systems.is_other_file(chosen.system) and test_systems.by_mdanalysis(chosen.system, given)):
+    if not test_systems.is_file(chosen.system):
         system = test_system(chosen)
         print(system.title)
         print(system.motion.report(system.positions, system.velocities))
         return 0
-    from kcons.comparison.test_systems import any_file
-
-    for name in ("forces", "force_field", "platform", "add_hydrogens"):
-        if name in given:
-            option = name.replace("_", "-") if name == "add_hydrogens" else name.replace("_", "")
-            raise InputError(f"a plan needs no forces; leave --{option} out", item=name)
-    found = any_file.plan(chosen.system, **given)
+    for name in (name for name in given if name not in HELD):
+        option = {"force_field": "forcefield"}.get(name, name.replace("_", "-"))
+        raise InputError(f"a plan needs no forces; leave --{option} out", item=name)
+    found = test_systems.plan(chosen.system, **given)
     print("\n".join([found.title, *found.notes]))
     if sites := len(found.rows.virtual_sites):
         print(f"{sites:,} virtual sites, placed by their molecules")

@@ -69,15 +69,7 @@ ALL_COLUMNS = (*COLUMNS, *AVERAGES)
 
 @dataclass(frozen=True)
 class Setting:
-    """What a stepper is made for.
-
-    Attributes
-    ----------
-    thermal_energy, step, friction : float
-    inner : float
-        Longest step of the cheap forces.
-    rng : int, numpy.random.Generator or None
-    """
+    """What a stepper is made for; `inner` is the longest step of the cheap forces."""
 
     thermal_energy: float
     step: float
@@ -318,21 +310,10 @@ def sample(
     rng: Rng = 1,
     watcher: Watcher | None = None,
 ) -> dict[str, Any]:
-    """The row of one sampler at one step.
+    """The row of one sampler at one step and friction, in internal units.
 
-    Parameters
-    ----------
-    system : TestSystem
-    sampler : Sampler
-    step, friction : float
-        Internal units.
-    cheap : TestSystem, optional
-    length : float, optional
-        Time to sample, besides a tenth of it that is left out at the start.
-    budget : float, optional
-        Instead: seconds of processor time.
-    rng : int, numpy.random.Generator or None
-    watcher : Watcher, optional
+    `length` is the time to sample, besides a tenth of it that is left out at the start; or `budget` seconds of
+    processor time are sampled.
     """
     if (length is None) == (budget is None):
         raise InputError("give either length or budget", item="length")
@@ -438,17 +419,7 @@ class _Sampling:
 
 
 def code(system: TestSystem, name: str, setting: float, friction: float, made_by: str) -> str:
-    """Lines of Python that run a sampler on a test system, to be pasted and changed; '' where it uses cheap forces.
-
-    Parameters
-    ----------
-    system : TestSystem
-    name : str
-    setting, friction : float
-        As in the table.
-    made_by : str
-        The expression that makes the test system after ``from kcons.comparison import test_systems``.
-    """
+    """Lines of Python that run a sampler on a test system, as `kcons.comparison.code`; '' with cheap forces."""
     if SAMPLERS[name].several:
         return ""
     dt, rate = setting * system.units.time_unit, (friction or 1.0) / system.units.long_time_unit

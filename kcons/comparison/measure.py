@@ -195,17 +195,15 @@ def reference_of(system: TestSystem, watcher: Watcher) -> Reference:
 def force_seconds(system: TestSystem) -> float:
     """Median wall time of the forces beyond that of a spring on one atom, which is that of a call of NumPy."""
     spring = Potential(lambda x: (0.5 * float(np.sum(x * x)), -x), "one spring")
-    both = ((system.potential, system.positions), (spring, np.ones((1, 3))))
     found: list[float] = []
     begun = perf_counter()
     while len(found) < 16 and perf_counter() - begun < 0.5:
-        times = []
-        for potential, x in both:
-            potential.forget()
-            now = perf_counter()
+        system.potential.forget()
+        times = [perf_counter()]
+        for potential, x in ((system.potential, system.positions), (spring, np.ones((1, 3)))):
             potential.watched(x)
-            times.append(perf_counter() - now)
-        found.append(times[0] - times[1])
+            times.append(perf_counter())
+        found.append(2 * times[1] - times[0] - times[2])
     return max(0.0, float(np.median(found[1:] or found)))
 
 
@@ -242,14 +240,13 @@ def all_settings(
     slow: float | None = None
     for setting in method.settings(system):
         left = budget - (clock() - begun)
-        row = about_row(system, method, setting)
         planned = 0 if method.adaptive else round(system.horizon / setting)
-        if found and left <= 0:
-            found.append({**row, "status": "not run", "note": f"the budget of {budget:g} s is used up"})
-            continue
+        note = f"the budget of {budget:g} s is used up" if found and left <= 0 else ""
         # A tighter tolerance takes at least as many steps as a looser one.
-        if slow is not None and slow * (planned or found[-1]["steps"]) > left:
-            found.append({**row, "status": "not run", "note": _too_slow(slow, budget)})
+        if not note and slow is not None and slow * (planned or found[-1]["steps"]) > left:
+            note = _too_slow(slow, budget)
+        if note:
+            found.append({**about_row(system, method, setting), "status": "not run", "note": note})
             continue
         found.append(measure(system, method, setting, reference, budget, left, watcher))
         last = found[-1]
@@ -282,21 +279,7 @@ def measure(
     left: float | None = None,
     watcher: Watcher | None = None,
 ) -> dict[str, Any]:
-    """The row of one method at one setting.
-
-    Parameters
-    ----------
-    system : TestSystem
-    method : Method
-    setting : float
-        A time step in internal units, or a tolerance.
-    reference : Reference
-    budget : float
-        Seconds for the method.
-    left : float, optional
-        Seconds that are left of them.
-    watcher : Watcher, optional
-    """
+    """The row of one method at one setting (internal units), with what is `left` of the budget for the method."""
     row, watching = about_row(system, method, setting), watcher or Watcher()
     what = f"{method.title}, {'rtol' if method.adaptive else 'dt'} {row['setting']:g}"
     log, begun = _Log(system), clock()
@@ -426,18 +409,8 @@ def rewind(system: TestSystem, run: Run) -> None:
 class Rounds:
     """Times of steps without observation, in rounds: every run once, then all again.
 
-    What slows the machine down for a while affects all methods alike.
-
-    Parameters
-    ----------
-    system : TestSystem
-    least : int
-        Rounds of one run at least.
-    limit : float
-        Seconds of the longest run that is timed.
-    patience : float
-        Seconds after which a round is interrupted.
-    watcher : Watcher
+    What slows the machine down for a while affects all methods alike. Runs of at most `limit` seconds are timed in
+    `least` rounds and more; one that takes longer than `patience` is interrupted.
     """
 
     def __init__(self, system: TestSystem, least: int, limit: float, patience: float, watcher: Watcher) -> None:
@@ -451,40 +424,30 @@ class Rounds:
         if short:
             with self.watcher.piece("times, in rounds", MOST_ROUNDS):
                 self._rounds(short, found)
-                self._settle(short)
-                uneven = _uneven(short)
-                if uneven:
-                    self._rounds(uneven, found)
-                    self._settle(short)
-                    for row in _uneven(short):
-                        row["note"] = "; ".join(filter(None, [row["note"], "steps cost more at some settings"]))
+                self._rounds(_uneven(short), found)
+            for row in _uneven(short):
+                _note(row, "steps cost more at some settings")
         return margin(found.values())
 
     def _rounds(self, rows: list[dict[str, Any]], found: dict[int, list[float]]) -> None:
-        spent = {id(row): 0.0 for row in rows}
-        due = list(rows)
+        spent, due = {id(row): 0.0 for row in rows}, list(rows)
         for number in range(1, MOST_ROUNDS + 1):
             for row in due:
                 begun = perf_counter()
                 try:
                     found[id(row)].append(self._one(row))
                 except Exception as error:  # whatever an MD engine raises is a result, and is shown
-                    row["note"] = "; ".join(filter(None, [row["note"], f"timed once: {first_line(error)}"]))
+                    _note(row, f"timed once: {first_line(error)}")
                     found[id(row)].clear()
                     spent[id(row)] = np.inf
                 spent[id(row)] += perf_counter() - begun
             self.watcher.advance(number)
-            due = [row for row in due if number < self.least or spent[id(row)] * (number + 1) / number < MORE_SECONDS]
-            due = [row for row in due if np.isfinite(spent[id(row)])]
+            more = MORE_SECONDS * number / (number + 1) if number >= self.least else np.inf
+            due = [row for row in due if spent[id(row)] < more]
             if not due:
                 break
         for row in rows:
-            row["_times"] = found[id(row)]
-
-    def _settle(self, rows: list[dict[str, Any]]) -> None:
-        for row in rows:
-            times = row.pop("_times", [])
-            if times:
+            if times := found[id(row)]:
                 step = float(np.median(times))
                 row["seconds"] *= step / row["step_seconds"]
                 row["step_seconds"], row["rounds"] = step, len(times)
@@ -506,12 +469,6 @@ class Rounds:
                 return (self.clock() - begun) / row["steps"]
             steps = int(row["steps"]) if method.holds else min(int(row["steps"]), BASELINE_STEPS)
             run.advance()  # what is set up lazily
-            try:
-                run.rewind()
-            except NotImplementedError:  # then it is timed from here on
-                begun = self.clock()
-                run.advance(max(steps - 1, 1))
-                return (self.clock() - begun) / max(steps - 1, 1)
             passes: list[float] = []
             while sum(passes) < PASS_SECONDS:
                 rewind(system, run)
@@ -523,6 +480,10 @@ class Rounds:
         if not np.isfinite(run.observe()[0]).all():
             raise KconsError("positions are not finite")
         return float(np.median(passes)) / steps
+
+
+def _note(row: dict[str, Any], words: str) -> None:
+    row["note"] = "; ".join(filter(None, [row["note"], words]))
 
 
 def _uneven(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -20,6 +20,7 @@ from kcons import steppers
 from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.comparison.runs import InAse, InOpenMM, OfStates, OnArrays, Run
 from kcons.comparison.test_systems import TestSystem
+from kcons.constraints import Angle, Distance
 from kcons.constraints.arguments import Count, checked
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -363,10 +364,10 @@ def _internals(system: TestSystem) -> Sequence[Any]:
     """FixInternals at its own tolerance."""
     from ase.constraints import FixInternals
 
-    atoms = system.atoms()
-    pairs = system.bonds if system.angle_bonds is None else system.angle_bonds
-    bonds = [[float(atoms.get_distance(*pair)), pair] for pair in np.asarray(pairs).tolist()]
-    angles = [[float(atoms.get_angle(*triple)), triple] for triple in system.angles.tolist()]
+    atoms, held = system.atoms(), system.constraint_set.constraints
+    pairs, triples = ([a for c in held if isinstance(c, k) for a in c.atoms.tolist()] for k in (Distance, Angle))
+    bonds = [[float(atoms.get_distance(*pair)), pair] for pair in pairs]
+    angles = [[float(atoms.get_angle(*triple)), triple] for triple in triples]
     return [*_fixed(system), FixInternals(bonds=bonds or None, angles_deg=angles or None)]
 
 

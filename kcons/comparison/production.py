@@ -32,23 +32,10 @@ FRICTION = 0.005
 def check_steps(
     system: TestSystem, steps: Sequence[float], budget: float, *, watcher: Watcher | None = None
 ) -> list[dict[str, Any]]:
-    """Look at steps, from the shortest on, until one is wrong.
+    """Look at steps (in the unit that is shown), from the shortest on, until one is wrong; `budget` seconds for each.
 
-    Parameters
-    ----------
-    system : TestSystem
-        Of molecules, in ASE's units.
-    steps : sequence of float
-        In the unit of time that is shown.
-    budget : float
-        Seconds for each step.
-    watcher : Watcher, optional
-
-    Returns
-    -------
-    list of dict
-        Rows of `kcons.comparison.averages.sample` with 'climb': the slope of the energy at constant energy over its
-        standard error.
+    Rows are those of `kcons.comparison.averages.sample` with 'climb': the slope of the energy at constant energy over
+    its standard error.
     """
     watching, unit = watcher or Watcher(), system.units.time_unit
     found: list[dict[str, Any]] = []

@@ -52,54 +52,43 @@ class ProjectedEquation:
         NonFiniteError
             The motion diverged; carries `step`.
         """
-        number, (time, left_over) = state.step + 1, state.later(dt)
-        advance = self._verlet if self.order == 2 else self._runge_kutta
-        try:
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                x, v, forces = advance(system, system.with_forces(state), dt, time)
-                if self.project:
-                    system.motion.project_velocities(x, v, time=time, out=v)
-        except ConvergenceError as error:
-            raise explained(error, system, state, dt, number) from error
-        check_finite(v, "velocity", number)
-        return State(x, v, time, forces, number, None, left_over, None, state.barostat)
-
-    def _verlet(
-        self, system: System, start: State, dt: float, time: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        motion, (x0, v0, f0), number = system.motion, system.kernel_arrays(start), start.step + 1
-        assert f0 is not None
-        a0 = motion.acceleration(x0, v0, f0, start.time)
-        half = v0 + (0.5 * dt) * a0
-        x = self._arrive(system, start, x0 + dt * half, time)
-        predicted = half + (0.5 * dt) * a0
-        f = system.forces(x, predicted, time, number)
-        return x, half + (0.5 * dt) * motion.acceleration(x, predicted, f, time), f
-
-    def _runge_kutta(
-        self, system: System, start: State, dt: float, time: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        x0, v0, f0 = system.kernel_arrays(start)
-        middle, number = start.time + 0.5 * dt, start.step + 1
+        number, (time, left_over), motion = state.step + 1, state.later(dt), system.motion
+        state = system.with_forces(state)
+        x0, v0, f0 = system.kernel_arrays(state)
         assert f0 is not None
 
         def slope(x: FloatArray, v: FloatArray, t: float) -> FloatArray:
             check_finite(x, "position", number)
-            return system.motion.acceleration(x, v, system.forces(x, v, t, number), t)
+            return motion.acceleration(x, v, system.forces(x, v, t, number), t)
 
-        a1 = system.motion.acceleration(x0, v0, f0, start.time)
-        x2, v2 = x0 + 0.5 * dt * v0, v0 + 0.5 * dt * a1
-        a2 = slope(x2, v2, middle)
-        x3, v3 = x0 + 0.5 * dt * v2, v0 + 0.5 * dt * a2
-        a3 = slope(x3, v3, middle)
-        x4, v4 = x0 + dt * v3, v0 + dt * a3
-        a4 = slope(x4, v4, time)
-        x = self._arrive(system, start, x0 + (dt / 6) * (v0 + 2 * v2 + 2 * v3 + v4), time)
-        return x, v0 + (dt / 6) * (a1 + 2 * a2 + 2 * a3 + a4), None
+        def arrive(x: FloatArray) -> FloatArray:
+            check_finite(x, "position", number)
+            if self.project:
+                motion.project_positions(x, state.positions, time=time, reference_time=state.time, out=x)
+            return x
 
-    def _arrive(self, system: System, start: State, x: FloatArray, time: float) -> FloatArray:
-        """The new positions, with `project` on the constraints."""
-        check_finite(x, "position", start.step + 1)
-        if self.project:
-            system.motion.project_positions(x, start.positions, time=time, reference_time=start.time, out=x)
-        return x
+        forces = None
+        try:
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                a0 = motion.acceleration(x0, v0, f0, state.time)
+                if self.order == 2:
+                    half = v0 + (0.5 * dt) * a0
+                    x, predicted = arrive(x0 + dt * half), half + (0.5 * dt) * a0
+                    forces = system.forces(x, predicted, time, number)
+                    v = half + (0.5 * dt) * motion.acceleration(x, predicted, forces, time)
+                else:
+                    middle = state.time + 0.5 * dt
+                    v2 = v0 + 0.5 * dt * a0
+                    a2 = slope(x0 + 0.5 * dt * v0, v2, middle)
+                    v3 = v0 + 0.5 * dt * a2
+                    a3 = slope(x0 + 0.5 * dt * v2, v3, middle)
+                    v4 = v0 + dt * a3
+                    a4 = slope(x0 + dt * v3, v4, time)
+                    x = arrive(x0 + (dt / 6) * (v0 + 2 * v2 + 2 * v3 + v4))
+                    v = v0 + (dt / 6) * (a0 + 2 * a2 + 2 * a3 + a4)
+                if self.project:
+                    motion.project_velocities(x, v, time=time, out=v)
+        except ConvergenceError as error:
+            raise explained(error, system, state, dt, number) from error
+        check_finite(v, "velocity", number)
+        return State(x, v, time, forces, number, None, left_over, None, state.barostat)

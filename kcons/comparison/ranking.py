@@ -7,7 +7,7 @@ call from Python, by force evaluations. Costs that differ by less than the scatt
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -274,36 +274,32 @@ def find_steps(
         best = min((row[cost] for row in found if (row.get("error") or math.inf) <= target), default=math.inf)
         seconds = promise["seconds"] * system.horizon / system.units.long_time_unit
         if promise[cost] < 1.5 * best and seconds <= budget:
-            method = METHODS[promise["method"]]
-            found += _search(system, method, promise["setting"], promise["order"], target, reference, budget, watcher)
+            method, unit = METHODS[promise["method"]], system.units.time_unit
+
+            def tried(setting: float, method: Method = method, unit: float = unit) -> dict[str, Any]:
+                internal = setting if method.adaptive else setting * unit
+                return measure(system, method, internal, reference, budget, watcher=watcher)
+
+            horizon = None if method.adaptive else system.horizon / unit
+            found += _search(tried, promise["setting"], promise["order"], target, horizon)
     return found
 
 
 def _search(
-    system: TestSystem,
-    method: Method,
-    setting: float,
-    order: float,
-    target: float,
-    reference: Reference,
-    budget: float,
-    watcher: Watcher | None,
+    tried: Callable[[float], dict[str, Any]], setting: float, order: float, target: float, horizon: float | None
 ) -> list[dict[str, Any]]:
     """Runs of one method at the predicted step and near it, until its longest step that makes the error is known."""
     found: list[dict[str, Any]] = []
     good, bad, smallest = 0.0, math.inf, math.inf  # the longest step that reaches the error, the shortest that does not
-    horizon = system.horizon / system.units.time_unit
     for _ in range(TRIES):
-        if not method.adaptive:  # the longest step that divides the horizon and is not longer, shorter than a bad one
+        if horizon is not None:  # the longest step that divides the horizon and is not longer, shorter than a bad one
             count = max(1, math.ceil(horizon / setting * (1 - 1e-9)))
             setting = horizon / (count + (horizon / count >= bad * (1 - 1e-9)))
-        if setting <= good or setting >= bad:
+        if not good < setting < bad:
             break
-        internal = setting if method.adaptive else setting * system.units.time_unit
-        row = measure(system, method, internal, reference, budget, watcher=watcher)
-        found.append(row)
-        error = row.get("error", math.inf)
-        if row["status"] not in ("ok", "failed"):
+        found.append(tried(setting))
+        error = found[-1].get("error", math.inf)
+        if found[-1]["status"] not in ("ok", "failed"):
             break
         if error <= target:
             good = setting

@@ -128,16 +128,9 @@ class InAse(Run):
 
 
 class InOpenMM(Run):
-    """A Context of OpenMM at its start.
+    """A Context of OpenMM at its start; `length` and `speed` are OpenMM's units over those of the test system.
 
-    Parameters
-    ----------
-    length, speed : float
-        OpenMM's units over those of the test system.
-    force_evaluations : int
-        Of a step.
-    half_step : bool
-        Whether the integrator keeps velocities half a step behind.
+    `half_step` says that the integrator keeps velocities half a step behind.
     """
 
     def __init__(

@@ -13,7 +13,7 @@ import numpy as np
 from ase.units import kB
 from scipy.sparse.csgraph import connected_components
 
-from kcons.comparison.test_systems import any_file
+from kcons.comparison import test_systems
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import System
@@ -44,12 +44,12 @@ def along(
     frames : sequence of int
         Numbers of the frames.
     **options
-        What `any_file.from_file` takes: constrain, select, force_field, platform.
+        What `test_systems.from_file` takes: constrain, select, force_field, platform.
 
     Raises
     ------
     InputError
-        Fewer than 32 frames; what `any_file.from_file` raises.
+        Fewer than 32 frames; what `test_systems.from_file` raises.
     UnsupportedError
         The box changes.
     """
@@ -66,10 +66,10 @@ def _along(
 ) -> SplitTemperatures:
     from kcons.mdanalysis import open_universe
 
-    test_system = any_file.from_file(topology, coordinates=trajectory, forces=forces, **options)
+    test_system = test_systems.from_file(topology, coordinates=trajectory, forces=forces, **options)
     motion, potential, lattice = test_system.motion, test_system.potential, test_system.constraint_set.lattice
     given = {name: value for name, value in options.items() if name not in ("force_field", "platform")}
-    described = any_file.plan(topology, coordinates=trajectory, angles="distances", **given).rows.snapshot.topology
+    described = test_systems.plan(topology, coordinates=trajectory, angles="distances", **given).rows.snapshot.topology
     bonds = described.bonds
     joins = test_system.constraint_set.incidence.astype(int)
     cluster = connected_components(joins.T @ joins, directed=False)[1]

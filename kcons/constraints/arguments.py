@@ -179,18 +179,9 @@ TAKES_TIME = "; say time_dependent=True for functions that take the time t as we
 
 
 def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str = "", needed: bool = False) -> None:
-    """Refuse what is no function, or cannot be called with as many arguments; None, where none is needed, passes.
+    """Refuse what is no function, or cannot be called with `arguments`; None, where none is needed, passes.
 
-    Parameters
-    ----------
-    item : str
-        What it is, for messages.
-    function : callable or None
-    arguments : tuple of str
-        Names of what it is called with.
-    hint : str
-        Ends the sentence.
-    needed : bool
+    `item` is what it is called in messages, `hint` ends their sentence.
     """
     if not callable(function) and (needed or function is not None):
         raise InputError(
@@ -236,14 +227,6 @@ def _value_text(value: Any) -> str:
         return f"of the type {type(value).__name__}"
 
 
-def positive(value: float, item: str) -> float:
-    """`value` as a float, which has to be finite and above zero."""
-    number = math.nan if isinstance(value, str | bytes | bool) else _float(value)
-    if not (math.isfinite(number) and number > 0):
-        raise InputError(f"{item} is {_value_text(value)}; give a positive number", item=item.rpartition(": ")[2])
-    return number
-
-
 def all_positive(values: ArrayLike, item: str) -> FloatArray:
     """Numbers above zero, infinite ones included, as an array of any shape."""
     array = as_float_array(values, item)
@@ -279,20 +262,20 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
     return found
 
 
-def not_negative(value: Any, item: str) -> float:
-    """`value` as a float, which has to be finite and not below zero."""
-    found = finite_number(value, item)
-    if found < 0:
-        raise InputError(f"{item} is {_value_text(value)}; give a number of 0 or more", item=item)
-    return found
+def _number_rule(good: Callable[[float], bool], words: str) -> Callable[[Any, str], float]:
+    def rule(value: Any, item: str) -> float:
+        number = math.nan if isinstance(value, bool) else _float(value)
+        if not (math.isfinite(number) and good(number)):
+            raise InputError(f"{item} is {_value_text(value)}; give a {words}", item=item.rpartition(": ")[2])
+        return number
+
+    return rule
 
 
-def share(value: Any, item: str) -> float:
-    """`value` as a float, a part of one: from 0 to less than 1."""
-    found = finite_number(value, item)
-    if not 0 <= found < 1:
-        raise InputError(f"{item} is {_value_text(value)}; give a number from 0 to less than 1", item=item)
-    return found
+#: `value` as a float: ``rule(value, item)``.
+positive = _number_rule(lambda x: x > 0, "positive number")
+not_negative = _number_rule(lambda x: x >= 0, "number of 0 or more")
+share = _number_rule(lambda x: 0 <= x < 1, "number from 0 to less than 1")
 
 
 def one_of(value: Any, item: str, words: tuple[Any, ...]) -> Any:
@@ -392,15 +375,10 @@ def has_units(values: Any) -> bool:
 
 
 def without_units(values: Any, item: str, kind: Kind) -> tuple[Any, bool]:
-    """Numbers in nm, ps, dalton, radian, and whether they would be others in other units.
+    """Numbers of Quantities, or of nested lists of them, in nm, ps, dalton, radian; anything else stays as it is.
 
-    Parameters
-    ----------
-    values : Quantity, nested lists of them, or anything else, which stays as it is
-    item : str
-        For messages.
-    kind : Kind
-        What they must be; plain numbers may be angles, too.
+    The second result is whether they would be others in other units. `kind` is what they must be; plain numbers may be
+    angles, too.
     """
     if not has_units(values):
         return values, False

@@ -88,14 +88,8 @@ def all_compiled() -> Iterator[None]:
 def plain_if_small(kernel: Any, size: int) -> Any:
     """A compiled function, or for little work the Python function that it was made of, unless it is loaded already.
 
-    For work on integers: both return the same. Where little comes again and again, it is loaded after all.
-
-    Parameters
-    ----------
-    kernel : numba.core.registry.CPUDispatcher
-        What it calls must be `numba.extending.register_jitable`, which is compiled as a part of the caller only.
-    size : int
-        About how many elements are looked at; see `SMALL`.
+    For work on integers, about `size` elements: both return the same. Where little comes again and again, it is loaded
+    after all. What it calls must be `numba.extending.register_jitable`, which is compiled as a part of the caller only.
     """
     if _all_compiled or size > SMALL or kernel.signatures or _in_python.get(kernel, 0) > MUCH:
         return kernel
@@ -232,19 +226,9 @@ class _Compiler(compiler.Compiler):  # type: ignore[misc]
 
 
 def njit(function: Any = None, /, *, cache: bool = False, **options: Any) -> Any:
-    """`numba.njit` for kernels of kcons.
+    """`numba.njit` for kernels of kcons, with its options; `cache` keeps them on disk. Without a function a decorator.
 
-    Its machine code is the same whether it was compiled or loaded, and it is compiled anew when any of its sources
-    changes.
-
-    Parameters
-    ----------
-    function : callable, optional
-        Without it a decorator is returned.
-    cache : bool
-        Whether it is kept on disk.
-    **options
-        Of `numba.njit`.
+    Machine code is the same whether it was compiled or loaded, and it is compiled anew when any of its sources changes.
     """
 
     def made(function: Any) -> Any:
@@ -274,20 +258,15 @@ def has_a_file(function: Any) -> bool:
     return Path(function.__code__.co_filename).is_file()
 
 
-def _nothing() -> None:
-    """What `keep_somewhere` asks Numba to keep."""
-
-
-def keep_somewhere() -> str | None:
-    """See that kernels can be kept; returns the folder that this process alone uses, if there is no other."""
+def keep_somewhere() -> bool:
+    """See that kernels can be kept; whether other processes find them."""
     try:
-        njit(cache=True)(_nothing)
+        njit(cache=True)(has_a_file)  # which is not compiled
     except RuntimeError:  # no locator: neither folder can be written to
-        folder = tempfile.mkdtemp(prefix="kcons-")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        _config.CACHE_DIR = folder
-        return folder
-    return None
+        _config.CACHE_DIR = tempfile.mkdtemp(prefix="kcons-")
+        atexit.register(shutil.rmtree, _config.CACHE_DIR, ignore_errors=True)
+        return False
+    return True
 
 
 class Announcer:
@@ -300,72 +279,54 @@ class Announcer:
     announced : bool
     """
 
-    def __init__(self, own_folder: str | None = None) -> None:
+    def __init__(self, keeps: bool = True) -> None:
         self.seconds = 0.0
         self.announced = False
-        self._own_folder = own_folder
-        self._lock = threading.Lock()
-        self._depth: dict[int, int] = {}
-        self._begun = 0.0
-        self._collected = False
-        self._timer: threading.Timer | None = None
-
-    @property
-    def keeps(self) -> bool:
-        """Whether other processes find what is compiled."""
-        return self._own_folder is None
+        #: Whether other processes find what is compiled.
+        self.keeps = keeps
+        # Numba compiles in one thread at a time.
+        self._depth, self._begun, self._collected = 0, 0.0, False
+        self._timer = threading.Timer(0.0, self._announce)
 
     @property
     def compiling(self) -> bool:
         """Whether a kernel is being compiled."""
-        return bool(self._depth)
+        return self._depth > 0
 
     def begin(self) -> None:
         """A kernel begins to be compiled; it may be a part of another one."""
-        with self._lock:
-            thread = threading.get_ident()
-            self._depth[thread] = self._depth.get(thread, 0) + 1
-            if sum(self._depth.values()) > 1:
-                return
-            self._begun = time.perf_counter()
-            self._collected = gc.isenabled()
-            gc.disable()
-            if not self.announced:
-                self._timer = threading.Timer(max(PATIENCE - self.seconds, 0.0), self._announce)
-                self._timer.daemon = True
-                self._timer.start()
+        self._depth += 1
+        if self._depth > 1:
+            return
+        self._begun = time.perf_counter()
+        self._collected = gc.isenabled()
+        gc.disable()
+        if not self.announced:
+            self._timer = threading.Timer(max(PATIENCE - self.seconds, 0.0), self._announce)
+            self._timer.daemon = True
+            self._timer.start()
 
     def end(self) -> None:
         """It is compiled, or has failed."""
-        with self._lock:
-            thread = threading.get_ident()
-            self._depth[thread] -= 1
-            if not self._depth[thread]:
-                del self._depth[thread]
-            if self._depth:
-                return
-            self.seconds += time.perf_counter() - self._begun
-            if self._collected:
-                gc.enable()
-            if self._timer is not None:
-                self._timer.cancel()
-                self._timer = None
+        self._depth -= 1
+        if self._depth:
+            return
+        self.seconds += time.perf_counter() - self._begun
+        if self._collected:
+            gc.enable()
+        self._timer.cancel()
 
     def _announce(self) -> None:
-        with self._lock:
-            if self.announced or not self._depth:
-                return
-            self.announced = True
-        if self.keeps:
-            logger.warning(
-                "kcons compiles the kernels that this system needs. This happens once on a machine and takes some "
-                "seconds; `kcons warmup` does it beforehand"
-            )
-        else:
-            logger.warning(
-                "kcons compiles the kernels that this system needs, and can keep them nowhere: neither its own folder "
-                "nor your home can be written to. Set NUMBA_CACHE_DIR to a folder of yours, and it happens only once"
-            )
+        if self.announced or not self._depth:
+            return
+        self.announced = True
+        said = (
+            "This happens once on a machine and takes some seconds; `kcons warmup` does it beforehand"
+            if self.keeps
+            else "It can keep them nowhere: neither its own folder nor your home can be written to. "
+            "Set NUMBA_CACHE_DIR to a folder of yours, and it happens only once"
+        )
+        logger.warning(f"kcons compiles the kernels that this system needs. {said}")
 
 
 def clock() -> float:

@@ -43,7 +43,7 @@ IntArray = NDArray[np.int64]
 #: A step along which derivatives are imaginary parts: its square vanishes beside 1, and a power of two does not round.
 _COMPLEX_STEP = 2.0**-100
 
-#: Rows of more atoms are compiled where others are taken at once, since loops over atoms are then long.
+#: Rows that loop over more atoms are compiled, where others are taken at once.
 WIDE = 6
 
 #: All families by name.
@@ -90,6 +90,8 @@ class Constraint:
     #: + - * /, ``numpy.sqrt`` and the like, so that it can be compiled, and takes arrays of many rows and complex
     #: numbers (``numpy.arctan2`` of real parts: only gradients are differentiated). See `VelocityRows` for those.
     row: Any = None
+    #: Puts dq/dt into ``out[0]``, where `row` depends on t: of the same.
+    rate: Any = None
     #: How many of the parameters, the first ones, are the same in all rows of an object: numbers of atoms and the like.
     alike: int = 0
     #: Atoms a row, where the family fixes it.
@@ -196,18 +198,17 @@ class Constraint:
     @property
     def moving(self) -> bool:
         """Whether value or gradient depend on time explicitly."""
-        return isinstance(self.target, MovingTarget)
+        return isinstance(self.target, MovingTarget) or self.rate is not None
 
-    def _evaluated(self, r: NDArray[Any], time: float) -> NDArray[Any]:
-        """What `row` puts out, shape (1 + 3 width, n_rows): for all rows at once, or compiled where they are wide."""
+    def _evaluated(self, r: NDArray[Any], time: complex, row: Any = None) -> NDArray[Any]:
+        """What `row` puts out, shape (1 + 3 width, n_rows): for all rows at once, or compiled where loops are long."""
         out = np.zeros((self.n_rows, 1 + 3 * self.width), r.dtype)
         if not self.n_rows:
             return out.T
-        row, table, places = type(self).row, self.parameters(), r.reshape(self.n_rows, -1)
-        assert row is not None
+        row, table, places = row or self.row, self.parameters(), r.reshape(self.n_rows, -1)
         if not self.holonomic:  # at the end of a flight that has gone nowhere
             places = np.concatenate([places, np.zeros(places.shape)], axis=1)
-        if self.width > WIDE:
+        if self.alike and self.width > WIDE:
             compiled = _compiled(row)
             for k in range(self.n_rows):
                 compiled(places[k], table[k], time, out[k])
@@ -223,13 +224,13 @@ class Constraint:
         r : ndarray, shape (n_rows, width, 3)
         time : float
         """
-        out = self._evaluated(r, time)
+        with np.errstate(all="ignore"):  # either may be undefined where the other is not
+            out = self._evaluated(r, time)
         return out[0], np.ascontiguousarray(out[1:].T).reshape(r.shape)
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         """Natural coordinate q, shape (n_rows,), from positions `r` of shape (n_rows, width, 3)."""
-        with np.errstate(all="ignore"):  # a gradient may be undefined where the value is not
-            return self.value_and_gradient(r, time)[0]
+        return self.value_and_gradient(r, time)[0]
 
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         """dq/dr (position rows) or the coefficients of v (velocity rows), shape (n_rows, width, 3)."""
@@ -237,15 +238,24 @@ class Constraint:
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         """v^T (d2q/dr2) v, or for velocity rows v . (d coefficients/dt along v, time terms included)."""
+        return self._bent(r + (1j * _COMPLEX_STEP) * v, v, time if self.holonomic else time + 1j * _COMPLEX_STEP)
+
+    def _bent(self, r: NDArray[Any], v: FloatArray, time: complex) -> FloatArray:
+        """Change of gradient times v along imaginary parts."""
         if not self.n_rows:
             return np.zeros(0)
-        slope = self._evaluated(r + (1j * _COMPLEX_STEP) * v, time)[1:].imag
+        slope = self._evaluated(r, time)[1:].imag
         return np.asarray(np.einsum("ck,kc->k", slope, v.reshape(self.n_rows, -1)) / _COMPLEX_STEP)
 
     def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         """(dq/dt, 2 (d2q/dr dt) . v + d2q/dt2) at fixed target, for coordinates that move by themselves."""
-        zero = np.zeros(self.n_rows)
-        return zero, zero
+        if self.rate is None or not self.holonomic:
+            return np.zeros(self.n_rows), np.zeros(self.n_rows)
+        step = 1j * _COMPLEX_STEP
+        with np.errstate(all="ignore"):
+            rate = self._evaluated(r, time, self.rate)[0]
+            changes = self._evaluated(r + step * v, time + step, self.rate)[0].imag / _COMPLEX_STEP
+            return rate, self._bent(r + 0j, v, time + step) + changes
 
     def acceleration_terms(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         """`curvature` and the second of `time_terms` together, shape (n_rows,); of position rows."""
@@ -321,20 +331,7 @@ class Constraint:
         return self.singular.format(row=row, atoms=" and ".join(str(a) for a in self.atoms[k, :6]))
 
     def refuse_singular(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int, str], str]) -> None:
-        """Raise where rows are undefined.
-
-        Parameters
-        ----------
-        bad : ndarray of bool, shape (n_rows,)
-        first_row : int
-            As for `check`.
-        say : callable
-            Gets the first bad row and what to call it, gives the message.
-
-        Raises
-        ------
-        SingularGeometryError
-        """
+        """Raise `SingularGeometryError` for the first row that is marked; `say` gets it and its name, and tells why."""
         k = first_true(bad)
         if k is not None:
             row = first_row + k

@@ -254,39 +254,22 @@ class ConstraintSet:
         Of velocity rows what they are held at, and its rate.
         """
         time = finite_number(time, "time")
-
-        def rate(c: Constraint) -> FloatArray:
-            if order == 2:
-                return _second_rate(c, time)
-            return self._rate(c, None, time)
-
-        return self._rows(rate)
+        return self._rows(lambda c: _rate_of(c, time, order))
 
     def velocity_target(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """c with A v = c for admissible velocities, shape (n_rows,); 0 where nothing moves by itself."""
         time = finite_number(time, "time")
         x = self._positions(x)
         y = self.whole(x)
-        return self._rows(lambda c: self._rate(c, self._gather(c, x, y) if c.moving else None, time))
-
-    def _rate(self, c: Constraint, r: FloatArray | None, time: float) -> FloatArray:
-        if not c.holonomic:
-            return c.target_at(time)
-        rate = _rate_at(c, time)
-        if c.moving and r is not None:
-            rate = rate - c.time_terms(r, np.zeros_like(r), time)[0]
-        return rate
+        return self._rows(lambda c: _speed_of(c, self._gather(c, x, y), time) if c.moving else _rate_of(c, time))
 
     def acceleration_target(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """b with A a = b (notes eqs. 90-92, time terms included), shape (n_rows,)."""
         velocities = self._positions(v, "velocities")
 
-        def b_of(c: Constraint, r: FloatArray, time: float) -> FloatArray:
-            u = velocities[c.atoms]
-            bend = c.acceleration_terms(r, u, time) if c.holonomic else c.curvature(r, u, time)
-            return _second_rate(c, time) - bend
-
-        return self._of_rows(x, time, b_of)
+        return self._of_rows(
+            x, time, lambda c, r, t: _rate_of(c, t, 2) - c.acceleration_terms(r, velocities[c.atoms], t)
+        )
 
     def curvature(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """v^T (d2q/dx2) v of position rows at fixed time, shape (n_rows,)."""
@@ -318,7 +301,7 @@ class ConstraintSet:
             reach.append(np.sum(size * np.linalg.norm(x[c.atoms], axis=2), axis=1))
             if v is not None:
                 u = v[c.atoms]
-                wanted = self._rate(c, r, time)
+                wanted = _speed_of(c, r, time)
                 rates.append(np.einsum("kai,kai->k", gradient, u) - wanted)
                 speeds.append(np.abs(wanted) + np.sum(size * np.linalg.norm(u, axis=2), axis=1))
         allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * joined(reach))
@@ -709,14 +692,20 @@ def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> N
         start += item.n_rows
 
 
-def _rate_at(c: Constraint, time: float) -> FloatArray:
-    return c.target.rate_at(time, c.n_rows, c.period) if isinstance(c.target, MovingTarget) else np.zeros(c.n_rows)
+def _rate_of(c: Constraint, time: float, order: int = 1) -> FloatArray:
+    """Rate of what rows are held at, or its acceleration; of velocity rows what they are held at, or its rate."""
+    if not c.holonomic and order == 1:
+        return c.target_at(time)
+    if not isinstance(c.target, MovingTarget):
+        return np.zeros(c.n_rows)
+    rate = c.target.acceleration_at if c.holonomic and order == 2 else c.target.rate_at
+    return rate(time, c.n_rows, c.period)
 
 
-def _second_rate(c: Constraint, time: float) -> FloatArray:
-    if not c.holonomic or not isinstance(c.target, MovingTarget):
-        return _rate_at(c, time)
-    return c.target.acceleration_at(time, c.n_rows, c.period)
+def _speed_of(c: Constraint, r: FloatArray, time: float) -> FloatArray:
+    """A v of admissible velocities."""
+    rate = _rate_of(c, time)
+    return rate - c.time_terms(r, np.zeros_like(r), time)[0] if c.moving and c.holonomic else rate
 
 
 def _compact(item: Constraint, atoms: IntArray) -> Constraint:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
+import scipy.sparse as sp
 
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.target import FloatArray, nearest_image
@@ -12,31 +13,15 @@ from kcons.errors import ContradictionError, InfeasibleError
 
 #: Relative difference of two targets (radian for angles) that counts as rounding.
 _SAME = 1e-10
-#: Pairs of edges looked at together while searching triangles; bounds the memory.
+#: Neighbors of ends looked at together while searching triangles; bounds the memory.
 _CHUNK = 2_000_000
 
 
 def refuse_contradictions(items: Sequence[Constraint], starts: IntArray, time: float) -> None:
-    """Raise if targets contradict each other.
+    """Raise if targets of `items`, which have them, contradict each other at a time; `starts` are their first rows.
 
-    Looks for the same distance, angle or dihedral held at two values, and for triangles of distances
-    that violate the triangle inequality: about 0.1 s for 10^5 distances.
-
-    Parameters
-    ----------
-    items : sequence of Constraint
-        With their targets resolved.
-    starts : ndarray of int
-        Number of the first row of each item.
-    time : float
-        When moving targets are compared.
-
-    Raises
-    ------
-    ContradictionError
-        Two targets for one coordinate.
-    InfeasibleError
-        A triangle with one side longer than the two others together.
+    Looks for the same distance, angle or dihedral held at two values (`ContradictionError`), and for triangles of
+    distances that violate the triangle inequality (`InfeasibleError`): about 0.1 s for 10^5 distances.
     """
     for family in {type(item): None for item in items if item.reversible}:
         chosen = [(item, start) for item, start in zip(items, starts, strict=False) if type(item) is family]
@@ -53,17 +38,10 @@ def refuse_contradictions(items: Sequence[Constraint], starts: IntArray, time: f
 
 
 def found_as_given(items: Sequence[Constraint], found: Sequence[bool], time: float) -> list[Constraint]:
-    """Lengths that were found from positions, as given where another row gives the same one.
+    """Lengths that were found from positions (as `found` says of each item) as given where another row gives the same
+    one.
 
     They differ by the rounding of positions, by which both could not be held.
-
-    Parameters
-    ----------
-    items : sequence of Constraint
-        With their targets resolved, and free of contradictions.
-    found : sequence of bool
-        Whose targets come from positions.
-    time : float
     """
     result = list(items)
     numbers = [n for n, item in enumerate(items) if item.holds_length and not item.moving]
@@ -112,55 +90,31 @@ def _refuse_impossible_triangles(pairs: IntArray, rows: IntArray, length: FloatA
         return
     first = np.concatenate([[True], (pairs[1:] != pairs[:-1]).any(axis=1)])
     pairs, rows, length = pairs[first], rows[first], length[first]
-    for sides in _triangles(pairs):
-        d = length[sides]
-        longest = np.argmax(d, axis=1)
-        top = d[np.arange(len(d)), longest]
-        excess = 2 * top - d.sum(axis=1)
-        bad = excess > _SAME * top
+    atoms, ends = np.unique(pairs, return_inverse=True)
+    i, j = ends.reshape(pairs.shape).T
+    side = np.arange(1.0, len(pairs) + 1)
+    sides = sp.coo_array((side, (i, j)), shape=(len(atoms), len(atoms))).tocsr()
+    sides = sides + sides.T
+    linked = sides.astype(bool).astype(np.float64)
+    work = np.cumsum(np.diff(sides.indptr)[i])
+    for some in np.split(np.arange(len(pairs)), np.searchsorted(work, np.arange(_CHUNK, work[-1], _CHUNK))):
+        # Where both ends of a distance are linked to a third atom: the two other sides.
+        one = sides[i[some]].multiply(linked[j[some]]).tocoo()
+        two = linked[i[some]].multiply(sides[j[some]]).tocoo()
+        members = np.stack([some[one.row], one.data.astype(int) - 1, two.data.astype(int) - 1], axis=1)
+        d = length[members]
+        excess = d[:, 0] - d[:, 1] - d[:, 2]
+        bad = excess > _SAME * d[:, 0]
         if bad.any():
             t = int(np.argmax(bad))
-            members = rows[sides[t]]
-            atoms = np.unique(pairs[sides[t]])
             best = float(excess[t]) ** 2 / 3
-            held = ", ".join(f"#{row} = {value:g}" for row, value in zip(members, d[t], strict=True))
+            named = np.unique(pairs[members[t]]).tolist()
+            held = ", ".join(f"#{row} = {value:g}" for row, value in sorted(zip(rows[members[t]], d[t], strict=True)))
             raise InfeasibleError(
                 f"infeasible: residual cannot go below {best:.6g} (sum of squares); the distances of atoms "
-                f"{tuple(atoms.tolist())} ({held}) violate the triangle inequality by {excess[t]:.6g}. "
+                f"{tuple(named)} ({held}) violate the triangle inequality by {excess[t]:.6g}. "
                 "Correct the longest or remove it",
                 residual=best,
-                row=int(members[longest[t]]),
-                atoms=atoms.tolist(),
+                row=int(rows[members[t, 0]]),
+                atoms=named,
             )
-
-
-def _triangles(pairs: IntArray) -> Iterator[IntArray]:
-    """Edge numbers of all triangles of a graph, shape (n, 3), a piece at a time.
-
-    Edges point from the atom of lower degree to the one of higher, so that few leave any atom; every
-    pair of edges that leave one atom is looked up.
-    """
-    atoms, ends = np.unique(pairs, return_inverse=True)
-    ends = ends.reshape(pairs.shape)
-    n = len(atoms)
-    degree = np.bincount(ends.ravel(), minlength=n)
-    place = np.empty(n, dtype=np.int64)
-    place[np.lexsort((np.arange(n), degree))] = np.arange(n)
-    low, high = np.sort(place[ends], axis=1).T
-    order = np.lexsort((high, low))
-    low, high = low[order], high[order]
-    key = low * n + high
-    leaving = np.searchsorted(low, np.arange(n + 1))
-    later = leaving[low + 1] - np.arange(len(low)) - 1
-    done = np.concatenate([[0], np.cumsum(later)])
-    at = 0
-    while at < len(low):
-        end = max(at + 1, int(np.searchsorted(done, done[at] + _CHUNK, side="right")) - 1)
-        count = later[at:end]
-        one = np.repeat(np.arange(at, end), count)
-        two = one + 1 + np.arange(len(one)) - np.repeat(done[at:end] - done[at], count)
-        wanted = high[one] * n + high[two]
-        three = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-        found = key[three] == wanted
-        yield order[np.stack([one[found], two[found], three[found]], axis=1)]
-        at = end

@@ -232,10 +232,11 @@ def project_velocities(
     matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0, rtol: float = RANK_TOLERANCE
 ) -> FloatArray:
     """The nearest velocities, in the mass metric, with A v = c: v - M^-1/2 B+ (A v - c)."""
-    A = _real_matrix(matrix)
+    A = _matrix(matrix, real=True)
     root = _Root(masses, A.shape[1])
-    flat = _real_vector(v, A.shape[1], "v")
-    correction = pseudo_inverse(root.weighted(A), rtol).matrix @ (A @ flat - np.broadcast_to(_real(c, "c"), (len(A),)))
+    flat = _vector(v, A.shape[1], "v", real=True)
+    off = A @ flat - np.broadcast_to(_numbers(c, "c", real=True), (len(A),))
+    correction = pseudo_inverse(root.weighted(A), rtol).matrix @ off
     return np.asarray(flat - root.from_weighted(correction)).reshape(np.shape(v))
 
 
@@ -247,7 +248,7 @@ def constrained_inverse(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK
 
     With independent rows it is M^-1 - M^-1 A^T (A M^-1 A^T)^-1 A M^-1.
     """
-    A = _real_matrix(matrix)
+    A = _matrix(matrix, real=True)
     root = _Root(masses, A.shape[1])
     half = root.from_weighted(parallel_projector(root.weighted(A), rtol))
     return root.from_weighted(half.T)
@@ -260,10 +261,10 @@ def multipliers(
 
     (A M^-1 A^T) lambda = b - A M^-1 f, solved by (B B^T)+ = (B+)^T B+.
     """
-    A = _real_matrix(matrix)
+    A = _matrix(matrix, real=True)
     root = _Root(masses, A.shape[1])
     B_plus = pseudo_inverse(root.weighted(A), rtol).matrix
-    right = _real_vector(b, len(A), "b") - A @ root.solve(_real_vector(f, A.shape[1], "f"))
+    right = _vector(b, len(A), "b", real=True) - A @ root.solve(_vector(f, A.shape[1], "f", real=True))
     return np.asarray(B_plus.T @ (B_plus @ right))
 
 
@@ -271,9 +272,9 @@ def constraint_force(
     matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
 ) -> FloatArray:
     """The force z = A^T (A M^-1 A^T)^-1 (b - A M^-1 f) = M^1/2 B+ (b - A M^-1 f), as f (notes eq. 104)."""
-    A = _real_matrix(matrix)
+    A = _matrix(matrix, real=True)
     root = _Root(masses, A.shape[1])
-    right = _real_vector(b, len(A), "b") - A @ root.solve(_real_vector(f, A.shape[1], "f"))
+    right = _vector(b, len(A), "b", real=True) - A @ root.solve(_vector(f, A.shape[1], "f", real=True))
     z = root.times(pseudo_inverse(root.weighted(A), rtol).matrix @ right)
     return np.asarray(z).reshape(np.shape(f))
 
@@ -285,10 +286,10 @@ def acceleration(
 
     The notes lost the M^-1 in front of A^T. In mass-weighted form the second term is M^-1/2 B+ b.
     """
-    A = _real_matrix(matrix)
+    A = _matrix(matrix, real=True)
     root = _Root(masses, A.shape[1])
-    free = constrained_inverse(A, masses, rtol) @ _real_vector(f, A.shape[1], "f")
-    driven = root.from_weighted(pseudo_inverse(root.weighted(A), rtol).matrix @ _real_vector(b, len(A), "b"))
+    free = constrained_inverse(A, masses, rtol) @ _vector(f, A.shape[1], "f", real=True)
+    driven = root.from_weighted(pseudo_inverse(root.weighted(A), rtol).matrix @ _vector(b, len(A), "b", real=True))
     return np.asarray(free + driven).reshape(np.shape(f))
 
 
@@ -302,17 +303,17 @@ def bott_duffin(
     matrix and no multipliers: an independent way to the same answer. A full M may be singular here, as long as it is
     positive on V_par.
     """
-    A = _real_matrix(matrix)
+    A = _matrix(matrix, real=True)
     n = A.shape[1]
     M = _mass_matrix(masses, n)
     P_perp = perpendicular_projector(A, rtol)
     P_par = np.eye(n) - P_perp
-    a_perp = pseudo_inverse(A, rtol).matrix @ _real_vector(b, len(A), "b")
+    a_perp = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b", real=True)
     # P_perp u may be given any unit: one of mass keeps both parts of the matrix of one size.
     diagonal = np.diagonal(M)[np.diagonal(M) > 0]
     unit = float(np.exp(np.mean(np.log(diagonal)))) if len(diagonal) else 1.0
     try:
-        u = np.linalg.solve(M @ P_par - unit * P_perp, _real_vector(f, n, "f") - M @ a_perp)
+        u = np.linalg.solve(M @ P_par - unit * P_perp, _vector(f, n, "f", real=True) - M @ a_perp)
     except np.linalg.LinAlgError:
         raise InputError(
             "the mass matrix is singular along what the constraints leave free; give a mass to what moves there",
@@ -327,15 +328,15 @@ def gauss_function(trial: ArrayLike, masses: ArrayLike, f: ArrayLike) -> float:
 
     Among all accelerations with A a = b the true one has the least; there it is (1/2) z^T M^-1 z.
     """
-    a = _real(trial, "trial").ravel()
-    off = _mass_matrix(masses, len(a)) @ a - _real_vector(f, len(a), "f")
+    a = _numbers(trial, "trial", real=True).ravel()
+    off = _mass_matrix(masses, len(a)) @ a - _vector(f, len(a), "f", real=True)
     return float(0.5 * off @ _Root(masses, len(a)).solve(off))
 
 
 # -- pieces -----------------------------------------------------------------------------------------
 
 
-def _numbers(values: ArrayLike, item: str) -> NumberArray:
+def _numbers(values: ArrayLike, item: str, real: bool = False) -> NumberArray:
     """float64 or complex128; nothing of a number is dropped."""
     if isinstance(values, np.ma.MaskedArray):
         raise InputError(f"{item} is a masked array: give its numbers, filled or left out", item=item)
@@ -345,18 +346,13 @@ def _numbers(values: ArrayLike, item: str) -> NumberArray:
         raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
     if array.dtype.kind not in "biufc":
         raise InputError(f"{item} holds {array.dtype}, not numbers", item=item)
+    if real and array.dtype.kind == "c":
+        raise InputError(f"{item} is complex, but a mechanical system is real: give the real part", item=item)
     return array.astype(np.complex128 if array.dtype.kind == "c" else np.float64, copy=False)
 
 
-def _real(values: ArrayLike, item: str) -> FloatArray:
-    array = _numbers(values, item)
-    if array.dtype.kind == "c":
-        raise InputError(f"{item} is complex, but a mechanical system is real: give the real part", item=item)
-    return np.asarray(array, dtype=np.float64)
-
-
-def _matrix(values: ArrayLike) -> NumberArray:
-    array = _numbers(values, "matrix")
+def _matrix(values: ArrayLike, real: bool = False) -> NumberArray:
+    array = _numbers(values, "matrix", real)
     if array.ndim != 2:
         raise InputError(f"a matrix has two axes, not shape {array.shape}", item="matrix")
     if not np.all(np.isfinite(array)):
@@ -365,24 +361,16 @@ def _matrix(values: ArrayLike) -> NumberArray:
     return array
 
 
-def _real_matrix(values: ArrayLike) -> FloatArray:
-    return np.asarray(_matrix(_real(values, "matrix")), dtype=np.float64)
-
-
-def _vector(values: ArrayLike, length: int, item: str) -> NumberArray:
-    array = _numbers(values, item).ravel()
+def _vector(values: ArrayLike, length: int, item: str, real: bool = False) -> NumberArray:
+    array = _numbers(values, item, real).ravel()
     if len(array) != length:
         raise InputError(f"{item} must have {length} entries, not {len(array)}", item=item)
     return array
 
 
-def _real_vector(values: ArrayLike, length: int, item: str) -> FloatArray:
-    return np.asarray(_vector(_real(values, item), length, item), dtype=np.float64)
-
-
 def _mass_diagonal(masses: ArrayLike, n: int) -> FloatArray:
     """The diagonal of M, shape (n,), from n/3 or n masses (notes eq. 79)."""
-    m = _real(masses, "masses").ravel()
+    m = _numbers(masses, "masses", real=True).ravel()
     if 3 * len(m) == n:
         m = np.repeat(m, 3)
     if len(m) != n:
@@ -424,7 +412,7 @@ class _Root:
 
 def _mass_matrix(masses: ArrayLike, n: int) -> FloatArray:
     """M as a matrix, shape (n, n), symmetric."""
-    M = _real(masses, "masses")
+    M = _numbers(masses, "masses", real=True)
     if M.shape != (n, n) or n == 1:
         return np.diag(_mass_diagonal(masses, n))
     if not np.all(np.isfinite(M)) or np.any(np.abs(M - M.T) > 1e-10 * np.max(np.abs(M))):

@@ -105,7 +105,9 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
     """
     series, factors = _checked(values, weights)
     n = len(series)
-    fluctuation = _linearized(series, factors)
+    value = factors @ series / n
+    # What the ratio sum w f/sum w fluctuates by, sample by sample: its mean is 0.
+    fluctuation = factors[:, None] * (series - value)
     counted = series[factors > 0]
     scale = np.maximum(np.abs(counted).max(axis=0), np.finfo(float).tiny)
     constant = np.abs(counted - counted[0]).max(axis=0) <= 1e-13 * scale
@@ -135,43 +137,25 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
             UserWarning,
             stacklevel=2,
         )
-    return Mean(_mean(series, factors), covariance, np.sqrt(np.diag(covariance)), n, effective, inefficiency)
+    return Mean(value, covariance, np.sqrt(np.diag(covariance)), n, effective, inefficiency)
 
 
-def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_covariance: ArrayLike) -> float:
-    """Probability of a difference of two means as large as theirs, by chi square, if they are of the same quantities.
+def agreement(one: FloatArray, other: FloatArray, covariance: FloatArray) -> float:
+    """Probability of a difference of two means (d,) as large as theirs, by chi square, if both are of the same.
 
     Held windows share no configurations, and so have no overlap that could be looked at: where a window has forgotten
-    how it was made, its mean force is the same from both sides.
-
-    Parameters
-    ----------
-    one, other : array_like, shape (d,) or ()
-    covariance, other_covariance : array_like, shape (d, d) or ()
-        Of the means. Where the sum of both is singular, only what has an error counts; a difference in what has none
-        has the probability 0. Differences of rounding, 1e-9 of the largest mean, are none.
+    how it was made, its mean force is the same from both sides. `covariance` (d, d) is that of both means together.
+    Where it is singular, only what has an error counts; a difference in what has none has the probability 0.
+    Differences of rounding, 1e-9 of the largest mean, are none.
     """
-    arrays = [as_float_array(values, name) for values, name in ((one, "one"), (other, "other"))]
-    spreads = [as_float_array(values, "covariance") for values in (covariance, other_covariance)]
-    d = arrays[0].size
-    if any(a.size != d or a.ndim > 1 for a in arrays) or any(
-        c.shape not in ((d, d), ()) or c.size != d * d for c in spreads
-    ):
-        raise InputError(f"two means of {d} quantities need covariances of shape {(d, d)}", item="covariance")
-    if not all(np.isfinite(each).all() for each in (*arrays, *spreads)):
-        raise InputError("a mean or a covariance is not finite", item="covariance")
-    if any((np.diagonal(c.reshape(d, d)) < 0).any() for c in spreads):
-        raise InputError("a variance is negative; give covariances of the means", item="covariance")
-    away = arrays[0].ravel() - arrays[1].ravel()
-    sizes, directions = np.linalg.eigh(sum(c.reshape(d, d) for c in spreads))
+    sizes, directions = np.linalg.eigh(covariance)
     known = sizes > 1e-12 * max(float(sizes[-1]), 0.0)
-    parts = directions.T @ away
-    parts[np.abs(parts) <= 1e-9 * np.abs(np.concatenate(arrays, axis=None)).max()] = 0.0
+    parts = directions.T @ (one - other)
+    parts[np.abs(parts) <= 1e-9 * max(np.abs(one).max(), np.abs(other).max())] = 0.0
     if parts[~known].any():
         return 0.0
-    square = float((parts[known] ** 2 / sizes[known]).sum())
     count = int(known.sum())
-    return float(chi2.sf(square, count)) if count else 1.0
+    return float(chi2.sf((parts[known] ** 2 / sizes[known]).sum(), count)) if count else 1.0
 
 
 def _checked(values: ArrayLike, weights: ArrayLike | None) -> tuple[FloatArray, FloatArray]:
@@ -195,12 +179,3 @@ def _checked(values: ArrayLike, weights: ArrayLike | None) -> tuple[FloatArray, 
             item="weights",
         )
     return series, factors / factors.mean()
-
-
-def _mean(series: FloatArray, factors: FloatArray) -> FloatArray:
-    return np.asarray(factors @ series / factors.sum())
-
-
-def _linearized(series: FloatArray, factors: FloatArray) -> FloatArray:
-    """What the ratio sum w f/sum w fluctuates by, sample by sample: its mean is 0."""
-    return factors[:, None] * (series - _mean(series, factors)) / factors.mean()

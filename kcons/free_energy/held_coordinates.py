@@ -141,15 +141,15 @@ class HeldCoordinates:
         rows: list[int] = []
         for name, coordinate in named(coordinates).items():
             found = rows_like(held, coordinate, name)
-            names += [name] if len(found) == 1 else [f"{name}[{k}]" for k in range(len(found))]
-            rows += found
-        if len(set(rows)) < len(rows):
-            row = next(row for row in rows if rows.count(row) > 1)
-            twice = [name for name, its in zip(names, rows, strict=True) if its == row]
-            raise InputError(f"{' and '.join(twice)} are the same row {row} of the set", item=twice[0])
-        if len(set(names)) < len(names):
-            again = next(name for name in names if names.count(name) > 1)
-            raise InputError(f"two coordinates have the name {again!r}; give each its own", item=again)
+            for k, row in enumerate(found):
+                label = name if len(found) == 1 else f"{name}[{k}]"
+                if row in rows:
+                    same = names[rows.index(row)]
+                    raise InputError(f"{same} and {label} are the same row {row} of the set", item=same)
+                if label in names:
+                    raise InputError(f"two coordinates have the name {label!r}; give each its own", item=label)
+                names.append(label)
+                rows.append(row)
         self.names = tuple(names)
         self.rows: IntArray = np.array(rows, dtype=np.int64)
         self._source = held
@@ -160,7 +160,7 @@ class HeldCoordinates:
                 f"{' and '.join(names)} share atoms with velocity constraints, under which configurations have no "
                 "known distribution; multipliers alone are those of Motion.multipliers"
             )
-        #: All rows of the clusters; in results those of the coordinates, as they are named, come after the others.
+        # All rows of the clusters; in results those of the coordinates, as they are named, come after the others.
         self._rows, self.atoms = held.subset(everything)
         self._order = np.searchsorted(everything, np.concatenate([others, self.rows]))
         self.periods = np.concatenate([np.full(c.n_rows, c.period or 0.0) for c in self._rows.constraints])
@@ -271,18 +271,6 @@ class HeldCoordinates:
         gradient = self._change_of_z(bent[:, 1 : 1 + d * d] @ metric.shares.swapaxes(1, 2))
         columns = (value, moving, moving - still, metric.log_det_z.tolist(), gradient, off.tolist(), turned, mean)
         return [Sample(*each) for each in zip(times, *columns, strict=True)]
-
-    def directions(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
-        """Displacements that change one coordinate by one, and no other nor any constraint, shape (d, n_atoms, 3).
-
-        The rows of M^-1 A^T (A M^-1 A^T)^-1 that belong to the coordinates: the shortest ones in the metric of the
-        masses.
-        """
-        here = as_array(x, (self._source.n_atoms, 3), "positions")
-        result = np.zeros((len(self), *here.shape))
-        metric = self._at(self._gathered(here[None, self.atoms]), time)
-        result[:, self.atoms] = metric.directions[0].reshape(len(self), -1, 3)
-        return result
 
     # -- pieces, on the atoms of the clusters ---------------------------------------------------
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from os import PathLike
-from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -64,8 +63,7 @@ class Series:
         isokinetic_degrees_of_freedom: int = 0,
         seconds: float = 0.0,
     ) -> None:
-        self.names = tuple(names)
-        self.seconds = seconds
+        self.names, self.seconds = tuple(names), seconds
         self.isokinetic_degrees_of_freedom = isokinetic_degrees_of_freedom
         self.periods: FloatArray = np.broadcast_to(np.asarray(periods, dtype=np.float64), (len(self.names),)).copy()
         self._samples: list[Sample] = []
@@ -89,16 +87,8 @@ class Series:
     def __iter__(self) -> Iterator[Sample]:
         return iter(self._samples)
 
-    @overload
-    def __getitem__(self, samples: int) -> Sample: ...
-
-    @overload
-    def __getitem__(self, samples: slice) -> Series: ...
-
-    def __getitem__(self, samples: int | slice) -> Sample | Series:
-        """One of the samples, or a series of some."""
-        if not isinstance(samples, slice):
-            return self._samples[samples]
+    def __getitem__(self, samples: slice) -> Series:
+        """A series of some of the samples."""
         part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom, self.seconds)
         part._samples = self._samples[samples]
         return part
@@ -134,10 +124,9 @@ class Series:
     def save(self, file: str | PathLike[str]) -> None:
         """Write all of it in NumPy's .npz format; an interrupted write leaves the older file."""
         arrays = {field: getattr(self, field) for field in Sample._fields}
+        for name in ("names", "periods", "isokinetic_degrees_of_freedom", "seconds"):
+            arrays[name] = np.array(getattr(self, name))
         with in_one_piece(file) as opened:
-            arrays |= {"names": np.array(self.names), "periods": self.periods}
-            for name in ("isokinetic_degrees_of_freedom", "seconds"):
-                arrays[name] = np.array(getattr(self, name))
             np.savez(opened, **arrays)  # type: ignore[arg-type]
 
     @classmethod
@@ -154,12 +143,9 @@ class Series:
                 data = stored_arrays(opened)
             g, seconds = int(data["isokinetic_degrees_of_freedom"]), float(data["seconds"])
             series = cls([str(name) for name in data["names"]], data["periods"], g, seconds)
-            d = len(series.names)
-            columns: list[Any] = [
-                data[f].reshape(-1).tolist() if f in _NUMBERS else data[f].reshape(-1, d) for f in Sample._fields
-            ]
-            for row in zip(*columns, strict=True):
-                series.append(Sample(*row))
+            shapes = {name: (-1,) if name in _NUMBERS else (-1, len(series.names)) for name in Sample._fields}
+            columns = [data[name].reshape(shape) for name, shape in shapes.items()]
+            series._samples = [Sample(*row) for row in zip(*columns, strict=True)]
         except FileNotFoundError:
             raise
         except Exception as error:  # a damaged archive raises whatever its bytes lead to
@@ -171,17 +157,14 @@ class Series:
 
         MDAnalysis reads it as an auxiliary: ``u.trajectory.add_auxiliary("held", "held.xvg")``.
         """
-        columns, titles = [self.time], []
-        for k, name in enumerate(self.names):
-            columns += [self.value[:, k], self.multiplier[:, k]]
-            titles += [name, f"multiplier of {name}"]
-        columns += [self.log_det_z, self.work]
-        titles += ["ln det Z", "work"]
+        pairs = np.stack([self.value, self.multiplier], axis=2).reshape(len(self), -1)
+        columns = np.column_stack([self.time, pairs, self.log_det_z, self.work])
+        titles = [title for name in self.names for title in (name, f"multiplier of {name}")] + ["ln det Z", "work"]
         with in_one_piece(file) as opened:
             opened.write(b'@ title "held coordinates"\n@ xaxis label "time"\n')
             for k, title in enumerate(titles):
                 opened.write(f'@ s{k} legend "{title}"\n'.encode())
-            np.savetxt(opened, np.column_stack(columns), fmt="%.12g")
+            np.savetxt(opened, columns, fmt="%.12g")
 
 
 class Collector:
@@ -223,8 +206,7 @@ class Recorder:
     """
 
     def __init__(self, system: System, coordinates: HeldCoordinates, series: Series | None = None) -> None:
-        self.system = system
-        self.coordinates = coordinates
+        self.system, self.coordinates = system, coordinates
         series = Series(coordinates.names, coordinates.periods) if series is None else series
         mine, its = ((s.names, s.periods.tolist()) for s in (coordinates, series))
         if mine != its:

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from openmm import unit
 
 NM = 0.1
-
 #: Bonds that are longer than so many times the median may be bonds across a box.
 CUT = 3.0
 
@@ -276,8 +275,7 @@ def universe_of(snapshot: Snapshot) -> Any:
         A cell whose first vector is not along x or whose second is not in the xy plane.
     """
     snapshot = snapshot.in_unit(1.0)
-    topology = snapshot.topology
-    box = None
+    topology, box = snapshot.topology, None
     if snapshot.cell is not None and snapshot.pbc.any():
         check_box(snapshot.cell, snapshot.pbc, stacklevel=4)
         box = dimensions_of(snapshot.cell)
@@ -370,8 +368,7 @@ def _openmm(
     from kcons.openmm import hold
     from kcons.openmm.topology import openmm_topology
 
-    rows = all_rescaled(_rows(constraints), NM)
-    sites = None
+    rows, sites = all_rescaled(_rows(constraints), NM), None
     if isinstance(constraints, HeldRows):
         sites = constraints.virtual_sites.in_unit(NM / constraints.snapshot.angstrom)
     snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)
@@ -399,10 +396,8 @@ def _openmm(
         system.addConstraint(i, j, length)
     others = [item for item in rows if not isinstance(item, Distance)]
     part = hold(system, others, x, periodic=snapshot.cell is not None) if others else None
-    velocities = None
-    if snapshot.velocities is not None:
-        velocities = snapshot.velocities * (unit.nanometer / unit.picosecond)
-    return ToOpenMM(topology, positions, velocities, system, part)
+    speeds = None if snapshot.velocities is None else snapshot.velocities * (unit.nanometer / unit.picosecond)
+    return ToOpenMM(topology, positions, speeds, system, part)
 
 
 def _system(
@@ -436,16 +431,14 @@ def _with_forces(topology: Any, files: Sequence[str], options: Any) -> openmm.Sy
         field = app.ForceField(*([files] if isinstance(files, str) else files))
     except Exception as error:  # whatever went wrong inside of OpenMM's reader
         raise InputError(f"force field {files}: {' '.join(str(error).split())}", item="force_field") from error
-    settings: dict[str, Any] = {"constraints": None, "rigidWater": False, "removeCMMotion": False}
+    settings: dict[str, Any] = {"constraints": None, "rigidWater": False}
+    for taken in settings.keys() & options:
+        raise UnsupportedError(f"{taken} is what `constraints` says here; leave it out")
+    settings |= {"removeCMMotion": False, "nonbondedMethod": app.NoCutoff}
     vectors = topology.getPeriodicBoxVectors()
-    if vectors is None:
-        settings["nonbondedMethod"] = app.NoCutoff
-    else:
+    if vectors is not None:
         width = min(float(vectors[k][k].value_in_unit(unit.nanometer)) for k in range(3))
         settings |= {"nonbondedMethod": app.PME, "nonbondedCutoff": min(0.9, 0.45 * width)}
-    for taken in ("constraints", "rigidWater"):
-        if taken in options:
-            raise UnsupportedError(f"{taken} is what `constraints` says here; leave it out")
     try:
         return field.createSystem(topology, **(settings | options))
     except ValueError as error:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, NonFiniteError
+from kcons.errors import InputError, NonFiniteError, did_you_mean
 from kcons.motion.motion import Motion
 from kcons.steppers import State
 from kcons.topology.holding import Holding, Options, with_options
@@ -26,7 +26,6 @@ from kcons.topology.topology import (
     elements_of,
     guessed_masses,
     listed,
-    near_misses,
     require_kind,
     require_standard_form,
     sorted_pairs,
@@ -103,7 +102,7 @@ def _hint(group: Any, words: str) -> str:
             present = [str(v) for v in np.unique(getattr(group, attribute).astype(str))]
             given = tokens[tokens.index(keyword) + 1] if tokens.index(keyword) + 1 < len(tokens) else ""
             if given not in present:
-                return f": no {keyword} {given}{near_misses(given, present)}; there are {listed(present)}"
+                return f": no {keyword} {given}{did_you_mean(given, present)}; there are {listed(present)}"
     if "resid" in tokens and hasattr(group, "resids"):
         return f"; residues are numbered {group.resids.min()} to {group.resids.max()}"
     return "; names are those of the topology, case counts"

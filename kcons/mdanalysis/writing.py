@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import sys
-import tempfile
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Any, Self, TextIO
 
 import MDAnalysis
 import numpy as np
-from MDAnalysis.lib.formats.libmdaxdr import XTCFile
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import finite_number, positive, whole_number
@@ -32,8 +30,8 @@ from kcons.steppers import State
 _SINGLE = float(np.finfo(np.float32).max)
 #: Rows up to which an XVG file has a column for each multiplier.
 MOST_COLUMNS = 64
-#: Of XTC: steps from the origin that an integer counts; range of steps from which on some frames are packed wrongly, by
-#: what lies between neighboring atoms; atoms up to which there is no packing.
+#: Of XTC: steps from the origin that an integer counts; range of steps from which on some frames are packed wrongly;
+#: atoms up to which there is no packing.
 _MOST, _SAFE, _FLOATS = 2**31 - 3, 2**23, 9
 _H5MD_UNITS = {
     "timeunit": "ps",
@@ -129,10 +127,9 @@ class TrajectoryWriter:
         **options: Any,
     ) -> None:
         self.path, self.units, self.motion = Path(path), units or RunUnits(), motion
-        self.n_frames = 0
+        self.n_frames, self._expects_forces = 0, False
         self.side_file: Path | None = None
         self._side: TextIO | None = None
-        self._expects_forces = False
         self._format = self.path.suffix[1:].upper()
         n_atoms = whole_number(n_atoms, "n_atoms")
         self._decimals = options.get("precision", 3) if self._format == "XTC" else None
@@ -142,6 +139,7 @@ class TrajectoryWriter:
         for asked, what in ((velocities, "velocities"), (forces, "forces")):
             if asked and not able:
                 raise UnsupportedError(f"{self._format} has no {what}; write TRR or H5MD")
+        self._side_title = f"# constraints of {self.path.name}, in "
         if motion is not None and self._format != "H5MD":
             self._refuse_others()
         kept = {"velocities": able if velocities is None else velocities, "forces": forces}
@@ -166,20 +164,15 @@ class TrajectoryWriter:
         except RuntimeError as error:
             raise UnsupportedError(f"{self.path.name}: {error}") from None
 
-    @property
-    def _side_title(self) -> str:
-        return f"# constraints of {self.path.name}, in "
-
     def _refuse_others(self) -> None:
         """The file beside the trajectory takes the place of its own older self only."""
         side = self.path.with_suffix(".xvg")
-        if not side.is_symlink():
-            if not side.exists():
-                return
-            if side.is_file():
-                with side.open(encoding="utf-8", errors="replace") as file:
-                    if file.readline().startswith(self._side_title):
-                        return
+        if not side.is_symlink() and not side.exists():
+            return
+        if side.is_file() and not side.is_symlink():
+            with side.open(encoding="utf-8", errors="replace") as file:
+                if file.readline().startswith(self._side_title):
+                    return
         raise InputError(
             f"{side} is not of {self.path.name}: residuals are not written over it; move it away, or give the "
             "trajectory another name",
@@ -245,10 +238,8 @@ class TrajectoryWriter:
         with quiet():
             self._writer.write(self._universe.atoms)
         if self._format == "H5MD":
-            group = self._writer.h5md_file
-            for place in (f"observables/{name}" for name in extras):
-                if place in group and "run_units" not in group[place].attrs:
-                    group[place].attrs["run_units"] = self.units.name
+            for name in extras:
+                self._writer.h5md_file[f"observables/{name}"].attrs.setdefault("run_units", self.units.name)
         elif extras:
             self._write_side(ts.time, extras)
         self._flush()
@@ -286,6 +277,7 @@ class TrajectoryWriter:
         return extras
 
     def _write_side(self, time: float, extras: dict[str, FloatArray]) -> None:
+        assert self.motion is not None
         sigma, rates = extras["residuals"], extras.get("velocity_residuals")
         multipliers = extras.get("multipliers", np.zeros(0))
         if len(multipliers) > MOST_COLUMNS:
@@ -293,10 +285,9 @@ class TrajectoryWriter:
         if self._side is None:
             self.side_file = self.path.with_suffix(".xvg")
             self._side = self.side_file.open("w", encoding="utf-8")
+            name = self.motion.constraint_set.row_name
             columns = ["largest residual", "rms residual", "largest velocity residual"]
-            if self.motion is not None:
-                name = self.motion.constraint_set.row_name
-                columns += [f"multiplier {name(k)}" for k in range(len(multipliers))]
+            columns += [f"multiplier {name(k)}" for k in range(len(multipliers))]
             self._width = len(columns)
             print(f"{self._side_title}{self.units.name}; time in ps", file=self._side)
             for k, column in enumerate(columns):
@@ -345,26 +336,13 @@ def _refuse_beyond_xtc(x: FloatArray, decimals: int, name: str) -> None:
     """Refuse coordinates, in angstrom, that XTC cannot hold: the library packs something else, and goes on."""
     if len(x) <= _FLOATS:
         return
-    in_nm = x / 10
-    steps, spread = (float(reach.max()) * 10.0**decimals for reach in (np.abs(in_nm), np.ptp(in_nm, axis=0)))
-    if max(steps, spread) > _MOST or (spread >= _SAFE and not _read_as_written(in_nm, decimals)):
+    steps, spread = (float(reach.max()) * 10.0 ** (decimals - 1) for reach in (np.abs(x), np.ptp(x, axis=0)))
+    if steps > _MOST or spread >= _SAFE:
         raise InputError(
             f"{name} cannot hold coordinates up to {np.abs(x).max():.4g} angstrom in steps of "
             f"{10.0 ** (1 - decimals):g}: nothing was written; give a smaller precision, or another format",
             item="positions",
         )
-
-
-def _read_as_written(in_nm: FloatArray, decimals: int) -> bool:
-    single = in_nm.astype(np.float32)
-    with tempfile.TemporaryDirectory() as folder:
-        place = str(Path(folder) / "frame.xtc")
-        with XTCFile(place, "w") as file:
-            file.write(single, np.eye(3, dtype=np.float32), 0, 0.0, 10.0**decimals)
-        with XTCFile(place) as file:
-            found = file.read().x
-    rounding = 10.0**-decimals + 4 * np.spacing(np.abs(single).max())
-    return bool((np.abs(found - single) <= rounding).all())
 
 
 # -- MD engines ------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ collective variables, surfaces and the constraint objects of kcons.
 - `ensembles`: Langevin, isokinetic, Nosé-Hoover
 - `collective`: collective variables
 - `callback_rows`: constraint objects of kcons
-- `surfaces`: particles on surfaces
+- `surface_integrator`: particles on surfaces
 - `device`: steps as kernels of a plugin
 """
 
@@ -19,7 +19,7 @@ try:
     from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
     from kcons.openmm.callback_rows.hold import hold, move_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
-    from kcons.openmm.collective.coordinates import Row, forces_by_term
+    from kcons.openmm.collective.coordinates import Row
     from kcons.openmm.device.device_integrator import DeviceIntegrator
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
     from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
@@ -32,7 +32,7 @@ try:
     from kcons.openmm.integrator.system_checks import worst_length
     from kcons.openmm.quantities import masses_of
     from kcons.openmm.states import positions_of, velocities_of
-    from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
+    from kcons.openmm.surface_integrator import SurfaceIntegrator
     from kcons.openmm.topology import constraints_of
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.openmm") from error
@@ -54,12 +54,10 @@ __all__ = [
     "Row",
     "SurfaceIntegrator",
     "constraints_of",
-    "forces_by_term",
     "hold",
     "masses_of",
     "move_constraints",
     "positions_of",
-    "surface_parts",
     "velocities_of",
     "worst_length",
 ]

@@ -159,29 +159,27 @@ def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: Fl
     largest = np.zeros(n_clusters, dtype=np.int64)
     np.maximum.at(largest, atom_label[atom_label >= 0], degree[atom_label >= 0])
     path = tree & ~anchored & ~small & (largest <= 2)
-    if path.any():
-        rows = np.flatnonzero(inside & path[np.maximum(labels, 0)])
-        yield _paths(rows, pairs[rows], constraint_set.n_atoms, int(path.sum()))
     sparse = distances_only & ~path & (~small | left_over)
-    for independent in (True, False):
-        chosen = sparse & (tree == independent)
-        if chosen.any():
-            rows = np.flatnonzero(inside & chosen[np.maximum(labels, 0)])
-            yield Shape("SparseDistances", rows, int(chosen.sum()), independent, pairs=pairs[rows])
     single = np.zeros(n_clusters, dtype=bool)
     single[labels[inside & (kinds == RowKind.FUNCTION)]] = True
     single &= n_rows == 1
     if constraint_set.images is not None:
         single &= ~anchored  # fixed atoms may be moved to another image, of which single rows know nothing
-    others: tuple[tuple[ShapeKind, NDArray[np.bool_]], ...] = (
+    kinds_of: tuple[tuple[ShapeKind, NDArray[np.bool_]], ...] = (
+        ("Chains", path),
+        ("SparseDistances", sparse & tree),
+        ("SparseDistances", sparse & ~tree),
         ("SingleRows", single),
         ("SparseRows", compiled & ~distances_only & ~single),
         ("GeneralClusters", ~compiled),
     )
-    for kind, chosen in others:
+    for kind, chosen in kinds_of:
         if chosen.any():
-            rows = np.flatnonzero(inside & chosen[np.maximum(labels, 0)])
-            yield Shape(kind, rows, int(chosen.sum()), False)
+            rows, clusters = np.flatnonzero(inside & chosen[np.maximum(labels, 0)]), int(chosen.sum())
+            if kind == "Chains":
+                yield _paths(rows, pairs[rows], constraint_set.n_atoms, clusters)
+            else:
+                yield Shape(kind, rows, clusters, bool((sparse & tree)[labels[rows[0]]]), pairs=pairs[rows])
 
 
 def _row_tables(constraint_set: ConstraintSet) -> tuple[NDArray[np.int64], IntArray]:

@@ -28,16 +28,8 @@ def alike(
 ) -> dict[tuple[tuple[Any, tuple[int, ...]], ...], Alike]:
     """Clusters by what they are made of: of each row what it is, and its atoms as they are met.
 
-    Parameters
-    ----------
-    labels : ndarray of int, shape (n_rows,)
-        Cluster of each row, -1 for none; see `Plan`.
-    last : ndarray of bool, shape (n_rows,)
-        Rows that come after the others of their cluster.
-    rows : sequence
-        What each row of the set is: equal for rows that are computed alike.
-    atoms : sequence of ndarray of int
-        Atoms of each row.
+    `labels` are the clusters of the rows, -1 for none; rows that are `last` come after the others of their cluster.
+    `rows` say what each row is, equal for rows that are computed alike, and `atoms` are those of each row.
     """
     order = np.lexsort((last, labels))
     order = order[labels[order] >= 0]

@@ -30,20 +30,10 @@ def fixed_atoms(constraint_set: ConstraintSet) -> IntArray:
 def row_blocks(
     constraint_set: ConstraintSet, accept: Callable[[Constraint], bool], rows: IntArray | None = None
 ) -> tuple[IntArray, IntArray]:
-    """Blocks of two rows and more; nothing for forests.
+    """Blocks of two rows and more, of the objects that `accept` takes and of `rows` (sorted; all by default).
 
-    Parameters
-    ----------
-    constraint_set : ConstraintSet
-    accept : callable
-        Which constraint objects take part. Velocity rows and fixed atoms never do.
-    rows : ndarray of int, optional
-        Only these rows, sorted; all by default.
-
-    Returns
-    -------
-    members, starts : ndarray of int
-        Block k consists of the rows ``members[starts[k]:starts[k + 1]]``, sorted.
+    Velocity rows and fixed atoms never take part. Gives members and starts: block k consists of the rows
+    ``members[starts[k]:starts[k + 1]]``, sorted; nothing for forests.
     """
     ground = fixed_atoms(constraint_set)
     ends: list[tuple[IntArray, IntArray, IntArray, bool]] = []

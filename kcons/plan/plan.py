@@ -135,13 +135,7 @@ class Plan:
         miss = np.abs(found.sigma)
         bad = rows[~(miss[rows] <= found.allowed[rows])]
         if len(bad):
-            row = int(bad[0])
-            raise ContradictionError(
-                f"row {self.named.row_name(row)} lies between fixed atoms and is off by {miss[row]:g}{where}; "
-                "remove it or free one of its atoms",
-                rows=[row],
-                atoms=self.named.row_atoms(row),
-            )
+            raise self._broken(bad[0], f" and is off by {miss[bad[0]]:g}{where}; remove it or free one of its atoms")
 
     def check_rates_between_fixed_atoms(
         self, x: FloatArray, y: FloatArray, rates: FloatArray | None, time: float, what: str
@@ -161,13 +155,15 @@ class Plan:
         miss = np.abs(jacobian @ fixed.ravel() - wanted)
         bad = np.flatnonzero(~(miss <= 1e-10 * (np.abs(wanted) + abs(jacobian) @ np.abs(fixed.ravel()))))
         if len(bad):
-            row = int(self.between_fixed_atoms[bad[0]])
-            raise ContradictionError(
-                f"row {self.named.row_name(row)} lies between fixed atoms, whose {what} does not follow it: off by "
-                f"{miss[bad[0]]:g}; remove it, free one of its atoms, or let the fixed atoms move with it",
-                rows=[row],
-                atoms=self.named.row_atoms(row),
+            raise self._broken(
+                self.between_fixed_atoms[bad[0]],
+                f", whose {what} does not follow it: off by {miss[bad[0]]:g}; remove it, free one of its atoms, or let "
+                "the fixed atoms move with it",
             )
+
+    def _broken(self, row: int, said: str) -> ContradictionError:
+        name, atoms = self.named.row_name(row), self.named.row_atoms(row)
+        return ContradictionError(f"row {name} lies between fixed atoms{said}", rows=[int(row)], atoms=atoms)
 
     def general_for_all(self, limit: int, *, equal: bool = False) -> GeneralClusters:
         """The damped solver for every cluster, for positions that are far off; with equal masses if that is enough.
@@ -222,13 +218,7 @@ def make_plan(
 ) -> Plan:
     """Find the clusters, their rank, and a solver for each.
 
-    Parameters
-    ----------
-    constraint_set : ConstraintSet
-    positions : ndarray, shape (n_atoms, 3)
-    time : float
-    named : ConstraintSet, optional
-        The same rows on the atom numbers of the whole system, for messages.
+    `named` has the same rows on the atom numbers of the whole system, for messages.
     """
     named = constraint_set if named is None else named
     pinned, pinned_rows = _pinned(constraint_set)

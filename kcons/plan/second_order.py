@@ -24,8 +24,8 @@ from itertools import combinations
 import numpy as np
 import scipy.sparse as sp
 
-from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.constraint import Constraint, IntArray, RowKind
+from kcons.constraints.constraint_set import ConstraintSet, whole_bodies
 from kcons.constraints.internal import Distance
 from kcons.constraints.linear import LinearRelation
 from kcons.constraints.periodic.one_piece import BoolArray
@@ -44,10 +44,9 @@ _FLAT_TARGETS = 1e-12
 #: Blocks of one shape that start off their targets are analyzed where they belong, until this many in a
 #: row turn out regular.
 _REGULAR_SAMPLES = 100
-_INTERNAL = frozenset({"Distance", "Angle", "Dihedral", "LinearRelation", "LinearCombination"})
 _LEVELS: tuple[Callable[[Constraint], bool], ...] = (
     lambda item: True,
-    lambda item: item.family in _INTERNAL and item.translation_invariant,
+    lambda item: item.translation_invariant and (item.reversible or item.kind is RowKind.LINEAR),
     lambda item: item.holds_length,
 )
 #: Directions that a step of Gauss-Newton leaves out. Towards a flat geometry singular values go with the square root of
@@ -58,8 +57,6 @@ DISPLACEMENT = 1e-2
 #: Part of the curvature outside the range of A that is more than rounding (or than the differences of a
 #: user's gradient).
 UNSOLVABLE = 1e-4
-#: Families whose rows a linear or planar group makes superfluous.
-_CONVERTIBLE = frozenset({"Distance", "Angle", "Dihedral"})
 #: Extent across a line or plane, relative to the extent along it, that still counts as flat.
 FLAT = 1e-6
 #: Relative misfit between the targets and a flat geometry above which the conversion is refused.
@@ -67,19 +64,7 @@ MISFIT = 1e-6
 
 
 def without_second_order_rows(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> ConstraintSet:
-    """The same set with second-order-singular rows replaced by linear ones.
-
-    Parameters
-    ----------
-    constraint_set : ConstraintSet
-    positions : ndarray, shape (n_atoms, 3)
-        Positions on or near the surface.
-    time : float
-
-    Returns
-    -------
-    ConstraintSet
-        The given object itself if it is regular.
+    """The same set with second-order-singular rows replaced by linear ones; the given object itself if it is regular.
 
     Raises
     ------
@@ -127,7 +112,7 @@ class _Stack:
 
     def suspects(self, constraint_set: ConstraintSet, x: FloatArray, time: float) -> BoolArray:
         """Blocks that are singular at second order at `x`, shape (n_blocks,)."""
-        unit, curvature = self._dense(constraint_set, x, time)
+        unit, _, curvature = self.dense(constraint_set, x, time)
         doubtful: BoolArray = np.asarray(np.isfinite(unit).all(axis=(1, 2)))
         doubtful[doubtful] = _deficient(unit[doubtful])
         if doubtful.any() and not doubtful.all():
@@ -139,10 +124,10 @@ class _Stack:
             doubtful = unsolvable(unit, curvature, np.where(extent > 0, extent, 1.0))
         return doubtful
 
-    def _dense(
-        self, constraint_set: ConstraintSet, x: FloatArray, time: float
-    ) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
-        """Row-normalized A of each block, fixed atoms' columns zero, and the curvatures of the same rows."""
+    def dense(
+        self, constraint_set: ConstraintSet, x: FloatArray, time: float, pinned: IntArray | None = None
+    ) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
+        """Row-normalized A of each block, fixed atoms' columns zero, its norms, and the curvatures of the same rows."""
         n_blocks, n_rows = self.rows.shape
         n_atoms = self.atoms.shape[1]
         a = np.zeros((n_blocks, n_rows, n_atoms, 3))
@@ -157,7 +142,7 @@ class _Stack:
             with np.errstate(divide="ignore", invalid="ignore"):
                 a[block[:, None], row[:, None], slots] = part.gradient(r, time)
             pieces.append((part, r, block, row, slots))
-        free = ~np.isin(self.atoms, fixed_atoms(constraint_set))
+        free = ~np.isin(self.atoms, fixed_atoms(constraint_set) if pinned is None else pinned)
         a *= free[:, None, :, None]
         unit = a.reshape(n_blocks, n_rows, -1)
         norms = np.linalg.norm(unit, axis=2)
@@ -170,7 +155,7 @@ class _Stack:
                 bent[block, row] = part.curvature(r, field[block[:, None], slots], time)
             return bent / norms
 
-        return unit / norms[:, :, None], curvature
+        return unit / norms[:, :, None], norms, curvature
 
     def straight_triangles(
         self, constraint_set: ConstraintSet, suspects: BoolArray, time: float
@@ -179,38 +164,23 @@ class _Stack:
         done = np.zeros(len(self.rows), bool)
         if self.rows.shape[1] != 3 or self.atoms.shape[1] != 3:
             return [], done
-        pairs = np.full((constraint_set.n_rows, 2), -1)
-        for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
-            if item.holds_length and not isinstance(item.target, MovingTarget):
-                pairs[start : start + item.n_rows] = item.atoms
-        sides = pairs[self.rows]
-        plain = (sides >= 0).all(axis=(1, 2)) & ~np.isin(self.atoms, fixed_atoms(constraint_set)).any(axis=1)
+        lengths = [np.full(c.n_rows, c.holds_length and not c.moving) for c in constraint_set.constraints]
+        plain = np.concatenate(lengths)[self.rows].all(axis=1)
+        plain &= ~np.isin(self.atoms, fixed_atoms(constraint_set)).any(axis=1)
         if not plain.any():
             return [], done
         length = constraint_set.target(time)[self.rows]
         order = np.argsort(length, axis=1)
         length = np.take_along_axis(length, order, axis=1)
-        sides = np.take_along_axis(sides, order[:, :, None], axis=1)
-        excess = np.abs(length[:, 0] + length[:, 1] - length[:, 2]) / length[:, 2]
-        done = plain & ((suspects & (excess <= MISFIT)) | (excess <= _FLAT_TARGETS))
+        rows = np.take_along_axis(self.rows, order, axis=1)
+        excess = np.abs(length[:, 0] + length[:, 1] - length[:, 2])
+        done = plain & (excess <= length[:, 2] * np.where(suspects, MISFIT, _FLAT_TARGETS))
         bodies = []
         for k in np.flatnonzero(done):
-            i, j = sides[k, 2]
-            middle = self.atoms[k].sum() - i - j
-            from_i = length[k, 0] if i in sides[k, 0] else length[k, 1]
-            c = from_i / (length[k, 0] + length[k, 1])
-            bodies.append(
-                FlatBody(
-                    atoms=self.atoms[k],
-                    rows=self.rows[k],
-                    bases=sides[k, 2],
-                    pairs=sides[k, 2:],
-                    lengths=length[k, 2:],
-                    tied=np.array([middle]),
-                    weights=np.array([[1.0 - c, c]]),
-                    linearized=7,
-                )
-            )
+            ends, side = constraint_set.row_atoms(int(rows[k, 2])), constraint_set.row_atoms(int(rows[k, 0]))
+            c = length[k, 0 if ends[0] in side else 1] / (length[k, 0] + length[k, 1])
+            middle, weights = self.atoms[k].sum(keepdims=True) - ends.sum(), np.array([[1.0 - c, c]])
+            bodies.append(FlatBody(self.atoms[k], self.rows[k], ends, ends[None], length[k, 2:], middle, weights))
         return bodies, done
 
     def off_target(self, constraint_set: ConstraintSet, x: FloatArray, sigma: FloatArray, time: float) -> BoolArray:
@@ -220,7 +190,7 @@ class _Stack:
         if self.rows.shape[1] <= 3 or not result.any():
             return np.zeros_like(result)
         far = np.flatnonzero(result)
-        unit, _ = self.chosen(far)._dense(constraint_set, x, time)
+        unit = self.chosen(far).dense(constraint_set, x, time)[0]
         if unit.shape[1] <= unit.shape[2]:
             # At a distance s from a flat geometry the smallest singular value is s, and the rows are off by s^2.
             smallest = np.linalg.svd(unit, compute_uv=False)[:, -1]
@@ -304,20 +274,11 @@ def _lost_rows(part: ConstraintSet, x: FloatArray, free: BoolArray, time: float)
 
 
 def unsolvable(unit: FloatArray, curvature: Callable[[FloatArray], FloatArray], extent: FloatArray) -> BoolArray:
-    """Whether A a = -v^T (d2sigma/dx2) v has no solution for some v with A v = 0.
+    """Whether A a = -v^T (d2sigma/dx2) v has no solution for some v with A v = 0 (notes eqs. 92, 95), of several
+    blocks.
 
-    Parameters
-    ----------
-    unit : ndarray, shape (n_blocks, n_rows, n_coordinates)
-        A of several blocks, rows scaled to unit norm.
-    curvature : callable
-        Maps v, shape (n_blocks, n_coordinates), to the curvatures, shape (n_blocks, n_rows), of the scaled rows.
-    extent : ndarray, shape (n_blocks,)
-        Length scale of each block.
-
-    References
-    ----------
-    Notes, eqs. 92 and 95.
+    `unit` is A with rows of unit norm, shape (n_blocks, n_rows, n_coordinates), `curvature` maps v, shape (n_blocks,
+    n_coordinates), to the curvatures of these rows, and `extent` is the length scale of each block.
     """
     u, s, vt = np.linalg.svd(unit, full_matrices=True)
     cut = LOST * s[:, :1]
@@ -370,28 +331,19 @@ class LocalRows:
         self.row_atoms = [self.part.row_atoms(k) for k in range(self.part.n_rows)]
 
     def inside(self, atoms: IntArray) -> IntArray:
-        """Rows (block numbering) of convertible families with all their atoms among `atoms` (block numbering)."""
-        chosen = np.zeros(len(self.atoms), bool)
-        chosen[atoms] = True
-        return np.array(
-            [
-                k
-                for k, members in enumerate(self.row_atoms)
-                if chosen[members].all() and self.part.locate(k)[0].family in _CONVERTIBLE
-            ],
-            dtype=np.int64,
-        )
+        """Rows (block numbering) that a rigid group of `atoms` (block numbering) makes superfluous."""
+        rows = [np.isin(item.atoms, atoms).all(axis=1) & item.reversible for item in self.part.constraints]
+        return np.flatnonzero(np.concatenate(rows))
 
-    def unit_jacobian(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Row-normalized A without the columns' part of fixed atoms, and the norms."""
-        a = self.part.jacobian(x, self.time).toarray()
-        a[:, np.repeat(self.pinned, 3)] = 0.0
-        norms = np.linalg.norm(a, axis=1)
-        return a / np.where(norms > 0, norms, 1.0)[:, None], norms
+    def linear(self, x: FloatArray) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
+        """Row-normalized A without the columns of fixed atoms, its norms, and the curvatures of the same rows."""
+        stack = _Stack(np.arange(self.part.n_rows)[None], np.arange(len(self.atoms))[None])
+        unit, norms, curvature = stack.dense(self.part, x, self.time, np.flatnonzero(self.pinned))
+        return unit[0], norms[0], lambda v: curvature(v[None])[0]
 
     def decomposed(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, int]:
         """u, s and v^T of these rows, all singular vectors, and their rank."""
-        u, s, vt = np.linalg.svd(self.unit_jacobian(x)[0], full_matrices=True)
+        u, s, vt = np.linalg.svd(self.linear(x)[0], full_matrices=True)
         return u, s, vt, int(np.sum(s > LOST * s[0]))
 
     def singular(self, x: FloatArray, rows: IntArray | None = None) -> bool:
@@ -399,19 +351,8 @@ class LocalRows:
         rows = np.arange(self.part.n_rows) if rows is None else rows
         if len(rows) < 2:
             return False
-        unit, _ = self.unit_jacobian(x)
-
-        def curvature(v: FloatArray) -> FloatArray:
-            return self.unit_curvature(x, v)[None, rows]
-
-        return bool(unsolvable(unit[None, rows], curvature, np.array([extent_of(x)]))[0])
-
-    def unit_curvature(self, x: FloatArray, v: FloatArray) -> FloatArray:
-        """v^T (d2sigma/dx2) v of the rows that `unit_jacobian` scales, shape (n_rows,)."""
-        _, norms = self.unit_jacobian(x)
-        field = np.where(self.pinned[:, None], 0.0, v.reshape(-1, 3))
-        bent = [c.curvature(self.part.gather(c, x), field[c.atoms], self.time) for c in self.part.constraints]
-        return np.asarray(np.concatenate(bent) / np.where(norms > 0, norms, 1.0))
+        unit, _, curvature = self.linear(x)
+        return bool(unsolvable(unit[None, rows], lambda v: curvature(v[0])[None, rows], np.array([extent_of(x)]))[0])
 
     def stressed(self, x: FloatArray) -> IntArray:
         """Rows (block numbering) that take part in a dependence omega^T A = 0."""
@@ -419,7 +360,7 @@ class LocalRows:
         return np.flatnonzero(np.einsum("rk,rk->r", u[:, rank:], u[:, rank:]) > 1e-10)
 
     def rank(self, x: FloatArray, rows: IntArray | None = None) -> int:
-        unit, _ = self.unit_jacobian(x)
+        unit = self.linear(x)[0]
         s = np.linalg.svd(unit if rows is None else unit[rows], compute_uv=False)
         return int(np.sum(s > LOST * s[0])) if len(s) else 0
 
@@ -432,8 +373,8 @@ class LocalRows:
             # Towards a flat geometry the singular value is the square root of this, 1e-7: lost by any measure.
             if np.max(np.abs(sigma) / self.part.scale) < 1e-14:
                 break
-            unit, norms = self.unit_jacobian(x)
-            step = np.linalg.lstsq(unit[held], -(sigma / np.where(norms > 0, norms, 1.0))[held], rcond=STEP_CUT)[0]
+            unit, norms, _ = self.linear(x)
+            step = np.linalg.lstsq(unit[held], -(sigma / norms)[held], rcond=STEP_CUT)[0]
             x = x + step.reshape(x.shape)
         other = copy.copy(self)
         other.x = x
@@ -468,22 +409,8 @@ class LocalRows:
 
     def unwrapped(self, x: FloatArray) -> FloatArray:
         """Positions made whole across the boundary, following the rows."""
-        if self.part.lattice is None:
-            return x
-        whole = x.copy()
-        placed = np.zeros(len(x), bool)
-        placed[0] = True
-        rows = [r for item in self.part.constraints for r in self.part.gather(item, x)]
-        for _ in range(len(x)):
-            if placed.all():
-                break
-            for members, r in zip(self.row_atoms, rows, strict=True):
-                known = placed[members]
-                if known.any() and not known.all():
-                    base = int(np.argmax(known))
-                    whole[members[~known]] = whole[members[base]] + r[~known] - r[base]
-                    placed[members] = True
-        return whole
+        found = [item.with_target(None) for item in self.part.constraints]
+        return whole_bodies(found, self.part.whole(x), self.part.lattice)
 
     def _shortest(self) -> float:
         lengths = [
@@ -518,8 +445,6 @@ class FlatBody:
         The other atoms.
     weights : ndarray, shape (n, n_bases)
         x_tied = weights @ x_bases.
-    linearized : int
-        Degrees of freedom that the replaced rows leave at first order; the body itself has 5 or 6.
     """
 
     atoms: IntArray
@@ -529,7 +454,6 @@ class FlatBody:
     lengths: FloatArray
     tied: IntArray
     weights: FloatArray
-    linearized: int
 
     def __str__(self) -> str:
         """For example 'atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows'."""
@@ -647,114 +571,69 @@ def _merged(found: list[IntArray], x: FloatArray) -> list[IntArray]:
 def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
     """What holds a flat group: bases, their distances, and the weights of the other atoms."""
     inside = block.inside(atoms)
-    moving = [k for k in inside if isinstance(block.part.locate(int(k))[0].target, MovingTarget)]
-    linearized = 3 * len(atoms) - int(block.pinned[atoms].sum()) * 3 - block.rank(block.x, inside)
-    flat = affine_dimension(x[atoms])
-    if moving:
-        raise SingularGeometryError(
-            _sentence(linearized, flat, block.atoms[atoms])
-            + "; it cannot be converted, since a target among these atoms is a function of time",
-            rows=block.rows[inside],
-            atoms=block.atoms[atoms],
-        )
-    plane = _fitted(block, atoms, inside, x, flat, linearized)
-    bases, weights = _bases(block, atoms, inside, plane)
-    others = np.setdiff1d(np.arange(len(atoms)), bases)
+    located = [block.part.locate(int(k)) for k in inside]
+    if any(isinstance(item.target, MovingTarget) for item, _ in located):
+        raise _refused(block, atoms, inside, x, "since a target among these atoms is a function of time")
+    plane = _fitted(block, atoms, inside, x)
+    bases, weights = _bases(plane, block.pinned[atoms])
     held = np.array(list(combinations(bases, 2)))
     lengths = np.linalg.norm(plane[held[:, 0]] - plane[held[:, 1]], axis=1)
-    pairs = atoms[held]
-    for k in inside:
-        item, row = block.part.locate(int(k))
+    pairs, others = atoms[held], np.setdiff1d(np.arange(len(atoms)), bases)
+    for item, row in located:
         if item.holds_length:
             same = np.flatnonzero((np.sort(pairs, axis=1) == np.sort(item.atoms[row])).all(axis=1))
             # A base distance that was held stays at its own target, to the last bit.
             lengths[same] = np.asarray(item.target)[row]
-    return FlatBody(
-        atoms=atoms,
-        rows=inside,
-        bases=atoms[list(bases)],
-        pairs=pairs,
-        lengths=lengths,
-        tied=atoms[others],
-        weights=weights[others],
-        linearized=linearized,
-    )
+    return FlatBody(atoms, inside, atoms[bases], pairs, lengths, atoms[others], weights[others])
 
 
-def _fitted(
-    block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, flat: int, linearized: int
-) -> FloatArray:
+def _fitted(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray) -> FloatArray:
     """Coordinates along the line or in the plane that fulfil the targets, shape (n, 1) or (n, 2).
 
     Gauss-Newton within the plane, where the rows are regular; starts from the present positions.
     """
-    y = x[atoms]
-    center = y.mean(axis=0)
-    axes = np.linalg.svd(y - center)[2][:flat]
-    plane = (y - center) @ axes.T
+    center, flat = x[atoms].mean(axis=0), affine_dimension(x[atoms])
+    axes = np.linalg.svd(x[atoms] - center)[2][:flat]
+    plane = (x[atoms] - center) @ axes.T
     columns = (3 * atoms[:, None] + np.arange(3)).ravel()
     scale = block.part.scale[inside]
     whole = x.copy()
-    best, miss = plane, np.inf
+    best, miss, worst = plane, np.inf, 0
     for _ in range(30):
         whole[atoms] = center + plane @ axes
-        sigma = block.part.value(whole, block.time)[inside]
-        size = float(np.max(np.abs(sigma) / scale))
-        if not size < miss:
+        sigma = block.part.value(whole, block.time)[inside] / scale
+        if not np.abs(sigma).max() < miss:
             break
-        best, miss = plane, size
-        if size < 1e-16:
+        best, worst, miss = plane, int(np.argmax(np.abs(sigma))), float(np.abs(sigma).max())
+        if miss < 1e-16:
             break
         a = block.part.jacobian(whole, block.time)[inside][:, columns].toarray()
         a = np.einsum("rnc,fc->rnf", a.reshape(len(inside), len(atoms), 3), axes).reshape(len(inside), -1)
-        step = np.linalg.lstsq(a / scale[:, None], -sigma / scale, rcond=STEP_CUT)[0]
-        plane = plane + step.reshape(plane.shape)
+        plane = plane + np.linalg.lstsq(a / scale[:, None], -sigma, rcond=STEP_CUT)[0].reshape(plane.shape)
     if not miss <= MISFIT:
-        whole[atoms] = center + best @ axes
-        worst = int(np.argmax(np.abs(block.part.value(whole, block.time)[inside]) / scale))
-        row = int(block.rows[inside[worst]])
-        raise SingularGeometryError(
-            _sentence(linearized, flat, block.atoms[atoms])
-            + f"; it cannot be converted, since the targets do not fit a {('linear', 'planar')[flat - 1]} group: "
-            f"row {block.set.row_name(row)} stays off by {miss:.2g} (relative)",
-            rows=block.rows[inside],
-            atoms=block.atoms[atoms],
+        name = block.set.row_name(int(block.rows[inside[worst]]))
+        why = (
+            f"since the targets do not fit a {('linear', 'planar')[flat - 1]} group: row {name} stays off by {miss:.2g}"
         )
+        raise _refused(block, atoms, inside, x, f"{why} (relative)")
     return best
 
 
-def _bases(
-    block: LocalRows, atoms: IntArray, inside: IntArray, plane: FloatArray
-) -> tuple[tuple[int, ...], FloatArray]:
-    """Two or three bases far apart (fixed atoms and pairs already held preferred), and all atoms' weights."""
-    n, flat = plane.shape
-    held = {tuple(sorted(block.row_atoms[k])) for k in inside if len(block.row_atoms[k]) == 2}
-    fixed = block.pinned[atoms]
-    candidates = list(range(n))
-    if flat == 2 and n > 40:
-        # The outermost atoms in a few directions; all triples of a large sheet would be too many.
-        angles = np.linspace(0, np.pi, 16, endpoint=False)
-        reach = plane @ np.stack([np.cos(angles), np.sin(angles)])
-        outer = np.concatenate([np.argmax(reach, 0), np.argmin(reach, 0), np.flatnonzero(fixed)[:8]])
-        candidates = np.unique(outer).tolist()
-    choices = list(combinations(candidates, flat + 1))
-    corners = plane[np.array(choices)]
-    edges = corners[:, 1:] - corners[:, :1]
-    size = np.abs(edges[:, 0, 0]) if flat == 1 else np.abs(np.linalg.det(edges))
-    good = np.flatnonzero(size >= 0.5 * size.max()) if flat == 2 else np.flatnonzero(size >= 0.999 * size.max())
-
-    def merit(k: int) -> tuple[int, int, float]:
-        pairs = combinations(choices[k], 2)
-        kept = sum(tuple(sorted((atoms[i], atoms[j]))) in held for i, j in pairs)
-        return int(fixed[list(choices[k])].sum()), kept, float(size[k])
-
-    bases = choices[max(good.tolist(), key=merit)]
-    corner = plane[list(bases)]
-    system = np.vstack([corner.T, np.ones(flat + 1)])
-    weights = np.linalg.solve(system, np.vstack([plane.T, np.ones(n)])).T
+def _bases(plane: FloatArray, fixed: BoolArray) -> tuple[IntArray, FloatArray]:
+    """Two or three bases far apart, fixed atoms before others not twice as far; and all atoms' weights."""
+    away, bases = plane - plane.mean(axis=0), list[int]()
+    for k in range(plane.shape[1] + 1):
+        far = np.linalg.norm(away, axis=1) * np.where(fixed, 2.0, 1.0)
+        bases.append(int(np.argmax(far > (1 - 1e-6) * far.max())))  # so that rounding does not choose
+        away = plane - plane[bases[0]]
+        if k == 1:
+            axis = away[bases[1]] / np.linalg.norm(away[bases[1]])
+            away = away - np.outer(away @ axis, axis)
+    system = np.vstack([plane[bases].T, np.ones(len(bases))])
+    weights = np.linalg.solve(system, np.vstack([plane.T, np.ones(len(plane))])).T
     # Round so that the weights sum to one: the relation then does not depend on the origin.
     weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
-    return bases, weights
+    return np.array(bases), weights
 
 
 def _without_repeats(block: LocalRows, bodies: list[FlatBody]) -> list[FlatBody]:
@@ -784,14 +663,15 @@ def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> Non
     """
     new = _rebuilt(block, bodies)
     u, s, vt, rank = new.decomposed(block.x)
-    old, _ = block.unit_jacobian(block.x)
+    old, _, bend = block.linear(block.x)
+    curvature = new.linear(block.x)[2]
     if np.abs(old @ vt[rank:].T).max(initial=0.0) > 1e-4 or new.singular(block.x):
         raise _unresolved(block, generic)
     rng = np.random.default_rng(20060921)
     for _ in range(3):
         v = rng.standard_normal(len(vt) - rank) @ vt[rank:]
-        a = -((u[:, :rank].T @ new.unit_curvature(block.x, v)) / s[:rank]) @ vt[:rank]
-        bent = block.unit_curvature(block.x, v)
+        a = -((u[:, :rank].T @ curvature(v)) / s[:rank]) @ vt[:rank]
+        bent = bend(v)
         miss = old @ a + bent
         # Rigid motion has no curvature but rounding.
         size = np.linalg.norm(bent) + 1e-5 * (v @ v) / extent_of(block.x)
@@ -837,20 +717,24 @@ def _listed(atoms: IntArray) -> str:
     return ", ".join(str(a) for a in atoms[:8]) + (", ..." if len(atoms) > 8 else "")
 
 
-def _sentence(linearized: int, flat: int, atoms: IntArray) -> str:
-    shown = _listed(atoms)
+def _refused(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, why: str) -> SingularGeometryError:
+    """The error for a flat group that cannot be converted."""
+    linearized = 3 * int(np.sum(~block.pinned[atoms])) - block.rank(block.x, inside)
     freedom, shape, remedy = (
         (5, "collinear", "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead")
-        if flat == 1
+        if affine_dimension(x[atoms]) == 1
         else (
             6,
             "coplanar",
             "hold three distances and x_a = c_i x_i + c_j x_j + c_k x_k (LinearRelation) for the other atoms instead",
         )
     )
-    return (
+    named = block.atoms[atoms]
+    return SingularGeometryError(
         f"constraint set singular at this geometry: {linearized} linearized degrees of freedom but the rigid body "
-        f"has {freedom} (atoms {shown} are {shape}); {remedy}"
+        f"has {freedom} (atoms {_listed(named)} are {shape}); {remedy}; it cannot be converted, {why}",
+        rows=block.rows[inside],
+        atoms=named,
     )
 
 

@@ -64,9 +64,6 @@ class ReversibilityCheck(Listed):
     def check(self, system: System) -> None:
         self.stepper.check(system)
 
-    def time_reversed(self, state: State) -> State:
-        return self.stepper.time_reversed(state) if isinstance(self.stepper, Listed) else state
-
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.
 

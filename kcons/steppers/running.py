@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any, TypeAlias, overload
 
 import numpy as np
@@ -18,51 +19,22 @@ from kcons.steppers.stepper import Stepper, require_stepper
 Observer: TypeAlias = Callable[[State], Any]
 
 
+@dataclass(eq=False, repr=False)
 class Trajectory:
-    """States of a run, from the first on. An observer: it can be given to `run` as well.
+    """States of a run, from the first on, as ``run(system, state, 0.01, 1000, record=10)`` returns 101 of them.
 
     Attributes
     ----------
+    frames : list of State
+    last : State
+        Where the run ended, or the last frame of a run that stopped; a run can go on from here.
     times : ndarray, shape (n_frames,)
     positions, velocities : ndarray, shape (n_frames, n_atoms, 3)
         In the caller's units.
-    last : State
-        Where the run ended, or the last frame of a run that stopped; a run can go on from here.
-
-    Examples
-    --------
-    ``run(system, state, 0.01, 1000, record=10)`` returns one with 101 frames.
     """
 
-    def __init__(self) -> None:
-        self.frames: list[State] = []
-        self._last: State | None = None
-
-    def __call__(self, state: State) -> None:
-        self.frames.append(state)
-        self._last = state
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, frame: int) -> State:
-        return self.frames[frame]
-
-    def __repr__(self) -> str:
-        if not self.frames:
-            return "Trajectory(no frames)"
-        return f"Trajectory({len(self)} frames, t = {self.frames[0].time:g} to {self.frames[-1].time:g})"
-
-    def end(self, state: State) -> Trajectory:
-        """Note where the run ended, which need not be a frame."""
-        self._last = state
-        return self
-
-    @property
-    def last(self) -> State:
-        if self._last is None:
-            raise IndexError("the trajectory has no frames yet")
-        return self._last
+    frames: list[State]
+    last: State
 
     @property
     def times(self) -> FloatArray:
@@ -146,8 +118,8 @@ def run(
     ------
     InputError
         A start off the constraints; negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units,
-        or that is no finite number; what is no system, state, stepper or observer; a state whose time is no finite number,
-        or whose step no count.
+        or that is no finite number; what is no system, state, stepper or observer; a state whose time is no finite
+        number, or whose step no count.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
     UnsupportedError
@@ -179,8 +151,8 @@ def run(
     if steps and state is not system.last:
         x = finite_array(system.kernel_arrays(state)[0], system.n_atoms, "positions")
         system.require_on_rows(x, state.time)
-    kept = Trajectory()
-    rhythms = [(observer, every) for observer in observers] + ([(kept, record)] if record is not None else [])
+    kept: list[State] = []
+    rhythms = [(observer, every) for observer in observers] + ([(kept.append, record)] if record is not None else [])
     march = getattr(stepper, "march", None)
     done = 0
     try:
@@ -202,6 +174,6 @@ def run(
                     observer(state.read_only())
     except BaseException as error:  # also one of the forces, or of the keyboard: nothing recorded is lost
         if record is not None:
-            error.trajectory = kept  # type: ignore[attr-defined]
+            error.trajectory = Trajectory(kept, kept[-1] if kept else state)  # type: ignore[attr-defined]
         raise
-    return state if record is None else kept.end(state)
+    return state if record is None else Trajectory(kept, state)

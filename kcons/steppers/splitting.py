@@ -59,7 +59,7 @@ def fractions_of(values: Sequence[float], item: str) -> tuple[float, ...]:
 
 
 class Splitting(Interpreted):
-    """Base of the steppers made of kicks and drifts.
+    """Base of the steppers made of kicks and drifts: reversible, and symplectic for position rows and potentials.
 
     Parameters
     ----------
@@ -139,8 +139,6 @@ class Splitting(Interpreted):
 class Rattle(Splitting):
     """Velocity Verlet with exactly solved constraints: order 2, one force evaluation a step.
 
-    Reversible; symplectic for position rows and forces that derive from a potential.
-
     One step from (x0, v0) at t0 to (x1, v1) at t1 = t0 + dt::
 
         u  = v0 + dt/2 M^-1 (f(x0) + A(x0)^T l0)       l0 such that sigma(x1, t1) = 0
@@ -174,16 +172,17 @@ class Rattle(Splitting):
 class Geodesic(Splitting):
     """Kick by M_par^+ f, drift along the constraints in small substeps: order 2, one force evaluation.
 
-    The drift is the free flight on the constraints (a geodesic where they rest). It is followed by `substeps`
-    RATTLE substeps, which cost no force, or exactly, by great circles, where every row holds one atom on a
-    sphere at rest. What is left is the error of the splitting alone: as that of velocity Verlet without
-    constraints, it depends on how fast the forces vary, no longer on how fast the constrained directions turn.
+    The drift is the free flight on the constraints (a geodesic where they rest). It is followed by `substeps` RATTLE
+    substeps, which cost no force, or exactly, by great circles, where every row holds one atom of its own on a sphere
+    at rest (`FixedAtoms` may stand beside them). What is left is the error of the splitting alone: as that of velocity
+    Verlet without constraints, it depends on how fast the forces vary, no longer on how fast the constrained directions
+    turn.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. Works with moving rows, which
-    are met at the time of each substep, with velocity rows, and with forces that depend on velocities.
+    Works with moving rows, which are met at the time of each substep, with velocity rows, and with forces that
+    depend on velocities.
 
     Not worth it where forces are cheap and vary as fast as the constrained directions turn: RATTLE with as many
-    smaller steps is then better. Great circles not for rows that move or hold more than one atom.
+    smaller steps is then better.
 
     A rigid rotor in free flight turns by exactly n asin(omega dt/n) a step of n substeps; without a solution for
     omega dt >= n. An atom on a sphere turns by exactly omega dt.
@@ -192,8 +191,6 @@ class Geodesic(Splitting):
     ----------
     substeps : int
         RATTLE substeps in a drift.
-    great_circles : bool, optional
-        None: where possible. True: insist. False: never.
 
     References
     ----------
@@ -201,22 +198,12 @@ class Geodesic(Splitting):
     """
 
     @checked
-    def __init__(self, substeps: Count = 8, great_circles: bool | None = None) -> None:
-        self.substeps, self.great_circles = substeps, great_circles
-        flight = (1.0 / self.substeps,) * self.substeps
-        super().__init__((0.5, 0.5), (1.0,), flight, exact_flight=great_circles is not False)
+    def __init__(self, substeps: Count = 8) -> None:
+        self.substeps = substeps
+        super().__init__((0.5, 0.5), (1.0,), (1.0 / substeps,) * substeps, exact_flight=True)
 
     def __repr__(self) -> str:
-        circles = "" if self.great_circles is None else f", great_circles={self.great_circles}"
-        return f"Geodesic(substeps={self.substeps}{circles})"
-
-    def check(self, system: System) -> None:
-        """Raise `UnsupportedError` if great circles are asked for where there are none."""
-        if self.great_circles and system.great_circles is None:
-            raise UnsupportedError(
-                "great circles need rows that each hold one atom of its own on a sphere at rest (FixedAtoms may "
-                "stand beside them); this set holds something else. Leave great_circles at None for RATTLE substeps"
-            )
+        return f"Geodesic(substeps={self.substeps})"
 
 
 class Composition(Splitting):
@@ -226,8 +213,7 @@ class Composition(Splitting):
     and a palindrome of fractions, cancel them: sum g^3 = 0 gives order 4, three more conditions order 6. Some fractions
     must be negative: constraints, targets and forces are then asked for earlier times.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. One force evaluation a
-    fraction, more for forces that depend on velocities.
+    One force evaluation a fraction, more for forces that depend on velocities.
 
     Works with all that `Rattle` works with: velocity rows, rows and targets that move, friction (of which the
     stages that go back see the reverse).
@@ -280,8 +266,7 @@ class Composition(Splitting):
 class Suzuki4(Composition):
     """Order 4, five force evaluations: the robust choice of order 4 for all that is held.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
-    Not for targets or forces that are not smooth in time.
+    All stages lie within the step. Not for targets or forces that are not smooth in time.
     """
 
     def __init__(self) -> None:
@@ -291,8 +276,8 @@ class Suzuki4(Composition):
 class Yoshida4(Composition):
     """Order 4, three force evaluations: the triple jump, the fewest and with the largest error.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. Stages lie between -0.35 and
-    1.35 of the step. Not for targets or forces that begin with the run, nor for strong friction.
+    Stages lie between -0.35 and 1.35 of the step. Not for targets or forces that begin with the run, nor for strong
+    friction.
     """
 
     def __init__(self) -> None:
@@ -302,9 +287,8 @@ class Yoshida4(Composition):
 class KahanLi6(Composition):
     """Order 6, nine force evaluations: for high accuracy where forces depend on velocities.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
-    Not for targets or forces that are not smooth in time, nor where solves are tight: some of its RATTLE steps are
-    0.79 of the whole step long.
+    All stages lie within the step. Not for targets or forces that are not smooth in time, nor where solves are
+    tight: some of its RATTLE steps are 0.79 of the whole step long.
     """
 
     def __init__(self) -> None:
@@ -319,8 +303,7 @@ class RungeKuttaNystrom(Splitting):
     exact drifts; a drift whose own order is that of the splitting keeps it, here a composition of RATTLE drifts, which
     costs projections and no force. Along great circles where every row allows it.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. Works with moving rows and with
-    rows linear in the velocities; forces may depend on time.
+    Works with moving rows and with rows linear in the velocities; forces may depend on time.
 
     Not with forces that depend on the velocities: the order would be lost without any sign, and `check` raises.
     Not worth it where forces cost less than the projections of a drift, five or nine to a force evaluation.
@@ -341,8 +324,7 @@ class RungeKuttaNystrom(Splitting):
 class BlanesMoan4(RungeKuttaNystrom):
     """Order 4, six force evaluations (SRKN_6^b), drifts by Suzuki's composition: 30 projections a step.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
-    Not for forces that depend on the velocities (raises; use Suzuki4 instead).
+    All stages lie within the step. Not for forces that depend on the velocities (raises; use Suzuki4 instead).
     """
 
     order = 4
@@ -354,8 +336,7 @@ class BlanesMoan4(RungeKuttaNystrom):
 class BlanesMoan6(RungeKuttaNystrom):
     """Order 6, eleven force evaluations (SRKN_11^b), drifts by Kahan and Li's composition: 99 projections a step.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
-    Not for forces that depend on the velocities (raises; use KahanLi6 instead).
+    All stages lie within the step. Not for forces that depend on the velocities (raises; use KahanLi6 instead).
     """
 
     order = 6
@@ -367,9 +348,8 @@ class BlanesMoan6(RungeKuttaNystrom):
 class BlanesMoan6a(RungeKuttaNystrom):
     """Order 6, fourteen force evaluations (SRKN_14^a), beginning and ending with a drift: 135 projections a step.
 
-    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
-    Not for forces that depend on the velocities (raises; use KahanLi6 instead), nor where the forces at the end of
-    a step are wanted: its states carry none.
+    All stages lie within the step. Not for forces that depend on the velocities (raises; use KahanLi6 instead), nor
+    where the forces at the end of a step are wanted: its states carry none.
     """
 
     order = 6

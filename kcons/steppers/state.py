@@ -136,19 +136,6 @@ class State:
             return False
         return self.is_of(system) and (there is here or np.array_equal(there, here))
 
-    def reversed(self, stepper: Any = None) -> State:
-        """The same point with opposite velocities; `stepper` is the thermostat whose variables it carries, if any.
-
-        Raises
-        ------
-        InputError
-            It carries some, and no stepper is given: they may be velocities, too.
-        """
-        if self.thermostat is not None and not hasattr(stepper, "step"):
-            raise InputError("the state carries variables of a thermostat; give it: reversed(stepper)", item="stepper")
-        back = replace(self, velocities=-self.velocities, forces=None)  # these may depend on velocities
-        return stepper.time_reversed(back) if hasattr(stepper, "time_reversed") else back
-
     def save(self, file: str | PathLike[str] | BinaryIO) -> None:
         """Write everything the state holds in NumPy's .npz format: a run continued from it is the same to the last bit.
 
@@ -181,26 +168,15 @@ class State:
 
     def read_only(self) -> State:
         """The same state for a function of the user, who can read its arrays and not change them."""
-        view = object.__new__(_Shown)
-        object.__setattr__(view, "__dict__", vars(self))
-        return view
+        return self._with_arrays(read_only_view)
 
     def copied(self) -> State:
         """The same state with arrays of its own."""
-        own: dict[str, Any] = {n: a.copy() if isinstance(a, np.ndarray) else a for n, a in vars(self).items()}
+        return self._with_arrays(np.ndarray.copy)
+
+    def _with_arrays(self, change: Callable[[FloatArray], FloatArray]) -> State:
+        own: dict[str, Any] = {n: change(a) if isinstance(a, np.ndarray) else a for n, a in vars(self).items()}
         return State(**own)
-
-
-class _Shown(State):
-    """A state that shares the arrays of another one, and lends them only."""
-
-
-def _lent(name: str) -> property:
-    return property(lambda self: None if vars(self)[name] is None else read_only_view(vars(self)[name]))
-
-
-for _name in ("positions", "velocities", "forces", "remainder", "thermostat", "barostat"):
-    setattr(_Shown, _name, _lent(_name))
 
 
 class System:
@@ -477,10 +453,19 @@ class System:
         """Kinetic plus potential energy; needs `potential` unless there are no forces."""
         if self.potential is None and self.force is not None:
             raise InputError("this System has no potential; pass potential=... to follow the energy", item="potential")
-        potential = (
-            0.0 if self.potential is None else float(self.potential(read_only_view(state.positions), state.time))
-        )
-        return self.kinetic_energy(state.velocities) + potential
+        return self.kinetic_energy(state.velocities) + self.potential_energy(state.positions, state.time)
+
+    def potential_energy(self, x: FloatArray, time: float) -> float:
+        """What `potential` gives, 0 without it; `InputError` if that is not one real number."""
+        if self.potential is None:
+            return 0.0
+        found = self.potential(read_only_view(x), time)
+        if np.ndim(found) or not np.issubdtype(np.asarray(found).dtype, np.number) or np.iscomplexobj(found):
+            raise InputError(
+                f"the potential returned {found!r}; it must return one real number, the energy of all atoms",
+                item="potential",
+            )
+        return float(found)
 
     # -- inner ----------------------------------------------------------------------------------
 

@@ -87,10 +87,6 @@ class Listed(DropsSystemCaches):
         """
         raise NotImplementedError
 
-    def time_reversed(self, state: State) -> State:
-        """A state that was `reversed`, with what its variables become: most stay."""
-        return state
-
     def listing(self, system: System | None = None) -> str:
         """A step in words, a line for each operation, with fractions of the step; `system` as for `operations`."""
         return "\n".join([f"a step of {self!r}", *(f"  {operation}" for operation in self.operations(system))])

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +49,7 @@ from kcons.motion.motion import Motion
 from kcons.steppers import System
 from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.correlated_series import MIN_SAMPLES, Estimate, few, spread
-from kcons.thermostats.freedom import UNCHANGED, atom_numbers, bodies, row_changes
+from kcons.thermostats.freedom import UNCHANGED, bodies, row_changes
 from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
@@ -223,8 +222,6 @@ class TemperatureSplit:
     displacement : float, optional
         Typical move of an atom for a difference; a thousandth of the distance to the next atom by default. Forces in
         single precision want three to ten times as much.
-    groups : mapping of str to array_like of int, optional
-        Atoms by name, whose temperatures `result` tells apart. A cluster belongs to the group of its first atom.
 
     Raises
     ------
@@ -243,7 +240,6 @@ class TemperatureSplit:
         *,
         rng: Rng = 0,
         displacement: float | None = None,
-        groups: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         refuse_other(system, System, "system", "a kcons.steppers.System")
         if system.motion.plan.driven or system.velocity_dependent:
@@ -252,15 +248,9 @@ class TemperatureSplit:
             raise UnsupportedError("configurations have a temperature where rows hold positions, not velocities only")
         if displacement is not None:
             positive(displacement, "displacement")
-        if groups is not None and not isinstance(groups, Mapping):
-            raise InputError(f"groups is {groups!r}; give a mapping of names to atoms", item="groups")
         self._system, self._displacement = system, displacement
-        self._groups = {name: atom_numbers(atoms, system.n_atoms) for name, atoms in (groups or {}).items()}
         self._rng = generator_of(rng)
-        self._clusters: Clusters | None = None
-        #: Clusters with motions besides shifts and turns; known after the first draw.
-        self._rest: NDArray[np.bool_] | None = None
-        self._flight = 0.0
+        self._flight = 0.0  # until the first configuration
         self._series: list[FloatArray] = []
 
     def __len__(self) -> int:
@@ -272,52 +262,41 @@ class TemperatureSplit:
         Raises
         ------
         InputError
-            Positions off the constraints; groups without a cluster.
+            Positions off the constraints.
         """
         system = self._system
         x = configuration(system, positions)
         f = self._forces(x) if forces is None else as_array(forces, x.shape, "forces")
         check_finite(f, "force", len(self._series))
-        if self._clusters is None:
+        if not self._flight:
             self._begin(x)
-        clusters, masses = self._clusters, system.masses[:, None]
-        assert clusters is not None
-        arms = clusters.arms(x)
-        turns = clusters.unit_turns(arms)
-        if self._rest is None:
-            rest = masses * self._rest_of(x, arms, turns) ** 2
-            self._rest = clusters.add_up(rest.sum(axis=1)) > RIGID
+        arms = self._clusters.arms(x)
+        turns = self._clusters.unit_turns(arms)
         above = self._squares(x, f, arms, turns)
         below = self._curvatures(x, arms, turns)
         for kinds in (above, below):  # what is left: all less shifts and turns
             kinds[2] = np.where(self._rest, kinds[2] - kinds[0] - kinds[1], 0.0)
-        self._series.append(np.stack([above, below]) @ self._member.T)
+        self._series.append(np.stack([above, below]).sum(axis=2))
 
-    def result(self, group: str | None = None) -> SplitTemperatures:
-        """Temperatures so far, of all clusters or of those of one group.
+    def result(self) -> SplitTemperatures:
+        """Temperatures so far.
 
         Raises
         ------
         InputError
-            Fewer than 32 samples; an unknown group.
+            Fewer than 32 samples.
 
         Warns
         -----
         UserWarning
             Fewer than 10 independent samples; a temperature that has no error, which is given as infinite.
         """
-        if len(self._series) < MIN_SAMPLES or self._clusters is None or self._rest is None:
+        if len(self._series) < MIN_SAMPLES:
             raise InputError(
                 f"{len(self._series)} samples are too few for an error; add {MIN_SAMPLES} or more", item="samples"
             )
-        names = [None, *self._groups]
-        if group not in names:
-            raise InputError(f"there is no group {group!r}; there are {', '.join(self._groups)}", item="group")
-        which = names.index(group)
-        inside = self._member[which] > 0
-        clusters = self._clusters
-        series = np.array(self._series)[:, :, :, which]
-        exists = (clusters.shifts & inside, self._axes * inside, self._rest & inside)
+        series = np.array(self._series)
+        exists = self._clusters.shifts, self._axes, self._rest
         found: list[Estimate | None] = [None, None, None]
         for kind, (name, there) in enumerate(zip(("shifts", "turns", "internal motions"), exists, strict=True)):
             if there.any() and series[:, 0, kind].any():
@@ -336,7 +315,7 @@ class TemperatureSplit:
             turn_frequency=math.sqrt(squares[1]),
             samples=len(series),
             left_out=(
-                *self._left_out(inside),
+                *self._left_out(),
                 *(
                     f"no force {does} clusters as a whole: that has no temperature"
                     for does, kind in (("shifts", 0), ("turns", 1))
@@ -350,22 +329,15 @@ class TemperatureSplit:
     def _begin(self, x: FloatArray) -> None:
         system = self._system
         moving = system.inverse_masses[:, 0] > 0
-        self._flight = flight_of(system, x, self._displacement, MOVE)
-        clusters = Clusters(system.motion, x, moving)
-        first = np.full(clusters.count, system.n_atoms)
-        atoms = np.flatnonzero(moving)
-        np.minimum.at(first, clusters.label[atoms], atoms)
-        members = [np.ones(clusters.count), *(np.isin(first, chosen) * 1.0 for chosen in self._groups.values())]
-        for name, member in zip(self._groups, members[1:], strict=True):
-            if not member.any():
-                raise InputError(
-                    f"group {name!r} has no first atom of a cluster that moves; give all atoms of its clusters",
-                    item="groups",
-                )
-        self._member: FloatArray = np.array(members)
-        #: Axes about which each cluster turns.
-        self._axes: IntArray = clusters.unit_turns(clusters.arms(x)).any(axis=1).sum(axis=1)
-        self._clusters = clusters
+        flight = flight_of(system, x, self._displacement, MOVE)
+        self._clusters = clusters = Clusters(system.motion, x, moving)
+        arms = clusters.arms(x)
+        turns = clusters.unit_turns(arms)
+        #: Axes about which each cluster turns, and clusters with motions besides shifts and turns.
+        self._axes: IntArray = turns.any(axis=1).sum(axis=1)
+        rest = system.masses[:, None] * self._rest_of(x, arms, turns) ** 2
+        self._rest: NDArray[np.bool_] = clusters.add_up(rest.sum(axis=1)) > RIGID
+        self._flight = flight
 
     def _forces(self, x: FloatArray) -> FloatArray:
         return self._system.forces(x, np.zeros_like(x), 0.0, len(self._series))
@@ -373,7 +345,6 @@ class TemperatureSplit:
     def _rest_of(self, x: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:
         """Thermal velocities of unit energy, less shifts and turns."""
         clusters, masses = self._clusters, self._system.masses[:, None]
-        assert clusters is not None
         v = thermal_velocities(self._system, x, 1.0, self._rng)
         pace = clusters.add_up(masses * v) / clusters.mass[:, None] * clusters.shifts[:, None]
         spins = np.einsum("cik,cjk,cj->ci", turns, turns, clusters.add_up(masses * np.cross(arms, v)))
@@ -382,7 +353,6 @@ class TemperatureSplit:
     def _squares(self, x: FloatArray, f: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:
         """Squares of the slopes by shifts, by turns, and of all, of each cluster; shape (3, clusters)."""
         clusters = self._clusters
-        assert clusters is not None
         sizes = np.sqrt((f * f).sum(axis=1))
         force = _unbalanced(clusters.add_up(f), clusters.add_up(sizes))
         reach = np.sqrt((arms * arms).sum(axis=1))
@@ -390,7 +360,7 @@ class TemperatureSplit:
         shift = np.where(clusters.shifts, (force * force).sum(axis=1) / clusters.mass, 0.0)
         turn = (np.einsum("cik,ci->ck", turns, torque) ** 2).sum(axis=1)
         whole = np.zeros_like(shift)
-        if self._rest is None or self._rest.any():
+        if self._rest.any():
             whole = clusters.add_up((f * constrained_acceleration(self._system, x, f, 0.0)).sum(axis=1))
         return np.stack([shift, turn, whole])
 
@@ -401,7 +371,6 @@ class TemperatureSplit:
         serves all three, so that it cancels in what is left.
         """
         clusters, h = self._clusters, self._flight
-        assert clusters is not None and self._rest is not None
         signs = self._rng.choice((-1.0, 1.0), size=(2, clusters.count, 3))
         pushed = clusters.spread(signs[0] * (clusters.shifts / np.sqrt(clusters.mass))[:, None])
         spin = clusters.spread(np.einsum("cik,ck->ci", turns, signs[1]))
@@ -423,21 +392,19 @@ class TemperatureSplit:
 
     def _slopes(self, x: FloatArray, v: FloatArray) -> FloatArray:
         """What the forces of each cluster do at x along v."""
-        assert self._clusters is not None
         return self._clusters.add_up((self._forces(x) * v).sum(axis=1))
 
-    def _left_out(self, inside: NDArray[np.bool_]) -> list[str]:
+    def _left_out(self) -> list[str]:
         clusters = self._clusters
-        assert clusters is not None
         several = np.bincount(clusters.label[clusters.label >= 0], minlength=clusters.count) > 1
         notes = []
-        tied = int((~clusters.shifts & inside).sum())
+        tied = int((~clusters.shifts).sum())
         if tied:
             notes.append(f"{tied} clusters are tied to a place in space and do not shift: they count as internal")
-        bound = int((clusters.shifts & several & ~clusters.turns & inside).sum())
+        bound = int((clusters.shifts & several & ~clusters.turns).sum())
         if bound:
             notes.append(f"{bound} clusters are tied to a direction in space and do not turn: they count as internal")
-        if not several[inside].any():
+        if not several.any():
             notes.append("single atoms only: nothing turns")
         fixed = int((clusters.label < 0).sum())
         if fixed:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from kcons.constraints.arguments import checked
 from kcons.constraints.constraint import IntArray
@@ -107,8 +107,6 @@ class Freedom:
     count : int
         Independent momenta g: 3 n less the rank of the rows, less one for each direction in which total momentum is
         conserved.
-    atoms : ndarray of int or None
-        None for all.
     directions : ndarray, shape (k, 3)
         Orthonormal directions in which total momentum is conserved, k <= 3.
     turns : bool
@@ -116,16 +114,13 @@ class Freedom:
     """
 
     count: int
-    atoms: IntArray | None
     directions: FloatArray
     turns: bool = False
 
 
 @checked
-def freedom(
-    system: System, state: State, forces: FloatArray, atoms: ArrayLike | None = None, momentum: Momentum = "auto"
-) -> Freedom:
-    """Count the degrees of freedom of all atoms or of some.
+def freedom(system: System, state: State, forces: FloatArray, momentum: Momentum = "auto") -> Freedom:
+    """Count the degrees of freedom.
 
     Parameters
     ----------
@@ -133,8 +128,6 @@ def freedom(
     state : State
     forces : ndarray, shape (n_atoms, 3)
         Applied forces at the state.
-    atoms : array_like of int, optional
-        A part of the system that no row couples to the rest.
     momentum : {'auto', 'conserved', 'free'}
         In which directions total momentum is conserved. 'auto' finds them: directions along which all rows may be
         shifted, and in which the forces add up to nothing, here and after a shift of the whole system (one force
@@ -144,62 +137,35 @@ def freedom(
     Raises
     ------
     UnsupportedError
-        A row couples the chosen atoms to others; 'conserved' with rows that hold atoms in space.
+        'conserved' with rows that hold atoms in space.
     OverdeterminedError
         No degree of freedom is left.
     """
-    chosen, count = _counted(system, state, atoms)
     directions = np.zeros((0, 3))
     turns = False
     if momentum == "conserved":
         directions = open_directions(system.motion, state.positions, state.time)
         if not len(directions):
             raise UnsupportedError(_HELD)
-    elif momentum == "auto" and chosen is None and system.n_atoms > 1:
+    elif momentum == "auto" and system.n_atoms > 1:
         directions, turns = _conserved(system, state, forces)
-    count -= len(directions)
+    count = system.motion.degrees_of_freedom - len(directions)
     if count <= 0:
         raise OverdeterminedError(
             "no degree of freedom is left for the thermostat: hold fewer rows"
             + (f" (total momentum, conserved, takes {len(directions)})" if len(directions) else ""),
             rows=range(system.motion.constraint_set.n_rows),
         )
-    return Freedom(count, chosen, directions, turns)
+    return Freedom(count, directions, turns)
 
 
-def may_be(count: float, system: System, state: State, atoms: ArrayLike | None, momentum: Momentum) -> bool:
+def may_be(count: float, system: System, state: State, momentum: Momentum) -> bool:
     """Whether `freedom` could find this count: states that were loaded may be of other rows, or of other `momentum`."""
-    chosen, most = _counted(system, state, atoms)
-    if momentum == "free" or (momentum == "auto" and chosen is not None):
+    most = system.motion.degrees_of_freedom
+    if momentum == "free":
         return count == most
     least = most - len(open_directions(system.motion, state.positions, state.time))
     return count == least if momentum == "conserved" else least <= count <= most
-
-
-def _counted(system: System, state: State, atoms: ArrayLike | None) -> tuple[IntArray | None, int]:
-    """The chosen atoms, None for all, and 3 for each less the rank of their rows."""
-    chosen = None if atoms is None else atom_numbers(atoms, system.n_atoms)
-    if chosen is None or len(chosen) == system.n_atoms:
-        return None, system.motion.degrees_of_freedom
-    held = system.motion.constraint_set
-    count = 3 * len(chosen)
-    if not held.n_rows:
-        return chosen, count
-    inside = np.zeros(system.n_atoms, dtype=np.int64)
-    inside[chosen] = 1
-    touches = held.incidence @ inside
-    width = np.asarray(held.incidence.sum(axis=1)).ravel()
-    crossing = np.flatnonzero((touches > 0) & (touches < width))
-    if len(crossing):
-        raise UnsupportedError(
-            f"row {held.row_name(int(crossing[0]))} couples thermostatted atoms to others; choose atoms such that "
-            "every row is wholly inside or outside"
-        )
-    rows = np.flatnonzero(touches > 0)
-    if len(rows):
-        part, numbers = held.subset(rows)
-        count -= Motion(part, state.positions[numbers], time=state.time).rank
-    return chosen, count
 
 
 # -- total momentum ---------------------------------------------------------------------------------
@@ -400,18 +366,6 @@ def _apart(system: System, state: State) -> bool:
         if any(felt(np.asarray((1.0 - 0.5**k) * way), moved) for k in range(1, NEARER + 1)):
             return False
     return True
-
-
-def atom_numbers(atoms: ArrayLike, n_atoms: int) -> IntArray:
-    """Different atom numbers in order, one or more; `InputError` otherwise."""
-    given = np.asarray(atoms)
-    if given.dtype == bool and given.shape == (n_atoms,):
-        given = np.flatnonzero(given)
-    whole = given.dtype.kind in "iu"
-    numbers = np.unique(given.ravel()).astype(np.int64) if whole else np.zeros(0, dtype=np.int64)
-    if len(numbers) == 0 or numbers[0] < 0 or numbers[-1] >= n_atoms:
-        raise InputError(f"atoms must be whole numbers from 0 to {n_atoms - 1}, at least one", item="atoms")
-    return numbers
 
 
 def refuse_dissipation(system: System, why: str) -> None:

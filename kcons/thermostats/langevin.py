@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from typing import Any
 
 import numpy as np
@@ -26,32 +25,10 @@ from kcons.thermostats.noise import fill_normal
 HEAT, WARM, FRICTION, KT, ASIDE, SEED, NUMBER, PART, PARTS, MASSES = 0, 1, 2, 3, 4, 5, 7, 8, 9, 10
 
 
-class _Generator(threading.local):
-    """A counter-based generator for each thread."""
-
-    def __init__(self) -> None:
-        self.bits = np.random.Philox(0)
-        self.numbers = np.random.Generator(self.bits)
-        self.counter, self.key = [0, 0, 0, 0], [0, 0]
-        self.state: Any = {
-            "bit_generator": "Philox",
-            "state": {"counter": self.counter, "key": self.key},
-            "buffer": [0, 0, 0, 0],
-            "buffer_pos": 4,
-            "has_uint32": 0,
-            "uinteger": 0,
-        }
-
-
-_GENERATOR = _Generator()
-
-
 def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
-    """This thread's generator of numbers that are a function of a key, the number of a step and its part."""
-    _GENERATOR.key[:] = key
-    _GENERATOR.counter[2:] = number, part
-    _GENERATOR.bits.state = _GENERATOR.state
-    return _GENERATOR.numbers
+    """A generator of numbers that are a function of a key, the number of a step and its part."""
+    counter = np.array([0, 0, number, part], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter))
 
 
 class SeededBath(Interpreted):

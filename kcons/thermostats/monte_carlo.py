@@ -8,11 +8,11 @@ neighboring temperatures.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import is_
-from typing import Annotated, TypeAlias
+from typing import Annotated
 from weakref import ref
 
 import numpy as np
@@ -264,7 +264,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         goes_on = self._left is not None and all(map(is_, self._left, (state.thermostat, state.positions)))
         strange = not goes_on and (state.origin is None or state.origin[0] is None)
         if strange or not state.has_forces_of(system) or math.isnan(held[POTENTIAL]):
-            known, held[POTENTIAL] = held[POTENTIAL], energy_at(system, state)
+            known, held[POTENTIAL] = held[POTENTIAL], system.potential_energy(state.positions, state.time)
             if not math.isnan(known) and known != held[POTENTIAL]:
                 state = replace(state, forces=None)
             if not math.isfinite(held[POTENTIAL]):
@@ -291,31 +291,26 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         self._left = held, end.positions
         return replace(end, time=time, time_remainder=left_over, step=number, thermostat=held, origin=origin)
 
-    def trajectory(self, system: System, state: State, dt: float, count: int) -> State:
-        """The end of so many steps from `state`, each of which was taken back, or `ReversibilityError`."""
-        if self._known is None or self._known[0] is not system:
-            self._known = system, ReversedSteps(system, self.stepper, self.tolerance)
-        steps = self._known[1]
-        for _ in range(count):
-            state = steps.step(system, state, dt)
-        return state
-
     # -- inner ----------------------------------------------------------------------------------
 
     def _judged(
         self, system: System, begin: State, dt: float, count: int, threshold: float, potential: float
     ) -> tuple[State, int, float, float]:
         """The end of a proposal, what became of it, the change of energy over kT, and the potential energy there."""
-        kinetic = system.kinetic_energy(begin.velocities)
+        kinetic, end = system.kinetic_energy(begin.velocities), begin
+        if self._known is None or self._known[0] is not system:
+            self._known = system, ReversedSteps(system, self.stepper, self.tolerance)
+        steps = self._known[1]
         try:
-            end = self.trajectory(system, begin, dt, count)
+            for _ in range(count):
+                end = steps.step(system, end, dt)
         except ReversibilityError:
             return begin, IRREVERSIBLE, math.nan, potential
         except (ConvergenceError, SingularGeometryError):
             return begin, UNSOLVED, math.nan, potential
         except NonFiniteError:
             return begin, NOT_FINITE, math.nan, potential
-        there = energy_at(system, end)
+        there = system.potential_energy(end.positions, end.time)
         change = (system.kinetic_energy(end.velocities) - kinetic + (there - potential)) / self.thermal_energy
         if not math.isfinite(change):
             return begin, NOT_FINITE, math.nan, potential
@@ -327,21 +322,6 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         noise = random.standard_normal(v.shape)
         noise *= np.sqrt((1 - self.keep**2) * self.thermal_energy * system.inverse_masses)
         return system.motion.project_velocities(x, self.keep * v + noise, time=state.time)
-
-
-def energy_at(system: System, state: State) -> float:
-    """The potential energy, 0 without forces; `InputError` if it is not one real number."""
-    if system.potential is None:
-        return 0.0
-    x = state.positions.view()
-    x.setflags(write=False)
-    found = system.potential(x, state.time)
-    if np.ndim(found) or not np.issubdtype(np.asarray(found).dtype, np.number) or np.iscomplexobj(found):
-        raise InputError(
-            f"the potential returned {found!r}; it must return one real number, the energy of all atoms",
-            item="potential",
-        )
-    return float(found)
 
 
 def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
@@ -358,52 +338,6 @@ def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
 #: Of dual averaging: how strongly proposals move the step, how many count as made already, how fast old ones are
 #: forgotten.
 PULL, BEFORE, FORGET = 0.2, 10, 0.75
-
-Proposals: TypeAlias = Annotated[int, partial(whole_number, least=20)]
-
-
-class DualAveraging:
-    """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5)."""
-
-    @checked
-    def __init__(self, dt: Positive, wanted: Annotated[float, positive, share]) -> None:
-        self.wanted = wanted
-        self._center = self._log = math.log(dt)
-        self._sum = self._mean = 0.0
-        self._told: list[float] = []
-        self.made = 0
-
-    @property
-    def dt(self) -> float:
-        """For the next proposal."""
-        return math.exp(self._log)
-
-    @property
-    def result(self) -> float:
-        """The mean, later proposals counting more."""
-        return math.exp(self._mean) if self.made else self.dt
-
-    @property
-    def acceptance(self) -> float:
-        """Mean probability of the second half of the proposals."""
-        second = self._told[(self.made + 1) // 2 :]
-        return sum(second) / len(second)
-
-    def refuse_failure(self, shown: Callable[[float], str] = "{:.3g}".format) -> None:
-        """Raise `ConvergenceError` where none of the second half of the proposals succeeded; `shown` tells a time."""
-        if not self.acceptance > 0:
-            raise ConvergenceError(
-                f"no proposal succeeded with time steps down to {shown(self.dt)}; is the start sound?"
-            )
-
-    def learn(self, probability: float) -> None:
-        """A proposal with `dt` had this probability of being accepted."""
-        self.made += 1
-        self._told.append(probability)
-        self._sum += self.wanted - probability
-        self._log = self._center - math.sqrt(self.made) / PULL * self._sum / (self.made + BEFORE)
-        share = self.made**-FORGET
-        self._mean += share * (self._log - self._mean)
 
 
 @dataclass(frozen=True)
@@ -439,11 +373,11 @@ def best_acceptance(order: int) -> float:
 def tune(
     system: System,
     state: State,
-    dt: float,
+    dt: Positive,
     sampler: HamiltonianMonteCarlo,
     *,
-    wanted: float | None = None,
-    proposals: Proposals = 80,
+    wanted: Annotated[float, positive, share] | None = None,
+    proposals: Annotated[int, partial(whole_number, least=20)] = 80,
 ) -> Tuned:
     """Find the time step for a share of accepted proposals, by proposals with steps that differ.
 
@@ -469,20 +403,35 @@ def tune(
         No proposal of the second half could be made, however small the step became.
     KconsError
         As `HamiltonianMonteCarlo.step`.
+
+    References
+    ----------
+    Dual averaging: Hoffman and Gelman, J. Mach. Learn. Res. 15, 1593 (2014), Algorithm 5.
     """
-    search = DualAveraging(dt, best_acceptance(sampler.order) if wanted is None else wanted)
     sampler.check(system)
     known = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
     held = np.zeros(SIZE) if known is None else known
-    for _ in range(proposals):
+    wanted = best_acceptance(sampler.order) if wanted is None else wanted
+    begin = log = math.log(dt)
+    missing = mean = 0.0
+    chances: list[float] = []
+    for made in range(1, proposals + 1):
         before = held[SUM]
-        state = sampler.step(system, state, search.dt)
+        state = sampler.step(system, state, math.exp(log))
         held = np.asarray(state.thermostat)
-        search.learn(float(held[SUM] - before))
-    search.refuse_failure(system.shown_time)
+        chances.append(float(held[SUM] - before))
+        missing += wanted - chances[-1]
+        log = begin - math.sqrt(made) / PULL * missing / (made + BEFORE)
+        mean += made**-FORGET * (log - mean)
+    second = chances[(proposals + 1) // 2 :]
+    acceptance = sum(second) / len(second)
+    if not acceptance > 0:
+        raise ConvergenceError(
+            f"no proposal succeeded with time steps down to {system.shown_time(math.exp(log))}; is the start sound?"
+        )
     potential, held = held[POTENTIAL], np.zeros(SIZE)
     held[POTENTIAL] = potential
-    return Tuned(search.result, search.acceptance, replace(state, thermostat=held))
+    return Tuned(math.exp(mean), acceptance, replace(state, thermostat=held))
 
 
 def exchange(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from kcons.steppers import Rattle, State, System
 from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Chain, Operation
 from kcons.steppers.program import Program, Row
-from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4, Splitting
+from kcons.steppers.splitting import SUZUKI_4
 from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import (
     AT_REST,
@@ -34,19 +34,13 @@ from kcons.thermostats.freedom import (
 )
 from kcons.thermostats.langevin import kinetic
 
-#: Fractions in which the chain moves, by order: a symmetric step, Suzuki's five, Kahan and Li's nine.
-FRACTIONS = {2: (1.0,), 4: SUZUKI_4, 6: KAHAN_LI_6}
+#: Fractions of its time in which the chain moves on at fixed velocities, of order 4.
+FRACTIONS = SUZUKI_4
 #: What comes before a step on the constraints, and after it.
 HALF = Chain(0.5)
-ChainOrder = Literal[2, 4, 6]
 #: What the numbers of a program begin with: k_B T, the links, the fractions in which they move, and how often they do;
 #: after them as many masses of the links, positions and velocities of these with g, and masses for each coordinate.
 KT, LINKS, PARTS, SIZE = range(4)
-
-
-def chain_fractions(chain_order: ChainOrder, repeats: int) -> tuple[float, ...]:
-    """The fractions of its time in which a chain moves on, `repeats` times in succession."""
-    return tuple(share / repeats for share in FRACTIONS[chain_order]) * repeats
 
 
 class NoseHooverChain(Interpreted):
@@ -63,19 +57,8 @@ class NoseHooverChain(Interpreted):
         Time in which the temperature oscillates; a few times the slowest vibration, at least 20 time steps.
     length : int
         Links of the chain.
-    chain_order : {2, 4, 6}
-        Of the motion of the chain at fixed velocities.
-    repeats : int
-        In how many parts of the time it is made.
-    stepper : Splitting, optional
-        Of order 2; `Rattle` by default.
     momentum : {'auto', 'conserved', 'free'}
         See `kcons.thermostats.freedom`.
-
-    Raises
-    ------
-    UnsupportedError
-        A stepper of another order than 2.
 
     Warns
     -----
@@ -96,6 +79,7 @@ class NoseHooverChain(Interpreted):
     order = 2
     reversible = True
     symplectic = False
+    force_evaluations = 1
 
     @checked
     def __init__(
@@ -104,27 +88,18 @@ class NoseHooverChain(Interpreted):
         period: Positive,
         *,
         length: Count = 3,
-        chain_order: ChainOrder = 4,
-        repeats: Count = 1,
-        stepper: Splitting | None = None,
         momentum: Momentum = "auto",
     ) -> None:
         self.thermal_energy, self.period, self.length = thermal_energy, period, length
-        self.fractions = chain_fractions(chain_order, repeats)
-        self.stepper: Splitting = Rattle() if stepper is None else stepper
-        if not isinstance(self.stepper, Splitting):
-            raise InputError(f"stepper is {stepper!r}; give a splitting, such as kcons.Rattle()", item="stepper")
-        if self.stepper.order != 2:
-            raise UnsupportedError(f"{self.stepper!r} has order {self.stepper.order}, the chain 2; use Rattle")
         self.momentum: Momentum = momentum
-        self.force_evaluations = self.stepper.force_evaluations
-        self._made: tuple[tuple[Operation, ...], Program] | None = None
+        self._operations = HALF, *Rattle().operations(), HALF
+        self._program = Program(self._operations, {"chain": _chain})
 
     def __repr__(self) -> str:
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        return HALF, *self.stepper.operations(system), HALF
+        return self._operations
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for rows whose targets demand velocities, velocity-dependent forces, or friction."""
@@ -133,7 +108,6 @@ class NoseHooverChain(Interpreted):
             raise UnsupportedError(
                 "targets move, or rows hold velocities, and scaled velocities would not follow them; use Langevin"
             )
-        self.stepper.check(system)
 
     def start(self, system: System, state: State) -> State:
         """The state with its forces, and a chain at rest if it carries none, or one of other degrees of freedom."""
@@ -143,21 +117,17 @@ class NoseHooverChain(Interpreted):
         state = system.with_forces(state)
         if known and state.thermostat is self._left:
             return state
-        goes_on = known and self._fits(system, state)
+        g = state.thermostat[-1] if known and state.thermostat is not None else math.nan
+        goes_on = known and may_be(float(g), system, state, self.momentum)
         if goes_on and not self._moves_on(system, state):
             return state
         assert state.forces is not None
-        free = freedom(system, state, state.forces, None, self.momentum)
+        free = freedom(system, state, state.forces, self.momentum)
         turns = free.turns and not goes_on
         warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8)
         if goes_on:
             return state
         return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [free.count]]))
-
-    def _fits(self, system: System, state: State) -> bool:
-        """Whether g is that of this system."""
-        assert state.thermostat is not None
-        return may_be(float(state.thermostat[-1]), system, state, None, self.momentum)
 
     def _moves_on(self, system: System, state: State) -> bool:
         """Whether velocities, which may be new ones, have total momentum, and g is less for what is conserved of it."""
@@ -167,29 +137,17 @@ class NoseHooverChain(Interpreted):
         directions = open_directions(system.motion, state.positions, state.time)
         return momentum_share(system.masses, state.velocities, directions) > AT_REST
 
-    def time_reversed(self, state: State) -> State:
-        """With the velocities of the links turned round, as those of a state that was `reversed` are."""
-        if not carried(state, 2 * self.length + 1, "this NoseHooverChain"):
-            return state
-        assert state.thermostat is not None
-        chain = state.thermostat.copy()
-        chain[self.length : 2 * self.length] *= -1
-        return replace(state, thermostat=chain)
-
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         begin = self.start(system, state)
         if begin.step == LOOK_AT:
             warn_of_bodies_apart(system, begin, stacklevel=7)
-        inner, made = self.stepper.operations(system), self._made
-        if made is None or made[0] is not inner:
-            made = self._made = inner, Program((HALF, *inner, HALF), {"chain": _chain})
-        return ChainStep(system, begin, dt, self, made[1], steps)
+        return ChainStep(system, begin, dt, self, self._program, steps)
 
     def at_once(self, state: State, steps: int) -> int:
         return min(steps, LOOK_AT - state.step) if state.step < LOOK_AT else steps
 
     def depends_on(self, system: System, state: State) -> Any:
-        return self.thermal_energy, self.period, self.length, self.fractions, state.step == LOOK_AT
+        return self.thermal_energy, self.period, self.length, state.step == LOOK_AT
 
     def note(self, state: State) -> None:
         self._left = state.thermostat
@@ -217,11 +175,12 @@ class ChainStep(Interpreter):
         self, system: System, start: State, dt: float, thermostat: NoseHooverChain, program: Program, steps: int
     ) -> None:
         assert start.thermostat is not None
-        chain, fractions = start.thermostat, thermostat.fractions
-        head = thermostat.thermal_energy, len(chain) // 2, len(fractions)
+        chain = start.thermostat
+        head = thermostat.thermal_energy, len(chain) // 2, len(FRACTIONS)
         links = thermostat._masses(float(chain[-1]))
-        self.chain_at = slice(SIZE + len(fractions) + len(links), SIZE + len(fractions) + len(links) + len(chain))
-        numbers = np.concatenate((head, fractions, links, chain, system.moving_masses))
+        first = SIZE + len(FRACTIONS) + len(links)
+        self.chain_at = slice(first, first + len(chain))
+        numbers = np.concatenate((head, FRACTIONS, links, chain, system.moving_masses))
         super().__init__(system, start, dt, program, steps, numbers)
         self.thermostat = thermostat
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import Rng, as_array, generator_of, positive
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 from kcons.steppers import System
 from kcons.thermostats.freedom import drift_velocity, open_directions
 
@@ -22,7 +19,6 @@ def thermal_velocities(
     *,
     time: float = 0.0,
     zero_momentum: bool = False,
-    kinetic_energy: float | None = None,
 ) -> FloatArray:
     """Velocities of the canonical distribution on the surface A v = c, shape (n_atoms, 3).
 
@@ -41,38 +37,18 @@ def thermal_velocities(
         For targets that move.
     zero_momentum : bool
         Take total momentum out, in the directions in which no row knows a place in space.
-    kinetic_energy : float, optional
-        Scale to exactly this kinetic energy, for the isokinetic thermostat.
 
     Raises
     ------
-    InputError
-        Nothing can move.
     UnsupportedError
         `zero_momentum` with rows that hold atoms in space in every direction.
     """
     positive(thermal_energy, "thermal_energy")
-    if kinetic_energy is not None:
-        positive(kinetic_energy, "kinetic_energy")
     generator = generator_of(rng)
     motion = system.motion
     x = as_array(positions, (system.n_atoms, 3), "positions")
     drive = motion.project_velocities(x, np.zeros_like(x), time=time)
     noise = generator.standard_normal(x.shape) * np.sqrt(thermal_energy * system.inverse_masses)
-    free = motion.degrees_of_freedom
     if zero_momentum:
-        directions = open_directions(motion, x, time)
-        noise -= drift_velocity(noise, system.masses, directions)
-        free -= len(directions)
-    v = motion.project_velocities(x, drive + noise, time=time) - drive
-    if kinetic_energy is not None:
-        # The drive is M-orthogonal to all that is tangent, so that energies add up.
-        has, left = system.kinetic_energy(v), kinetic_energy - system.kinetic_energy(drive)
-        if not (free > 0 and has > 0 and left > 0):
-            raise InputError(
-                f"no velocities have the kinetic energy {kinetic_energy}: moving targets alone take "
-                f"{kinetic_energy - left:g}, and {free} degrees of freedom are left",
-                item="kinetic_energy",
-            )
-        v *= math.sqrt(left / has)
-    return drive + v
+        noise -= drift_velocity(noise, system.masses, open_directions(motion, x, time))
+    return motion.project_velocities(x, drive + noise, time=time)

@@ -13,8 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from kcons.constraints import Angle
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import minimum_image, neighbor_lists
+from kcons.constraints.periodic.one_piece import lined_up, minimum_image, neighbor_lists
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross, dot, norm
 from kcons.topology.rigid_groups import body_numbers, inside_bodies
@@ -57,7 +58,9 @@ def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -
     for k, rings in enumerate(systems.rings):
         inside = bonds[systems.of_bond == k]
         every = bond_angles(inside, n)
-        straight = _angle(snapshot, every) > np.radians(STRAIGHT)
+        straight = Angle(every).measure(lined_up(snapshot.positions[every], snapshot.lattice), 0.0) > np.radians(
+            STRAIGHT
+        )
         bent, impropers = every[~straight], _impropers(snapshot, inside)
         angles, dihedrals = ring_rows(
             snapshot, inside, bent, impropers, rings, lambda rows: inside_bodies(n, rows, rigid)
@@ -173,9 +176,3 @@ def _impropers(snapshot: Snapshot, bonds: IntArray) -> IntArray:
 def _directions(snapshot: Snapshot, vertex: IntArray, others: IntArray) -> FloatArray:
     u = minimum_image(snapshot.positions[others] - snapshot.positions[vertex], snapshot.lattice)
     return np.asarray(u / norm(u)[..., None])
-
-
-def _angle(snapshot: Snapshot, triples: IntArray) -> FloatArray:
-    u = _directions(snapshot, triples[:, 1], triples[:, 0])
-    w = _directions(snapshot, triples[:, 1], triples[:, 2])
-    return np.arctan2(norm(cross(u, w)), dot(u, w))

@@ -7,11 +7,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from kcons.constraints import Angle
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import minimum_image
+from kcons.constraints.periodic.one_piece import connected, lined_up, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
+from kcons.topology.topology import BoolArray, Snapshot, bond_angles, sorted_pairs
 
 #: Covalent radii in angstrom of elements that form bonds that could be held. Cordero et al., Dalton Trans. 2832 (2008).
 RADII: dict[str, float] = {
@@ -116,18 +117,8 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     """Bonds that the distances alone suggest, where neither elements nor the unit of length are known, shape (n, 2).
 
     Two atoms are bonded if they are closer than `NEAREST` times the geometric mean of the distances of each to its
-    nearest neighbor. Nothing is guessed where the molecules of `atoms` then do not look like molecules.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n_atoms, 3)
-        In any unit; atoms that are not finite get no bonds.
-    lattice : ndarray, shape (2, 3, 3), or None
-        A periodic cell and its inverse, as `ConstraintSet.lattice`.
-    atoms : ndarray of int
-        Whose molecules are looked at.
-    able : ndarray of bool, shape (n_atoms,)
-        Only these atoms form bonds.
+    nearest neighbor. Nothing is guessed where the molecules of `atoms` then do not look like molecules. Only atoms that
+    are `able` and finite form bonds.
     """
     from scipy.spatial import cKDTree
 
@@ -164,10 +155,9 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     if torn.any() or crowded.any():
         return nothing
     kept = bonds[seen[bonds[:, 0]]]
-    i, j, k = bond_angles(kept, len(y)).T
-    u, w = minimum_image(y[i] - y[j], lattice), minimum_image(y[k] - y[j], lattice)
-    angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
-    return nothing if np.any(angle < SHARPEST) else finite[kept]
+    angles = bond_angles(kept, len(y))
+    sharp = Angle(angles).measure(lined_up(y[angles], lattice), 0.0) < SHARPEST
+    return nothing if np.any(sharp) else finite[kept]
 
 
 def across(pairs: IntArray, lengths: FloatArray) -> BoolArray:

@@ -12,10 +12,10 @@ from typing import Any, Literal, TypedDict, TypeVar
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import checked
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError, did_you_mean
 from kcons.topology.rigid_groups import GEOMETRIES, WATER
-from kcons.topology.topology import near_misses
 
 #: What can be held by name, and what that means.
 CONSTRAIN: dict[str, str] = {
@@ -102,8 +102,6 @@ class Holding:
                 f"{', '.join(CONSTRAIN)}",
                 item="constrain",
             )
-        if self.angles not in ("angles", "distances"):
-            raise InputError(f"angles must be 'angles' or 'distances', not {self.angles!r}", item="angles")
         if not (self.kind != "none" or self.rigid_water or self.residues or self.bodies or self.on):
             raise InputError("nothing is to be held; name bonds, water, residues, bodies or rows", item="constrain")
         for entry in self.own_rows:
@@ -149,13 +147,16 @@ class Holding:
             name = given.lower().replace("-", "").replace("/", "").replace("_", "")
             if name not in GEOMETRIES:
                 raise InputError(
-                    f"no water model {given!r}{near_misses(given, GEOMETRIES)}; there are {', '.join(GEOMETRIES)}; or "
+                    f"no water model {given!r}{did_you_mean(given, GEOMETRIES)}; there are {', '.join(GEOMETRIES)}; or "
                     "give (O-H in angstrom, H-O-H in degrees)",
                     item="water_geometry",
                 )
             length, angle, site = GEOMETRIES[name]
             return (length, angle), site
         return water_geometry(given, "water_geometry"), 0.0
+
+
+Holding.__init__ = checked(Holding.__init__)  # type: ignore[method-assign]
 
 
 def water_geometry(given: Any, item: str) -> tuple[float, float]:

@@ -18,8 +18,8 @@ import numpy as np
 from kcons.constraints import Constraint, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, SingularGeometryError
-from kcons.topology.topology import BoolArray, Snapshot, listed, near_misses
+from kcons.errors import InputError, SingularGeometryError, did_you_mean
+from kcons.topology.topology import BoolArray, Snapshot, listed, selected_numbers
 from kcons.topology.virtual_sites import VirtualSites, fitted
 from kcons.topology.whole_molecules import whole_groups
 
@@ -219,7 +219,7 @@ def residue_bodies(snapshot: Snapshot, names: Sequence[str]) -> list[IntArray]:
         same = present == str(name).strip().upper()
         if not same.any():
             raise InputError(
-                f"no residue is called {name}{near_misses(str(name), present)}; there are "
+                f"no residue is called {name}{did_you_mean(str(name), present.tolist())}; there are "
                 + listed(topology.residue_names),
                 item="rigid_residues",
             )
@@ -242,24 +242,12 @@ def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]
         Atoms that do not exist or come twice; bodies of one atom.
     """
     by_size: dict[int, list[IntArray]] = {}
-    n = snapshot.topology.n_atoms
     for k, body in enumerate(bodies):
-        atoms = np.asarray(body)
-        if atoms.dtype == bool and atoms.shape == (n,):
-            atoms = np.flatnonzero(atoms)
-        if atoms.ndim != 1 or len(atoms) < 2 or not np.issubdtype(atoms.dtype, np.integer):
-            raise InputError(
-                f"rigid body {k} has shape {atoms.shape}; give the numbers of two atoms or more", item="rigid_bodies"
-            )
-        atoms = np.sort(atoms.astype(np.int64))
-        if atoms[0] < 0 or atoms[-1] >= n:
-            raise InputError(
-                f"rigid body {k} names atom {atoms[0] if atoms[0] < 0 else atoms[-1]}; there are atoms 0 to {n - 1}",
-                item="rigid_bodies",
-            )
-        if (np.diff(atoms) == 0).any():
-            twice = int(atoms[np.argmax(np.diff(atoms) == 0)])
-            raise InputError(f"rigid body {k} names atom {twice} twice", item="rigid_bodies", atoms=[twice])
+        atoms = np.sort(selected_numbers(body, snapshot.topology.n_atoms, "rigid_bodies", f"rigid body {k}"))
+        twice = atoms[1:][np.diff(atoms) == 0].tolist()
+        if len(atoms) < 2 or twice:
+            what = f"names atom {twice[0]} twice" if twice else "has one atom; give two atoms or more"
+            raise InputError(f"rigid body {k} {what}", item="rigid_bodies", atoms=twice[:1])
         by_size.setdefault(len(atoms), []).append(atoms)
     return [np.array(group) for _, group in sorted(by_size.items())]
 
@@ -283,57 +271,50 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT
     pairs: list[IntArray] = []
     lengths: list[FloatArray] = []
     tied: dict[int, list[tuple[IntArray, IntArray, FloatArray]]] = {2: [], 3: []}
+
+    def hold(ends: IntArray, places: FloatArray) -> None:
+        pairs.append(ends.reshape(-1, 2))
+        lengths.append(np.linalg.norm(places[..., 0, :] - places[..., 1, :], axis=-1).ravel())
+
     for atoms in groups:
-        r = whole_groups(snapshot, atoms)
+        r, n = whole_groups(snapshot, atoms), atoms.shape[1]
         center = r.mean(axis=1, keepdims=True)
         _, s, axes = np.linalg.svd(r - center, full_matrices=False)
-        if atoms.shape[1] == 2:
-            dimension = np.ones(len(atoms), dtype=np.int64)
-        else:
-            dimension = 1 + (s[:, 1:3] > flat * s[:, :1]).sum(axis=1)
+        dimension = 1 + (s[:, 1:3] > flat * s[:, :1]).sum(axis=1) if n > 2 else np.ones(len(atoms), np.int64)
         _refuse_coincident(snapshot, atoms, s)
         for d in np.unique(dimension).tolist():
             these = np.flatnonzero(dimension == d)
-            if d == 3 and atoms.shape[1] > LARGE:
+            if d == 3 and n > LARGE:
                 for body in these.tolist():
                     ends = _braced(r[body])
-                    pairs.append(atoms[body][ends])
-                    lengths.append(np.linalg.norm(r[body][ends[:, 0]] - r[body][ends[:, 1]], axis=1))
+                    hold(atoms[body][ends], r[body][ends])
                 continue
-            along = axes[these, :d]
-            y = (r[these] - center[these]) @ np.swapaxes(along, 1, 2)
+            y = (r[these] - center[these]) @ np.swapaxes(axes[these, :d], 1, 2)
             bases = _bases(y)
             corners = np.take_along_axis(y, bases[:, :, None], axis=1)
             own = np.take_along_axis(atoms[these], bases, axis=1)
-            i, j = np.triu_indices(d + 1, 1)
-            pairs.append(own[:, np.stack([i, j], axis=1)].reshape(-1, 2))
-            lengths.append(np.linalg.norm(corners[:, i] - corners[:, j], axis=2).ravel())
-            n = atoms.shape[1]
+            sides = np.stack(np.triu_indices(d + 1, 1), axis=1)
+            hold(own[:, sides], corners[:, sides])
             if n == d + 1:
                 continue
             others = np.ones((len(these), n), dtype=bool)
             np.put_along_axis(others, bases, False, axis=1)
-            rest = y[others].reshape(len(these), n - d - 1, d)
+            rest, named = y[others].reshape(len(these), n - d - 1, d), atoms[these][others].reshape(len(these), -1)
             if d == 3:
                 seen = _best_triples(rest, corners)
-                at = np.take_along_axis(own[:, None], seen, axis=2)
-                ends = np.broadcast_to(atoms[these][others].reshape(len(these), -1, 1), at.shape)
-                pairs.append(np.stack([at, ends], axis=3).reshape(-1, 2))
-                from_base = np.linalg.norm(rest[:, :, None] - corners[:, None], axis=3)
-                lengths.append(np.take_along_axis(from_base, seen, axis=2).ravel())
-                continue
-            edges = corners[:, 1:] - corners[:, :1]
-            # rest - corner_0 = sum_i w_i edge_i
-            w = np.linalg.solve(np.swapaxes(edges, 1, 2), np.swapaxes(rest - corners[:, :1], 1, 2))
-            w = np.swapaxes(w, 1, 2)
-            w = np.concatenate([1 - w.sum(axis=2, keepdims=True), w], axis=2)
-            tied[d + 1].append(
-                (
-                    atoms[these][others],
-                    np.repeat(own[:, None], n - d - 1, axis=1).reshape(-1, d + 1),
-                    w.reshape(-1, d + 1),
+                number = np.arange(len(these))[:, None, None]
+                at, places = own[number, seen], corners[number, seen]
+                hold(
+                    np.stack([at, np.broadcast_to(named[..., None], at.shape)], axis=-1),
+                    np.stack([places, np.broadcast_to(rest[:, :, None], places.shape)], axis=-2),
                 )
-            )
+                continue
+            # rest - corner_0 = sum_i w_i edge_i
+            edges = corners[:, 1:] - corners[:, :1]
+            w = np.linalg.solve(np.swapaxes(edges, 1, 2), np.swapaxes(rest - corners[:, :1], 1, 2))
+            w = np.concatenate([1 - w.sum(axis=1, keepdims=True), w], axis=1)
+            bases_of = np.repeat(own, n - d - 1, axis=0)
+            tied[d + 1].append((named.ravel(), bases_of, np.swapaxes(w, 1, 2).reshape(-1, d + 1)))
     rows: list[Constraint] = []
     if pairs:
         joined, first = _each_once(np.concatenate(pairs))
@@ -416,17 +397,7 @@ def _first_four(x: FloatArray, order: IntArray) -> IntArray:
 
 
 def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:
-    """For each atom the three of four bases that are farthest from being seen in one plane.
-
-    Parameters
-    ----------
-    rest : ndarray, shape (n_bodies, n_atoms, 3)
-    corners : ndarray, shape (n_bodies, 4, 3)
-
-    Returns
-    -------
-    ndarray of int, shape (n_bodies, n_atoms, 3)
-    """
+    """For each atom the three of four bases that are farthest from being seen in one plane."""
     triples = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
     sight = corners[:, None] - rest[:, :, None]
     sight = sight / np.linalg.norm(sight, axis=3, keepdims=True)

@@ -14,9 +14,9 @@ import numpy as np
 
 from kcons.constraints import Angle, Dihedral, Distance
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.periodic.one_piece import lined_up, neighbor_lists
+from kcons.constraints.periodic.one_piece import connected, lined_up, neighbor_lists
 from kcons.constraints.target import FloatArray
-from kcons.topology.topology import BoolArray, Snapshot, connected
+from kcons.topology.topology import BoolArray, Snapshot
 
 #: Rings of more atoms are chains that happen to close.
 LARGEST = 8

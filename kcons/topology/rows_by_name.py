@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import minimum_image
+from kcons.constraints.periodic.one_piece import lined_up
 from kcons.errors import InputError
 from kcons.topology.angle_rows import STRAIGHT, angle_rows
 from kcons.topology.guessed_bonds import FAR, guess_bonds, reaches
@@ -253,18 +253,12 @@ def _with_waters(snapshot: Snapshot, holding: Holding, remedy: str) -> tuple[Sna
     if not named:
         return snapshot, waters, 0
     # The bonds of rigid water are known; guessing them would take most of the time.
-    snapshot = _with_water_bonds(snapshot, waters.triples)
+    if len(waters.triples):
+        both = np.concatenate([snapshot.topology.bonds, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2)])
+        snapshot = replace(snapshot, topology=snapshot.topology.with_bonds(both))
     nowhere[waters.triples] = nowhere[waters.sites.sites] = True
     snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
     return snapshot, waters, guessed
-
-
-def _with_water_bonds(snapshot: Snapshot, triples: IntArray) -> Snapshot:
-    if not len(triples):
-        return snapshot
-    known = snapshot.topology.bonds
-    both = np.concatenate([known, triples[:, [[0, 1], [0, 2]]].reshape(-1, 2)])
-    return replace(snapshot, topology=snapshot.topology.with_bonds(both))
 
 
 def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: BoolArray) -> tuple[Snapshot, int]:
@@ -277,12 +271,7 @@ def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: Boo
     lacking = ~bonded & (topology.elements != "")
     if topology.residues_known:
         lacking &= size > 1
-    if guess is True:
-        known = topology.bonds[settled[topology.bonds].any(axis=1)]
-        found = guess_bonds(snapshot, ~settled, ~settled)
-        both = sorted_pairs(np.concatenate([known, found]))
-        return replace(snapshot, topology=topology.with_bonds(both)), len(found)
-    if not lacking.any():
+    if guess is not True and not lacking.any():
         return snapshot, 0
     if guess is False:
         atom = int(np.argmax(lacking))
@@ -294,9 +283,10 @@ def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: Boo
             item="bonds",
             atoms=[atom],
         )
-    found = guess_bonds(snapshot, lacking, ~settled)
-    both = sorted_pairs(np.concatenate([topology.bonds, found]))
-    return replace(snapshot, topology=topology.with_bonds(both)), len(both) - len(topology.bonds)
+    known = topology.bonds[settled[topology.bonds].any(axis=1)] if guess is True else topology.bonds
+    found = guess_bonds(snapshot, ~settled if guess is True else lacking, ~settled)
+    both = sorted_pairs(np.concatenate([known, found]))
+    return replace(snapshot, topology=replace(topology, bonds=both)), len(both) - len(known)
 
 
 def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray | None) -> IntArray:
@@ -357,15 +347,14 @@ def _internal(
     triples = triples[~inside_bodies(topology.n_atoms, triples, rigid)]
     if angles == "distances":
         return [*rows, Distance(np.sort(triples[:, [0, 2]], axis=1)), Dihedral(quads)]
-    u = minimum_image(snapshot.positions[triples[:, 0]] - snapshot.positions[triples[:, 1]], snapshot.lattice)
-    w = minimum_image(snapshot.positions[triples[:, 2]] - snapshot.positions[triples[:, 1]], snapshot.lattice)
-    value = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.sum(u * w, axis=1))
+    r = lined_up(snapshot.positions[triples], snapshot.lattice)
+    value = Angle(triples).measure(r, 0.0)
     straight = value > np.radians(STRAIGHT)
     rows.append(Angle(triples[~straight]))
     if straight.any():
         # At 180 degrees an angle is singular: the vertex divides the line between its neighbors.
-        lu, lw = np.linalg.norm(u[straight], axis=1), np.linalg.norm(w[straight], axis=1)
-        weights = np.stack([lw, lu], axis=1) / (lu + lw)[:, None]
+        arms = np.linalg.norm(np.diff(r[straight], axis=1), axis=2)
+        weights = arms[:, ::-1] / arms.sum(axis=1, keepdims=True)
         i, j, k = triples[straight].T
         rows.append(LinearRelation(j, np.stack([i, k], axis=1), weights))
     return [*rows, Dihedral(quads)]

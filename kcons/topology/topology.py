@@ -6,7 +6,6 @@ where virtual sites go) is derived once, for MDAnalysis, ASE and OpenMM alike.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import BoolArray, lattice_of, neighbor_lists
+from kcons.constraints.periodic.one_piece import BoolArray, connected, lattice_of, neighbor_lists
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -222,18 +221,6 @@ def sorted_pairs(pairs: ArrayLike) -> IntArray:
     return np.stack(np.divmod(code, int(table.max()) + 1), axis=1)
 
 
-def connected(pairs: IntArray, n: int) -> tuple[IntArray, int]:
-    """Number of the component of each atom, counted from 0 in the order of their first atoms, and how many."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, label = connected_components(links, directed=False)
-    _, first, number = np.unique(label, return_index=True, return_inverse=True)
-    order = np.argsort(np.argsort(first))
-    return order[number].astype(np.int64), int(count)
-
-
 def bond_angles(bonds: IntArray, n_atoms: int) -> IntArray:
     """All i-j-k with bonds i-j and j-k, i < k, sorted by (j, i, k), shape (n, 3)."""
     starts, ends = neighbor_lists(bonds, n_atoms)
@@ -432,19 +419,13 @@ def require_kind(given: Any, kind: type | UnionType, item: str, wanted: str) -> 
         raise InputError(f"{item} must be {wanted}, not {type(given).__name__}{each}", item=item)
 
 
-def near_misses(name: str, known: Iterable[str]) -> str:
-    """' (did you mean A or B?)', or nothing."""
-    close = difflib.get_close_matches(name.upper(), sorted({str(k).upper() for k in known}), n=3, cutoff=0.5)
-    return f" (did you mean {' or '.join(close)}?)" if close else ""
-
-
 def listed(names: Iterable[str], most: int = 12) -> str:
     """Names in a sentence, shortened."""
     distinct = sorted({str(n) for n in names})
     return ", ".join(distinct[:most]) + (f", ... ({len(distinct)} in all)" if len(distinct) > most else "")
 
 
-def selected_numbers(select: Any, n: int) -> IntArray:
+def selected_numbers(select: Any, n: int, item: str = "select", name: str = "the selection") -> IntArray:
     """Numbers of the atoms that a mask or a list of numbers names.
 
     Raises
@@ -457,12 +438,13 @@ def selected_numbers(select: Any, n: int) -> IntArray:
         given = np.flatnonzero(given)
     if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
         raise InputError(
-            f"select {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
+            f"{item} {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
             "for kcons.mdanalysis",
-            item="select",
+            item=item,
         )
     if not given.size:
-        raise InputError("the selection has no atoms; widen it", item="select")
+        raise InputError(f"{name} has no atoms; widen it", item=item)
     if given.min() < 0 or given.max() >= n:
-        raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
+        beyond = int(given.min() if given.min() < 0 else given.max())
+        raise InputError(f"{name} names atom {beyond}; there are atoms 0 to {n - 1}", item=item)
     return given.astype(np.int64)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import lined_up, make_whole, minimum_image, spanning_tree
+from kcons.constraints.periodic.one_piece import connected, lined_up, make_whole, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray
-from kcons.topology.topology import Snapshot, connected
+from kcons.topology.topology import Snapshot
 
 #: No two images of an atom are that close, in angstrom.
 _ROUNDING = 1e-3

@@ -95,7 +95,7 @@ def test_a_file_of_ones_own(tmp_path, monkeypatch, capsys):
     assert run("compare", ALANINE, "--constrain", "allbonds", "--methods", names, "--dt", "2,1", "--quick") == 0
     assert "OpenMM + kcons rattle" in capsys.readouterr().out
     table = read_csv(tmp_path / f"compare-{ALANINE.name}" / "compare.csv")
-    assert "AllBonds: 21 distances" in table.attrs["title"] and table.attrs["asked"]["constrain"] == "allbonds"
+    assert "allbonds: 21 Distance" in table.attrs["title"] and table.attrs["asked"]["constrain"] == "allbonds"
     assert observed_orders(table)["OpenMM + kcons rattle"] == pytest.approx(2.0, abs=0.2)
 
 

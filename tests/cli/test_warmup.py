@@ -60,13 +60,13 @@ def test_what_was_compiled_beforehand_is_there():
     assert json.loads(needed) and set(json.loads(needed)) <= set(json.loads(called))
 
 
-@pytest.mark.parametrize("folder", [None, "gone at the end"])
-def test_kernels_that_nobody_keeps_are_announced(folder, monkeypatch, capsys):
+@pytest.mark.parametrize("keeps", [True, False])
+def test_kernels_that_nobody_keeps_are_announced(keeps, monkeypatch, capsys):
     monkeypatch.setattr(announcer, "announced", False)
-    monkeypatch.setattr(announcer, "_own_folder", folder)
+    monkeypatch.setattr(announcer, "keeps", keeps)
     monkeypatch.setattr(compiled_systems, "KINDS", {})
     assert main.main(["warmup"]) == 0
-    assert announcer.announced == (folder is None)
+    assert announcer.announced == keeps
 
 
 def test_it_says_what_was_compiled(monkeypatch, capsys):

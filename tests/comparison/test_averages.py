@@ -119,7 +119,7 @@ def test_between_kicks_an_odd_number_of_inner_steps_becomes_even():
 
 @functools.cache
 def table():
-    return compare_averages(chain(), ["langevin", "isokinetic"], steps=[10.0, 5.0], budget=1.5)
+    return compare_averages(chain(), ["langevin", "isokinetic"], steps=[10.0, 5.0], budget=0.8)
 
 
 def test_one_table_as_that_of_trajectories():
@@ -127,7 +127,7 @@ def test_one_table_as_that_of_trajectories():
     assert list(found.columns) == [*COLUMNS, *AVERAGES] and set(found.status) == {"ok"}
     assert list(found.setting) == [5, 5, 10, 10, 5, 10]
     assert list(found.friction) == pytest.approx([16, 4, 16, 4, 0, 0])  # 1 in 12.5 and 1 in 50 steps of 5 fs, a ps
-    assert found.attrs["environment"]["cpu"] and found.attrs["budget"] == 1.5
+    assert found.attrs["environment"]["cpu"] and found.attrs["budget"] == 0.8
 
 
 def row(title, error, seconds, setting=2.0, friction=5.0):
@@ -163,15 +163,6 @@ def test_of_two_frictions_the_cheaper_one_that_is_right_is_ranked_and_the_better
     assert list(rank(rows, "temperature").table.friction) == [2.0]
     (curve,) = (line for line in figure(rows).axes[0].lines if line.get_markerfacecolor() == "none")
     assert list(curve.get_ydata()) == [0.005]
-
-
-def test_a_figure_of_averages_is_not_cut():
-    drawn = figure(table(), 7.0)
-    drawn.canvas.draw()
-    (axes,) = drawn.axes
-    for label in (axes.xaxis.label, axes.yaxis.label, *axes.texts):
-        box = label.get_window_extent()
-        assert drawn.bbox.x0 - 1 <= box.x0 and box.x1 <= drawn.bbox.x1 + 1, label.get_text()
 
 
 def test_a_sampler_of_ones_own_goes_on_and_its_lines_run():

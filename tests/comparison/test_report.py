@@ -18,7 +18,7 @@ from kcons.errors import InputError
 def table():
     names = ["rattle", "suzuki4", "blanes-moan4", "kahan-li6", "blanes-moan6", "dop853", "ase-kcons"]
     names += ["ase-bonds", "verlet", "openmm-verlet", "openmm-kcons-rattle", "openmm-verlet-1e-12"]
-    system = test_systems.build("dumbbells").shortened(10).with_time_steps([0.01, 0.005])
+    system = test_systems.build("dumbbells").shortened(50).with_time_steps([0.01, 0.005])
     return compare(system, names, rounds=1, budget=10)
 
 

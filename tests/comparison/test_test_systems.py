@@ -15,17 +15,14 @@ import numpy as np
 import pytest
 from ase import Atoms, units
 from ase.calculators.calculator import CalculationFailed, Calculator
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from small_test_systems import SMALL, end, small
 
 from kcons.comparison import Potential, add_system, compare, test_systems
-from kcons.comparison.test_systems import butane, chain, rotor, sphere, water
-from kcons.comparison.test_systems.minimal import integrated, spin, turned
+from kcons.comparison.test_systems import chain, rotor, sphere, water
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
 from kcons.comparison.test_systems.potential import of_calculator
 from kcons.comparison.test_systems.system import converged, thermal_velocities
-from kcons.constraints import Dihedral
 from kcons.errors import CalculatorError, InputError
 from kcons.steppers import State, System, run
 
@@ -193,9 +190,10 @@ def test_chain_shapes(shape, angle):
 def test_ethanol():
     system = small("ethanol")
     symbols = np.array(system.symbols)
-    bonds = sorted("".join(sorted(symbols[pair])) for pair in system.angle_bonds)
+    lengths, angles = system.constraint_set.constraints
+    bonds = sorted("".join(sorted(symbols[pair])) for pair in lengths.atoms)
     assert bonds == ["CC"] + ["CH"] * 5 + ["CO"] + ["HO"]
-    assert (len(system.angles), system.motion.rank, system.motion.degrees_of_freedom) == (13, 19, 8)
+    assert (angles.n_rows, system.motion.rank, system.motion.degrees_of_freedom) == (13, 19, 8)
     assert len(system.bonds) == 21  # the same set by distances alone
     if find_spec("tblite") is not None:
         assert "xTB" in test_systems.build("ethanol").potential.name
@@ -240,24 +238,6 @@ def test_slab_is_periodic_and_its_lower_layers_are_fixed(size):
 # -- solutions --------------------------------------------------------------------------------------
 
 
-def test_quaternions_turn_vectors():
-    rng = np.random.default_rng(0)
-    q, omega, r, h = rng.standard_normal(4), rng.standard_normal(3), rng.standard_normal((5, 3)), 1e-5
-    np.testing.assert_allclose(turned(q, r), Rotation.from_quat(q).apply(r), atol=1e-14)
-    np.testing.assert_allclose(turned(3.0 * q, r), turned(q, r), atol=1e-14)
-    q /= np.linalg.norm(q)
-    change = (turned(q + h * spin(q, omega), r) - turned(q - h * spin(q, omega), r)) / (2 * h)
-    np.testing.assert_allclose(change, turned(q, np.cross(omega, r)), atol=1e-9)
-
-
-def test_integration_meets_the_exponential_and_states_an_honest_error():
-    matrix, start = np.array([[0.0, 1.0], [-4.0, -0.1]]), np.array([1.0, 0.5])
-    found = integrated(lambda t, y: matrix @ y, start, 7.0, lambda y: np.append(y, 0.0)[None], "a linear system")
-    off = np.linalg.norm(found.positions[0, :2] - expm(7.0 * matrix) @ start)
-    assert off < 1e-13 and off < found.error + 1e-15 < 1e-11
-    assert found.how == "a linear system, DOP853 at rtol 2.3e-14"
-
-
 def test_free_particles_stay_on_their_great_circles():
     system = test_systems.build("sphere", 3, rng=5)
     there, x, v = system.reference().positions[0], system.positions[0], system.velocities[0]
@@ -290,40 +270,3 @@ def test_a_symmetric_top_precesses_evenly():
         found = rotor.flight(x, np.cross(omega, x) + drift, np.ones(4), time)
         np.testing.assert_allclose(found.positions, turn.apply(x) + time * drift, atol=1e-12)
         assert found.error < 1e-11
-
-
-def test_distances_of_the_top_stay_and_the_start_is_the_start():
-    v, h, pairs = rotor.VELOCITIES, 1e-4, rotor.PAIRS
-    flight = functools.partial(rotor.flight, rotor.POSITIONS, v, rotor.MASSES)
-    np.testing.assert_allclose((flight(h).positions - flight(-h).positions) / (2 * h), v, atol=1e-7)
-    x = flight(test_systems.build("rotor").horizon).positions
-    was, now = (np.linalg.norm(y[pairs[:, 0]] - y[pairs[:, 1]], axis=1) for y in (rotor.POSITIONS, x))
-    np.testing.assert_allclose(now, was, atol=1e-12)
-
-
-def test_the_torsion_of_butane():
-    row = Dihedral([[0, 1, 2, 3]])
-    for seed in range(4):
-        x = butane.POSITIONS + 0.3 * np.random.default_rng(seed).normal(size=(4, 3))
-        phi = float(row.measure(x[row.atoms], 0.0)[0])
-        energy, forces = butane.torsion(x)
-        assert energy == pytest.approx(butane.BARRIER * (1 + np.cos(3 * phi)))
-        slope = 3 * butane.BARRIER * np.sin(3 * phi) * row.gradient(x[row.atoms], 0.0)[0]
-        np.testing.assert_allclose(forces, slope, atol=1e-12)
-
-
-def test_the_reference_of_butane_keeps_rows_momenta_and_energy():
-    rows, h, m = test_systems.build("butane").constraint_set, 2e-4, butane.MASSES
-    energies, spins = [], []
-    for time in (0.0, 1.0):
-        twist = functools.partial(butane.twist, butane.POSITIONS, butane.VELOCITIES, m)
-        before, here, after = (twist(time + s).positions for s in (-h, 0.0, h))
-        assert np.abs(rows.value(here)).max() < 1e-12
-        v = (after - before) / (2 * h)
-        if time == 0.0:
-            np.testing.assert_allclose(here, butane.POSITIONS, atol=1e-14)
-            np.testing.assert_allclose(v, butane.VELOCITIES, atol=1e-6)
-        energies.append(butane.torsion(here)[0] + 0.5 * np.sum(m[:, None] * v**2))
-        spins.append(m @ np.cross(here, v))
-    np.testing.assert_allclose(energies, energies[0], rtol=1e-6)
-    np.testing.assert_allclose(spins, [spins[0]] * 2, atol=1e-5)

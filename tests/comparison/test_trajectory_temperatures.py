@@ -12,8 +12,7 @@ from ase import units
 from ase.build import molecule
 from ase.io import write
 
-from kcons.comparison import Potential, trajectory_temperatures
-from kcons.comparison.test_systems import any_file
+from kcons.comparison import Potential, test_systems, trajectory_temperatures
 from kcons.errors import InputError, UnsupportedError
 from kcons.thermostats import Estimate, SplitTemperatures
 
@@ -39,13 +38,13 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def named(monkeypatch):
     """The forces that the file was drawn with, by the name of others."""
-    made = any_file.from_file
+    made = test_systems.from_file
 
     def from_file(*where, **options):
         forces = fluids.water(N).forces
         return dataclasses.replace(made(*where, **options), potential=Potential(forces.evaluate, "the fluid's"))
 
-    monkeypatch.setattr(any_file, "from_file", from_file)
+    monkeypatch.setattr(test_systems, "from_file", from_file)
 
 
 def test_samples_are_as_hot_as_they_were_drawn(folder, named):

@@ -72,12 +72,6 @@ def test_kept_in_a_folder_and_announced_once(tmp_path):
     assert second == ("1 0", "")
 
 
-def test_two_processes_at_once(tmp_path):
-    both = [started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
-    assert {ended(process)[0] for process in both} <= {"0 1", "1 0"}
-    assert ended(started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path)))[0] == "1 0"
-
-
 #: A few hundred steps with kernels of several kinds: a digest of the last bits of each.
 BITS = """
 import hashlib
@@ -131,22 +125,14 @@ def test_a_kernel_calls_its_own_copies_of_others():
     assert {f.linkage.name for f in shared} == {"linkonce_odr"}  # one for all that a further caller links
 
 
-def cut(content: bytes) -> bytes:
-    return content[: len(content) // 2]
-
-
-def empty(_: bytes) -> bytes:
-    return b""
-
-
-@pytest.mark.parametrize("ending", ["nbi", "nbc"])
-@pytest.mark.parametrize("damage", [cut, empty])
-def test_damaged_files_are_made_anew(tmp_path, damage, ending):
+@pytest.mark.parametrize(("ending", "part"), [("nbi", 0.5), ("nbc", 0.0)])
+def test_damaged_files_are_made_anew(tmp_path, ending, part):
     given = {"NUMBA_CACHE_DIR": str(tmp_path)}
     whole, _ = ended(started(HOLDS, **given))
     files = list(tmp_path.rglob(f"*.{ending}"))
     for file in files:
-        file.write_bytes(damage(file.read_bytes()))
+        content = file.read_bytes()
+        file.write_bytes(content[: int(part * len(content))])
     assert files
     assert ended(started(HOLDS, **given))[0] == whole == "True 1"
     assert ended(started(HOLDS, **given)) == ("True 0", "")

@@ -145,23 +145,6 @@ def test_common_shift_changes_only_rows_that_say_so(name):
         assert not unchanged
 
 
-@pytest.mark.parametrize(
-    ("atoms", "message"),
-    [
-        ([[0, 0]], "row 0 names an atom twice"),
-        ([[0, 1], [3, -1]], "row 1 has the negative atom index -1"),
-        ([[0.5, 1.0]], "must be integers"),
-        ([[True, False]], "must be integers"),
-        ([[0, 1, 2]], "a row has 2 atoms"),
-        ([[0, 1], [2]], "different numbers of atoms"),
-        ([[[0, 1]]], "shape"),
-    ],
-)
-def test_bad_atoms_are_named(atoms, message):
-    with pytest.raises(InputError, match=message):
-        Distance(atoms)
-
-
 def test_no_rows_at_all():
     item = Distance([])
     assert (item.n_rows, item.width) == (0, 2)

@@ -8,7 +8,7 @@ from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
 
 from kcons.constraints import Angle, Distance, FixedAtoms, LinearCombination, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import ConstraintError, InputError
+from kcons.errors import InputError
 
 TRICLINIC = np.array([[10.0, 0.0, 0.0], [3.0, 9.0, 0.0], [-2.0, 1.0, 8.0]])
 
@@ -159,26 +159,6 @@ def test_lengths_of_half_the_box_are_refused():
 # -- bad input --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"positions": np.zeros((8, 2))}, r"positions must have shape \(n_atoms, 3\), not \(8, 2\)"),
-        ({"positions": "here"}, "positions is no array of numbers"),
-        ({"masses": np.ones(7)}, r"masses must have shape \(8,\), not \(7,\)"),
-        ({"cell": np.ones(4)}, r"cell must have shape \(3, 3\) or \(3,\)"),
-        ({"cell": np.ones((3, 3))}, "cell vectors are zero or not independent"),
-        ({"cell": [1.0, np.nan, 1.0]}, "cell has a NaN or infinity"),
-        ({"constraints": ["bond"]}, "'bond' is no kcons constraint"),
-        ({"constraints": [Distance([[2, 3], [0, 8]])]}, r"row 1, Distance\(0, 8\): there is no atom 8"),
-    ],
-)
-def test_bad_arguments_are_named(change, message):
-    arguments = {"constraints": [Distance([[0, 1]])], "positions": scattered(0), "masses": MASSES} | change
-    cell = arguments.pop("cell", None)
-    with pytest.raises(InputError, match=message):
-        ConstraintSet(*arguments.values(), cell=cell)
-
-
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_positions_of_constrained_atoms_must_be_finite(number):
     x = scattered(0)
@@ -206,11 +186,6 @@ def test_arrays_of_the_wrong_shape_are_named_later_too():
         held.acceleration_target(scattered(0), np.zeros((7, 3)))
 
 
-def test_rows_without_a_target_say_where_they_get_one():
-    with pytest.raises(ConstraintError, match="has no target; put it in a ConstraintSet first"):
-        Distance([[0, 1]]).target_at(0.0)
-
-
 def test_inputs_are_left_alone_and_single_precision_is_cast():
     x = scattered(0).astype(np.float32)
     before = x.copy()
@@ -231,14 +206,6 @@ def test_nothing_held():
     assert not held.moving
 
 
-def test_moving_is_known():
-    x = scattered(0)
-    assert not ConstraintSet([Distance([[0, 1]])], x, MASSES).moving
-    assert ConstraintSet([Distance([[0, 1]], lambda t: 1 + t)], x, MASSES).moving
-    assert ConstraintSet([CASES["ImplicitSurface moving"]()], x, MASSES).moving
-    assert not ConstraintSet([LinearCombination([0], [[1, 0, 0]])], x, MASSES).moving
-
-
 def test_what_was_given_may_be_changed_afterwards():
     target, center, coefficients = np.array([1.0]), np.array([[0.0, 0.0, 3.0]]), np.ones((1, 2, 3))
     x, masses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([1.0, 2.0])
@@ -250,8 +217,3 @@ def test_what_was_given_may_be_changed_afterwards():
     assert np.array_equal(held.value(x), before[0])
     assert np.array_equal(held.jacobian(x).toarray(), before[1])
     assert held.masses.tolist() == [1.0, 2.0]
-
-
-def test_periodicity_is_one_flag_or_three():
-    with pytest.raises(InputError, match=r"pbc is \[True, False\]; give True, False, or one for each"):
-        ConstraintSet([], np.zeros((1, 3)), np.ones(1), cell=[5.0] * 3, pbc=[True, False])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -10,9 +11,8 @@ from constraint_cases import MASSES, scattered
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kcons.constraints import Angle, Dihedral, Distance
+from kcons.constraints import Angle, Dihedral, Distance, contradictions
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.contradictions import _triangles
 from kcons.errors import ContradictionError, InfeasibleError
 
 
@@ -77,23 +77,25 @@ def test_flat_triangles_pass():
     ConstraintSet([Distance([[0, 1], [1, 2], [0, 2]])], x, np.ones(3))
 
 
-@given(edges=st.sets(st.tuples(st.integers(0, 9), st.integers(0, 9)).filter(lambda e: e[0] < e[1]), min_size=1))
-def test_triangles_of_any_graph(edges):
-    pairs = np.array(sorted(edges))
-    found = {tuple(sorted(np.unique(pairs[t]).tolist())) for part in _triangles(pairs) for t in part}
-    expected = {
-        three for three in itertools.combinations(range(10), 3) if set(itertools.combinations(three, 2)) <= edges
-    }
-    assert found == expected
-    assert sum(len(part) for part in _triangles(pairs)) == len(expected)
-
-
-def test_every_triangle_is_found_where_memory_is_bounded(monkeypatch):
-    monkeypatch.setattr("kcons.constraints.contradictions._CHUNK", 50)
-    pairs = np.array(list(itertools.combinations(range(30), 2)))
-    parts = list(_triangles(pairs))
-    assert len(parts) > 10
-    assert sum(map(len, parts)) == 30 * 29 * 28 // 6
+@given(
+    lengths=st.dictionaries(st.sampled_from(list(itertools.combinations(range(8), 2))), st.floats(0.3, 3), min_size=3),
+    chunk=st.sampled_from([20, 2_000_000]),
+)
+def test_what_cannot_close_is_refused_in_any_graph(lengths, chunk):
+    """Also where few triangles are looked at together."""
+    triangles = [
+        sorted(lengths[pair] for pair in itertools.combinations(three, 2))
+        for three in itertools.combinations(range(8), 3)
+        if set(itertools.combinations(three, 2)) <= set(lengths)
+    ]
+    infeasible = any(a + b < c * (1 - 1e-10) for a, b, c in triangles)
+    with mock.patch.object(contradictions, "_CHUNK", chunk):
+        try:
+            ConstraintSet([Distance(list(lengths), list(lengths.values()))], scattered(0), MASSES)
+        except InfeasibleError:
+            assert infeasible
+        else:
+            assert not infeasible
 
 
 def test_one_bad_water_among_many():

@@ -119,16 +119,6 @@ def test_singular_values_and_full_rank_factors_agree(p: Problem) -> None:
     np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-11 * np.abs(ours).max(initial=1e-300))
 
 
-def test_independent_rows_of_any_scale_keep_all_digits() -> None:
-    """(D U)+ = U+ D^-1 for independent rows, column by column and not only in norm."""
-    p = make_problem(seed=5, atoms=4, rows=6, rank=6, decades=0)
-    scales = 10.0 ** np.array([-40.0, -9, -3, 0, 7, 40])
-    expected = p.A.T @ np.linalg.inv(p.A @ p.A.T) / scales
-    found = projection.pseudo_inverse(p.A * scales[:, None]).matrix
-    error = np.linalg.norm(found - expected, axis=0) / np.linalg.norm(expected, axis=0)
-    assert error.max() < 1e-13
-
-
 def complex_matrix(seed: int, rows: int, columns: int, rank: int, decades: float = 2.0) -> np.ndarray:
     """A complex matrix of this rank, its rows in units of their own, some of them turned in the complex plane."""
     rng = np.random.default_rng(seed)
@@ -147,33 +137,22 @@ def test_complex_matrices(rows: int, columns: int, rank: int) -> None:
     inverse = projection.pseudo_inverse(A)
     assert inverse.rank == projection.rank(A) == rank
     assert max(projection.penrose_residuals(A, inverse.matrix)) < 2e-14
-    # A X A, X A X, (A X)^H, (X A)^H written out, on rows of one size.
     U = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
     X = projection.pseudo_inverse(U).matrix
     np.testing.assert_allclose(X, np.linalg.pinv(U, rcond=1e-10), atol=1e-12)
-    for left, right in ((U @ X @ U, U), (X @ U @ X, X), ((U @ X).conj().T, U @ X), ((X @ U).conj().T, X @ U)):
-        np.testing.assert_allclose(left, right, atol=1e-12)
     F, G = projection.full_rank_factors(U)
     assert (F.shape, G.shape) == ((rows, rank), (rank, columns))
     np.testing.assert_allclose(F @ G, U, atol=1e-13)
     np.testing.assert_allclose(projection.full_rank_pseudo_inverse(F, G), X, atol=1e-11)
-    V, W = projection.row_space(A), projection.column_space(U)
-    np.testing.assert_allclose(V.conj().T @ V, np.eye(rank), atol=1e-14)
-    np.testing.assert_allclose(W @ (W.conj().T @ U), U, atol=1e-13)
     across, along = projection.perpendicular_projector(A), projection.parallel_projector(A)
     np.testing.assert_allclose(across, X @ U, atol=1e-12)
-    np.testing.assert_allclose(U @ along, 0.0, atol=1e-13)
-    # Solvability and all solutions, with complex right sides and vectors y.
-    b = U @ (rng.normal(size=columns) + 1j * rng.normal(size=columns))
-    y = rng.normal(size=columns) + 1j * rng.normal(size=columns)
+    b, y = U @ (rng.normal(size=columns) * (1 + 2j)), rng.normal(size=columns) * (2 - 1j)
     assert projection.is_solvable(U, b)
     np.testing.assert_allclose(U @ projection.general_solution(U, b, y), b, atol=1e-12)
     np.testing.assert_allclose(projection.general_solution(U, b, X @ b + along @ y), X @ b + along @ y, atol=1e-12)
     if rank < rows:
-        off = b + 1j * (np.eye(rows) - W @ W.conj().T) @ rng.normal(size=rows)
-        assert not projection.is_solvable(U, off)
-        with pytest.raises(ContradictionError):
-            projection.require_solvable(U, off)
+        W = projection.column_space(U)
+        assert not projection.is_solvable(U, b + 1j * (np.eye(rows) - W @ W.conj().T) @ rng.normal(size=rows))
 
 
 def test_an_imaginary_part_alone_decides() -> None:
@@ -203,14 +182,6 @@ def test_mechanics_is_real() -> None:
             unreal = [*arguments[:k], np.asarray(argument) * (1 + 1e-3j), *arguments[k + 1 :]]
             with pytest.raises(InputError, match="complex"):
                 function(*unreal)
-
-
-def test_what_is_no_array_of_numbers_is_refused() -> None:
-    masked = np.ma.masked_array([[1.0, 2.0]], mask=[[False, True]])
-    for bad in (masked, [["a", "b"]], np.array([[object(), 1.0]]), [[1.0], [1.0, 2.0]]):
-        with pytest.raises(InputError) as caught:
-            projection.pseudo_inverse(bad)
-        assert caught.value.item == "matrix"
 
 
 @pytest.mark.parametrize("scale", [1e-290, 1e-200, 1e200, 1e290])
@@ -374,23 +345,6 @@ def test_dalembert_constraint_force_does_no_work_on_tangent_displacements(p: Pro
 
 
 @PROPERTY
-@given(problems(), st.floats(-6, 6))
-def test_scaling_a_row_changes_nothing_but_its_multiplier(p: Problem, exponent: float) -> None:
-    if len(p.A) == 0 or p.rank < len(p.A):
-        return
-    scaled_A, scaled_b = p.A.copy(), p.b.copy()
-    scaled_A[0] *= 10**exponent
-    scaled_b[0] *= 10**exponent
-    z = projection.constraint_force(p.A, p.masses, p.f, p.b)
-    close = 1e-12 * np.abs(z).max()
-    np.testing.assert_allclose(projection.constraint_force(scaled_A, p.masses, p.f, scaled_b), z, rtol=0, atol=close)
-    lam = projection.multipliers(p.A, p.masses, p.f, p.b)
-    found = projection.multipliers(scaled_A, p.masses, p.f, scaled_b)
-    assert found[0] * 10**exponent == pytest.approx(lam[0], rel=1e-10, abs=1e-12 * np.abs(lam).max())
-    np.testing.assert_allclose(found[1:], lam[1:], rtol=0, atol=1e-11 * np.abs(lam).max())
-
-
-@PROPERTY
 @given(problems(), st.data())
 def test_dependent_rows_leave_the_motion_unique_and_the_multipliers_shortest(p: Problem, data: st.DataObject) -> None:
     if len(p.A) == 0:
@@ -435,34 +389,29 @@ def test_a_full_mass_matrix_is_a_diagonal_one_in_other_coordinates(p: Problem) -
     back = np.linalg.inv(T)
     M = T.T @ (np.repeat(p.masses, 3)[:, None] * T)
     M, A, f, v = 0.5 * (M + M.T), p.A @ T, p.f.ravel() @ T, p.rng.normal(size=n)
-    a = projection.acceleration(p.A, p.masses, p.f, p.b).ravel()
-    z = projection.constraint_force(p.A, p.masses, p.f, p.b).ravel()
+    mine, theirs = (A, M, f, p.b), (p.A, p.masses, p.f.ravel(), p.b)
+    a, z = projection.acceleration(*theirs), projection.constraint_force(*theirs)
     spread = p.masses.max() / p.masses.min()
     close = 1e-12 * spread * (1 + np.abs(a).max() + np.abs(z).max())
-    np.testing.assert_allclose(T @ projection.acceleration(A, M, f, p.b), a, rtol=0, atol=close)
-    np.testing.assert_allclose(projection.constraint_force(A, M, f, p.b), z @ T, rtol=0, atol=close)
-    lam = projection.multipliers(p.A, p.masses, p.f, p.b)
-    found = projection.multipliers(A, M, f, p.b)
-    np.testing.assert_allclose(found, lam, rtol=0, atol=1e-11 * spread * (1 + np.abs(lam).max(initial=0)))
-    np.testing.assert_allclose(
-        T @ projection.project_velocities(A, M, back @ v, 0.0 * p.b),
-        projection.project_velocities(p.A, p.masses, v),
-        rtol=0,
-        atol=close,
-    )
-    np.testing.assert_allclose(
-        T @ projection.constrained_inverse(A, M) @ T.T,
-        projection.constrained_inverse(p.A, p.masses),
-        rtol=0,
-        atol=close / p.masses.min(),
-    )
-    literal = projection.bott_duffin(A, M, f, p.b)
-    np.testing.assert_allclose(T @ literal.acceleration, a, rtol=0, atol=10 * close)
-    np.testing.assert_allclose(literal.constraint_force, z @ T, rtol=0, atol=10 * close)
-    trial = p.rng.normal(size=n)
-    assert projection.gauss_function(back @ trial, M, f) == pytest.approx(
-        projection.gauss_function(trial, p.masses, p.f), rel=1e-10
-    )
+    literal = projection.bott_duffin(*mine)
+    for found, expected, times in (
+        (T @ projection.acceleration(*mine), a, 1),
+        (projection.constraint_force(*mine), z @ T, 1),
+        (T @ projection.project_velocities(A, M, back @ v), projection.project_velocities(p.A, p.masses, v), 1),
+        (
+            T @ projection.constrained_inverse(A, M) @ T.T,
+            projection.constrained_inverse(p.A, p.masses),
+            1 / p.masses.min(),
+        ),
+        (T @ literal.acceleration, a, 10),
+        (literal.constraint_force, z @ T, 10),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=times * close)
+    lam = projection.multipliers(*theirs)
+    atol = 1e-11 * spread * (1 + np.abs(lam).max(initial=0))
+    np.testing.assert_allclose(projection.multipliers(*mine), lam, rtol=0, atol=atol)
+    least = projection.gauss_function(v, p.masses, p.f)
+    assert projection.gauss_function(back @ v, M, f) == pytest.approx(least, rel=1e-10)
 
 
 def test_a_singular_mass_matrix_that_is_positive_where_something_moves() -> None:
@@ -575,14 +524,6 @@ def test_contradiction_names_its_rows() -> None:
     assert "1, 3" in str(caught.value)
 
 
-def test_a_row_of_zeros_asks_for_nothing_or_for_the_impossible() -> None:
-    A = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    assert projection.is_solvable(A, [0.0, 2.0])
-    assert not projection.is_solvable(A, [1.0, 2.0])
-    with pytest.raises(ContradictionError):
-        projection.require_solvable(A, [1.0, 2.0])
-
-
 # -- errors and architecture ------------------------------------------------------------------------
 
 
@@ -594,6 +535,9 @@ def test_bad_masses_are_refused(masses: list[float]) -> None:
 
 
 def test_bad_arrays_are_refused() -> None:
+    for bad in (np.ma.masked_array([[1.0, 2.0]], mask=[[False, True]]), [["a", "b"]], [[1.0], [1.0, 2.0]]):
+        with pytest.raises(InputError, match=r"^matrix"):
+            projection.pseudo_inverse(bad)
     with pytest.raises(InputError, match="two axes"):
         projection.pseudo_inverse(np.ones(3))
     with pytest.raises(InputError, match="row 1"):

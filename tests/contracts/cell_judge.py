@@ -10,16 +10,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from ase import Atoms
-from ase.calculators.calculator import Calculator, all_changes
-from ase.md.verlet import VelocityVerlet
 from cell_molecules import half_width
 from cell_oracle import EPS, Array, NoSolution, advance, stepper_of
 from cell_worlds import World, world, wrapping
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.ase import ConstrainedDynamics, constrain
 from kcons.errors import KconsError
+from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, KahanLi6, Rattle, Suzuki4
 
 OUTCOMES = ("right", "refused", "unfounded", "silent")
 #: Seconds of computing that a case may take.
@@ -30,6 +27,8 @@ ROOM = 50.0
 FAR_JUMP = 3.0
 #: Said of a point that is as good as the oracle's; `summary` counts them.
 ANOTHER = "another solution"
+#: Steppers of runs that nothing bounds.
+WILD = (Rattle(), Rattle(), Geodesic(), Suzuki4(), BlanesMoan4(), KahanLi6(), BlanesMoan6())
 #: Said where a held dihedral becomes straight.
 UNDEFINED = "where a dihedral angle is undefined"
 #: Said of lengths to be found that could as well close through the boundary.
@@ -221,18 +220,17 @@ class Judge:
 
     # -- operations -----------------------------------------------------------------------------
 
+    def build(self) -> None:
+        w = self.w
+        self.held = ConstraintSet(w.constraints(), self.x, w.masses, cell=w.cell if self.periodic else None, pbc=w.pbc)
+        self.motion = Motion(self.held, self.x)
+
     def all(self) -> list[Verdict]:
         w, rng = self.w, self.rng
-        masses = w.masses.copy()
         link = w.nearness(w.x)
 
-        def build() -> Motion:
-            cell = w.cell if self.periodic else None
-            self.held = ConstraintSet(w.constraints(), self.x, masses, cell=cell, pbc=w.pbc)
-            return Motion(self.held, self.x)
-
         try:
-            self.motion = build()
+            self.build()
         except Exception as error:  # judged below
             unknown = [i for i in w.items if i.family == "Distance" and i.how == "open"]
             if TO_GIVE in str(error) and unknown:
@@ -240,7 +238,7 @@ class Judge:
                     item.how = "given"
                 self.say("set-up", "refused", TO_GIVE)
         if self.motion is None:
-            self.motion = self.attempt("set-up", build, [self.x, masses], link)
+            self.attempt("set-up", self.build, [self.x, w.masses], link)
         if self.motion is None:
             return self.verdicts
         self.statics("")
@@ -248,11 +246,10 @@ class Judge:
             self.values()
             self.restore()
         self.steps()
+        if not self.periodic:
+            self.wild()
         if self.periodic and not self._far() and not w.elsewhere and rng.random() < 0.3:
             self.new_cell()
-        still = all(i.how != "moving" for i in w.items)
-        if still and rng.random() < 0.2:
-            self.ase()
         return self.verdicts
 
     def elsewhere(self, chance: float) -> Array:
@@ -466,6 +463,35 @@ class Judge:
         if not np.array_equal(cell, w.cell):
             self._use_cell(w.cell, w.x, w.images)
 
+    def wild(self) -> None:
+        """Strong forces and long steps far away: states on the rows, or a typed error with nothing changed."""
+        w, rng, motion = self.w, self.rng, self.motion
+        strength, dt, stepper = 10 ** rng.uniform(-1, 3), 10 ** rng.uniform(-3, 1), WILD[int(rng.integers(len(WILD)))]
+        start = self.x + (0.0 if w.placed.any() or rng.random() < 0.7 else 10 ** rng.uniform(0, 6))
+        anchors = start + 0.2 * rng.normal(size=start.shape)
+        system = System(motion, lambda x, t: strength * (anchors - x))
+        before = system.initial_state(start, w.v, project=True)
+        for _ in range(4):
+            kept = before.positions.tobytes(), before.velocities.tobytes()
+            try:
+                state = stepper.step(system, before, dt)
+            except KconsError:
+                if kept != (before.positions.tobytes(), before.velocities.tobytes()):
+                    self.say("wild", "silent", "the state before the step was changed")
+                return
+            x, v, t = state.positions, state.velocities, state.time
+            off = (np.abs(self.held.value(x, t)) - 4 * self.held.tolerance(x, t)) / self.held.scale
+            rows = motion.constraint_set.jacobian(x, t)  # rows that are converted have no gradients of their own
+            size = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
+            rate = np.abs(rows @ v.ravel() - motion.constraint_set.velocity_target(x, t)) / np.where(
+                size > 0, size, 1.0
+            )
+            worst = max(off.max(initial=0.0), rate.max(initial=0.0) / (float(np.linalg.norm(v)) or 1.0))
+            if not worst <= 1e-9:
+                self.say("wild", "silent", "off its rows, or not tangent", worst)
+                return
+            before = state
+
     def _pull(self, x: Array) -> Array:
         return -self.w.springs * (x - self.w.anchors)
 
@@ -548,53 +574,6 @@ class Judge:
         self.rows.set_cell(old)
         w.cell = old
 
-    def ase(self) -> None:
-        """`constrain` and VelocityVerlet, with the atoms wrapped between two steps."""
-        w, rng = self.w, self.rng
-        images = w.images
-        calculator = Springs(w.springs, w.stored(w.anchors))
-        atoms = Atoms("H" * len(w.x), positions=self.x, calculator=calculator)
-        atoms.set_cell(w.cell)
-        atoms.pbc = w.pbc & self.periodic
-        atoms.set_masses(w.masses)
-        atoms.set_velocities(w.v)
-        steps = 1 if w.placed.any() else int(rng.integers(1, 3))
-        link, pair = w.nearness(w.x), Pair(self)
-        dynamics = (VelocityVerlet if rng.random() < 0.6 else ConstrainedDynamics)(atoms, w.dt)
-        name = f"ASE {type(dynamics).__name__}"
-
-        def go(number: int) -> bool:
-            if number == 0:
-                constrain(atoms, w.constraints())
-            dynamics.run(1)
-            return True
-
-        for number in range(steps):
-            solvable = True
-            try:
-                pair.first("Rattle", 0.0)
-                pair.second("Rattle", 0.0)
-                link = max(link, w.nearness(pair.x, every=True))
-            except NoSolution:
-                solvable = False
-            if number and self.periodic:
-                # Near a face rounding decides, so that ASE's own choice is taken.
-                whole = atoms.positions - images @ w.cell
-                atoms.wrap()
-                images = np.round(np.linalg.solve(w.cell.T, (atoms.positions - whole).T).T).astype(int)
-                calculator.anchors = w.anchors + images @ w.cell
-            if not self.attempt(name, lambda n=number: go(n), [], link, solvable) or not solvable:
-                return
-            largest = _top(atoms.positions, self.x)
-            (x, v), (off_x, off_v) = (pair.x, pair.v), pair.apart()
-            rounding = 64 * EPS * self.dependent[2] * largest
-            room = ROOM * (number + 1)
-            if not self.compare(name, atoms.positions - images @ w.cell, x, room * off_x + rounding):
-                return
-            # ASE takes velocities from differences of positions.
-            if not self.compare(name, atoms.get_velocities(), v, room * off_v + rounding / w.dt):
-                return
-
 
 class Pair:
     """The oracle's motion, and a twin whose start and targets are rounded otherwise."""
@@ -616,21 +595,6 @@ class Pair:
     def apart(self) -> tuple[float, float]:
         one, other = (self.x, self.v), self.twin
         return float(np.abs(one[0] - other[0]).max()), float(np.abs(one[1] - other[1]).max())
-
-
-class Springs(Calculator):
-    """Each atom on a spring of its own."""
-
-    implemented_properties = ["energy", "forces"]
-
-    def __init__(self, springs: Array, anchors: Array) -> None:
-        super().__init__()
-        self.springs, self.anchors = springs, anchors
-
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes) -> None:
-        super().calculate(atoms, properties, system_changes)
-        d = atoms.positions - self.anchors
-        self.results = {"energy": 0.5 * float((self.springs * d * d).sum()), "forces": -self.springs * d}
 
 
 def _top(*arrays: Array) -> float:

@@ -37,18 +37,8 @@ class NoSolution(Exception):
 class Row:
     """One row: q(x) = target + amplitude (sin(rate t + phase) - sin(phase)).
 
-    Attributes
-    ----------
-    kind : str
-        'norm' |d|, 'angle' between d_1 and d_2, 'dihedral' of d_1, d_2, d_3, 'linear' sum c . x, 'gyration'.
-    vectors : list of dict
-        Each vector as {atom: weight}; for 'gyration' one entry, the weights of the atoms.
-    images : list of three int
-        What each vector has besides, in lattice vectors.
-    coefficients : dict
-        {atom: three numbers} of a linear row.
-    place : array, optional
-        What is subtracted from the vector of a 'norm' (the center of a sphere).
+    Kinds: 'norm' |d|, 'angle' between d_1 and d_2, 'dihedral' of d_1, d_2, d_3, 'linear' sum c . x, 'gyration'. Each
+    vector is {atom: weight}, with `images` lattice vectors besides; of a 'norm', `place` is subtracted.
     """
 
     kind: str
@@ -83,13 +73,7 @@ def wave(amplitude: Array, omega: Array, phase: Array, time: float, derivative: 
 class Dense:
     """All rows on all atoms.
 
-    Parameters
-    ----------
-    rows : list of Row
-    masses : array, shape (n,)
-    cell : array, shape (3, 3)
-    pinned : array of int
-        Fixed atoms; `places` and their waves (amplitude, omega, phase, each of shape (n_pinned, 3)) say where they are.
+    Where the `pinned` atoms are, `places` and their waves (amplitude, omega, phase; shape (3, n_pinned, 3)) say.
     """
 
     def __init__(self, rows: list[Row], masses: Array, cell: Array, pinned: Array, places: Array, waves: Array) -> None:
@@ -335,14 +319,6 @@ class Dense:
             last = length
         raise NoSolution("the nearest point")
 
-    def amplification(self, x: Array, x_ref: Array) -> Array:
-        """By how much each coordinate moves, at most, where each sigma is off by one: shape (3 n, rows)."""
-        spread = (self.basis(x_ref)[0] * self.root).T
-        a = self.jacobian(x)
-        size = np.linalg.norm(a, axis=1)
-        size[size == 0] = 1.0
-        return np.abs(spread @ np.linalg.pinv((a @ spread) / size[:, None], rcond=1e-10)) / size
-
     def rounding(self, x: Array, stored: float) -> Array:
         """What double precision leaves of each sigma where coordinates are as large as `stored`."""
         reach = np.abs(self.jacobian(x)).sum(axis=1) * stored
@@ -402,7 +378,8 @@ def _dihedral_along(d: Array, v: Array) -> tuple[list[Array], list[Array]]:
 def stepper_of(name: str) -> Any:
     """A stepper of the package: its fractions of kicks and drifts are the only thing that the oracle takes from it."""
     if name.startswith("Geodesic"):
-        return steppers.Geodesic(int(name[8:]), great_circles=False)
+        substeps = int(name[8:])
+        return steppers.Splitting((0.5, 0.5), (1.0,), (1.0 / substeps,) * substeps)
     if name == "ProjectedVerlet":
         return ProjectedEquation(project=True)
     return getattr(steppers, name)()

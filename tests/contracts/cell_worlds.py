@@ -31,25 +31,11 @@ STEPPERS = (
 
 @dataclass
 class World:
-    """One random system.
+    """One random system: whole molecules on their rows, with tangent velocities.
 
-    Attributes
-    ----------
-    kinds : list of str
-        What molecules it is made of.
-    x, v : array, shape (n, 3)
-        Whole molecules on their rows, and tangent velocities.
-    images : array of int, shape (n, 3)
-        In which image each atom is given to the engine.
-    cell, pbc
-    items : list of Item
-    rows : Dense
-    placed : array of bool
-        Atoms that a row holds at a place in space, in the image in which they are given: these must not change it.
-    impossible : bool
-        A row between fixed atoms that moves by itself: must be refused.
-    drifting : bool
-        Members that nothing ties fly apart.
+    `images` says in which image the engine gets each atom; those that are `placed` are held at a place in space, and
+    must not change it. `impossible` is a row between fixed atoms that moves by itself, which must be refused;
+    `drifting` are members that nothing ties and that fly apart.
     """
 
     kinds: list[str]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from tests.reference import cases
 
 @functools.cache
 def solution(name, time):
-    return small(name).solution(time)
+    system = small(name)
+    return replace(system, horizon=time).reference() if system.solution is None else system.solution(time)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -94,6 +96,10 @@ def test_system_is_the_stored_case(name):
         np.testing.assert_allclose(a, s.accelerations, rtol=0, atol=2e-10 * max(1.0, np.abs(s.accelerations).max()))
 
 
+#: Those with a solution of their own; the others are compared with steps of order six.
+SOLVED = [name for name in STORED if small(name).solution is not None]
+
+
 @pytest.mark.parametrize("name", STORED)
 def test_solution_meets_the_stored_one(name):
     # What is wrong at the start, or on the way, grows as the stored case is sensitive to its start. The start is wrong
@@ -105,12 +111,13 @@ def test_solution_meets_the_stored_one(name):
     for s, grown in known:
         found = solution(name, s.time)
         off = system.deviation(found.positions, s.positions)
-        assert off < 4 * FINEST * grown
-        assert found.error < 4 * (FINEST + COARSER) * grown
-        assert off < 5 * found.error + 4 * EPS * grown  # the estimate is honest
+        if name in SOLVED:
+            assert off < 4 * FINEST * grown
+            assert found.error < 4 * (FINEST + COARSER) * grown
+        assert off < 5 * found.error + 4 * EPS * grown and found.error < 1e-8  # the estimate is honest
 
 
-@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize("name", SOLVED)
 def test_solution_stays_on_the_constraints(name):
     system = small(name)
     for time in (0.0, 0.3 * system.horizon, system.horizon):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ase.build import molecule
-from ase.calculators.emt import EMT
 from ase.io import read
 from ase.io.trajectory import Trajectory
 from ase.md.andersen import Andersen
@@ -13,7 +12,6 @@ from ase.md.bussi import Bussi
 from ase.md.langevin import Langevin
 from ase.md.nvtberendsen import NVTBerendsen
 from ase.md.verlet import VelocityVerlet
-from ase.optimize import BFGS, FIRE, LBFGS, MDMin
 from ase_systems import FS, TEMPERATURE, Field, equal, off, random, state, water
 
 from kcons.ase import constrain
@@ -72,27 +70,6 @@ def test_dynamics(name, case, tmp_path):
     frames = read(tmp_path / "md.traj", index=":")
     assert len(frames) == 4
     assert equal(state(frames[-1]), state(good))
-
-
-@pytest.mark.parametrize("case", FAILURES)
-@pytest.mark.parametrize("cls", [BFGS, LBFGS, FIRE, MDMin], ids=lambda c: c.__name__)
-def test_optimizer(cls, case):
-    class Spoiled(EMT):
-        left = 3
-
-        def get_forces(self, atoms=None):
-            forces = super().get_forces(atoms)
-            self.left -= 1
-            return forces if self.left > 0 else how(forces)
-
-    how, error, _ = FAILURES[case]
-    atoms = molecule("CH3CH2OH")
-    atoms.calc = Spoiled()
-    held = constrain(atoms, Distance([[0, 1], [1, 2]]))
-    with pytest.raises(error):
-        cls(atoms, logfile=None).run(fmax=0.01, steps=20)
-    assert np.isfinite(atoms.positions).all()
-    assert off(atoms, held) <= 1e-13
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -130,14 +130,3 @@ def test_classes_that_refuse_constraints_themselves(name):
     atoms, _ = dumbbells(4)
     with pytest.raises(NotImplementedError, match="does not support constraints"):
         REFUSE_THEMSELVES[name](atoms)
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("name", ["Langevin", "Bussi", "Andersen"])
-def test_temperature_long(name):
-    atoms, held = dumbbells()
-    seen = follow(CANONICAL[name](atoms), atoms.get_temperature, 40_000)
-    mean, error = mean_and_error(seen[400:], blocks=20)
-    assert error < 1.5
-    assert abs(mean - TEMPERATURE) <= 3 * error
-    assert off(atoms, held) <= 1e-12

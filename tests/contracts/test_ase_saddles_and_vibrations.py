@@ -10,7 +10,6 @@ from ase.build import fcc100, molecule
 from ase.calculators.emt import EMT
 from ase.constraints import FixAtoms
 from ase.mep import NEB, DimerControl, MinModeAtoms, MinModeTranslate
-from ase.mep.neb import NEBOptimizer
 from ase.optimize import BFGS
 from ase.optimize.optimize import Dynamics
 from ase.phonons import Phonons
@@ -86,32 +85,6 @@ def test_neb_keeps_lengths_in_all_images(rigid_path):
 
 def test_no_search_is_forgotten():
     assert set(classes_in(ase.mep, Dynamics)) == {"MinModeTranslate", "DimerTranslate", "NEBOptimizer"}
-
-
-def test_the_optimizer_of_bands(rigid_path):
-    first, last = (image.copy() for image in (rigid_path[0], rigid_path[-1]))
-    images = [first, first.copy(), first.copy(), first.copy(), last]
-    for image in images:
-        image.calc = EMT()
-    band = NEB(images, method="improvedtangent")
-    band.interpolate(apply_constraint=True)
-    NEBOptimizer(band, logfile=None).run(fmax=0.05, steps=100)
-    for image in images:
-        assert off(image, image.constraints[0]) <= 1e-12
-    assert barrier(images) == pytest.approx(barrier(rigid_path), abs=0.02)
-
-
-def test_neb_with_the_calculator(rigid_path):
-    first, last = (image.copy() for image in (rigid_path[0], rigid_path[-1]))
-    held = first.constraints[0]
-    images = [first, first.copy(), first.copy(), first.copy(), last]
-    for image in images:
-        image.set_constraint()
-        image.calc = ConstrainedCalculator(EMT(), held)
-    band = NEB(images, climb=True, method="improvedtangent")
-    band.interpolate()
-    assert BFGS(band, logfile=None).run(fmax=0.03, steps=200)
-    assert barrier(images) == pytest.approx(barrier(rigid_path), abs=2e-3)
 
 
 @pytest.mark.parametrize("calculator", [False, True])

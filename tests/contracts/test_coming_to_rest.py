@@ -7,7 +7,6 @@ import pytest
 from stepper_systems import gravity, system_of
 
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge
-from kcons.errors import CertificateError
 from kcons.steppers import (
     Geodesic,
     KahanLi6,
@@ -93,23 +92,3 @@ def test_the_check_of_reversibility_still_sees_what_moves() -> None:
 
     with pytest.raises(Exception, match="not reversible"):
         ReversibilityCheck(Pushed()).step(system, rest, 0.1)
-
-
-@pytest.mark.parametrize("friction", [False, True], ids=["force", "friction of the system"])
-def test_states_at_rest_are_certified(friction: bool) -> None:
-    """Each of them, for rows whose velocities are off by no more than the kick is rounded to, and by no more."""
-    system, start = pendulum()
-    if friction:
-        weight = gravity(MASSES)(start.positions, 0.0)
-        system = System(system.motion, lambda x, t: weight, friction=1.2)
-    end = run(system, start, 0.1, 1000, check_every=1)
-    assert np.abs(end.velocities).max() <= 1e-12
-    along = np.zeros_like(start.positions)
-    along[1] = [0.0, 0.0, 1e-12]
-    with pytest.raises(CertificateError, match="A v - c"):
-        system.schedule._certify(end.positions, end.velocities + along, end.time, 0.1)
-    # A run that goes back to time 0 ends at what rounding leaves of it.
-    with pytest.raises(CertificateError, match="A v - c"):
-        system.schedule._certify(end.positions, end.velocities + along, 1e-17, -0.1)
-    with pytest.raises(CertificateError, match="sigma"):
-        system.schedule._certify(end.positions + 1e6 * along, end.velocities, end.time, 0.1)

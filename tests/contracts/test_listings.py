@@ -49,7 +49,7 @@ ALL = [
     LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 2}, slow_kicks="middle"),
     *(IsokineticSpheres(1.0, 0.5, 1, steps={"a": 1, "b": 2, "c": 4}), IsokineticSpheres(1.0, 0.5, 1)),
     ConstantPressure(Langevin(1.0, 0.5, 1), MonteCarloBarostat(1.0)),
-    *(NoseHooverChain(1.0, 9.0), NoseHooverChain(1.0, 9.0, stepper=Geodesic(2))),
+    *(NoseHooverChain(1.0, 9.0),),
 ]
 STEPPERS = pytest.mark.parametrize("stepper", ALL, ids=repr)
 #: Kicks of all kinds share the step among themselves, and so do drifts, and each kind of bath.

@@ -22,11 +22,8 @@ from openmm_systems import (
 
 from kcons.constraints import Distance, projection
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import SCHEMES
-from kcons.steppers import State
-from kcons.steppers import System as CoreSystem
 
 TIME = 0.048  # ps
 #: Order, and time steps in fs that divide the time, where the leading term rules and rounding does not.
@@ -77,21 +74,6 @@ def test_far_fewer_force_evaluations_than_rattle(truth):
 
 
 # -- constraints ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(  # on the CPU, programs are run by the code of Reference
-    ("scheme", "platform"),
-    [*((scheme, "Reference") for scheme in SCHEMES), ("rattle", "CPU")],
-)
-def test_constraints_to_the_last_digits(scheme, platform):
-    system, x, v = alanine()
-    integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-13)
-    context = started(system, integrator, x, v, platform)
-    for _ in range(10):
-        integrator.step(3)
-        distance, along = residuals(system, context)
-        assert distance <= 1e-12
-        assert along <= 1e-12
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
@@ -164,53 +146,6 @@ def test_projector_against_the_dense_oracle():
     integrator.applyVelocityConstraints(context)
     found = state_of(context)[1][atoms].ravel()
     assert np.abs(found - exact).max() <= 1e-12 * np.abs(exact).max()
-
-
-@pytest.mark.parametrize("platform", PLATFORMS)
-def test_one_bond_as_verlet_integrator(platform):
-    """RATTLE and OpenMM's leapfrog visit the same positions."""
-    system, x, v = dumbbell()
-    dt = 0.5e-3
-    ours = ProjectedIntegrator(dt, tolerance=1e-14)
-    context = started(system, ours, x, v, platform)
-    ours.applyVelocityConstraints(context)
-    v = state_of(context)[1]
-    theirs = openmm.VerletIntegrator(dt)
-    theirs.setConstraintTolerance(1e-14)
-    other = started(system, theirs, x, platform=platform)
-    other.setVelocities(v - 0.5 * dt * forces_at(other) / masses_of(system)[:, None])
-    ours.step(100)
-    theirs.step(100)
-    assert np.abs(state_of(context)[0] - state_of(other)[0]).max() <= 1e-12
-    ours.step(3900)
-    theirs.step(3900)
-    assert np.abs(state_of(context)[0] - state_of(other)[0]).max() <= 1e-9
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_one_bond_as_the_core_stepper(scheme):
-    """The same scheme in kcons' own engine, with the same forces."""
-    system, x, v = dumbbell()
-    dt = 0.5e-3
-    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14)
-    context = started(system, integrator, x, v)
-    integrator.applyVelocityConstraints(context)
-    v = state_of(context)[1]
-    k, c = 50.0, 500.0
-
-    def force(r, t):
-        x, y, z = r.T
-        return -np.stack([2 * k * x + c * y**3, 2.6 * k * y + 3 * c * x * y**2, 1.4 * k * z], axis=1)
-
-    np.testing.assert_allclose(forces_at(context), force(x, 0.0), rtol=1e-12)
-    motion = Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x)
-    core, state = CoreSystem(motion, force), State(x, v)
-    stepper = SCHEMES[scheme]()
-    for steps, limit in ((100, 1e-12), (1900 if scheme == "rattle" else 400, 1e-9)):
-        for _ in range(steps):
-            state = stepper.step(core, state, dt)
-        integrator.step(steps)
-        assert np.abs(state_of(context)[0] - state.positions).max() <= limit
 
 
 def test_one_force_evaluation_a_step():

@@ -1,26 +1,20 @@
-"""OpenMM's barostats beside our integrators: all is held, and volumes and densities have their distribution.
+"""OpenMM's barostats beside our integrators: all is held, and volumes have their distribution.
 
 Volumes of rigid ideal gases have an exact one: N is the number of molecules as OpenMM counts them, joined by
-constraints of the System, by bonds, and by the bonds of no strength of `hold(..., join=True)`. KCONS_BAROSTATS names a
-file, if any, into which the validation runs write what they find; see docs/constant_pressure.md.
+constraints of the System, by bonds, and by the bonds of no strength of `hold(..., join=True)`.
 """
 
 from __future__ import annotations
 
 import copy
-import json
-import os
-from pathlib import Path
 
 import numpy as np
 import openmm
 import pytest
-from openmm import unit
-from openmm_systems import GPUS, PLATFORMS, context_of, residuals, started, state_of, volumes_under_pressure, water_box
+from openmm_systems import GPUS, PLATFORMS, residuals, started, state_of, volumes_under_pressure, water_box
 from pressure_systems import TRIANGLE, p_value, placed
 from scipy import stats
 
-from kcons.comparison import environment
 from kcons.constraints import Distance
 from kcons.openmm import (
     Isokinetic,
@@ -29,9 +23,7 @@ from kcons.openmm import (
     ProjectedIntegrator,
     hold,
 )
-from kcons.steppers.files import text
 from kcons.thermostats import mean
-from kcons.thermostats.correlated_series import spread
 
 BAROSTATS = {
     "isotropic": openmm.MonteCarloBarostat(1.0, 300.0, 2),
@@ -99,37 +91,6 @@ def test_on_gpus(name, platform):
         assert residuals(system, context)[0] < 2e-7
     assert len(volumes) > 3
     integrator.check()
-
-
-def densities(make, blocks, steps, x, system):
-    """Mean densities (kg/l) of blocks of a run, the first two left out."""
-    integrator = make()
-    integrator.setRandomNumberSeed(3)
-    context = context_of(system, integrator, "CPU")
-    context.setPositions(x)
-    openmm.LocalEnergyMinimizer.minimize(context, 10, 100)
-    context.setVelocitiesToTemperature(300, 1)
-    mass = sum(system.getParticleMass(k)._value for k in range(system.getNumParticles())) * 1.66053907e-3
-    means = []
-    for _ in range(blocks):
-        found = []
-        for _ in range(steps // 20):
-            integrator.step(20)
-            found.append(mass / context.getState().getPeriodicBoxVolume().value_in_unit(unit.nanometer**3))
-        means.append(np.mean(found))
-    return np.array(means[2:])
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("name", ["Langevin", "Isokinetic", "NoseHoover"])
-def test_density_is_that_of_openmm(name):
-    """64 waters; standard errors from blocks of 10 ps, which are long beside the correlation time of the volume."""
-    system, x = pressed("isotropic", 64)
-    ours = densities(MADE[name], 12, 5000, x, system)
-    theirs = densities(lambda: openmm.LangevinMiddleIntegrator(300, 1.0, 2e-3), 12, 5000, x, system)
-    error = np.sqrt(sum(np.var(found, ddof=1) / len(found) for found in (ours, theirs)))
-    assert error < 0.02
-    assert abs(ours.mean() - theirs.mean()) < 3.5 * error
 
 
 # -- rigid ideal gases --------------------------------------------------------------------------------
@@ -229,59 +190,6 @@ def test_virtual_sites_move_with_their_molecules():
     judge(found, N, PRESSURE)
     y = state_of(context)[0].reshape(N, 4, 3)
     assert y[:, 3] == pytest.approx(0.5 * y[:, 0] + 0.25 * (y[:, 1] + y[:, 2]), abs=1e-6)
-
-
-SHAPED = {
-    "isotropic": lambda p: openmm.MonteCarloBarostat(p, 300, 1),
-    "flexible": lambda p: openmm.MonteCarloFlexibleBarostat(p, 300, 1),
-    "three axes": lambda p: openmm.MonteCarloAnisotropicBarostat(openmm.Vec3(p, p, p), 300, True, True, True, 1),
-    "membrane": lambda p: M(p, 0.0, 300, M.XYIsotropic, M.ZFree, 1),
-}
-
-
-def judge_beside(ensemble, barostat, count, off, n=12, side=4.0):
-    """What was found, with the p of the exact distribution for N and for `off` more and less, which are told from it.
-
-    Rigid molecules, and an energy that keeps the shape of the box and knows nothing of its volume.
-
-    Without it shapes of a gas wander; it is stiff enough that no box vector has to be replaced by a shorter one, about
-    which OpenMM's flexible barostat is not exact, also beside its own integrators.
-    """
-    system, x = gas(n=n, side=side)
-    system.addForce(openmm.CustomVolumeForce(f"{20 * KT}*((ax^2+bx^2+by^2+cx^2+cy^2+cz^2)/v^(2/3)-3)"))
-    pressure = (n + 1) * KT / side**3
-    integrator = ProjectedIntegrator(0.002, ensemble=ENSEMBLES[ensemble]())
-    found, context = volumes(system, integrator, x, SHAPED[barostat](pressure * BAR), count)
-    laws = [stats.gamma(m + 1, scale=KT / pressure) for m in (n - off, n, n + off)]
-    less, right, more = (p_value(found, law) for law in laws)
-    assert right > 0.01 and less < 1e-3 and more < 1e-3, (less, right, more)
-    box = context.getState().getPeriodicBoxVectors(asNumpy=True)._value
-    assert (abs(box[np.tril_indices(3, -1)]) > 1e-3).all() == (barostat == "flexible")
-    integrator.check()
-    told = {"ensemble": ensemble, "barostat": barostat, "steps": count, "molecules": n, "off": off}
-    return told | {"independent": spread(found).independent, "less": less, "p": right, "more": more}
-
-
-@pytest.fixture(scope="module")
-def measured():
-    """Name -> what was found; written when all are done."""
-    found, here = {}, environment()
-    yield found
-    if file := os.environ.get("KCONS_BAROSTATS"):
-        known = json.loads(Path(file).read_text())["runs"] if Path(file).exists() else {}
-        Path(file).write_text(text({"format": "kcons barostats", "environment": here, "runs": known | found}, 1) + "\n")
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("ensemble", ENSEMBLES)
-@pytest.mark.parametrize("barostat", SHAPED)
-def test_volumes_of_each_beside_each(ensemble, barostat, measured):
-    """With fewer molecules OpenMM's trials reach volumes below zero, but for those of the flexible barostat."""
-    if barostat == "flexible":  # six lengths at once: few volumes are independent
-        found = judge_beside(ensemble, barostat, 20_000, 2)
-    else:
-        found = judge_beside(ensemble, barostat, 20_000, 2 if barostat == "membrane" else 1, N, SIDE)
-    measured[f"{barostat}, {ensemble}"] = found
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from carried_systems import context_of, free, peptide, pull, start, state_of
+from carried_systems import context_of, free, pull, start, state_of
 
 from kcons.constraints import (
     Distance,
@@ -67,23 +67,3 @@ def test_multipliers_of_a_hanging_weight():
     context = context_of(system, ProjectedIntegrator(0.001, parts=[part]))
     context.setPositions([[0, 0, 0], [0, 0, -0.5]])
     assert part.multipliers(context)[0] == pytest.approx(-19.6, abs=1e-12)
-    with pytest.raises(InputError, match="two steps"):
-        part.step_multipliers  # noqa: B018
-    # The first steps still move by the tolerance of the solver, 1e-14 of the length, divided by dt^2.
-    context.getIntegrator().step(4)
-    assert part.step_multipliers[0] == pytest.approx(-19.6, abs=1e-9)
-
-
-@pytest.mark.usefixtures("without_device")
-def test_multipliers_of_a_step_are_of_second_order():
-    errors = []
-    steps = (8, 16, 32)
-    for count in steps:
-        part, integrator, context = peptide(dt=0.008 / count)
-        integrator.step(count)
-        exact = part.multipliers(context)
-        context.getState(energy=True, forces=True)  # evaluates all groups between steps
-        integrator.step(1)
-        errors.append(np.abs(part.step_multipliers - exact).max())
-    slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert slope == pytest.approx(2, abs=0.15)

@@ -99,35 +99,3 @@ def test_everything_that_a_simulation_does(name, platform, tmp_path):
         np.testing.assert_allclose(
             state_of(again.context)[0], end[0], rtol=0, atol=1e-9 if platform in PLATFORMS else 2e-6
         )
-
-
-@pytest.mark.parametrize("name", MADE)
-def test_minimized_states_are_held(name):
-    """By the Simulation, and as OpenMM's users do it, with velocities drawn by the Context."""
-    made = simulation_of(MADE[name](), "CPU")
-    made.context.setPositions(alanine("HBonds")[1])
-    before = made.context.getState(energy=True).getPotentialEnergy()
-    made.minimizeEnergy(maxIterations=50)
-    assert made.context.getState(energy=True).getPotentialEnergy() < before
-    made.context.setVelocitiesToTemperature(300, 3)
-    made.step(20)
-    made.integrator.check()
-    assert residuals(made.system, made.context)[1] < 1e-8
-
-
-def test_states_pass_between_platforms(tmp_path):
-    """Equilibrated on one, run on another, with another integrator: positions, velocities and the clock."""
-    first = simulation_of(MADE["Langevin"](), "Reference")
-    _, x, v = alanine("HBonds")
-    first.context.setPositions(x)
-    first.context.setVelocities(v)
-    first.step(15)
-    second = simulation_of(MADE["rattle"](), "CPU")
-    second.context.setState(first.context.getState(positions=True, velocities=True))
-    assert second.currentStep == 15
-    energy = [second.context.getState(energy=True)]
-    second.step(100)
-    energy.append(second.context.getState(energy=True))
-    total = [(state.getPotentialEnergy() + state.getKineticEnergy())._value for state in energy]
-    assert abs(total[1] - total[0]) < 1.0
-    np.testing.assert_allclose(energy[0].getTime()._value, 0.015, rtol=1e-9)

@@ -179,51 +179,6 @@ def test_gpus_place_sites_within_steps(platform):
 # -- ensembles --------------------------------------------------------------------------------------
 
 
-def test_orientations_of_dipoles_in_a_field():
-    """Only sites feel the field: <cos> = coth(a) - 1/a, a = dipole x field/kT; 2K = g kT, sites do not count.
-
-    Both within four standard errors of runs whose friction makes samples independent.
-    """
-    molecules = 40
-    system = openmm.System()
-    field = openmm.CustomExternalForce("-strength*z")
-    field.addPerParticleParameter("strength")
-    x = []
-    kT = GAS_CONSTANT * 300
-    for n in range(molecules):
-        first = system.getNumParticles()
-        for m in (16.0, 1.0, 1.0, 0.0):
-            system.addParticle(m)
-        for i, j, d in ((0, 1, 0.1), (0, 2, 0.1), (1, 2, 0.16)):
-            system.addConstraint(first + i, first + j, d)
-        # From the oxygen along the bisector, whose length to the middle of the hydrogens is 0.06 nm.
-        system.setVirtualSite(
-            first + 3, openmm.ThreeParticleAverageSite(first, first + 1, first + 2, -1 / 3, 2 / 3, 2 / 3)
-        )
-        site = 0.06 * 4 / 3
-        field.addParticle(first + 3, [2 * kT / site])
-        field.addParticle(first, [-2 * kT / site])  # no force on the whole
-        x += [[n, 0, 0], [n + 0.08, 0, 0.06], [n - 0.08, 0, 0.06], [n, 0, site]]
-    system.addForce(field)
-    integrator = ProjectedIntegrator(2e-3, ensemble=Langevin(300, 20))
-    integrator.setRandomNumberSeed(5)
-    context = started(system, integrator, np.array(x, dtype=float))
-    integrator.setVelocitiesToTemperature(context, 300, 3)
-    integrator.step(500)
-    cosines, temperatures = [], []
-    for _ in range(200):
-        integrator.step(50)
-        x, v = state_of(context)
-        cosines.append(np.mean((x[3::4] - x[::4])[:, 2]) / site)
-        temperatures.append(twice_kinetic(system, v) / GAS_CONSTANT / (6 * molecules))
-    assert integrator.degrees_of_freedom() == 6 * molecules
-    for values, exact in ((cosines, 1 / np.tanh(2) - 1 / 2), (temperatures, 300)):
-        blocks = np.mean(np.reshape(values, (20, 10)), axis=1)
-        error = np.std(blocks, ddof=1) / np.sqrt(20)
-        assert error < 0.02 * exact
-        assert abs(np.mean(values) - exact) < 4 * error
-
-
 @pytest.mark.parametrize("model", ["tip4pew", "mixed"])
 @pytest.mark.parametrize("ensemble", [Isokinetic(), NoseHoover(300, 20)], ids=["Isokinetic", "NoseHoover"])
 def test_energies_of_thermostats_are_conserved_to_second_order(model, ensemble):

@@ -12,7 +12,7 @@ from openmm import Vec3, unit
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, constrain, draw_velocities
-from kcons.constraints import FAMILIES, Angle, CustomVelocity, Dihedral, Distance, MovingTarget, Sphere, from_dict
+from kcons.constraints import FAMILIES, CustomVelocity, Distance, from_dict
 from kcons.constraints.arguments import (
     ANGLE,
     ANY,
@@ -174,25 +174,6 @@ def test_a_quantity_is_the_same_number(family, name):
         with pytest.raises(InputError, match=f"{family.family}: {name} is .* give it in") as caught:
             family(**{**arguments, name: value.tolist() * WRONG[kind]})
         assert kind.words in str(caught.value) and name in caught.value.item
-
-
-def test_positional_arguments_and_units_of_different_size():
-    same(Distance([[0, 1], [1, 2]], [1 * nm, 15 * angstrom]), Distance([[0, 1], [1, 2]], [1.0, 1.5]))
-    same(Sphere([0], Vec3(1, 2, 3) * angstrom, 0.5), Sphere([0], [0.1, 0.2, 0.3], 0.5))
-    moved = Distance([[0, 1]], 1.0).with_target(12 * angstrom)
-    assert moved.units == MD_UNITS and moved.target == pytest.approx([1.2])
-    target = MovingTarget(lambda t: 1.0, time_step=5 * fs)
-    made = Distance([[0, 1]], target)
-    assert made.units == MD_UNITS and made.target.time_step == pytest.approx(0.005)
-
-
-def test_angles_are_the_same_everywhere():
-    x = scattered(3)
-    q = np.degrees(Angle([[0, 1, 2]]).measure(x[None, :3], 0.0)[0])
-    held = ConstraintSet([Angle([[0, 1, 2]], q * unit.degrees)], x, np.ones(8))
-    assert abs(held.value(x)[0]) < 1e-14
-    same(Dihedral([[0, 1, 2, 3]], 90 * unit.degree), Dihedral([[0, 1, 2, 3]], np.pi / 2))
-    same(Angle([[0, 1, 2]], 1.9 * unit.dimensionless), Angle([[0, 1, 2]], 1.9))
 
 
 def test_what_is_in_nm_is_refused_where_nobody_knows_units():

@@ -248,23 +248,3 @@ def test_rattle_stays_on_the_constraints(name: str) -> None:
         np.testing.assert_allclose(
             rows @ state.velocities.ravel(), c, rtol=0, atol=1e-14 * (np.abs(state.velocities).max() + np.abs(c).max())
         )
-
-
-@pytest.mark.validation
-@HOLONOMIC
-def test_rattle_extrapolates_to_the_reference_at_later_times(name: str) -> None:
-    """The last stored time that is not more than a hundredfold sensitive to the start.
-
-    Positions and velocities together: at the turning points of a pendulum the error of the positions alone is the
-    square of that of the phase, of order four.
-    """
-    case = cases.load(name)
-    first = case.solution[0].time - case.initial.time
-    known = [s for s in case.solution if s.time <= 20 * first and not s.condition > 100]
-    reference = known[-1]
-    runs = trajectories(name, reference, int(np.ceil(64 * (reference.time - case.initial.time) / first)))
-    errors = np.maximum(runs.errors("positions"), runs.errors("velocities"))
-    np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), 2.0, rtol=0, atol=0.1)
-    for item in ("positions", "velocities"):
-        left = np.abs(runs.extrapolated(item) - getattr(reference, item)).max()
-        assert left <= max(1e-10, 1e-2 * errors[-1]), f"{item}: {left:.2e}, plain error {errors[-1]:.2e}"

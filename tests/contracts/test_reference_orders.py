@@ -1,4 +1,4 @@
-"""Every stepper on every reference case: its order by slope, and the bound on round-off at every stored time.
+"""Steppers on every reference case: their order by slope, and the bound on round-off of those of order six.
 
 The slope is fitted where the error is 30 times above the bound max(1e-11, 100 cond eps) or more, cond being the
 sensitivity of the solution to its start. Isokinetic cases are run with the thermostat as a force that depends on
@@ -14,69 +14,31 @@ import numpy as np
 import pytest
 from reference import cases
 from reference.cases import Case, Snapshot
-from stepper_systems import SYMMETRIC
 
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
-from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, KahanLi6, Rattle, State, Stepper, System, run
+from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, KahanLi6, State, Stepper, Suzuki4, System, run
 
 EPS = float(np.finfo(float).eps)
-STEPPERS: list[Stepper] = SYMMETRIC
-#: Run by every test run, where they do not take long; all steppers by the long one. The bound on round-off is that of
-#: steppers of order six in every run.
-USUAL = {"Rattle()", "Geodesic(substeps=4)", "Suzuki4()", "BlanesMoan4()"}
+#: Beside RATTLE, whose error `test_reference_cases` extrapolates to nothing.
+STEPPERS: list[Stepper] = [Geodesic(4), Suzuki4(), BlanesMoan4()]
 #: Slopes are measured from this error (or 8 times the lowest allowed one) down: small enough for the leading term.
-START = {2: 3e-4, 4: 4e-9, 6: 0.0}
+START = {2: 3e-4, 4: 4e-9}
 #: From there on to so many times as many steps, the first where all errors are above the bound.
 FINER = (1.4, 1.25)
-#: So accurate that the leading term shows only below 30 times the bound of all others: for these the bound is what
-#: rounding really leaves, which is measured as well.
-FINEST = {
-    ("A02_spherical_pendulum_near_planar", "BlanesMoan6a()"): 3e-13,
-    ("A03_planar_pendulum_150deg", "BlanesMoan6a()"): 3e-13,
-    ("A03_planar_pendulum_179deg", "BlanesMoan6a()"): 1e-13,
-    ("A03_planar_pendulum_90deg", "BlanesMoan6a()"): 3e-13,
-    ("A05_two_dumbbells_lj", "BlanesMoan6()"): 2e-13,
-    ("A05_two_dumbbells_lj", "BlanesMoan6a()"): 2e-13,
-    ("A08_bead_vertical_ellipse", "BlanesMoan6()"): 3e-13,
-}
-#: The stored times where the leading term shows best: those that are later have higher bounds.
-ORDER_TIMES = {
-    ("A03_planar_pendulum_179deg", "BlanesMoan6()"): 2,
-    ("A03_planar_pendulum_179deg", "BlanesMoan6a()"): 2,
-    ("A05_two_dumbbells_lj", "KahanLi6()"): 1,
-    ("A05_two_dumbbells_lj", "BlanesMoan6()"): 1,
-    ("A05_two_dumbbells_lj", "BlanesMoan6a()"): 1,
-}
-#: The leading term along great circles is below 30 times what rounding leaves here, and what is above it falls with
-#: dt^8 or faster: the order is that of the same scheme with flights by composition, and the great circles are to be
-#: better and fall no slower.
-BELOW_THE_FLOOR = {
-    ("A02_spherical_pendulum_near_top", "BlanesMoan6a()"),
-    ("A02_spherical_pendulum_near_top_Lz", "BlanesMoan6a()"),
-    ("A03_planar_pendulum_rotating", "BlanesMoan6a()"),
-}
 #: Surfaces without compiled solvers: a projection takes a millisecond.
-SLOW = frozenset(name for name in cases.NAMES if name.startswith("A08"))
-#: Nothing is left of the error where atoms fly along great circles and no forces act.
-EXACT = {("A01_sphere_free", s) for s in ("Geodesic(substeps=4)", "BlanesMoan4()", "BlanesMoan6()", "BlanesMoan6a()")}
-
-#: Left to the long run: what takes seconds, where another stepper of that order is on the same case or its kind.
+SURFACES = frozenset(name for name in cases.NAMES if name.startswith("A08"))
+#: Cases on which `BlanesMoan4` takes seconds, and is left to `Suzuki4`.
 LONG = {
-    "A02_spherical_pendulum_near_top": {"BlanesMoan4()"},
-    "A02_spherical_pendulum_near_top_Lz": {"BlanesMoan4()"},
-    "A04_double_pendulum": {"BlanesMoan4()"},
-    "A04_double_spherical_pendulum": {"BlanesMoan4()"},
-    "A04_triple_pendulum": {"BlanesMoan4()"},
-    "A05_two_dumbbells_lj": {"BlanesMoan4()"},
-    "A06_water_free3": {"BlanesMoan4()"},
-    "A09_hanging_chain5_3d": {"BlanesMoan4()"},
-    "A09_ring6_planar": {"BlanesMoan4()"},
-    "A10_isokinetic_lj4": {"Rattle()", "Suzuki4()"},
+    *("A02_spherical_pendulum_near_top", "A02_spherical_pendulum_near_top_Lz", "A04_double_pendulum"),
+    *("A04_double_spherical_pendulum", "A04_triple_pendulum", "A05_two_dumbbells_lj", "A06_water_free3"),
+    *("A09_hanging_chain5_3d", "A09_ring6_planar"),
 }
-#: Later times are left to the long run.
-SLOW_AT_THE_BOUND = SLOW | {"A04_triple_pendulum", "A05_two_dumbbells_lj", "A06_water_free3"}
+#: Nothing is left of the error where atoms fly along great circles and no forces act.
+EXACT = {("A01_sphere_free", s) for s in ("Geodesic(substeps=4)", "BlanesMoan4()")}
+#: Later times take minutes.
+SLOW_AT_THE_BOUND = SURFACES | {"A04_triple_pendulum", "A05_two_dumbbells_lj", "A06_water_free3"}
 #: Steps with which the bound is reached, and the stepper for it; 0.05 and BlanesMoan6 otherwise.
 FLOOR_STEPS = {
     "A02_spherical_pendulum_near_top": 0.025,
@@ -200,8 +162,7 @@ def deviations(end: State, reference: Snapshot) -> tuple[float, float]:
 
 def slope(name: str, stepper: Stepper, index: int) -> tuple[float, Sequence[tuple[int, float]]]:
     """Observed order at one stored time, and the numbers of steps and errors it was fitted to."""
-    reference, rounding = cases.load(name).solution[index], FINEST.get((name, repr(stepper)))
-    lowest = 30 * (rounding or bound_of(name, index))
+    reference, lowest = cases.load(name).solution[index], 30 * bound_of(name, index)
     first = max(START[stepper.order], 8 * lowest)
     errors: dict[int, float] = {}
 
@@ -226,75 +187,40 @@ def slope(name: str, stepper: Stepper, index: int) -> tuple[float, Sequence[tupl
         if len(points) == 3:
             break
     assert len(points) == 3, f"too few points above {lowest:.1e}: {points}"
-    if rounding:
-        assert rounding < bound_of(name, index)
-        assert error(name, stepper, reference, 4 * points[-1][0]) <= rounding
     logarithms = np.log(points).T
     return -float(np.polyfit(*logarithms, 1)[0]), points
 
 
-def check_order(name: str, stepper: Stepper, index: int) -> None:
-    if (name, repr(stepper)) in EXACT:
-        reference = cases.load(name).solution[index]
-        assert error(name, stepper, reference, 3) <= bound_of(name, index)
-        return
-    if isinstance(stepper, BlanesMoan4 | BlanesMoan6 | BlanesMoan6a) and depends_on_velocities(cases.load(name)):
-        before = start(name)
+def is_quick(name: str, stepper: Stepper) -> bool:
+    if stepper.order == 2:
+        return True
+    slow = name in SURFACES or name.startswith("A07") or name == "A10_isokinetic_lj4"
+    return not slow and not (isinstance(stepper, BlanesMoan4) and name in LONG)
+
+
+@pytest.mark.parametrize(
+    ("name", "stepper"),
+    [(name, stepper) for name in cases.NAMES for stepper in STEPPERS if is_quick(name, stepper)],
+    ids=lambda p: p if isinstance(p, str) else repr(p),
+)
+def test_order(name: str, stepper: Stepper) -> None:
+    if isinstance(stepper, BlanesMoan4) and depends_on_velocities(cases.load(name)):
         with pytest.raises(UnsupportedError, match="use Suzuki4 or KahanLi6"):
-            stepper.step(system(name), before, 0.01)
+            stepper.step(system(name), start(name), 0.01)
         return
-    if (name, repr(stepper)) in BELOW_THE_FLOOR:
-        exact, stepper = stepper, BlanesMoan6a()
-        stepper.exact_flight = False
-        faster, exact_points = slope(name, exact, index)
-        assert faster >= stepper.order - 0.15, exact_points
-        n, best = exact_points[-1]
-        assert best < error(name, stepper, cases.load(name).solution[index], n)
+    index = telling_time(name, 5.0) if isinstance(stepper, BlanesMoan4) else 0
+    if (name, repr(stepper)) in EXACT:
+        assert error(name, stepper, cases.load(name).solution[index], 3) <= bound_of(name, index)
+        return
     measured, points = slope(name, stepper, index)
     assert measured == pytest.approx(stepper.order, abs=0.15), points
 
 
-PAIRS = [(name, stepper) for name in cases.NAMES for stepper in STEPPERS]
-
-
-def order_time(name: str, stepper: Stepper) -> int:
-    """The first stored time where that will do."""
-    if (name, repr(stepper)) in ORDER_TIMES:
-        return ORDER_TIMES[name, repr(stepper)]
-    if name in SLOW:
-        return 1 if isinstance(stepper, BlanesMoan6 | BlanesMoan6a) else 0
-    if not isinstance(stepper, KahanLi6 | BlanesMoan4 | BlanesMoan6 | BlanesMoan6a):
-        return 0
-    return telling_time(name, 20.0 if stepper.order == 6 else 5.0)
-
-
-def is_quick(name: str, stepper: Stepper) -> bool:
-    """Whether the usual run takes it; everything else waits for the long run."""
-    if isinstance(stepper, Rattle) and not cases.load(name).isokinetic:
-        return False  # `test_reference_cases` extrapolates its error to nothing
-    slow = name in SLOW or name.startswith("A07")
-    return repr(stepper) in USUAL - LONG.get(name, set()) and (stepper.order == 2 or not slow)
-
-
-QUICK = [p for p in PAIRS if is_quick(*p)]
-
-
-@pytest.mark.parametrize(("name", "stepper"), QUICK, ids=lambda p: p if isinstance(p, str) else repr(p))
-def test_order(name: str, stepper: Stepper) -> None:
-    check_order(name, stepper, order_time(name, stepper))
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize(
-    ("name", "stepper"), [p for p in PAIRS if p not in QUICK], ids=lambda p: p if isinstance(p, str) else repr(p)
-)
-def test_order_of_the_others(name: str, stepper: Stepper) -> None:
-    check_order(name, stepper, order_time(name, stepper))
-
-
-def check_bound(name: str, latest: float) -> None:
+@pytest.mark.parametrize("name", cases.NAMES)
+def test_round_off_bound(name: str) -> None:
     case, setting, state = cases.load(name), system(name), start(name)
-    stepper: Stepper = KahanLi6() if name in SLOW or depends_on_velocities(case) else BlanesMoan6()
+    latest = 1.0 if name in SLOW_AT_THE_BOUND or depends_on_velocities(case) else 5.0
+    stepper: Stepper = KahanLi6() if name in SURFACES or depends_on_velocities(case) else BlanesMoan6()
     for k, reference in enumerate(case.solution):
         if k and reference.time > latest:
             return
@@ -303,14 +229,3 @@ def check_bound(name: str, latest: float) -> None:
         allowed = bound_of(name, k)
         for item, off in zip(("positions", "velocities"), deviations(state, reference), strict=True):
             assert off <= allowed, f"{item} at t = {reference.time}: {off:.1e}, allowed {allowed:.1e}"
-
-
-@pytest.mark.parametrize("name", cases.NAMES)
-def test_round_off_bound(name: str) -> None:
-    check_bound(name, 1.0 if name in SLOW_AT_THE_BOUND or depends_on_velocities(cases.load(name)) else 5.0)
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("name", cases.NAMES)
-def test_round_off_bound_at_every_stored_time(name: str) -> None:
-    check_bound(name, np.inf)

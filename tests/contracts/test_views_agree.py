@@ -62,23 +62,3 @@ def test_hangles_as_angles_are_the_same_angles(views):
     less = {tuple(sorted(p)) for item in rows if item.family == "Distance" for p in item.atoms.tolist()}
     assert more - less == ends
     assert len(ends) == angles.n_rows > 100
-
-
-def test_selection_keeps_rows_inside(views):
-    universe = views[0]
-    every = quietly(kcons.mdanalysis.constraints_of, universe, "allbonds")
-    some = quietly(kcons.mdanalysis.constraints_of, universe, "allbonds", select="resid 1:5 and protein")
-    inside = set(universe.select_atoms("resid 1:5 and protein").indices.tolist())
-    expected = {tuple(p) for item in every for p in item.atoms.tolist() if set(p) <= inside}
-    assert {tuple(p) for item in some for p in item.atoms.tolist()} == expected
-    assert expected
-
-
-def test_a_group_counts_its_own_atoms(views):
-    universe = views[0]
-    group = universe.select_atoms("protein and resid 3:6")
-    local = quietly(kcons.mdanalysis.constraints_of, group, "hbonds")
-    whole = quietly(kcons.mdanalysis.constraints_of, universe, "hbonds", select="protein and resid 3:6")
-    assert [group.indices[item.atoms].tolist() for item in local] == [item.atoms.tolist() for item in whole]
-    np.testing.assert_allclose(local[0].target, whole[0].target, rtol=0, atol=1e-12)
-    assert local.constraint_set.n_atoms == len(group)

@@ -177,6 +177,7 @@ def test_two_coordinates_with_z_off_the_diagonal():
     np.testing.assert_allclose(local_mean_force(series, KT), np.tile(exact, (64, 1)), rtol=0, atol=1e-8)
 
 
+@pytest.mark.validation
 @pytest.mark.filterwarnings("ignore:.*independent ones")
 def test_errors_of_repeated_runs_are_as_large_as_they_say():
     """An angle held between two springs, its energy coupled to a slow particle: runs of 25 of its memories of 2.

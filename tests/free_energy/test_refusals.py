@@ -33,10 +33,7 @@ from kcons.free_energy import (
     pull_free_energy,
     scan,
     weighted_mean,
-    work_along,
-    work_profile,
 )
-from kcons.free_energy.averages import agreement
 from kcons.free_energy.scans.scan_result import Grid
 
 TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
@@ -165,7 +162,7 @@ def series(values):
     return found
 
 
-N20, ONE = np.arange(20.0), np.diag([1.0, 0.0])
+N20 = np.arange(20.0)
 MEANS = [
     (lambda: mean_force(N20, 1.0), "series", r"give a kcons\.free_energy\.Series"),
     (lambda: mean_force(series([1.0] * 20), 0.0), "kT", "kT is 0.0; give a positive number"),
@@ -180,10 +177,6 @@ MEANS = [
     (lambda: weighted_mean(N20, -np.ones(20)), "weights", "negative"),
     (lambda: weighted_mean(N20, np.zeros(20)), "weights", "positive"),
     (lambda: weighted_mean(N20, np.eye(20)[3]), "weights", "sample 3 has all of the weight"),
-    (lambda: agreement([0.0, 1.0], ONE, [0.0], [[1.0]]), "covariance", "two means of 2"),
-    (lambda: agreement([0.0], ONE, [0.0], ONE), "covariance", "two means of 1"),
-    (lambda: agreement([np.nan], [[1.0]], [0.0], [[1.0]]), "covariance", "not finite"),
-    (lambda: agreement(1.0, -1.0, 2.0, 2.0), "covariance", "negative"),
 ]
 
 # -- profiles, surfaces, works --
@@ -207,7 +200,6 @@ PROFILES = [
     (lambda: integrate(N3, N3[:2], [1.0] * 3), "f", r"shape \(3,\)"),
     (lambda: integrate(N3, N3, [1.0, 1.0, -1.0]), "e", "window 2 is negative"),
     (lambda: integrate(N3, N3, [1.0] * 3, zero=3.0), "zero", "beyond the windows"),
-    (lambda: integrate(N3, N3, [1.0] * 3, at=[-1.0]), "at", "beyond the windows"),
     (lambda: integrate(N3, N3, [1.0] * 3, period=-1.0), "period", "positive"),
     (lambda: integrate(N3, N3, [1.0] * 3, period="360"), "period", "positive"),
     (lambda: integrate(N4, [0.0, 1.0, 2.0, 2.0], [0.0] * 4), "e", "windows at 1 have mean forces from 1 to"),
@@ -215,12 +207,6 @@ PROFILES = [
     *((lambda n=n: profile().next_windows(n), "count", "count is") for n in (-1, 0, 1.5)),
     *((lambda b=b: profile().next_windows(1, below=b), "below", "below is") for b in (-1.0, np.nan)),
     (lambda: profile().next_windows(1, below=-5.0), "below", "below is"),
-    (lambda: profile().without_jacobian("distance", 1.0), "jacobian", "no distance of -1"),
-    (lambda: profile().without_jacobian("length", 1.0), "jacobian", "unknown jacobian"),
-    (lambda: profile().without_jacobian(lambda x: x - 1.0, 1.0), "jacobian", "not positive at -1"),
-    (lambda: profile().without_jacobian(np.cosh, "1"), "thermal_energy", "thermal_energy is '1'"),
-    (lambda: profile().without_jacobian(np.cosh, 0.0), "thermal_energy", "positive number"),
-    (lambda: profile().without_jacobian(np.cosh, 1.0).without_jacobian(np.cosh, 1.0), "jacobian", "already"),
     (lambda: surface(x=np.zeros((3, 2))), "x", r"d \+ 2 or more"),
     (lambda: surface(x=np.ones((9, 2))), "x", "one value of coordinate 0"),
     (lambda: surface(f=np.zeros((9, 3))), "f", r"shape \(9, 2\)"),
@@ -244,11 +230,6 @@ PROFILES = [
         (lambda kT=kT: pull_free_energy([1.0] * 5, thermal_energy=kT), "thermal_energy", "positive")
         for kT in (-1.0, "x", "1")
     ),
-    (lambda: pull_free_energy([1.0] * 5, thermal_energy=1.0, rng="x"), "rng", "rng is 'x'"),
-    (lambda: work_along([0.0, 1.0], [0.0, 1.0, 2.0]), "force", "do not go"),
-    (lambda: work_along([0.0, 1.0], [0.0, np.nan]), "force", "finite"),
-    (lambda: work_profile(np.zeros(5), thermal_energy=1.0), "works", "shape"),
-    (lambda: work_profile(np.zeros((5, 2)), thermal_energy=1.0, log_weights=np.zeros(5)), "log_weights", "shape"),
 ]
 
 # -- scans --

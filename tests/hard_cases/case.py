@@ -16,25 +16,27 @@ from typing import Any, Literal
 from hard_cases.contract import CannotExpressError, Program
 from kcons.errors import KconsError
 
+#: 'bound': the checks must hold; 'raise': a refusal is asked for; 'warn-or-raise': either will do.
 Kind = Literal["bound", "raise", "warn-or-raise"]
 Verdict = Literal["right", "refused", "silently wrong", "crash/NaN", "cannot express"]
 
 #: Columns of the table, in order.
 SYSTEMS = ("kcons", "kcons in ASE", "kcons in OpenMM", "ASE", "OpenMM")
 OURS = SYSTEMS[:3]
-#: Modules that hold cases, in the order they are shown.
+#: Modules that hold cases.
 THEMES = (
-    "bodies",
-    "rings",
-    "chains",
-    "starts",
-    "steps",
-    "long_runs",
-    "inputs",
-    "invariance",
-    "thermostats",
+    *("bodies", "rings", "chains", "starts", "steps", "long_runs", "inputs", "invariance", "thermostats"),
     "growth_models",
 )
+#: Which programs reasons are of that a case gives by these names.
+_NAMES = {
+    "ase": ("ASE",),
+    "openmm": ("OpenMM",),
+    "peers": ("ASE", "OpenMM"),
+    "in_ase": ("kcons in ASE",),
+    "in_openmm": ("kcons in OpenMM",),
+    "md_engines": SYSTEMS[1:],
+}
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,6 @@ class Check:
     name: str
     value: float
     limit: float
-
-    @property
-    def finite(self) -> bool:
-        return math.isfinite(self.value)
 
     @property
     def passed(self) -> bool:
@@ -75,54 +73,26 @@ Function = Callable[["Program", bool], Outcome]
 
 @dataclass(frozen=True)
 class Case:
-    """A hard case.
-
-    Attributes
-    ----------
-    number : str
-        H01 to H42 as in the list of the issue, X01 and on for the others.
-    title : str
-    limit : str
-        What must be true, in words.
-    kind : {'bound', 'raise', 'warn-or-raise'}
-        'bound': the checks must hold; 'raise': a refusal is asked for; 'warn-or-raise': either will do.
-    theme : str
-        The module it is in.
-    function : callable
-    cannot : mapping
-        Programs that cannot be asked, with the reason.
-    """
+    """A hard case: H01 to H42 are those of the list, X01 and on others; `limit` says in words what must be true."""
 
     number: str
     title: str
     limit: str
     kind: Kind
-    theme: str
     function: Function
+    #: Programs that cannot be asked, with the reason.
     cannot: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The verdict on one program in one case.
-
-    Attributes
-    ----------
-    verdict : str
-    met : bool
-        Whether what the case asks for is met: right, or refused where that is asked for.
-    text : str
-        The number against its limit, the error's type and text, or the reason.
-    checks : list of dict
-        All measured numbers.
-    seconds : float
-    """
+    """The verdict on one program in one case; `met` where it is right, or refused where that is asked for."""
 
     verdict: Verdict
     met: bool
+    #: The number against its limit, the error's type and text, or the reason.
     text: str
     checks: list[dict[str, Any]] = field(default_factory=list)
-    seconds: float = 0.0
 
 
 _CASES: dict[str, Case] = {}
@@ -132,24 +102,12 @@ def case(number: str, title: str, limit: str, kind: Kind = "bound", **cannot: st
     """Register a function as a case; `cannot` takes reasons by program, such as ``ase="no surfaces"``."""
 
     def register(function: Function) -> Function:
-        if number in _CASES:
-            raise ValueError(f"there are two cases {number}")
-        theme = function.__module__.rsplit(".", 1)[-1]
+        assert number not in _CASES, number
         reasons = {name: reason for key, reason in cannot.items() for name in _NAMES[key]}
-        _CASES[number] = Case(number, title, limit, kind, theme, function, reasons)
+        _CASES[number] = Case(number, title, limit, kind, function, reasons)
         return function
 
     return register
-
-
-_NAMES = {
-    "ase": ("ASE",),
-    "openmm": ("OpenMM",),
-    "peers": ("ASE", "OpenMM"),
-    "in_ase": ("kcons in ASE",),
-    "in_openmm": ("kcons in OpenMM",),
-    "md_engines": SYSTEMS[1:],
-}
 
 
 def all_cases() -> dict[str, Case]:
@@ -160,44 +118,35 @@ def all_cases() -> dict[str, Case]:
 
 
 def judge(case: Case, found: Outcome | BaseException, warned: str = "", program: str = "") -> Cell:
-    """The verdict on what a program made of a case.
+    """The verdict on what a case function returned or raised, and on the text of a warning, if there was one.
 
-    Parameters
-    ----------
-    case : Case
-    found : Outcome or exception
-        What its function returned or raised.
-    warned : str
-        Text of a warning of the program, if there was one.
-    program : str
-        Its name: of kcons only typed errors count as refusals.
+    Of kcons only typed errors count as refusals.
     """
-    if isinstance(found, CannotExpressError):
-        return Cell("cannot express", False, str(found))
     if isinstance(found, BaseException):
         words = " ".join(str(found).split())
+        if isinstance(found, CannotExpressError):
+            return Cell("cannot express", False, str(found))
         if isinstance(found, ImportError):
             return Cell("cannot express", False, f"not installed: {words}")
         if program in OURS and not isinstance(found, KconsError):
             return Cell("crash/NaN", False, f"untyped {type(found).__name__}: {words}")
         met = case.kind != "bound"
-        if not met and type(found).__name__ == "OpenMMException" and "NaN" in words:
-            return Cell("crash/NaN", False, f"{type(found).__name__}: {words}")
-        return Cell("refused", met, f"{type(found).__name__}: {words}")
+        nan = not met and type(found).__name__ == "OpenMMException" and "NaN" in words
+        return Cell("crash/NaN" if nan else "refused", met, f"{type(found).__name__}: {words}")
     checks = [{**asdict(check), "passed": check.passed} for check in found.checks]
     notes = "; ".join(part for part in (found.remark, f"warned: {warned}" if warned else "") if part)
     tail = f"; {notes}" if notes else ""
-    broken = [check for check in found.checks if not check.finite]
+    broken = next((check for check in found.checks if not math.isfinite(check.value)), None)
     if broken:
-        return Cell("crash/NaN", False, f"{broken[0].name} is {broken[0].value}{tail}", checks)
-    failed = [check for check in found.checks if not check.passed]
+        return Cell("crash/NaN", False, f"{broken.name} is {broken.value}{tail}", checks)
+    failed = next((check for check in found.checks if not check.passed), None)
     if failed:
         if warned and case.kind != "raise":
-            return Cell("refused", case.kind == "warn-or-raise", f"warned: {warned}; {failed[0]}", checks)
-        return Cell("silently wrong", False, f"{failed[0]}{tail}", checks)
-    if warned and not found.checks and case.kind != "bound":
-        return Cell("refused", True, notes)
+            return Cell("refused", case.kind == "warn-or-raise", f"warned: {warned}; {failed}", checks)
+        return Cell("silently wrong", False, f"{failed}{tail}", checks)
     if not found.checks:
+        if warned and case.kind != "bound":
+            return Cell("refused", True, notes)
         return Cell("silently wrong", False, f"accepted without a word{tail}", checks)
     worst = max(found.checks, key=lambda check: check.value / check.limit if check.limit > 0 else 0.0)
     return Cell("right", True, f"{worst}{tail}", checks)

@@ -58,13 +58,7 @@ class Course(NamedTuple):
 
 
 class Program:
-    """Something that can run a problem.
-
-    Attributes
-    ----------
-    name : str
-        As in `SYSTEMS`.
-    """
+    """Something that can run a problem; its name is one of `SYSTEMS`."""
 
     name = ""
     #: How long runs may be, as a part of what a case asks for.
@@ -86,20 +80,10 @@ class Program:
         wrap: bool = False,
         stepper: Stepper | None = None,
     ) -> Frame:
-        """Run and return the last frame.
+        """Run and return the last frame; `watch` sees the start and every `every` steps.
 
-        Parameters
-        ----------
-        problem : Problem
-        dt, steps
-        watch : callable, optional
-            Sees the start and every `every` steps.
-        project : bool
-            Whether to bring the start onto the constraints by the means the program offers for it.
-        wrap : bool
-            Whether to put atoms back into the cell after each step.
-        stepper : Stepper, optional
-            For the core only.
+        `project` brings the start onto the constraints by the means the program offers for it, `wrap` puts atoms back
+        into the cell after each step, `stepper` is for the core only.
         """
         run = self.begin(problem, Course(dt, steps, project, stepper))
 

@@ -26,28 +26,9 @@ Numbers: TypeAlias = Any
 class Problem:
     """Atoms, what is held, and forces.
 
-    Attributes
-    ----------
-    positions, masses : array_like, shapes (n_atoms, 3) and (n_atoms,)
-    pairs, lengths
-        Distances that are held; without lengths, at what they are.
-    triples, angles
-        Angles that are held, in radian.
-    fixed : sequence of int
-        Atoms that do not move.
-    velocities : array_like, shape (n_atoms, 3), optional
-    push : array_like, shape (n_atoms, 3), optional
-        Constant forces.
-    springs : sequence of (i, j, k, rest length)
-        Harmonic bonds.
-    tether : float
-        Constant of springs that hold each atom near `anchors`.
-    anchors : array_like, shape (n_atoms, 3), optional
-        By default the positions.
-    cell : array_like, shape (3, 3), optional
-        Periodic lattice vectors.
-    others : sequence of Constraint
-        Rows that only kcons knows.
+    Without lengths (angles), distances of `pairs` (angles of `triples`, radian) are held at what they are. Forces are a
+    constant `push`, harmonic `springs` (i, j, k, rest length), and springs of the constant `tether` to `anchors`, by
+    default the positions. `others` are rows that only kcons knows.
     """
 
     positions: Numbers

@@ -132,7 +132,7 @@ def test_all_calls_have_to_be_refused():
 # -- verdicts -----------------------------------------------------------------------------------------
 
 BOUND, RAISE, WARN = (
-    Case("Y00", "a case", "a limit", kind, "bodies", lambda program, quick: outcome())
+    Case("Y00", "a case", "a limit", kind, lambda program, quick: outcome())
     for kind in ("bound", "raise", "warn-or-raise")
 )
 SMALL, LARGE, NAN = outcome(("energy", 1e-9, 1e-8)), outcome(("energy", 1e-7, 1e-8)), outcome(("energy", np.nan, 1.0))

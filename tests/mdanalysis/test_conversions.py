@@ -306,13 +306,6 @@ def ethane():
     return universe
 
 
-def test_converted_atoms_are_those_of_to_ase(ethane):
-    atoms = ethane.atoms.convert_to("ASE")
-    assert np.array_equal(atoms.positions, to_ase(ethane).positions) and list(atoms.symbols) == ["C"] * 2 + ["H"] * 6
-    assert not atoms.constraints
-    assert np.array_equal(ethane.atoms.convert_to.ase().positions, atoms.positions)
-
-
 def test_converted_atoms_carry_constraints(ethane):
     by_name = ethane.atoms.convert_to("ASE", constrain="hbonds")
     (held,) = by_name.constraints

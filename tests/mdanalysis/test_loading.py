@@ -138,21 +138,6 @@ def test_topologies_of_gromacs_and_amber_have_one_ending(tmp_path):
     assert "ITP" not in str(error.value)
 
 
-def test_files_of_dl_poly_have_no_ending(tmp_path, x):
-    y = files.whole(x)
-    lines = ["water", f"0 0 {3 * N}"]
-    for k in range(3):
-        lines.append(f"timestep {k} {3 * N} 0 0 0.001")
-        lines += [line for a, r in enumerate(y[k]) for line in (f"O {a + 1} 16.0 0.0", f"{r[0]:f} {r[1]:f} {r[2]:f}")]
-    for name in ("HISTORY", "first.run"):
-        (tmp_path / name).write_text("\n".join(lines) + "\n")
-    made = files.universe(N)
-    load_trajectory(made, tmp_path / "HISTORY")
-    assert made.trajectory.n_frames == 3
-    load_trajectory(made, tmp_path / "first.run", format="HISTORY")
-    assert made.trajectory.n_frames == 3
-
-
 def test_a_format_of_the_topology_can_be_named(tmp_path, x):
     path = files.topology(tmp_path / "w.gro", N, x[0]).rename(tmp_path / "confout")
     with pytest.raises(InputError, match=r"confout: its name tells no format of a topology .*--topology-format") as e:

@@ -17,7 +17,6 @@ from kcons.constraints import (
     KnifeEdge,
     MovingTarget,
     Sphere,
-    Torus,
 )
 from kcons.constraints.arguments import ANY, LENGTH, Unitless
 from kcons.errors import InputError
@@ -30,7 +29,6 @@ from kcons.openmm import (
     Row,
     constraints_of,
     hold,
-    surface_parts,
 )
 from kcons.openmm.quantities import accepted, array, number
 
@@ -111,20 +109,6 @@ def test_functions_may_return_quantities_and_can_be_pickled():
     assert Unitless(float, "x", LENGTH)("3") == 3.0
 
 
-def test_surfaces():
-    x = np.array([[0.5, 0, 0], [0.75, 0, 0]])
-    for make in (
-        lambda length: Sphere([0], [0, 0, 0] * nm, 5 * length),
-        lambda length: Torus([1], [0, 0, 0] * nm, [0, 0, 1], 5 * length, 2.5 * length),
-    ):
-        system = atoms(2)
-        (part,) = surface_parts(make(angstrom), system=system, positions=x * nm)
-        context = started(system, ProjectedIntegrator(1e-3, parts=[part]), x, 0 * x)
-        part.check(context)
-    with pytest.raises(InputError, match="Sphere: radius is 5 K; give it in nm"):
-        Sphere([0], [0, 0, 0], 5 * kelvin)
-
-
 def test_collective_variables_of_composite_units():
     """A product of two distances, and a spring's energy times a length: OpenMM does not tell their units."""
     system = atoms()
@@ -176,7 +160,6 @@ def test_arguments_of_methods():
 def test_positions_of_the_wrong_kind():
     for call in (
         lambda: hold(atoms(), [Distance([[0, 1]])], positions=X * kelvin),
-        lambda: surface_parts(Sphere([0], [1, 0, 0]), system=atoms(), positions=X * kelvin),
         lambda: constraints_of(openmm.app.Topology(), X[:0] * kelvin),
     ):
         with pytest.raises(InputError, match=r"positions .*give it in nm"):

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from committed_pages import said
 
+import kcons.comparison.measure  # noqa: F401  (conftest shortens its timings once it is there)
 from kcons.cli import main
 from kcons.constraints import Constraint, projection
 from kcons.constraints.constraint_set import ConstraintSet

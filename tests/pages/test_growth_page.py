@@ -22,15 +22,6 @@ def rows_of(capsys):
     return [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
 
 
-def test_random_systems_run_to_their_end(script, capsys):
-    script.random_systems(2, seed=7)
-    rows = rows_of(capsys)
-    assert len(rows) == 18
-    for _, _, count, ended, _, residual, _ in rows:
-        assert count == ended == "2"
-        assert float(residual) < 1e-14
-
-
 def test_work_and_precision(script, capsys):
     script.work_precision("to t = 5", script.START, 5.0, (1e-6,))
     rows = {" ".join(row[:2]): [float(number) for number in row[5:]] for row in rows_of(capsys)[1:]}

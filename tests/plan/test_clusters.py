@@ -40,14 +40,6 @@ def same_partition(labels, groups) -> bool:
 # -- labels -----------------------------------------------------------------------------------------
 
 
-def test_rows_that_share_an_atom_belong_together() -> None:
-    rows = [held.Distance([[0, 1], [4, 5], [1, 2]]), held.Angle([[6, 4, 7]]), held.Plane([9, 2], [0, 0, 1])]
-    constraint_set = ConstraintSet(rows, places(10), np.ones(10))
-    labels = cluster_labels(constraint_set, NONE, NONE)
-    assert same_partition(labels, [(0, 2, 5), (1, 3), (4,)])
-    assert sorted(set(labels.tolist())) == [0, 1, 2]
-
-
 def test_fixed_atoms_separate_and_their_rows_belong_to_no_cluster() -> None:
     rows = [held.FixedAtoms([2, 5]), held.Distance([[0, 1], [1, 2], [2, 3], [3, 4], [2, 5]])]
     x = places(6)
@@ -59,17 +51,6 @@ def test_fixed_atoms_separate_and_their_rows_belong_to_no_cluster() -> None:
 def test_labels_of_no_rows() -> None:
     assert len(cluster_labels(ConstraintSet([], places(3), np.ones(3)), NONE, NONE)) == 0
     assert list(classify(ConstraintSet([], places(3), np.ones(3)), NONE, np.zeros(3))) == []
-
-
-def test_labels_do_not_depend_on_the_order_of_rows() -> None:
-    rng = np.random.default_rng(4)
-    pairs = np.array([(k, k + 1) for k in range(30) if k % 5])
-    x = places(31)
-    label = cluster_labels(ConstraintSet(held.Distance(pairs), x, np.ones(31)), NONE, NONE)
-    order = rng.permutation(len(pairs))
-    other = cluster_labels(ConstraintSet(held.Distance(pairs[order]), x, np.ones(31)), NONE, NONE)
-    together = label[:, None] == label[None, :]
-    np.testing.assert_array_equal((other[:, None] == other[None, :]), together[order][:, order])
 
 
 # -- shapes -----------------------------------------------------------------------------------------
@@ -149,22 +130,6 @@ def test_other_graphs_are_sparse(pairs: list[tuple[int, int]], independent: bool
     assert shape.independent is independent
 
 
-@pytest.mark.parametrize(
-    ("pairs", "fixed", "independent"),
-    [
-        ([(0, 1)], [0], True),
-        ([(0, 1), (1, 2)], [0], True),
-        ([(0, 1), (1, 2)], [0, 2], False),
-        ([(0, 1), (0, 2), (1, 2)], [0], False),
-        ([(0, 1), (0, 2), (0, 3)], [0], True),  # three pendulums
-    ],
-)
-def test_anchored_clusters_are_sparse(pairs, fixed, independent) -> None:
-    shapes = shapes_of([held.FixedAtoms(fixed), held.Distance(pairs)], places(4))
-    assert {s.kind for s in shapes} == {"SparseDistances"}
-    assert {s.independent for s in shapes} == {independent}
-
-
 def test_mixed_and_general_rows() -> None:
     rows = [
         held.Distance([[0, 1], [4, 5], [8, 9], [12, 13]]),
@@ -180,14 +145,6 @@ def test_mixed_and_general_rows() -> None:
     assert shapes["SingleRows"].rows.tolist() == [7] and shapes["SingleRows"].clusters == 1
     assert shapes["GeneralClusters"].rows.tolist() == [8, 9] and shapes["GeneralClusters"].clusters == 2
     assert shapes["SmallClusters"].rows.tolist() == [[3]]
-
-
-def test_functions_that_know_all_rows_at_once_are_called_for_all() -> None:
-    def surface(atoms):
-        return held.ImplicitSurface(atoms, lambda r: r[:, 2], lambda r: np.tile([0, 0, 1.0], (len(r), 1)), target=None)
-
-    assert [s.kind for s in shapes_of(surface([0, 1]), places(2))] == ["GeneralClusters"]
-    assert [s.kind for s in shapes_of(surface([0]), places(2))] == ["SingleRows"]
 
 
 @pytest.mark.parametrize("seed", range(5))

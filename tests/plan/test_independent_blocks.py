@@ -9,7 +9,7 @@ import pytest
 
 from kcons.constraints import Angle, Distance, FixedAtoms, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.plan.independent_blocks import fixed_atoms, row_blocks
+from kcons.plan.independent_blocks import row_blocks
 
 
 def blocks(rows, n_atoms, only=None):
@@ -47,13 +47,6 @@ def test_only_some_rows():
     assert blocks([square], 4)[2] == [[0, 1, 2, 3, 4]]
     assert blocks([square], 4, np.array([0, 1, 4]))[2] == [[0, 1, 4]]
     assert blocks([square], 4, np.array([0, 1, 2]))[2] == []
-
-
-def test_atoms_that_are_fixed():
-    x = np.random.default_rng(2).normal(size=(5, 3))
-    held = ConstraintSet([FixedAtoms([3]), Distance([[0, 1]]), FixedAtoms([0])], x, np.ones(5))
-    assert fixed_atoms(held).tolist() == [0, 3]
-    assert fixed_atoms(ConstraintSet([Distance([[0, 1]])], x, np.ones(5))).tolist() == []
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -12,8 +12,6 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.motion import Motion
 from kcons.plan import make_plan
-from kcons.plan.clusters import Shape
-from kcons.plan.rank import ORDERED_IN_ALL, ORDERED_ROWS, mark_dependent_rows, rank_of_small, small_enough
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -235,32 +233,3 @@ def test_dependent_rows_are_eliminated_last():
         push = masses[:, None] * (out - start)
         assert np.abs(push.sum(axis=0)).max() < 1e-14 * masses.sum()
         assert np.abs(np.cross(x, push).sum(axis=0)).max() < 1e-13 * masses.sum()
-
-
-def test_left_over_are_the_rows_that_are_conditioned_worst():
-    """A flat square with both diagonals: one row of six is left for the end; a tetrahedron has none."""
-    x = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [5, 0, 0], [6, 0, 0], [5, 1, 0], [5, 0, 1]], float)
-    pairs = [[i + base, j + base] for base in (0, 4) for i in range(4) for j in range(i)]
-    rows = ConstraintSet([held.Distance(pairs)], x, np.ones(8))
-    eliminate_last = np.zeros(12, bool)
-    assert mark_dependent_rows(rows, [np.arange(6), np.arange(6, 12)], np.ones(8), x, 0.0, eliminate_last) == 11
-    assert eliminate_last[:6].sum() == 1 and not eliminate_last[6:].any()
-
-
-def test_many_small_clusters_are_counted_at_once():
-    """Three waters in a row across a cell, and one that is straight: nine rows, of rank eight."""
-    water = np.array([[0.0, 0, 0], [0.9, 0.3, 0], [-0.3, 0.9, 0]])
-    straight = np.array([[0.0, 0, 0], [1.0, 0, 0], [-1.0, 0, 0]])
-    x = np.concatenate([water, water + 3.0, straight + 6.0])
-    atoms = np.arange(9).reshape(3, 3)
-    shape = Shape("SmallClusters", np.arange(9).reshape(3, 3), 3, False, atoms, np.array([[0, 1], [0, 2], [1, 2]]))
-    assert rank_of_small(shape, np.ones(9), x, None) == 8
-    wrapped = np.where(np.arange(9)[:, None] % 2, x + np.array([20.0, 0, 0]), x)
-    lattice = np.stack([np.eye(3) * 20.0, np.eye(3) / 20.0])
-    assert rank_of_small(shape, np.ones(9), wrapped, lattice) == 8
-
-
-def test_clusters_small_enough_to_look_at_rows_one_by_one():
-    assert small_enough([]) and small_enough([np.arange(ORDERED_ROWS)])
-    assert not small_enough([np.arange(ORDERED_ROWS + 1)])
-    assert not small_enough([np.arange(ORDERED_ROWS)] * (ORDERED_IN_ALL // ORDERED_ROWS + 1))

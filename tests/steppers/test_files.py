@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import zipfile
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -60,27 +59,6 @@ def test_writers_of_one_path_do_not_meet(tmp_path: Path) -> None:
         one.write(b", and the second")
     assert path.read_bytes() == b"the first half, and the second"
     assert [found.name for found in tmp_path.iterdir()] == ["a"]
-
-
-def test_states_saved_by_several_at_once_are_whole(tmp_path: Path) -> None:
-    path = tmp_path / "state.npz"
-    states = [State(np.full((20_000, 3), float(k)), np.full((20_000, 3), float(k))) for k in range(3)]
-    states[0].save(path)
-
-    def save(state: State) -> None:
-        for _ in range(15):
-            state.save(path)
-
-    with ThreadPoolExecutor(3) as pool:
-        writing = [pool.submit(save, state) for state in states]
-        loaded = 0
-        while not all(job.done() for job in writing):
-            found = State.load(path)
-            assert np.ptp(found.positions) == np.ptp(found.velocities) == 0
-            loaded += 1
-        for job in writing:
-            job.result()
-    assert loaded > 1 and [found.name for found in tmp_path.iterdir()] == ["state.npz"]
 
 
 # -- folders of results -----------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 from stepper_systems import SYMMETRIC, gravity, slope, system_of
 
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge, LinearVelocity, MovingTarget, Sphere
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError
 from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6,
@@ -17,14 +17,12 @@ from kcons.steppers import (
     Geodesic,
     KahanLi6,
     Rattle,
-    ReversibilityCheck,
     State,
     Suzuki4,
     System,
     Yoshida4,
     run,
 )
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
 
 MASSES = np.array([1.0, 2.0, 0.5])
 RATE = 0.8
@@ -120,13 +118,6 @@ def test_a_step_can_be_taken_back(stepper) -> None:
     np.testing.assert_allclose(back.velocities, start.velocities, rtol=0, atol=3e-14)
 
 
-def test_it_brings_to_rest_under_the_check_of_reversibility() -> None:
-    system, start = pendulum(2 * RATE)
-    end = run(system, start, 0.1, 1000, stepper=ReversibilityCheck(Rattle()))
-    assert np.abs(end.velocities).max() <= 1e-9
-    assert np.abs(system.motion.project_forces(end.positions, end.forces)[1:]).max() <= 1e-9
-
-
 @pytest.mark.parametrize("stepper", [Rattle(), Geodesic(3)], ids=repr)
 def test_rows_of_velocities_keep_order_and_way_back(stepper) -> None:
     """A blade whose contact is driven sideways: its rows hold at the middle of the time, not of the flight."""
@@ -143,69 +134,7 @@ def test_rows_of_velocities_keep_order_and_way_back(stepper) -> None:
     np.testing.assert_allclose(back.positions, x, rtol=0, atol=1e-13)
 
 
-def test_forces_that_depend_on_velocities_besides() -> None:
-    """Half of the drag by the system, half by a force: together the whole."""
-    whole, start = pendulum(0.8)
-    drag = 0.4 * MASSES[:, None]
-    force = whole.force
-    both = System(whole.motion, lambda x, v, t: force(x, t) - drag * v, velocity_dependent=True, friction=0.4)
-    a = run(whole, start, 0.1, 10, stepper=KahanLi6())
-    b = run(both, start, 0.1, 10, stepper=KahanLi6())
-    assert np.abs(a.positions - b.positions).max() <= 1e-8
-
-
-def test_energy_goes_where_the_friction_takes_it() -> None:
-    """dE/dt = -sum gamma m v^2."""
-    system, start = pendulum()
-    weight = np.outer(MASSES, [0.0, 0.3, -1.0])
-    system.potential = lambda x, t: float(0.1 * (x * x).sum() - (weight * x).sum())
-    powers: list[float] = []
-    lost = lambda s: powers.append(float((RATE * MASSES[:, None] * s.velocities**2).sum()))  # noqa: E731
-    end = run(system, start, 0.01, 200, stepper=Suzuki4(), observers=[lost])
-    dissipated = 0.01 * (sum(powers) - 0.5 * (powers[0] + powers[-1]))
-    assert system.total_energy(start) - system.total_energy(end) == pytest.approx(dissipated, rel=1e-4)
-
-
-@pytest.mark.parametrize("offset", [0.0, 1e6])
-def test_far_from_the_origin_it_is_the_same(offset: float) -> None:
-    x = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.5, 0.9, 0.0]])
-    v = np.array([[0.3, -0.2, 0.1], [0.3, 0.8, 0.0], [-0.5, 0.8, 0.4]])
-    system = system_of([Distance([[0, 1], [1, 2]])], x + offset, MASSES, friction=0.4)
-    end = run(system, system.initial_state(x + offset, v, project=True), 0.05, 200)
-    near = system_of([Distance([[0, 1], [1, 2]])], x, MASSES, friction=0.4)
-    known = run(near, near.initial_state(x, v, project=True), 0.05, 200)
-    np.testing.assert_allclose(np.diff(end.positions, axis=0), np.diff(known.positions, axis=0), rtol=0, atol=5e-10)
-    np.testing.assert_allclose(end.velocities, known.velocities, rtol=0, atol=1e-11)
-
-
-def test_without_friction_nothing_changes_and_thermostats_refuse_it() -> None:
-    system, start = pendulum(0.0)
-    assert system.friction == 0.0
-    a, b = run(system, start, 0.1, 5), run(System(system.motion, system.force), start, 0.1, 5)
-    np.testing.assert_array_equal(a.positions, b.positions)
-    system, start = pendulum(0.5)
-    for thermostat in (Langevin(1.0, 0.5, 1), NoseHooverChain(1.0, 5.0), Isokinetic()):
-        with pytest.raises(UnsupportedError, match="give the rate to Langevin"):
-            run(system, start, 0.01, 1, stepper=thermostat)
-
-
 # -- refusals ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("friction", "message"),
-    [
-        (-0.1, r"friction is -0\.1; give a number of 0 or more"),
-        (np.nan, "friction is nan"),
-        ([0.1, 0.2], r"friction is \[0\.1, 0\.2\]; give a finite number"),
-        (0.1 + 0j, "friction is"),
-        ("much", "friction is 'much'"),
-    ],
-)
-def test_bad_rates(friction, message: str) -> None:
-    system, _ = pendulum(0.0)
-    with pytest.raises(InputError, match=message):
-        System(system.motion, friction=friction)
 
 
 def test_a_step_that_leaves_nothing_is_refused() -> None:

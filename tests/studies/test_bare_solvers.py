@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-import bare_solvers
 import bare_systems
 import numpy as np
 import pytest
@@ -18,16 +17,6 @@ SYSTEMS = {
     "chain": bare_systems.chain(20),
 }
 BY_NAME = {candidate.name: candidate for candidate in CANDIDATES}
-
-
-@pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
-def test_systems_are_on_their_constraints_and_leave_them_in_a_step(system):
-    assert system.stretch(system.positions) < 1e-12
-    assert system.departure(system.positions, system.tangent) < 1e-13
-    assert 1e-4 < system.stretch(system.moved) < 0.5
-    assert system.departure(system.positions, system.thermal) > 0.1
-    speed = np.mean(system.masses[:, None] * system.thermal**2)
-    assert speed == pytest.approx(bare_systems.THERMAL_ENERGY, rel=0.5)
 
 
 @pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
@@ -77,15 +66,3 @@ def test_lammps_holds_clusters_and_refuses_chains():
         assert solver.timing("V").residual < 1e-12
     with pytest.raises(UnsupportedError, match="center"):
         BY_NAME["lammps"].make(SYSTEMS["chain"], 1e-10)
-
-
-def test_what_takes_long_is_done_once(monkeypatch):
-    calls = []
-    monkeypatch.setattr(bare_solvers, "LONG", -1.0)
-    bare_solvers.sampled(lambda: calls.append("solve"), lambda: calls.append("reset"))
-    assert calls == ["reset", "solve"]
-    calls.clear()
-    monkeypatch.setattr(bare_solvers, "LONG", 10.0)
-    monkeypatch.setattr(bare_solvers, "MOST", 5)
-    bare_solvers.sampled(lambda: calls.append("solve"), lambda: calls.append("reset"))
-    assert calls == ["reset", "solve"] * 6

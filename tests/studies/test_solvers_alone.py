@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import harness
 import pandas as pd
-import pytest
 import solvers_alone
 from bare_solvers import CANDIDATES
 
@@ -31,20 +30,6 @@ def test_points_of_the_scaling_come_from_processes_of_their_own():
     assert late["status"] == "stopped"
     figure = solvers_alone.figures(pd.DataFrame(rows))["report-scaling"]
     assert len(figure.axes) == 3
-
-
-def test_exponents_are_fitted_beyond_the_cost_of_a_call():
-    sizes = (100, 1000, 10_000, 100_000)
-    rows = [
-        {"kind": "chain", "size": n, "solver": solver, "status": "ok", "P seconds": 1e-8 * max(n, 1000) ** power}
-        for solver, power in (("kcons", 1.0), ("sweeps", 1.5))
-        for n in sizes
-    ]
-    table = pd.DataFrame(rows).assign(**{"V seconds": None, "set-up": None})
-    fitted = solvers_alone.exponents(table)
-    assert fitted["chain", "kcons", "P seconds"] == pytest.approx(1.0)
-    assert fitted["chain", "sweeps", "P seconds"] == pytest.approx(1.5)
-    assert ("chain", "kcons", "V seconds") not in fitted
 
 
 def test_what_solvers_of_others_raise_is_a_result(monkeypatch):

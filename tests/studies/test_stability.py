@@ -41,18 +41,14 @@ def test_drift_and_reversal():
 
 
 def test_the_study_goes_on_and_finds_faults(tmp_path, monkeypatch, capsys):
-    """Quick, of the rotor and random molecules."""
-    given = ["--quick", "--systems", "rotor", "--only", "reversal,molecules", "--out", str(tmp_path)]
+    """Quick, of the rotor."""
+    given = ["--quick", "--systems", "rotor", "--only", "reversal", "--out", str(tmp_path)]
     assert stability.main(given) == 0
     assert "Rattle" in capsys.readouterr().out
     head, table = harness.read(tmp_path / "stability.csv")
-    assert head["settings"] == "quick=True" and set(table.part) == {"reversal", "molecules"}
-    assert table[table.part == "molecules"]["count"].sum() == 100
-    monkeypatch.setattr(stability, "molecules", lambda *_: pytest.fail("done before"))
+    assert head["settings"] == "quick=True" and set(table.part) == {"reversal"}
+    monkeypatch.setattr(stability, "reversal", lambda *_: pytest.fail("done before"))
     assert stability.main(given) == 0
-    # A molecule that ends silently off its rows, and a step of kcons that does.
-    table.loc[table.how == "solved", "how"] = "silent"
-    assert "random molecules: silent" in stability.faults(table)[0]
     row = {"piece": "steps, water, Rattle", "part": "steps", "method": "Rattle", "silent residual": 1e-3}
     steps = pd.DataFrame([row])
     assert stability.faults(steps) == ["steps, water, Rattle: residual 1.0e-03 without an error"]

@@ -6,7 +6,7 @@ import pytest
 from openmm_systems import alanine, context_of, masses_of, started, state_of
 
 from kcons.constraints import Angle, Sphere
-from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold, surface_parts
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold
 
 
 def twice_kinetic(system, v):
@@ -57,26 +57,20 @@ def tied(masses, spring, x):
     return system, np.array(x)
 
 
-def three_parts():
-    """Six particles: an angle carried by kcons, a distance as a collective row, one particle on a sphere."""
+def two_parts():
+    """Six particles: an angle and a sphere carried by kcons, a distance as a collective row."""
     places = [[0.1, 0, 0], [0.2, 0.1, 0], [0.3, 0, 0.05], [0.8, 0.1, 0], [0.8, 0.6, 0.1], [0.0, 0.6, 0.1]]
     system, x = tied(range(12, 18), "200*(r-0.5)^2", places)
-    carried = hold(system, [Angle([(0, 1, 2)], 1.9)], positions=x)
+    carried = hold(system, [Angle([(0, 1, 2)], 1.9), Sphere([5], [0, 0, 0], 0.6)], positions=x)
     distance = openmm.CustomBondForce("r")
     distance.addBond(3, 4)
     rows = CollectiveRows(system, [Row(distance, 0.5)])
-    (sphere,) = surface_parts(Sphere([5], center=[0, 0, 0], radius=0.6), system=system)
-    return system, x, (carried, rows, sphere)
+    return system, x, (carried, rows)
 
 
 def on_their_rows(r, u):
-    """Check that `three_parts` hold what they should."""
+    """Check that `two_parts` hold what they should."""
     assert abs(np.linalg.norm(r[3] - r[4]) - 0.5) < 1e-12
     assert abs(np.linalg.norm(r[5]) - 0.6) < 1e-13
     assert abs((r[3] - r[4]) @ (u[3] - u[4])) < 1e-11 and abs(r[5] @ u[5]) < 1e-11
     return r, u
-
-
-def three_on_a_sphere():
-    system, x = tied([20.0] * 3, "100*(r-0.5)^2", [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]])
-    return system, x, Sphere([0, 1, 2], center=[0, 0, 0], radius=0.5)

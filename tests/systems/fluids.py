@@ -62,15 +62,6 @@ def dumbbells(size: int, seed: int = 1) -> Fluid:
     return Fluid(held, x, forces, "Ar" * len(x))
 
 
-def triatomics(size: int, seed: int = 1) -> Fluid:
-    """Rigid triangles of Lennard-Jones sites, one of them twice as heavy."""
-    box = TRIATOMIC_EDGE * (size / 8) ** (1 / 3)
-    x = placed(TRIATOMIC_SHAPE, size, box, seed)
-    masses = np.tile([2.0, 1.0, 1.0], size)
-    forces = LennardJones(np.repeat(range(size), 3), box, masses=masses, sigma=SITE, cutoff=min(CUTOFF, 0.5 * box))
-    return Fluid(ConstraintSet(Distance(triangles(size)), x, masses), x, forces, "Ar" * len(x))
-
-
 def water(size: int, seed: int = 1) -> Fluid:
     """Rigid TIP3P water with a smooth cutoff and a reaction field, at 400 K and 0.9 g/cm3."""
     box = WATER_EDGE * (size / 27) ** (1 / 3)

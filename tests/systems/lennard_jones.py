@@ -25,21 +25,8 @@ class LennardJones:
     Berthelot: charges with a conducting reaction field beyond the cutoff c. S falls from 1 to 0 with two continuous
     derivatives.
 
-    Parameters
-    ----------
-    molecule : array_like of int, shape (n_atoms,)
-        Molecule of each atom; atoms of one molecule follow each other.
-    masses, epsilon, sigma, charges : array_like, shape (n_atoms,), or float
-        `charges` in units in which the energy of two is q q'/r.
-    box : float
-        Edge of the cube.
-    cutoff : float, optional
-        Half the box by default.
-
-    Raises
-    ------
-    InputError
-        A cutoff above half the box: minimum images would be wrong.
+    Atoms of one molecule follow each other; `charges` are in units in which the energy of two is q q'/r. The cutoff is
+    half the box by default, and at most: beyond, minimum images would be wrong.
     """
 
     def __init__(
@@ -103,21 +90,9 @@ class LennardJones:
         shift: float,
         turn: float,
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Canonical sampling of rigid molecules by plain Metropolis moves, without forces or velocities.
+        """Canonical sampling of rigid molecules by Metropolis moves: energies, positions, share of accepted moves.
 
-        Parameters
-        ----------
-        x : array_like, shape (n_atoms, 3)
-        thermal_energy : float
-        sweeps, every : int
-            Moves of each molecule, and how many of them lie between two records of the energy.
-        seed : int or sequence of int
-        shift, turn : float
-            Largest shift of a molecule along each axis, and largest angle about a random axis.
-
-        Returns
-        -------
-        energies, positions at the end, share of accepted moves
+        Moves are at most `shift` along each axis and `turn` about a random one; energies are recorded each `every`.
         """
         y = np.array(x, dtype=np.float64)
         energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)

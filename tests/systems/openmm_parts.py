@@ -15,20 +15,23 @@ class HeldCoordinates(Part):
     `steepest` is the largest displacement that is accepted in one drift; beyond it the part fails.
     """
 
-    def __init__(self, particles, axis, value, n, *, evaluates=False, steepest=np.inf, groups=()):
+    def __init__(self, particles, axis, value, n, *, steepest=np.inf, groups=()):
         self.mask = np.zeros((n, 3))
         self.mask[list(particles), axis] = 1.0
-        self.value, self.evaluates, self.steepest = value, evaluates, steepest
+        self.value, self.steepest = value, steepest
         self.groups = frozenset(groups)
         self.particles, self.axis = list(particles), axis
 
     def declare(self, program):
-        program.vector_setting("held", "1 where a coordinate is held", self.mask)
+        program.vector("held", "1 where a coordinate is held")
         program.setting("level", "where it is held", self.value)
         program.number("steepest", "longest way accepted", self.steepest)
         program.number("off", "how far off it was")
         if self.groups:
             program.vector("row", "gradient")
+
+    def attach(self, program, context):
+        program.integrator.setPerDofVariableByName("held", self.mask.tolist())
 
     def remember(self, program):
         for group in self.groups:

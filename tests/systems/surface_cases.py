@@ -10,7 +10,7 @@ from openmm_systems import context_of
 from kcons.constraints import Cylinder, Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator
+from kcons.openmm import SurfaceIntegrator
 from kcons.steppers import State
 from kcons.steppers import System as CoreSystem
 

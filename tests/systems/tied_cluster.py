@@ -7,14 +7,13 @@ import numpy as np
 import openmm
 from openmm_systems import context_of
 
-from kcons.constraints import Distance, Sphere
+from kcons.constraints import Distance
 from kcons.openmm import (
     CollectiveRows,
     Isokinetic,
     Langevin,
     ProjectedIntegrator,
     Row,
-    SurfaceIntegrator,
     hold,
 )
 
@@ -71,21 +70,10 @@ def begun(system, integrator, restore=None, part=None):
     return Made(integrator, context, part)
 
 
-#: Radius of the sphere that holds particle 0, about a center that is not the origin.
-RADIUS, CENTER = 0.2, X[0] - [0.2, 0, 0]
-
-
 def bond(i=0, j=7):
     force = openmm.CustomBondForce("r")
     force.addBond(i, j)
     return force
-
-
-def on_a_sphere(radius=RADIUS, strength=200.0, **options):
-    system = cluster(strength)
-    surface = Sphere([0], CENTER, radius)
-    integrator = SurfaceIntegrator(0.002, surfaces=surface, system=system, **options)
-    return begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.parts[0])
 
 
 def row_at(target=0.30, strength=200.0, **options):
@@ -107,10 +95,9 @@ KINDS = {
     "Langevin": thermostatted(Langevin(300, 1.0)),
     "Isokinetic": thermostatted(Isokinetic(300)),
     "isokinetic4": thermostatted(Isokinetic(300), scheme="isokinetic4"),
-    "sphere": on_a_sphere,
-    "sphere, Langevin": lambda **given: on_a_sphere(ensemble=Langevin(300, 1.0), **given),
     "collective": row_at,
     "collective, Langevin": lambda **given: row_at(ensemble=Langevin(300, 1.0), **given),
     "carried": carried_at,
+    "carried, Langevin": lambda **given: carried_at(ensemble=Langevin(300, 1.0), **given),
     "carried, suzuki4": lambda **given: carried_at(scheme="suzuki4", **given),
 }

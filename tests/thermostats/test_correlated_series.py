@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
-from thermostat_systems import system
 
 from kcons.free_energy import weighted_mean
-from kcons.thermostats import TemperatureSplit, mean
+from kcons.thermostats import mean
 from kcons.thermostats.configurational_temperature import temperature
 from kcons.thermostats.correlated_series import slope, spread
 
@@ -107,23 +106,6 @@ def test_errors_of_ratios():
         below = 2.0 + slow[:, 0] + rng.standard_normal(800)
         found.append(temperature(0.7 * below + slow[:, 1] + 0.5 * slow[:, 0] ** 2 - 0.5, below)[0])
     assert 0.9 <= scatter(found, 0.7) <= 1.15
-
-
-@pytest.mark.filterwarnings("ignore:temperature of")
-def test_errors_of_temperatures_by_kind_of_motion():
-    """Pairs of atoms in traps, which forget where they were in 4 samples: each pair is a run of its own."""
-    kT, pairs, samples = 0.8, 250, 640
-    stiff = np.tile([[1.0, 2.0, 3.0], [2.0, 1.0, 0.5]], (pairs, 1))
-    held = system([], np.zeros((2 * pairs, 3)), np.tile([1.0, 2.0], pairs), lambda x, t: -stiff * x)
-    groups = {f"pair {k}": [2 * k, 2 * k + 1] for k in range(pairs)}
-    rng, found = np.random.default_rng(4), []
-    for _ in range(4):
-        split = TemperatureSplit(held, displacement=1e-3, groups=groups)
-        for x in fading(rng, samples, 4.0, 6 * pairs).reshape(-1, 2 * pairs, 3) * np.sqrt(kT / stiff):
-            split.add(x, -stiff * x)
-        found += [split.result(pair).shift for pair in groups]
-    assert len(found) == 1000
-    assert 0.9 <= scatter(found, kT) <= 1.15
 
 
 @pytest.mark.parametrize("name", ["independent", "memory 10", "fast and slow", "smooth"])

@@ -126,20 +126,6 @@ def test_momentum_by_request(momentum, count):
     assert freedom(held, state, waves(SCATTERED), momentum=momentum).count == count
 
 
-def test_a_part_of_the_system():
-    held, x = mixed(swirling)
-    state = State(x, thermal_velocities(held, x, 1.0, 0))
-    forces = swirling(x)
-    assert freedom(held, state, forces, [2, 3, 8]).count == 9 - 1
-    assert freedom(held, state, forces, [0, 1, 6]).count == 9 - 3 - 1 - 1
-    assert freedom(held, state, forces, [10, 11]).count == 6
-    assert freedom(held, state, forces, np.arange(12) >= 10).count == 6
-    everything = freedom(held, state, forces, range(12))
-    assert everything.atoms is None and everything.count == 28
-    with pytest.raises(UnsupportedError, match=r"couples thermostatted atoms to others"):
-        freedom(held, state, forces, [2, 8])
-
-
 def test_what_cannot_be():
     held, x = mixed(swirling)
     state = State(x, np.zeros_like(x))

@@ -1,4 +1,4 @@
-"""Velocities drawn on the constraints: covariance k T M_par^+, exact energies, zero momentum."""
+"""Velocities drawn on the constraints: covariance k T M_par^+, zero momentum."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from thermostat_systems import METHANE, TEN, dumbbells, system
+from thermostat_systems import METHANE, TEN, system
 
 from kcons.constraints import Distance, FixedAtoms, Plane
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import UnsupportedError
 from kcons.thermostats import thermal_velocities
 
 
@@ -35,21 +35,6 @@ def test_covariance_is_the_constrained_one():
     assert np.abs(rows @ drawn.T).max() <= 1e-12
 
 
-def test_the_same_seed_draws_the_same():
-    held, x = dumbbells(2)
-    a, b = (thermal_velocities(held, x, 1.0, 5) for _ in range(2))
-    assert np.array_equal(a, b)
-    assert not np.array_equal(a, thermal_velocities(held, x, 1.0, np.random.default_rng(6)))
-
-
-def test_exact_energy_and_zero_momentum():
-    held, x = dumbbells(2)
-    v = thermal_velocities(held, x, 1.0, 5, zero_momentum=True, kinetic_energy=3.3)
-    assert held.kinetic_energy(v) == pytest.approx(3.3, rel=1e-14)
-    assert np.abs(held.masses @ v).max() <= 1e-14
-    assert np.abs(held.motion.project_velocities(x, v) - v).max() <= 1e-14
-
-
 def test_momentum_is_taken_out_along_open_directions_only():
     x = np.random.default_rng(0).standard_normal((5, 3)) * [1, 1, 0]
     flat = system([Plane(range(5), [0, 0, 1.0], lambda t: 0.3 * t)], x, np.arange(1.0, 6))
@@ -60,11 +45,8 @@ def test_momentum_is_taken_out_along_open_directions_only():
 def test_moving_targets_are_followed():
     x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     held = system([Distance([[0, 1]], lambda t: 1 + 0.5 * t)], x, [1.0, 3.0])
-    v = thermal_velocities(held, x, 1.0, 5, kinetic_energy=2.0)
+    v = thermal_velocities(held, x, 1.0, 5)
     assert v[1, 0] - v[0, 0] == pytest.approx(0.5, rel=1e-13)
-    assert held.kinetic_energy(v) == pytest.approx(2.0, rel=1e-14)
-    with pytest.raises(InputError, match=r"moving targets alone take 0.09375, and 5 degrees of freedom are left"):
-        thermal_velocities(held, x, 1.0, 5, kinetic_energy=0.09)
 
 
 def test_fixed_atoms_stay():
@@ -76,5 +58,3 @@ def test_fixed_atoms_stay():
         thermal_velocities(held, x, 1.0, 5, zero_momentum=True)
     still = system([FixedAtoms([0, 1])], x, [1.0, 3.0])
     assert (thermal_velocities(still, x, 1.0, 5) == 0).all()
-    with pytest.raises(InputError, match="0 degrees of freedom are left"):
-        thermal_velocities(still, x, 1.0, 5, kinetic_energy=1.0)

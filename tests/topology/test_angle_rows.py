@@ -19,7 +19,7 @@ from kcons.motion import Motion
 from kcons.topology.angle_rows import FLAT_CENTER, angle_rows
 from kcons.topology.guessed_bonds import guess_bonds
 from kcons.topology.rows_by_name import held_rows
-from kcons.topology.topology import bond_angles, sorted_pairs
+from kcons.topology.topology import bond_angles
 
 
 def singular_values(whole, x):
@@ -211,11 +211,3 @@ def test_selected_atoms_and_distances():
     assert {item.family for item in apart} == {"Distance", "Dihedral"}
     assert condition(apart.constraint_set, made.positions)[1] == 3 * len(made.positions) - 6 - 2
     assert condition(apart.constraint_set, made.positions)[0] < 50
-
-
-def test_the_order_of_the_bonds_does_not_matter():
-    made = of_ase("C5H5N")
-    turned = sorted_pairs(made.topology.bonds[::-1, ::-1])
-    for one, two in zip(angle_rows(made, made.topology.bonds, []), angle_rows(made, turned, []), strict=True):
-        np.testing.assert_array_equal(one, two)
-        assert len(np.unique(one, axis=0)) == len(one)

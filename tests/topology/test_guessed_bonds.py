@@ -9,32 +9,33 @@ from snapshots import WATER, rotations, snapshot
 from kcons.errors import InputError
 from kcons.topology.guessed_bonds import guess_bonds
 
-
-def test_water_has_two_bonds():
-    assert guess_bonds(snapshot(["O", "H", "H"], WATER)).tolist() == [[0, 1], [0, 2]]
-
-
-def test_the_unit_of_length_does_not_matter():
-    assert guess_bonds(snapshot(["O", "H", "H"], WATER / 10, angstrom=0.1)).tolist() == [[0, 1], [0, 2]]
+SHORT = [[0, 0, 0], [1.05, 0, 0], [2.2, 0, 0]]  # a hydrogen bond: 1.05 and 1.15 angstrom to two oxygens
+FAR = [[0, 0, 0], [2.0, 0, 0], [0, 1.95, 0]]
 
 
-def test_a_hydrogen_keeps_its_nearest_neighbor():
-    # A short hydrogen bond: 1.05 and 1.15 angstrom to two oxygens.
-    x = [[0, 0, 0], [1.05, 0, 0], [2.2, 0, 0]]
-    assert guess_bonds(snapshot(["O", "H", "O"], x)).tolist() == [[0, 1]]
-    # Also where only the farther one is asked about: the nearest neighbor may have its bonds already.
-    assert guess_bonds(snapshot(["O", "H", "O"], x), np.array([False, False, True])).tolist() == []
+@pytest.mark.parametrize(
+    ("elements", "x", "expected"),
+    [
+        ("O H H", WATER, [[0, 1], [0, 2]]),
+        ("O H O", SHORT, [[0, 1]]),  # a hydrogen keeps its nearest neighbor
+        ("H H", [[0, 0, 0], [0.74, 0, 0]], [[0, 1]]),
+        ("H H", [[0, 0, 0], [1.0, 0, 0]], []),
+        ("C Zn C", FAR, []),  # a metal, and 1.95 angstrom
+        ("C Zn C", [*FAR[:2], [0, 1.85, 0]], [[0, 2]]),
+    ],
+)
+def test_what_is_bonded(elements, x, expected):
+    x = np.array(x, dtype=float)
+    assert guess_bonds(snapshot(elements.split(), x)).tolist() == expected
+    assert guess_bonds(snapshot(elements.split(), x / 10, angstrom=0.1)).tolist() == expected
 
 
-def test_hydrogen_molecule_and_neighboring_hydrogens():
-    assert guess_bonds(snapshot(["H", "H"], [[0, 0, 0], [0.74, 0, 0]])).tolist() == [[0, 1]]
-    assert guess_bonds(snapshot(["H", "H"], [[0, 0, 0], [1.0, 0, 0]])).tolist() == []
-
-
-def test_metals_and_far_atoms_have_no_bonds():
-    x = [[0, 0, 0], [2.0, 0, 0], [0, 1.95, 0]]
-    assert guess_bonds(snapshot(["C", "Zn", "C"], x)).tolist() == []
-    assert guess_bonds(snapshot(["C", "Zn", "C"], [[0, 0, 0], [2.0, 0, 0], [0, 1.85, 0]])).tolist() == [[0, 2]]
+def test_only_bonds_of_marked_atoms():
+    x = np.concatenate([WATER, WATER + 5.0])
+    marked = np.array([False] * 4 + [True, False])
+    assert guess_bonds(snapshot(["O", "H", "H"] * 2, x), marked).tolist() == [[3, 4]]
+    # The nearest neighbor of the hydrogen, which is not marked, may have its bonds already.
+    assert guess_bonds(snapshot(["O", "H", "O"], SHORT), np.array([False, False, True])).tolist() == []
 
 
 @pytest.mark.parametrize(
@@ -56,12 +57,6 @@ def test_bonds_across_the_cell_are_those_of_whole_molecules(cell):
     first = 3 * np.arange(count)
     expected = np.concatenate([np.stack([first, first + k], 1) for k in (1, 2)])
     assert sorted(map(tuple, bonds.tolist())) == sorted(map(tuple, expected.tolist()))
-
-
-def test_only_bonds_of_marked_atoms():
-    x = np.concatenate([WATER, WATER + 5.0])
-    marked = np.array([False] * 4 + [True, False])
-    assert guess_bonds(snapshot(["O", "H", "H"] * 2, x), marked).tolist() == [[3, 4]]
 
 
 def test_what_cannot_be_guessed_is_refused():

@@ -7,14 +7,13 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from snapshots import WATER, snapshot
 
 import kcons.ase
 import kcons.mdanalysis
 import kcons.openmm
 from kcons.errors import InputError
-from kcons.topology import Holding, held_rows
-from kcons.topology.holding import CONSTRAIN, Options
+from kcons.topology import Holding
+from kcons.topology.holding import Options
 
 ENGINES = [kcons.ase.constraints_of, kcons.mdanalysis.constraints_of, kcons.openmm.constraints_of]
 
@@ -36,21 +35,11 @@ def test_help_shows_every_option_with_its_default(function):
     assert page.index("guess_bonds :") < page.index("Returns\n") < page.index("Raises\n")
 
 
-def test_an_unknown_option_is_refused_by_its_name():
-    with pytest.raises(TypeError, match="rigid_watr"):
-        held_rows(snapshot(["O", "H", "H"], WATER), rigid_watr=False)
-
-
 def test_iterables_are_read_once():
     holding = Holding("none", rigid_bodies=iter([[0, 1, 2]]), rigid_residues=iter(["HOH"]), rigid_water=False)
     assert holding.bodies == holding.bodies == ([0, 1, 2],)
     assert holding.residues == holding.residues == ("HOH",)
     assert Holding("none", rigid_residues="HOH").residues == ("HOH",)
-
-
-@pytest.mark.parametrize("name", [*CONSTRAIN, None, "HBonds"])
-def test_names_of_what_is_held(name):
-    assert Holding(name).kind == ("none" if name is None else name.lower())
 
 
 def test_own_rows_are_a_mapping_or_pairs():
@@ -68,10 +57,6 @@ def test_geometry_of_water():
         Holding(water_geometry=(np.nan, 109)).geometry()
     assert Holding(rigid_water=False).waters == frozenset()
     assert "MINE" in Holding(water_names=[" mine "]).waters
-
-
-def test_one_body_in_words_is_one_body():
-    assert Holding(rigid_bodies="protein and resid 45").bodies == ("protein and resid 45",)
 
 
 @pytest.mark.parametrize("on", [{"protein": "CenterOfMass"}, [("protein", None)], ["protein"], [1]])

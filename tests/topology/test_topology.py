@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from snapshots import WATER, snapshot
 
+from kcons.constraints.periodic.one_piece import connected
 from kcons.errors import InputError
 from kcons.topology.topology import (
     Snapshot,
     as_written,
-    connected,
     elements_of,
-    near_misses,
     require_standard_form,
     sorted_pairs,
     split_residues,
@@ -125,11 +124,6 @@ def test_units_and_numbers_of_atoms():
     np.testing.assert_allclose(there.velocities, WATER / 10)
     with pytest.raises(InputError, match="3 atoms in the topology, but positions have shape"):
         Snapshot(made.topology, WATER[:2])
-
-
-def test_near_misses():
-    assert near_misses("tip3", ["TIP3P", "SPC"]) == " (did you mean TIP3P?)"
-    assert near_misses("benzene", ["SPC"]) == ""
 
 
 def test_numbers_of_residues_that_have_letters():

@@ -13,24 +13,6 @@ from kcons.topology.whole_molecules import whole_groups, whole_molecules
 CELLS = [np.diag([7.0, 8.0, 9.0]), np.array([[7.0, 0, 0], [2.0, 8.0, 0], [-1.0, 3.0, 9.0]])]
 
 
-@pytest.mark.parametrize("cell", CELLS, ids=["right-angled", "triclinic"])
-def test_a_chain_longer_than_the_cell_comes_back(cell):
-    rng = np.random.default_rng(3)
-    steps = rng.normal(size=(40, 3))
-    chain = np.cumsum(1.5 * steps / np.linalg.norm(steps, axis=1)[:, None], axis=0)
-    ring = 1.4 * np.array([[np.cos(a), np.sin(a), 0] for a in np.arange(6) * np.pi / 3])
-    x = np.concatenate([chain, ring, [[100.0, 0, 0]]])
-    bonds = [(k, k + 1) for k in range(39)] + [(40 + k, 40 + (k + 1) % 6) for k in range(6)]
-    order = rng.permutation(47)  # bonds need not follow the order of the atoms
-    place = np.argsort(order)
-    wrapped = x[order] + rng.integers(-3, 4, size=(47, 3)) @ cell
-    found = whole_molecules(snapshot(["C"] * 47, wrapped, place[np.array(bonds)], cell=cell)).positions[place]
-    for part in (slice(0, 40), slice(40, 46), slice(46, 47)):
-        shift = found[part] - x[part]
-        np.testing.assert_allclose(shift, np.tile(shift[0], (len(shift), 1)), atol=1e-12)
-        np.testing.assert_allclose(shift[0] @ np.linalg.inv(cell), np.round(shift[0] @ np.linalg.inv(cell)), atol=1e-12)
-
-
 def test_what_is_whole_or_has_no_cell_stays():
     made = snapshot(["C", "C"], [[0.0, 0, 0], [1.5, 0, 0]], [(0, 1)], cell=CELLS[0])
     assert whole_molecules(made) is made

@@ -1,16 +1,12 @@
-"""A chain of four atoms with bonds and angles held and a free torsion, k (1 + cos 3 phi), in free flight.
-
-Solution: the equations of motion of a body that turns and twists, with the torsion and a quaternion as coordinates.
-"""
+"""A chain of four atoms with bonds and angles held and a free torsion, k (1 + cos 3 phi), in free flight."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from kcons.comparison.test_systems.minimal import integrated, spin, turned
 from kcons.comparison.test_systems.potential import Potential
 from kcons.comparison.test_systems.registry import add_system
-from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
+from kcons.comparison.test_systems.system import BARE, TestSystem
 from kcons.constraints import Angle, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -55,9 +51,6 @@ def build(size: int, rng: int) -> TestSystem:
         units=BARE,
         # Between held arms, an angle is the distance of its ends.
         bonds=np.concatenate([BONDS, TRIPLES[:, [0, 2]]]),
-        angles=TRIPLES,
-        angle_bonds=BONDS,
-        solution=lambda time: twist(POSITIONS, VELOCITIES, MASSES, time),
     )
 
 
@@ -74,57 +67,6 @@ def torsion(x: FloatArray) -> tuple[float, FloatArray]:
     shared = (first @ middle) / length * a - (last @ middle) / length * b
     gradient = np.stack([-length * a, length * a + shared, -length * b - shared, length * b])
     return BARRIER * (1.0 + np.cos(3.0 * phi)), 3.0 * BARRIER * np.sin(3.0 * phi) * gradient
-
-
-def twist(x: FloatArray, v: FloatArray, masses: FloatArray, time: float) -> Reference:
-    """Free flight of a body whose last atom turns about the bond before it.
-
-    In axes fixed to the first three atoms, r(s) are the places relative to the center of mass after a twist by s.
-    With I = inertia, h = sum m r x r', G = sum m r'^2 (primes: d/ds), momenta Pi = I omega + h s_t and
-    p = h . omega + G s_t obey Pi_t = Pi x omega and p_t = dT/ds - dV/ds.
-    """
-    total = masses.sum()
-    center, drift = masses @ x / total, masses @ v / total
-    axis = (x[2] - x[1]) / np.linalg.norm(x[2] - x[1])
-    arm = x[3] - x[2]
-    along = (arm @ axis) * axis
-    across, normal = arm - along, np.cross(axis, arm)
-
-    def shape(s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """r, r', r''."""
-        parts = (np.cos(s) * across + np.sin(s) * normal, np.cos(s) * normal - np.sin(s) * across)
-        places, change, bend = x.copy(), np.zeros_like(x), np.zeros_like(x)
-        places[3], change[3], bend[3] = x[2] + along + parts[0], parts[1], -parts[0]
-        return tuple(p - masses @ p / total for p in (places, change, bend))  # type: ignore[return-value]
-
-    def inertia(r: FloatArray, change: FloatArray) -> FloatArray:
-        """The 4 x 4 matrix of the kinetic energy in omega and s_t."""
-        matrix = np.empty((4, 4))
-        matrix[:3, :3] = np.sum(masses[:, None] * r**2) * np.eye(3) - r.T @ (masses[:, None] * r)
-        matrix[:3, 3] = matrix[3, :3] = masses @ np.cross(r, change)
-        matrix[3, 3] = np.sum(masses[:, None] * change**2)
-        return matrix
-
-    def rate(_: float, y: FloatArray) -> FloatArray:
-        q, s, momenta = y[:4], y[4], y[5:]
-        r, change, bend = shape(s)
-        speeds = np.linalg.solve(inertia(r, change), momenta)
-        omega, pace = np.asarray(speeds[:3], dtype=float), float(speeds[3])
-        velocity = np.cross(omega, r) + pace * change
-        uphill = np.sum(masses[:, None] * velocity * (np.cross(omega, change) + pace * bend))
-        torque = np.sum(torsion(r)[1] * change)
-        return np.concatenate([spin(q, omega), [pace], np.cross(momenta[:3], omega), [uphill + torque]])
-
-    r, change, _ = shape(0.0)
-    # The four speeds that give v; the rest of it would violate the constraints.
-    columns = [np.cross(e, r).ravel() for e in np.eye(3)] + [change.ravel()]
-    speeds = np.linalg.lstsq(np.stack(columns, axis=1), (v - drift).ravel(), rcond=None)[0]
-    start = np.concatenate([[0.0, 0.0, 0.0, 1.0, 0.0], inertia(r, change) @ speeds])
-
-    def place(y: FloatArray) -> FloatArray:
-        return np.asarray(center + drift * time + turned(y[:4], shape(y[4])[0]))
-
-    return integrated(rate, start, time, place, "equations of rotation and torsion")
 
 
 add_system("butane", build, "four-atom chain, bonds and angles held, free torsion", unit="molecule", only=True)

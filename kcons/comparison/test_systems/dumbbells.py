@@ -1,7 +1,4 @@
-"""Two rigid Lennard-Jones dumbbells that collide, in reduced units.
-
-Solution: each dumbbell's own equations of motion for its center and its axis.
-"""
+"""Two rigid Lennard-Jones dumbbells that collide, in reduced units."""
 
 from __future__ import annotations
 
@@ -9,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from kcons.comparison.test_systems.minimal import integrated
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Potential
 from kcons.comparison.test_systems.registry import add_system
-from kcons.comparison.test_systems.system import Reference, TestSystem, Units
+from kcons.comparison.test_systems.system import TestSystem, Units
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -56,7 +52,6 @@ def build(size: int, rng: int) -> TestSystem:
         tolerances=(1e-4, 1e-7, 1e-10),
         units=REDUCED,
         bonds=PAIRS,
-        solution=encounter,
         openmm=OpenMMEngine(_collision_system, length=1.0, time=1.0),
     )
 
@@ -78,42 +73,6 @@ def _collision_system() -> Any:
         for j in (2, 3):
             force.addBond(i, j)
     return system_of(MASSES, force, pairs=PAIRS, lengths=LENGTHS)
-
-
-def encounter(time: float) -> Reference:
-    """Centers C and unit axes n: C'' = F/M and n'' = (K - (K . n) n)/I - |n'|^2 n.
-
-    With the atoms at C + a_i n, K = sum a_i f_i and I = sum m_i a_i^2.
-    """
-    masses = MASSES.reshape(2, 2)
-    shares = masses / masses.sum(axis=1)[:, None]
-    # Places of the atoms on the axis, from the center.
-    arms = np.stack([-shares[:, 1], shares[:, 0]], axis=1) * LENGTHS[:, None]
-    inertia = np.sum(masses * arms * arms, axis=1)[:, None]
-
-    def place(y: FloatArray) -> FloatArray:
-        centers, axes = y.reshape(4, 2, 3)[:2]
-        n = axes / np.linalg.norm(axes, axis=1)[:, None]
-        return np.asarray((centers[:, None] + arms[..., None] * n[:, None]).reshape(4, 3))
-
-    def rate(_: float, y: FloatArray) -> FloatArray:
-        n, drift, turn = y.reshape(4, 2, 3)[1:]
-        f = attraction(place(y))[1].reshape(2, 2, 3)
-        pull = np.sum(arms[..., None] * f, axis=1) / inertia
-        n_squared = np.sum(n * n, axis=1)[:, None]
-        along = np.sum((pull * n + turn * turn), axis=1)[:, None]
-        change = pull - along * n / n_squared
-        return np.concatenate([drift, turn, f.sum(axis=1) / masses.sum(axis=1)[:, None], change]).ravel()
-
-    x, v = POSITIONS.reshape(2, 2, 3), VELOCITIES.reshape(2, 2, 3)
-    weights = shares[..., None]
-    start = [
-        np.sum(weights * x, axis=1),
-        (x[:, 1] - x[:, 0]) / LENGTHS[:, None],
-        np.sum(weights * v, axis=1),
-        (v[:, 1] - v[:, 0]) / LENGTHS[:, None],
-    ]
-    return integrated(rate, np.concatenate(start).ravel(), time, place, "equations of the centers and axes")
 
 
 add_system("dumbbells", build, "collision of two rigid dumbbells", size=2, unit="collision of two dumbbells", only=True)

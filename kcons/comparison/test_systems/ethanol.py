@@ -45,8 +45,6 @@ def build(size: int, rng: int, *, forces: str = "") -> TestSystem:
         horizon=32 * units.fs,
         time_steps=tuple(dt * units.fs for dt in (8.0, 4.0, 2.0, 1.0)),
         bonds=pairs,
-        angles=angles,
-        angle_bonds=bonds,
         thermal_energy=units.kB * TEMPERATURE,
     )
 

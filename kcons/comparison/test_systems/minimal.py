@@ -25,18 +25,9 @@ def integrated(
     place: Callable[[FloatArray], FloatArray],
     how: str,
 ) -> Reference:
-    """Positions at `time` of a system with coordinates y, y' = rate(t, y).
+    """Positions at `time` of a system with coordinates y, y' = rate(t, y); `place` gives positions, shape (n_atoms, 3).
 
-    Parameters
-    ----------
-    rate : callable
-    start : array_like
-        y at time 0.
-    time : float
-    place : callable
-        Coordinates to positions, shape (n_atoms, 3).
-    how : str
-        Name of the equations.
+    `how` names the equations.
     """
     ends = []
     for rtol in (FINEST, COARSER):

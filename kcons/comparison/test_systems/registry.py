@@ -26,8 +26,6 @@ class Entry:
 
 
 SYSTEMS: dict[str, Entry] = {}
-#: Options that say what is held in molecules with forces of OpenMM.
-STRUCTURE_OPTIONS = ("constrain", "force_field", "platform", "add_hydrogens")
 
 
 def add_system(
@@ -98,13 +96,6 @@ def build(name: str, size: Count | None = None, rng: Rng = 1, *, quick: bool = F
     if entry.only and size != entry.size:
         raise InputError(f"{name} is one {entry.unit}; it cannot be built at size {size}", item="size")
     for option in sorted(set(options) - set(entry.takes)):
-        if option in STRUCTURE_OPTIONS:
-            names = ", ".join(key for key, other in SYSTEMS.items() if option in other.takes)
-            raise InputError(
-                "what to hold, the force field and the platform can be chosen for "
-                f"{names or 'files'} and PDB files, not for {name!r}",
-                item=option,
-            )
         raise InputError(f"{name} takes {', '.join(entry.takes) or 'no options'}, not {option}", item=option)
     system = entry.make(size, seed_from(rng), **{**entry.options, **options})
     return system.shortened(2) if quick else system

@@ -87,10 +87,6 @@ class TestSystem:
     units : Units
     bonds : ndarray of int, shape (n, 2), or None
         Pairs whose distances, all held, are the same thing as the constraint set; None if there are none.
-    angles : ndarray of int, shape (n, 3)
-        With `angle_bonds`, the same as bonds and angles.
-    angle_bonds : ndarray of int, shape (n, 2), or None
-        The bonds that go with `angles`; None takes `bonds`.
     fixed : ndarray of int, shape (n,)
         Atoms that the constraint set holds by FixedAtoms; MD engines that hold `bonds` fix them in their own way.
     refusals : mapping
@@ -122,8 +118,6 @@ class TestSystem:
     tolerances: Sequence[float] = (1e-2, 1e-4, 1e-6)
     units: Units = ASE_UNITS
     bonds: IntArray | None = None
-    angles: IntArray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
-    angle_bonds: IntArray | None = None
     fixed: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     refusals: Mapping[str, str] = field(default_factory=dict)
     solution: Callable[[float], Reference] | None = None

@@ -66,16 +66,15 @@ class PythonRows(Constraint, base=True):
         """Gradient, or coefficients, of row `k` alone, shape (width, 3), at an `r` that cannot be changed."""
         raise NotImplementedError
 
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        found = [self.row_gradient(k, read_only_view(r[k]), time) for k in range(self.n_rows)]
+        return np.array(found).reshape(r.shape)
+
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        return self.measure(r, time), self.gradient(r, time)
+
     def _time(self, time: float) -> tuple[float, ...]:
         return (time,) if self.time_dependent else ()
-
-    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        """Results of a user's function for all rows, shape (n_rows, *shape)."""
-        out = np.empty((self.n_rows, *shape))
-        for k in range(self.n_rows):
-            found = function(*(read_only_view(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
-            out[k] = self._checked(found, k, name, shape)
-        return out
 
     def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
         """What a function returned for row `k`, as float64 of that shape."""
@@ -155,16 +154,12 @@ class Custom(PythonRows):
     def called(self) -> tuple[Any, ...]:
         return self.function, self.gradient_function
 
-    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        return self.measure(r, time), self.gradient(r, time)
-
     def measure(self, r: FloatArray, time: float) -> FloatArray:
-        return self._call(self.function, "function", (), r, *self._time(time))
+        return self._values(r, time, 0)
 
-    def gradient(self, r: FloatArray, time: float) -> FloatArray:
-        if self.gradient_function is None:
-            return self._differenced_gradient(r, time)
-        return self._call(self.gradient_function, "gradient", (self.width, 3), r, *self._time(time))
+    def _values(self, r: FloatArray, time: float, first: int) -> FloatArray:
+        """Values of the rows from `first` on."""
+        return np.array([self.row_value(first + k, read_only_view(r[k]), time) for k in range(len(r))])
 
     def row_value(self, k: int, r: FloatArray, time: float) -> float:
         """Value of row `k` alone at `r`, shape (width, 3), which cannot be written to; for kernels."""
@@ -174,18 +169,15 @@ class Custom(PythonRows):
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         if self.gradient_function is None:
-            step = 1e-3 * float(self._length(r[None])[0])
-            places = read_only_view(r + step * _along(self.width))  # the function may keep what it sees
-            values = self._from_the_first(np.array([self.row_value(k, place, time) for place in places]))
-            return np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(r.shape) / step
+            return self._differenced_gradient(r[None], time, k)[0]
         found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
         return np.asarray(self._checked(found, k, "gradient", r.shape))
 
-    def _differenced_gradient(self, r: FloatArray, time: float) -> FloatArray:
+    def _differenced_gradient(self, r: FloatArray, time: float, first: int = 0) -> FloatArray:
         step = 1e-3 * self._length(r)
         places = r + step[:, None, None] * _along(self.width)[:, None]
-        values = self._from_the_first(np.array([self.measure(place, time) for place in places]))
-        slope = np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(-1, self.n_rows) / step
+        values = self._from_the_first(np.array([self._values(place, time, first) for place in places]))
+        slope = np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(-1, len(r)) / step
         return np.ascontiguousarray(slope.T).reshape(r.shape)
 
     def _from_the_first(self, values: FloatArray) -> FloatArray:
@@ -325,23 +317,32 @@ class ImplicitSurface(Custom):
     def called(self) -> tuple[Any, ...]:
         return (None,)
 
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        if self.gradient_function is None:
+            return self._differenced_gradient(r, time)
+        return self._call(self.gradient_function, "gradient", r, time, (3,)).reshape(r.shape)
+
     def row_value(self, k: int, r: FloatArray, time: float) -> float:
         return float(self.measure(r[None], time)[0])
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         return np.asarray(self.gradient(r[None], time)[0])
 
-    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        found = function(*(read_only_view(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments))
-        result = as_float_array(found, f"ImplicitSurface: {name}")
-        wanted = (self.n_rows, 3) if shape == (1, 3) else (self.n_rows, *shape)
+    def _values(self, r: FloatArray, time: float, first: int) -> FloatArray:
+        return self._call(self.function, "function", r, time, ())
+
+    def _call(
+        self, function: Callable[..., Any], name: str, r: FloatArray, time: float, shape: tuple[int, ...]
+    ) -> FloatArray:
+        found = function(read_only_view(r[:, 0]), *self._time(time))
+        result, wanted = as_float_array(found, f"ImplicitSurface: {name}"), (self.n_rows, *shape)
         if result.shape != wanted:
             raise InputError(
                 f"ImplicitSurface: {name} returned shape {result.shape} for positions of shape ({self.n_rows}, 3); "
                 f"it must return {wanted}",
                 item=name,
             )
-        return result.reshape(self.n_rows, *shape)
+        return result
 
 
 class CustomVelocity(PythonRows, VelocityRows):
@@ -392,9 +393,8 @@ class CustomVelocity(PythonRows, VelocityRows):
     def called(self) -> tuple[Any, ...]:
         return (self.coefficients,)
 
-    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        shape = (self.width, 3)
-        return np.zeros(self.n_rows), self._call(self.coefficients, "coefficients", shape, r, *self._time(time))
+    def measure(self, r: FloatArray, time: float) -> FloatArray:
+        return np.zeros(self.n_rows)
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         found = self.coefficients(read_only_view(r), *self._time(time))

@@ -1,53 +1,50 @@
-"""Formulas as code: what is written is checked, differentiated by SymPy, and kept in a file.
+"""Formulas as code: what is written is checked, differentiated, and kept in a file.
 
-Formulas come from files of others, too. So names are those of a list, and length, depth and the size of the second
-derivatives are bounded before SymPy sees anything. It sees numbers as they are computed with, in double precision: it
-would find 9**9**9 to the last digit.
+Formulas come from files of others, too: names are those of a list, and length and depth are bounded.
 
-The file is a module of functions on plain numbers, or on arrays of one number a row: value and gradient, and what
-accelerations need; of a formula that is linear in the velocities its coefficients, and what these need. It lies where
-Numba can keep what it compiles of it, so that another process finds both.
+Derivatives are taken backwards through the operations, which are written down once each; second ones are complex steps
+of the first. The file is a module of functions on plain numbers, or on arrays of one number a row. It lies where Numba
+can keep what it compiles of it, so that another process finds both.
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
-import logging
 import math
 import os
 import re
 import sys
 import tempfile
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from itertools import count
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import ModuleType
 from typing import Any
 
 import numba
 import numpy as np
 
+from kcons.constraints.functions.straight_line import ELEMENTARY, Operand, Tape, differentiated
 from kcons.errors import InputError, UnsupportedError
 
-logger = logging.getLogger("kcons")
-
-#: Characters of a formula, levels of its tree (a sum of n terms has n), and parts of its second derivatives.
-MAX_LENGTH, MAX_DEPTH, MAX_PARTS = 10_000, 200, 20_000
-#: Functions of formulas: name -> the one of NumPy; of the same name in SymPy, but for those below.
+#: Characters of a formula, and levels of its tree (a sum of n terms has n).
+MAX_LENGTH, MAX_DEPTH = 10_000, 200
+#: Functions of formulas: name -> the one of NumPy.
 FUNCTIONS: dict[str, Any] = {
     **{name: getattr(np, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")},
     **{f"a{name[3:]}": getattr(np, name) for name in ("arcsin", "arccos", "arctan", "arctan2")},
     "abs": np.abs,
 }
-_IN_SYMPY = {"abs": "Abs"}
 #: What a sum that vanishes may be off by, beside its parts, at places where these are of order one.
 _SAME = 1e-9
 _COORDINATE = re.compile(r"[xyz]([1-9][0-9]{0,5})")
 _SPEED = re.compile(r"v[xyz]([1-9][0-9]{0,5})")
-_OPERATIONS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
+_OPERATIONS: dict[type, Callable[[Any, Any], Any]]
+_OPERATIONS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power}
+_PI = {"pi": np.float64(np.pi)}
 
 
 def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tuple[ast.expr, set[int]]:
@@ -121,8 +118,6 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                     f"and functions{hint}",
                     item="formula",
                 )
-    if _parts(tree)[2] > MAX_PARTS:
-        raise _too_large(formula, f"has second derivatives of more than {MAX_PARTS} parts")
     return _with_numbers(formula, tree), found
 
 
@@ -158,12 +153,11 @@ def _with_numbers(formula: str, tree: ast.expr) -> ast.expr:
             elif isinstance(part, ast.expr) and field != "func":
                 setattr(tree, field, _with_numbers(formula, part))
         return tree
-    known = {**FUNCTIONS, "pi": np.float64(np.pi), "": np.float64}
-    what = undefined_part(tree, known)
+    what = undefined_part(tree, _PI)
     if what is not None:
         raise InputError(f"Formula: {what} in {formula!r:.200}; give numbers with a finite value", item="formula")
     with np.errstate(all="ignore"):
-        return ast.copy_location(ast.Constant(float(evaluated(tree, known))), tree)
+        return ast.copy_location(ast.Constant(float(_value(tree, _PI))), tree)
 
 
 def _operands(tree: ast.expr) -> list[ast.expr]:
@@ -178,73 +172,38 @@ def _operands(tree: ast.expr) -> list[ast.expr]:
     return []
 
 
-def _parts(tree: ast.expr) -> tuple[int, int, int]:
-    """About how many parts a formula, its first and its second derivative along a direction are written with."""
-    match tree:
-        case ast.Name(id=name):
-            return 1, int(name != "pi"), 0
-        case ast.UnaryOp(operand=operand):
-            return _parts(operand)
-        case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
-            a, b = _parts(left), _parts(right)
-            return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-        case ast.BinOp(left=left, right=right) | ast.Call(args=[left, right]):
-            a, b = _parts(left), _parts(right)
-            size = a[0] + b[0] + 1
-            first = bool(a[1]) * (a[1] + b[0] + 1) + bool(b[1]) * (a[0] + b[1] + 1)
-            both = 2 * (a[1] + b[1] + 1) if a[1] and b[1] else 0
-            return size, first, bool(a[2]) * (a[2] + b[0]) + bool(b[2]) * (a[0] + b[2]) + both + first
-        case ast.Call(args=[inner]):
-            size, first, second = _parts(inner)
-            return size + 1, bool(first) * (size + first + 1), bool(first) * (2 * (size + first) + second + 1)
-    return 1, 0, 0
-
-
-def evaluated(tree: ast.expr, names: dict[str, Any]) -> Any:
-    """The value of a tree, with numbers or symbols for names and functions.
-
-    ``names[""]`` makes constants, and ``names["**"]``, if it is there, exponents that are constants.
-    """
+def _value(tree: ast.expr, numbers: Mapping[str, Any], constant: Callable[[Any], Any] = np.float64) -> Any:
+    """The value of a tree, with numbers for names."""
     match tree:
         case ast.Constant(value=value):
-            return names[""](value)
+            return constant(value)
         case ast.Name(id=name):
-            return names[name]
-        case ast.UnaryOp(op=operation, operand=operand):
-            value = evaluated(operand, names)
-            return -value if isinstance(operation, ast.USub) else value
-        case ast.Call(func=ast.Name(id=name), args=args):
-            return names[name](*(evaluated(each, names) for each in args))
-        case ast.BinOp(left=left, op=operation, right=right):
-            exponent = isinstance(operation, ast.Pow) and isinstance(right, ast.Constant) and "**" in names
-            a, b = evaluated(left, names), evaluated(right, {**names, "": names["**"]} if exponent else names)
-            match operation:
-                case ast.Add():
-                    return a + b
-                case ast.Sub():
-                    return a - b
-                case ast.Mult():
-                    return a * b
-                case ast.Div():
-                    return a / b
-            return a**b
+            return numbers[name]
+        case ast.UnaryOp(op=sign, operand=operand):
+            value = _value(operand, numbers, constant)
+            return -value if isinstance(sign, ast.USub) else value
+    parts = [_value(each, numbers, constant) for each in _operands(tree)]
+    match tree:
+        case ast.Call(func=ast.Name(id=name)):
+            return FUNCTIONS[name](*parts)
+        case ast.BinOp(op=operation):
+            return _OPERATIONS[type(operation)](*parts)
     raise AssertionError(ast.dump(tree))
 
 
-def undefined_part(tree: ast.expr, names: dict[str, Any]) -> str | None:
+def undefined_part(tree: ast.expr, numbers: Mapping[str, float]) -> str | None:
     """The smallest part of a tree that has no finite value with these numbers, in words; None if all have one."""
     inside = _operands(tree)
     for node in inside:
-        found = undefined_part(node, names)
+        found = undefined_part(node, numbers)
         if found:
             return found
     with np.errstate(all="ignore"):
-        value = evaluated(tree, names)
-    if np.isfinite(value):
-        return None
-    with np.errstate(all="ignore"):
+        value = _value(tree, numbers)
+        if np.isfinite(value):
+            return None
         if isinstance(tree, ast.Call):
-            return f"{ast.unparse(tree)} is {value} where {ast.unparse(inside[0])} = {evaluated(inside[0], names):g}"
+            return f"{ast.unparse(tree)} is {value} where {ast.unparse(inside[0])} = {_value(inside[0], numbers):g}"
     return f"{ast.unparse(tree)} is {value}"
 
 
@@ -283,7 +242,7 @@ def code_of(formula: str, width: int, parameters: tuple[str, ...], speeds: bool 
         As `width_of`; another width; a formula that does not change with the positions, or is not linear in the
         velocities.
     UnsupportedError
-        SymPy is needed and not there.
+        There is no folder that it can be written to.
     """
     tree, _ = parsed(formula, parameters, speeds)
     named = width_of(formula, parameters, speeds)
@@ -293,7 +252,7 @@ def code_of(formula: str, width: int, parameters: tuple[str, ...], speeds: bool 
             "names",
             item="atoms",
         )
-    return Code(tree, _module(formula, tree, width, parameters, speeds))
+    return Code(formula, tree, width, parameters, speeds)
 
 
 class Code:
@@ -301,39 +260,119 @@ class Code:
 
     Attributes
     ----------
-    row : callable
-        ``row(r, p, t, out)`` for `kcons.solvers.sparse.row_functions`, to be compiled.
-    first : callable
-        Value and gradient of all rows: of the coordinates, the time and the parameters, an array each. Of velocities
-        of where a flight ends: of the coordinates in its middle, the way, the time and the parameters.
-    second : callable
-        v^T (d2q/dr2) v, dq/dt and 2 (d2q/dr dt) . v + d2q/dt2, of the coordinates, the velocities, the time and the
-        parameters. Of velocities v . (d coefficients/dt).
-    invariant, moving : bool
-        Whether a common shift of all atoms changes nothing; whether the time is in it.
+    row, rate : callable
+        As of a `Constraint`; `rate` is None where the time is not in the formula.
+    invariant : bool
+        Whether a common shift of all atoms changes nothing.
     """
 
-    def __init__(self, tree: ast.expr, module: ModuleType) -> None:
-        self.tree, self.row = tree, module.row
-        self.first = FunctionType(module.first.py_func.__code__, _NUMPY)
-        self.second = FunctionType(module.second.__code__, _NUMPY)
-        self.invariant, self.moving = bool(module.INVARIANT), bool(module.MOVING)
+    def __init__(self, formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], speeds: bool) -> None:
+        self.tree, n = tree, 3 * width
+        names = [f"{kind}{axis}{atom}" for kind in ["", "v"] for atom in range(1, width + 1) for axis in "xyz"]
+
+        def value(r: Any, p: Any, t: Any) -> Any:
+            known = {name: r[k] for k, name in enumerate(names)} | {name: p[k] for k, name in enumerate(parameters)}
+            return _value(tree, {**known, "t": t, "pi": math.pi}, float)
+
+        with np.errstate(all="ignore"):  # of constants
+            tape = differentiated(value, n + n * speeds)
+        found, *slopes, moves = (_text(each) for each in tape.results)
+        steep, slope = slopes[:n], slopes[n:] or slopes
+        self.invariant = _look(formula, tape, n, speeds, len(parameters)) and width > 1
+        ends = [f"{part} + 0.5*{bent}" for part, bent in zip(slope, steep, strict=True)] if speeds else slope
+        texts = [_function("row", tape, [found, *ends])]
+        if moves != "0.0":
+            texts.append(_function("rate", tape, [moves]))
+        module = _module("\n\n".join([f"# Written by kcons for {formula!r}.", "from numpy import *\n", *texts]))
+        self.row, self.rate = module.row, getattr(module, "rate", None)
 
 
-_NUMPY: dict[str, Any] = {**FUNCTIONS, "copysign": np.copysign, "__builtins__": {"abs": np.abs}}
+#: Operations of tapes, for real numbers and, to first order in imaginary parts, complex ones.
+_TEXT = {
+    **{name: f"{{}}{sign}{{}}" for sign, name in ((" + ", "add"), (" - ", "subtract"), ("*", "multiply"))},
+    **{"divide": "{}/{}", "power": "{}**{}", "negative": "-{}", "copysign": "copysign({}, {}.real)"},
+    "absolute": "copysign(1.0, {0}.real)*{0}",
+    "arctan2": "arctan2({0}.real, {1}.real) + ({1}*({0} - {0}.real) - {0}*({1} - {1}.real))/({0}*{0} + {1}*{1})",
+}
 
 
-def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], speeds: bool) -> ModuleType:
-    """The module of a formula, from its file if there is one that is whole."""
-    meant = repr((formula.strip(), width, parameters, speeds)).encode()
-    key = hashlib.sha256(Path(__file__).read_bytes() + meant).hexdigest()[:24]  # other code writes other files
-    path = _folder() / f"formula_{key}.py"
-    text = _whole(path)
-    if text is None:
-        text = _written(formula, tree, width, parameters, speeds).encode()
+def _text(operand: Operand) -> str:
+    if not isinstance(operand, tuple):
+        return repr(operand) if operand >= 0 else f"({operand!r})"
+    kind, k = operand
+    return {"t": "t", "k": f"_{k}"}.get(kind, f"{kind}[{k}]")
+
+
+def _function(name: str, tape: Tape, results: list[str]) -> str:
+    """Code that puts results of a tape out, with the steps that these need."""
+    needed, lines = " ".join(results), []
+    for k, (operation, operands) in reversed(list(enumerate(tape.steps))):
+        if re.search(rf"\b_{k}\b", needed):
+            texts = [_text(each) for each in operands]
+            if operation == "power" and isinstance(operands[1], float) and operands[1].is_integer():
+                texts[1] = str(int(operands[1])) if 0 < operands[1] < 1000 else texts[1]
+            lines.append(f"    _{k} = {_TEXT.get(operation, f'{operation}({{}})').format(*texts)}")
+            needed += lines[-1]
+    outs = [f"    out[{k}] = {each}" for k, each in enumerate(results)]
+    return "\n".join([f"def {name}(r, p, t, out):", *reversed(lines), *outs]) + "\n"
+
+
+def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bool:
+    """Whether common shifts change nothing, found out at random places; what is no row is refused.
+
+    At complex ones, where all functions are defined, and whatever the signs of what is in ``abs``.
+    """
+    rng = np.random.default_rng(0)
+    r, faster, p = (rng.normal(size=(size, 40, 2)) @ [1.0, 1.0j] for size in (2 * n, 2 * n, parameters + 1))
+    signs = rng.choice([-1.0, 1.0], (len(tape.steps), 40))
+    text = _function("found", tape, [_text(each) for each in tape.results[:-1]])
+
+    def looked(places: Any) -> Any:
+        some = iter(signs)
+        known: dict[str, Any] = {name: getattr(np, name) for name in (*ELEMENTARY, "inf", "nan")}
+        made: dict[str, Any] = {}
+        exec(text, known | {"copysign": lambda _, x: next(some)}, made)
+        out = np.empty((len(tape.results) - 1, 40), complex)
+        made["found"](places, p, p[-1], out)
+        return out
+
+    with np.errstate(all="ignore"):
+        value, *slopes = looked(r)
+        steep, slope = np.array(slopes[:n]), np.array(slopes[n:] or slopes)
+        seen = np.isfinite(slopes).all(axis=0)
+        if seen.all() and not slope.any():
+            what = "velocities: it has none of them" if speeds else "positions: its gradient is zero"
+            raise InputError(
+                f"Formula: {formula!r} does not change with the {what}; write one that does", item="formula"
+            )
+        if speeds:
+            faster[:n] = r[:n]
+            bent, rest = looked(faster)[1 + n :] - slope, looked(np.concatenate([r[:n], 0 * r[n:]]))[0]
+            if not all(map(_vanishes, [rest, *bent], [value, *slope])):
+                left = "" if _vanishes(rest, value) else "; at rest it is not 0: what the sum is held at is the target"
+                raise InputError(
+                    f"VelocityFormula: {formula!r} is not a sum of velocities times functions of the positions and the "
+                    f"time{left}",
+                    item="formula",
+                )
+        return all(_vanishes(steep[k::3].sum(axis=0), *steep[k::3]) for k in range(3))
+
+
+def _vanishes(sums: Any, *parts: Any) -> bool:
+    """Whether a sum is nothing beside its parts, at all places that are seen."""
+    size = np.abs(parts).sum(axis=0)
+    seen = np.isfinite(sums) & np.isfinite(size)
+    return bool(seen.sum() > 5 and (np.abs(sums) <= _SAME * size)[seen].all())
+
+
+def _module(text: str) -> ModuleType:
+    """The module with this text, which is kept in a file: Numba keeps beside files what it compiles of them."""
+    own = text.encode()
+    path = _folder() / f"formula_{hashlib.sha256(own).hexdigest()[:24]}.py"
+    if not path.is_file() or path.read_bytes() != own:
         unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
         try:
-            unfinished.write_bytes(_digest(text) + text)
+            unfinished.write_bytes(own)
             os.replace(unfinished, path)
         except OSError as error:
             unfinished.unlink(missing_ok=True)
@@ -343,23 +382,8 @@ def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...
             ) from error
     # Numba looks for what it has kept by the names of modules.
     module = sys.modules[f"kcons_{path.stem}"] = ModuleType(f"kcons_{path.stem}")
-    exec(compile(b"\n" + text, path, "exec"), module.__dict__)  # the digest is the first line
+    exec(compile(own, path, "exec"), module.__dict__)
     return module
-
-
-def _digest(text: bytes) -> bytes:
-    return f"# {hashlib.sha256(text).hexdigest()}\n".encode()
-
-
-def _whole(path: Path) -> bytes | None:
-    """The code in a file, None where there is none or where it is not what its first line is the digest of."""
-    if not path.is_file():
-        return None
-    head, newline, text = path.read_bytes().partition(b"\n")
-    if head + newline == _digest(text):
-        return text
-    logger.warning("the kept code of a formula is damaged (%s); it is written anew", path)
-    return None
 
 
 def _folder() -> Path:
@@ -383,123 +407,3 @@ def _folder() -> Path:
 @cache
 def _passing() -> str:
     return tempfile.mkdtemp(prefix="kcons-formulas-")
-
-
-def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], linear: bool) -> str:
-    """The text of a module: exact derivatives with common parts computed once."""
-    try:
-        import sympy
-        from sympy.printing.pycode import PythonCodePrinter
-    except ImportError:
-        raise UnsupportedError(
-            "formulas are differentiated by SymPy, which is not installed: python -m pip install 'kcons[formulas]'. "
-            "Custom takes a function and its gradient without it"
-        ) from None
-
-    class Printer(PythonCodePrinter):  # type: ignore[misc]
-        """For numbers and arrays alike."""
-
-        def _print_sign(self, expr: Any) -> str:
-            return f"copysign(1.0, {self._print(expr.args[0])})"
-
-        def _print_Exp1(self, expr: Any) -> str:
-            return repr(math.e)
-
-        def _print_Pi(self, expr: Any) -> str:
-            return repr(math.pi)
-
-        def _print_Integer(self, expr: Any) -> str:
-            if abs(expr.p) < 2**53:
-                return str(expr.p)
-            return repr(float(expr)) if abs(expr.p) < 2**1023 else repr(math.copysign(1e308, expr.p))
-
-        def _print_Rational(self, expr: Any) -> str:
-            return f"{self._print_Integer(sympy.Integer(expr.p))}/{self._print_Integer(sympy.Integer(expr.q))}"
-
-    printer = Printer({"fully_qualified_modules": False})
-    axes = [f"{axis}{atom}" for atom in range(1, width + 1) for axis in "xyz"]
-    speeds = [f"v{name}" for name in axes]
-    symbols = {name: sympy.Symbol(name, real=True) for name in (*axes, *speeds, *parameters, "t")}
-    functions = {name: getattr(sympy, _IN_SYMPY.get(name, name)) for name in FUNCTIONS}
-    value = sympy.sympify(evaluated(tree, {**functions, **symbols, "pi": sympy.pi, "": sympy.Float, "**": _exponent}))
-    t = symbols["t"]
-    steep = [value.diff(symbols[name]) for name in axes]
-    slope = [value.diff(symbols[name]) for name in speeds] if linear else steep
-    if all(part == 0 for part in slope):
-        what = "velocities: it has none of them" if linear else "positions: its gradient is zero"
-        raise InputError(f"Formula: {formula!r} does not change with the {what}; write one that does", item="formula")
-    along = sum((part * symbols[v] for part, v in zip(slope, speeds, strict=True)), sympy.S.Zero)
-    bend = sum((along.diff(symbols[n]) * symbols[v] for n, v in zip(axes, speeds, strict=True)), sympy.S.Zero)
-    second = [bend, value.diff(t), 2 * along.diff(t) + value.diff(t, 2)]
-    if linear:
-        moving = [symbols[name] for name in speeds]
-        rest = value.subs(dict.fromkeys(moving, 0))
-        rest = sympy.S.Zero if _is_zero([rest], value) else rest
-        if rest != 0 or any(part.has(*moving) for part in slope):
-            raise InputError(
-                f"VelocityFormula: {formula!r} is not a sum of velocities times functions of the positions and the time"
-                + (f": {rest} is left without velocities; what the sum is held at is the target" if rest != 0 else ""),
-                item="formula",
-            )
-        second = [bend + along.diff(t)]
-    invariant = width > 1 and all(_is_zero(steep[k::3], None) for k in range(3))
-
-    def function(name: str, arguments: Sequence[str], results: Sequence[Any]) -> str:
-        smooth = [part.replace(sympy.DiracDelta, lambda *_: sympy.S.Zero) for part in results]  # beside kinks of abs
-        common, last = sympy.cse(smooth, symbols=(sympy.Symbol(f"_{k}") for k in range(10**6)))
-        lines = [f"    {printer.doprint(part)} = {printer.doprint(what)}" for part, what in common]
-        shown = ", ".join(printer.doprint(sympy.Float(what) if what.is_Integer else what) for what in last)
-        return "\n".join([f"def {name}({', '.join(arguments)}):", *lines, f"    return ({shown},)\n"])
-
-    # Of velocities: of where a flight ends, see `kcons.solvers.sparse.row_functions`.
-    ends = [part + bent / 2 for part, bent in zip(slope, steep, strict=True)] if linear else slope
-    places = [f"r[{k}]" for k in range((6 if linear else 3) * width)] + ["t"]
-    places += [f"p[{k}]" for k in range(len(parameters))]
-    row = ["def row(r, p, t, out):", f"    found = first({', '.join(places)})"]
-    row += [f"    out[{k}] = found[{k}]" for k in range(3 * width + 1)]
-    names = ", ".join(sorted({*FUNCTIONS, "copysign"} - {"abs"}))
-    head = f"# Written by kcons for {formula!r}.\nfrom math import {names}\n\nimport numba\n"
-    flags = '@numba.njit(fastmath={"contract", "arcp", "nsz"}, error_model="numpy")'
-    return "\n\n".join(
-        [
-            head,
-            f"INVARIANT, MOVING = {invariant}, {value.has(t)}",
-            flags + "\n" + function("first", [*axes, *(speeds if linear else []), "t", *parameters], [value, *ends]),
-            function("second", [*axes, *speeds, "t", *parameters], second),
-            "\n".join(row) + "\n",
-        ]
-    )
-
-
-def _exponent(value: float) -> Any:
-    """A power that is a number: whole ones and halves are written as such."""
-    import sympy
-
-    return sympy.Rational(value) if abs(value) <= 1000 and 2 * value == int(2 * value) else sympy.Float(value)
-
-
-def _is_zero(parts: Sequence[Any], size: Any) -> bool:
-    """Whether a sum vanishes everywhere, whatever the signs of what is in ``abs``; `size` is what it is small beside.
-
-    Where SymPy does not see it, it is found at random places, complex ones, where all functions are defined.
-    """
-    import sympy
-
-    def free(part: Any) -> Any:
-        return part.replace(sympy.sign, lambda inner: sympy.Symbol(f"sign of {inner}")).replace(
-            sympy.DiracDelta, lambda *_: sympy.S.Zero
-        )
-
-    parts = [free(part) for part in parts]
-    total = sum(parts, sympy.S.Zero)
-    if total == 0:
-        return True
-    beside = parts if size is None else [size]
-    names = sorted(set().union(*(part.free_symbols for part in [*parts, *beside])), key=str)
-    function = sympy.lambdify(names, [total, *beside], "numpy")
-    places = np.random.default_rng(0).normal(size=(len(names), 40, 2)) @ [1.0, 1.0j]
-    with np.errstate(all="ignore"):
-        found, *others = (np.broadcast_to(np.asarray(part, dtype=complex), 40) for part in function(*places))
-        near = np.abs(found) <= _SAME * sum(np.abs(other) for other in others)
-    seen = np.isfinite(found) & np.isfinite(sum(others))
-    return bool(seen.sum() > 5 and near[seen].all())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from keyword import iskeyword
 from typing import Annotated, Any, ClassVar, Self
 
@@ -48,7 +48,7 @@ class Formula(Constraint):
     Notes
     -----
     Where the formula depends on differences of positions alone, which is found out, minimum images apply in periodic
-    cells. SymPy, which differentiates, is needed once for each formula; the code is kept in files.
+    cells. The code is kept in files.
 
     Raises
     ------
@@ -56,8 +56,6 @@ class Formula(Constraint):
         Unknown names, atoms that are not named or not given, a formula that does not depend on the positions.
     SingularGeometryError
         When put into a set: no finite value or gradient, or a gradient of zero.
-    UnsupportedError
-        SymPy is not installed.
 
     Examples
     --------
@@ -127,37 +125,12 @@ class Formula(Constraint):
         return code_of(self.formula, self.width, tuple(self.names), self.of_speeds)
 
     @property
-    def moving(self) -> bool:
-        return super().moving or self.code().moving
-
-    @property
-    def row(self) -> Callable[[Any, Any, Any, Any], None]:  # type: ignore[override]
+    def row(self) -> Any:  # type: ignore[override]
         return self.code().row
 
-    def _evaluated_by(self, function: Callable[..., Any], time: float, *arrays: FloatArray) -> list[FloatArray]:
-        """Results of `function` for all rows, an array of one number a row each."""
-        columns = [column for array in arrays for column in array.reshape(self.n_rows, -1).T]
-        with np.errstate(all="ignore"):
-            found = function(*columns, time, *self.values.T)
-        return [np.broadcast_to(np.asarray(part, dtype=np.float64), (self.n_rows,)) for part in found]
-
-    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        value, *slope = self._evaluated_by(self.code().first, time, *([r] if self.holonomic else [r, 0.0 * r]))
-        return np.array(value), np.array(slope).T.reshape(r.shape).copy()
-
-    def _second(self, r: FloatArray, v: FloatArray, time: float) -> Sequence[FloatArray]:
-        return self._evaluated_by(self.code().second, time, r, v)
-
-    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        return self._second(r, v, time)[0]
-
-    def acceleration_terms(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        curvature, _, mixed = self._second(r, v, time)
-        return curvature + mixed
-
-    def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        _, rate, mixed = self._second(r, v, time)
-        return rate, mixed
+    @property
+    def rate(self) -> Any:  # type: ignore[override]
+        return self.code().rate
 
     def parameters(self) -> FloatArray:
         return self.values
@@ -165,8 +138,8 @@ class Formula(Constraint):
     def undefined(self, k: int, row: str, r: FloatArray, time: float) -> str:
         axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
         numbers = dict(zip([*axes, "t", *self.names], [*r.ravel(), time, *self.values[k]], strict=True))
-        numbers |= {f"v{axis}": 1.0 for axis in axes}
-        what = undefined_part(self.code().tree, {**FUNCTIONS, **numbers, "pi": np.float64(np.pi), "": np.float64})
+        numbers |= {f"v{axis}": 1.0 for axis in axes} | {"pi": np.pi}
+        what = undefined_part(self.code().tree, {name: np.float64(value) for name, value in numbers.items()})
         if what is None:
             flat = not self.select([k]).gradient(r[None], time).any()
             what = f"its gradient is {'zero' if flat else 'not finite'}"
@@ -213,8 +186,6 @@ class VelocityFormula(Formula):
         As `Formula`; a formula that is not linear in the velocities.
     SingularGeometryError
         When put into a set: coefficients that are all zero, or not finite.
-    UnsupportedError
-        SymPy is not installed.
 
     Examples
     --------
@@ -238,6 +209,3 @@ class VelocityFormula(Formula):
         target: Target = 0.0,
     ) -> None:
         super().__init__(formula, atoms, parameters, 0.0 if target is None else target)
-
-    def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        return np.zeros(self.n_rows), np.zeros(self.n_rows)

@@ -1,4 +1,4 @@
-"""Functions of rows as lists of operations, from which engines in other languages are written.
+"""Functions of rows as lists of operations: these are differentiated, and written in other languages.
 
 The function `row` of a declaration is straight arithmetic with elementary functions, and loops over numbers that are
 known. Run on symbols it writes down what it does.
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.functions.formula import Formula
 from kcons.errors import UnsupportedError
 
 #: A number; or a position 'r', a parameter 'p', the time 't', or the result of a step 'k', and which one.
@@ -32,10 +31,14 @@ class Tape(NamedTuple):
     results: tuple[Operand, ...]
 
 
+#: Steps so far, each once, with their numbers.
+_Steps: TypeAlias = dict[tuple[str, tuple[Operand, ...]], int]
+
+
 class _Symbol(NDArrayOperatorsMixin):
     """A number that is not known, by its place; `steps` are those so far."""
 
-    def __init__(self, place: tuple[str, int], steps: list[Any]) -> None:
+    def __init__(self, place: tuple[str, int], steps: _Steps) -> None:
         self.place, self.steps = place, steps
 
     @property
@@ -67,8 +70,7 @@ class _Symbol(NDArrayOperatorsMixin):
             for _ in range(int(inputs[1]) - 1):
                 product = product * base
             return product
-        self.steps.append((name, tuple(given)))
-        return _Symbol(("k", len(self.steps) - 1), self.steps)
+        return _Symbol(("k", self.steps.setdefault((name, tuple(given)), len(self.steps))), self.steps)
 
 
 def _operand(given: Any) -> Operand:
@@ -78,7 +80,7 @@ def _operand(given: Any) -> Operand:
 class _Places:
     """Numbers of which the first are known."""
 
-    def __init__(self, name: str, steps: list[Any], known: Sequence[float] = ()) -> None:
+    def __init__(self, name: str, steps: _Steps, known: Sequence[float] = ()) -> None:
         self.name, self.steps, self.known = name, steps, known
 
     def __getitem__(self, k: int) -> Any:
@@ -102,7 +104,7 @@ def record(function: Callable[..., Any], known: Sequence[float] = (), remedy: st
     UnsupportedError
         The function branches, or calls what is no elementary function of NumPy.
     """
-    steps: list[Any] = []
+    steps: _Steps = {}
     out: dict[int, Any] = {}
     try:
         function(_Places("r", steps), _Places("p", steps, known), _Symbol(("t", 0), steps), out)
@@ -115,39 +117,77 @@ def record(function: Callable[..., Any], known: Sequence[float] = (), remedy: st
     return Tape(tuple(steps), results)
 
 
+#: What operations change by with each of their operands; y is their result.
+_PARTIALS: dict[str, Callable[..., tuple[Any, ...]]] = {
+    "add": lambda y, a, b: (1.0, 1.0),
+    "subtract": lambda y, a, b: (1.0, -1.0),
+    "multiply": lambda y, a, b: (b, a),
+    "divide": lambda y, a, b: (1.0 / b, -y / b),
+    "power": lambda y, a, b: (b * a ** (b - 1.0), y * np.log(a)),
+    "negative": lambda y, a: (-1.0,),
+    "absolute": lambda y, a: (np.copysign(1.0, a),),
+    "sqrt": lambda y, a: (0.5 / y,),
+    "exp": lambda y, a: (y,),
+    "log": lambda y, a: (1.0 / a,),
+    "sin": lambda y, a: (np.cos(a),),
+    "cos": lambda y, a: (-np.sin(a),),
+    "tan": lambda y, a: (1.0 + y * y,),
+    "sinh": lambda y, a: (np.cosh(a),),
+    "cosh": lambda y, a: (np.sinh(a),),
+    "tanh": lambda y, a: (1.0 - y * y,),
+    "arcsin": lambda y, a: (1.0 / np.sqrt(1.0 - a * a),),
+    "arccos": lambda y, a: (-1.0 / np.sqrt(1.0 - a * a),),
+    "arctan": lambda y, a: (1.0 / (1.0 + a * a),),
+    "arctan2": lambda y, a, b: (b / (a * a + b * b), -a / (a * a + b * b)),
+}
+
+
+def _times(a: Any, b: Any) -> Any:
+    for one, other in ((a, b), (b, a)):
+        if isinstance(one, float) and abs(one) == 1.0:
+            return other if one > 0 else -other
+    return a * b
+
+
+def differentiated(function: Callable[[Any, Any, Any], Any], places: int) -> Tape:
+    """The tape of a function of places r, parameters p and the time: value, derivatives by places, and by the time.
+
+    They are taken backwards through the steps.
+    """
+    steps: _Steps = {}
+
+    def number(operand: Operand) -> Any:
+        return _Symbol(operand, steps) if isinstance(operand, tuple) else np.float64(operand)
+
+    value = _operand(function(_Places("r", steps), _Places("p", steps), _Symbol(("t", 0), steps)))
+    slopes: dict[Operand, Any] = {value: 1.0}
+    for (name, operands), k in reversed(list(steps.items())):
+        if ("k", k) not in slopes:
+            continue
+        slope = slopes["k", k]
+        for operand, part in zip(operands, _PARTIALS[name](number(("k", k)), *map(number, operands)), strict=True):
+            if isinstance(operand, tuple):
+                own = _times(slope, part)
+                slopes[operand] = slopes[operand] + own if operand in slopes else own
+    by = [*(("r", k) for k in range(places)), ("t", 0)]
+    results = value, *(_operand(slopes.get(each, 0.0)) for each in by)
+    return Tape(tuple(steps), results)
+
+
 class Function(NamedTuple):
     """What rows are computed by. Rows of objects with the same function share its code.
 
-    `known` are the first parameters where they are the same in all rows; a formula is a function of `numbers` (how
-    many of positions, and of parameters), and `second` gives its rate, if the time is in it.
+    `known` are the first parameters where they are the same in all rows; `rate` is that of a `Constraint`.
     """
 
     row: Callable[..., Any]
     known: tuple[float, ...] = ()
-    second: Callable[..., Any] | None = None
-    numbers: tuple[int, int] = (0, 0)
+    rate: Callable[..., Any] | None = None
     is_distance: bool = False
 
     def tape(self, remedy: str = "") -> Tape:
         """See `record`."""
-        places, parameters = self.numbers
-
-        def formula(r: Any, p: Any, t: Any, out: Any) -> None:
-            given = [*(r[k] for k in range(places)), t, *(p[k] for k in range(parameters))]
-            out.update(enumerate(self.row(*given)))
-
-        return record(formula if places else self.row, self.known, remedy)
-
-    def rate_tape(self, remedy: str = "") -> Tape:
-        """That of dq/dt, at rest, of a formula with the time in it."""
-        places, parameters = self.numbers
-
-        def rate(r: Any, p: Any, t: Any, out: Any) -> None:
-            assert self.second is not None
-            here = [r[k] for k in range(places)]
-            out[0] = self.second(*here, *[0.0] * places, t, *(p[k] for k in range(parameters)))[1]
-
-        return record(rate, (), remedy)
+        return record(self.row, self.known, remedy)
 
 
 @cache
@@ -165,11 +205,7 @@ def function_of(item: Constraint) -> Function | None:
     """The function of an object's rows; None where only Python can compute them."""
     if item.functions or (item.row is None and item.kind is not RowKind.LINEAR):
         return None
-    if isinstance(item, Formula):
-        code = item.code()
-        numbers = (3 if item.holonomic else 6) * item.width, len(item.names)
-        return Function(code.first, (), code.second if item.holonomic and code.moving else None, numbers)
     if item.row is None:
         return Function(_linear(3 * item.width))
-    known = [float(item.width)] if item.uses_masses else item.parameters()[0, : item.alike].tolist()
-    return Function(item.row, tuple(known), is_distance=item.holds_length)
+    known = [float(item.width)] if item.uses_masses else item.parameters()[:1, : item.alike].ravel().tolist()
+    return Function(item.row, tuple(known), item.rate if item.holonomic else None, item.holds_length)

@@ -31,7 +31,7 @@ import scipy.sparse as sp
 
 from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
-from kcons.constraints.periodic.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
+from kcons.constraints.periodic.one_piece import BoolArray, connected, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import ImageError, InputError
 
@@ -139,25 +139,9 @@ def find_images(
 ) -> tuple[list[Constraint], Images | None]:
     """Sort rows into plain and whole ones and find the tree.
 
-    Parameters
-    ----------
-    constraints : sequence of Constraint
-        Targets may still be missing.
-    starts : ndarray of int
-        First row of each.
-    x : ndarray, shape (n_atoms, 3)
-    lattice : ndarray, shape (2, 3, 3), or None
-    half_width : float
-    time : float
-    ties : sequence of Constraint
-        What the constraints replace: rows that are held still and tie atoms together.
-
-    Returns
-    -------
-    constraints : list of Constraint
-        Copies that know which of their rows are whole, and the cell_offsets of these.
-    images : Images or None
-        None if all rows are plain.
+    Targets may still be missing; `starts` are the first rows, `ties` what the constraints replace: rows that are held
+    still and tie atoms together. Gives copies that know which of their rows are whole, with their cell_offsets, and the
+    tree, None if all rows are plain.
 
     Raises
     ------
@@ -357,14 +341,11 @@ class _Links:
 
 def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: float) -> None:
     """Lengths as found are right in pieces whose links, laid end to end, are shorter than half the cell."""
-    from scipy.sparse.csgraph import connected_components  # slow to import
-
     held = [table for table in tables if table.held]
     if not any(table.unsure.any() for table in held):
         return
     pairs = np.concatenate([table.item.atoms for table in held])
-    graph = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
-    piece = connected_components(graph, directed=False)[1]
+    piece, _ = connected(pairs, n_atoms)
     reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([t.lengths[:, 0] for t in held]))
     for table in held:
         table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
@@ -386,7 +367,7 @@ def _tree(
     InputError
         A link that is needed is as long as half the cell.
     """
-    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree  # slow to import
+    from scipy.sparse.csgraph import minimum_spanning_tree  # slow to import
 
     n_atoms = len(x)
     offered = [table.offered() for table in tables]
@@ -413,8 +394,8 @@ def _tree(
     if np.any(length[link] >= half_width):
         worst = int(link[np.argmax(length[link])])
         _refuse_long(given, int(row[worst]), pair[worst], float(length[worst]), half_width)
-    component = connected_components(forest, directed=False)[1].astype(np.int64)
-    longest = np.zeros(int(component.max(initial=-1)) + 1)
+    component, count = connected(pair[link], n_atoms)
+    longest = np.zeros(count)
     np.maximum.at(longest, component[pair[link, 0]], length[link])
     # Atoms that are fixed, or have a row of their own with a place in space, are not moved where that can be had.
     firm = np.zeros(n_atoms, bool)

@@ -74,6 +74,16 @@ def neighbor_lists(pairs: IntArray, n_atoms: int) -> tuple[IntArray, IntArray]:
     return start, ends[order, 1]
 
 
+def connected(pairs: IntArray, n_atoms: int) -> tuple[IntArray, int]:
+    """Number of the piece of each atom, counted from 0 in the order of their first atoms, and how many."""
+    from scipy.sparse.csgraph import connected_components  # slow to import
+
+    links = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
+    count, label = connected_components(links, directed=False)
+    _, first, number = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[number].astype(np.int64), int(count)
+
+
 def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) -> tuple[IntArray, IntArray]:
     """All atoms breadth first along pairs, and their parents, which come before them.
 
@@ -84,10 +94,9 @@ def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) 
     """
     if not len(pairs):
         return np.arange(n_atoms), np.arange(n_atoms)
-    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
+    from scipy.sparse.csgraph import breadth_first_order  # slow to import
 
-    graph = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
-    label = connected_components(graph, directed=False)[1]
+    label, _ = connected(pairs, n_atoms)
     order = np.arange(n_atoms) if roots is None else roots
     first = order[np.unique(label[order], return_index=True)[1]]
     # One more node, from which all pieces hang.

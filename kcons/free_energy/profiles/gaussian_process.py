@@ -19,11 +19,13 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve, cholesky
 from scipy.optimize import OptimizeResult, minimize, root
 
-from kcons.constraints.arguments import FloatArray
+from kcons.constraints.arguments import FloatArray, as_float_array
+from kcons.errors import InputError
 from kcons.thermostats import Estimate
 
 #: Of the diagonal, added to the covariance: rounding of a matrix of that size.
@@ -32,11 +34,15 @@ _ROUNDING = 1e-10
 _WIDE, _LOCAL = 1.5, 0.5
 #: Prior standard deviation of a constant gradient, in units of the largest gradient seen.
 _TREND = 10.0
+#: Step along the imaginary axis, exact but for rounding.
+_TINY = 1e-30
 #: Step of differences of logarithms of hyperparameters, least curvature of the likelihood that is believed, and the
 #: logarithm of the largest weight of a place against that of a normal distribution.
 _STEP, _FLATTEST, _HEAVIEST = 0.05, 0.5, 2.0
 #: By how much more the last parameter counts than the first where directions of the cubature are chosen.
 _TILT = 1e-3
+#: Part of the range of the windows below which places are the same.
+_SAME = 1e-9
 #: Largest logarithm of a parameter, and minus the log likelihood of those that are too smooth for double precision.
 _FURTHEST, _IMPOSSIBLE = 7.0, 1e30
 #: Lengths from which the search for the most likely ones starts, as parts of the range.
@@ -77,6 +83,30 @@ def difference(values: FloatArray, covariance: FloatArray) -> Estimate:
     """Of the second value from the first."""
     variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
     return Estimate(float(values[1] - values[0]), math.sqrt(max(float(variance), 0.0)))
+
+
+def inside(x: ArrayLike, low: FloatArray, high: FloatArray, periods: Sequence[float | None], item: str) -> FloatArray:
+    """Places (m, d) within the range of the windows; into it by periods where there is one.
+
+    Raises
+    ------
+    InputError
+        A wrong shape; a NaN or infinity; a place beyond the windows.
+    """
+    places = np.array(as_float_array(x, item))
+    if places.ndim != 2 or places.shape[1] != len(low) or not np.isfinite(places).all():
+        raise InputError(f"{item} must be finite numbers of shape (m, {len(low)})", item=item)
+    for column, a, b, period in zip(places.T, low, high, periods, strict=True):
+        outside = (column < a - _SAME * (b - a)) | (column > b + _SAME * (b - a))
+        if period is not None:
+            column[outside] = a + (column[outside] - a) % period
+        elif outside.any():
+            raise InputError(
+                f"{item} {column[outside][0]:g} is beyond the windows, which are between {a:g} and {b:g}; add a window "
+                "there",
+                item=item,
+            )
+    return np.clip(places, low, high)
 
 
 def _matern(square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -152,12 +182,12 @@ class GradientProcess:
     def slope(self, directions: FloatArray) -> FloatArray:
         """Derivatives of the log likelihood along directions in the space of parameters, shape (k, parameters).
 
-        Those of the covariance are complex steps, exact but for rounding.
+        Those of the covariance are complex steps.
         """
         inverse = cho_solve((self._root, True), np.eye(len(self._weights)), check_finite=False)
         kernel = 0.5 * (np.outer(self._weights, self._weights) - inverse)
-        steps = (self._prior(self.parameters + 1e-30j * direction) for direction in directions)
-        return np.array([float((kernel * step.imag).sum()) / 1e-30 for step in steps])
+        steps = (self._prior(self.parameters + _TINY * 1j * direction) for direction in directions)
+        return np.array([float((kernel * step.imag).sum()) / _TINY for step in steps])
 
     def _prior(self, parameters: FloatArray) -> FloatArray:
         """Covariance of the gradients seen, without their errors; complex where the parameters are."""
@@ -267,20 +297,17 @@ def learn(
     def process(p: FloatArray) -> GradientProcess:
         return GradientProcess(points, gradients, covariances, axes, p, trends)
 
-    def prior(p: FloatArray) -> tuple[float, FloatArray]:
-        """Of the parameters: minus the logarithm of its density, and the slope of that."""
-        value, slope = 0.5 * (p[0] / _WIDE) ** 2, np.zeros_like(p)
-        slope[0] = p[0] / _WIDE**2
-        ends = np.cumsum([1, *counts])
-        for own, out in zip(np.split(p[1:], ends[1:-1] - 1), np.split(slope[1:], ends[1:-1] - 1), strict=True):
+    def prior(p: FloatArray) -> Any:
+        """Minus the logarithm of the density of parameters, complex where these are."""
+        value = 0.5 * (p[0] / _WIDE) ** 2
+        for own in np.split(p[1:], np.cumsum(counts)[:-1]):
             level, bends = (own.mean() + math.log(_STARTS[0])) / _WIDE, np.diff(own) / _LOCAL
-            value += 0.5 * level**2 + 0.5 * float(bends @ bends)
-            out += level / (_WIDE * len(own)) - np.diff(bends, prepend=0.0, append=0.0) / _LOCAL
-        return value, slope
+            value += 0.5 * (level**2 + bends @ bends)
+        return value
 
     def unlikely(p: FloatArray) -> float:
         try:
-            return prior(p)[0] - process(p).log_likelihood()
+            return float(prior(p)) - process(p).log_likelihood()
         except np.linalg.LinAlgError:
             return _IMPOSSIBLE
 
@@ -293,8 +320,8 @@ def learn(
                 here = process(p)
             except np.linalg.LinAlgError:
                 return _IMPOSSIBLE, np.zeros_like(q)
-            value, slope = prior(p)
-            return value - here.log_likelihood(), slope @ directions - here.slope(directions.T)
+            slope = np.array([prior(p + _TINY * 1j * direction).imag / _TINY for direction in directions.T])
+            return float(prior(p)) - here.log_likelihood(), slope - here.slope(directions.T)
 
         options = {"ftol": 1e-12, "gtol": 1e-7, "maxiter": 200}
         bounds = [(-_FURTHEST, _FURTHEST)] * len(start)

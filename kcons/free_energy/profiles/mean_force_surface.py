@@ -19,9 +19,10 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from kcons.constraints.arguments import FloatArray, as_float_array, positive
+from kcons.constraints.target import nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
-from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, difference, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, difference, inside, learn
 from kcons.thermostats import Estimate
 
 #: Sizes of the field that is no gradient, relative to the gradient, among which the most likely one is looked for.
@@ -100,14 +101,13 @@ class Surface:
 
     def minima(self) -> list[Minimum]:
         """Minima inside of the range, lowest first; each is what a search from some window comes to."""
-        size = self.high - self.low
+        size, periods = self.high - self.low, np.array([period or 0.0 for period in self.periods])
         found: list[FloatArray] = []
         for start in self.windows:
-            place = self._wrapped(_descended(self._process, start, self.low, self.high, self.periods))
-            open_ends = np.array([period is None for period in self.periods])
-            if (open_ends & ((place <= self.low) | (place >= self.high))).any():
-                continue
-            if all(np.abs(self._away(place - other) / size).max() > _SAME for other in found):
+            (place,) = self._places(_descended(self._process, start, self.low, self.high, self.periods)[None])
+            at_an_end = (periods == 0) & ((place <= self.low) | (place >= self.high))
+            known = (np.abs(nearest_image(place - other, periods) / size).max() <= _SAME for other in found)
+            if not at_an_end.any() and not any(known):
                 found.append(place)
         if not found:
             return []
@@ -116,27 +116,7 @@ class Surface:
         return sorted(minima, key=lambda minimum: minimum.F)
 
     def _places(self, x: ArrayLike) -> FloatArray:
-        places = as_float_array(x, "x")
-        if places.ndim != 2 or places.shape[1] != len(self.low) or not np.isfinite(places).all():
-            raise InputError(f"places must be finite and have shape (m, {len(self.low)})", item="x")
-        slack = 1e-9 * (self.high - self.low)
-        for j, period in enumerate(self.periods):
-            outside = (places[:, j] < self.low[j] - slack[j]) | (places[:, j] > self.high[j] + slack[j])
-            if period is None and outside.any():
-                raise InputError(
-                    f"coordinate {j} of place {int(np.argmax(outside))} is beyond the windows, which are between "
-                    f"{self.low[j]:g} and {self.high[j]:g}",
-                    item="x",
-                )
-        return places
-
-    def _away(self, x: FloatArray) -> FloatArray:
-        """Differences, the shortest way round."""
-        return np.array([v if p is None else v - p * round(v / p) for v, p in zip(x, self.periods, strict=True)])
-
-    def _wrapped(self, x: FloatArray) -> FloatArray:
-        ends = zip(x, self.low, self.periods, strict=True)
-        return np.array([v if p is None else low + (v - low) % p for v, low, p in ends])
+        return inside(x, self.low, self.high, self.periods, "x")
 
 
 def fit_surface(

@@ -9,81 +9,51 @@ helps most.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import FloatArray, as_float_array, checked, positive, whole_number
+from kcons.constraints.arguments import FloatArray, checked, positive, whole_number
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
-from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, inside, learn
 from kcons.thermostats import Estimate
 
-#: Points of a profile unless they are given, and points at which a window may be proposed.
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Points of a profile, and points at which a window may be proposed.
 _POINTS = 201
 #: Windows from which on lengths are learned that differ from place to place, and coefficients of those.
 _MANY, _COEFFICIENTS = 7, 6
 #: Standard errors by which a closed profile may miss its beginning before that is warned of.
 _CLOSES = 4.0
+#: Colors of figures, color-blind safe (Okabe and Ito), and standard errors of their bands.
+_BLUE, _RED, _GREY, _BAND = "#0072B2", "#D55E00", "0.35", 2.0
 #: Part of the largest variance of a mean force that is rounding.
 _KNOWN = 1e-9
 #: Part of the range of the windows below which places are the same.
 _SAME = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class _Windows:
-    """Mean forces in the order of their places, and the process learned from them."""
-
-    x: FloatArray
-    f: FloatArray
-    e: FloatArray
-    period: float | None
-
-    @property
-    def end(self) -> float:
-        """Where the profile ends that begins at the first window."""
-        return float(self.x[-1] if self.period is None else self.x[0] + self.period)
-
-    @cached_property
-    def learned(self) -> Learned:
-        """Gaussian processes that need not close."""
-        low, many = float(self.x[0]), len(self.x) >= _MANY
-        axis = Axis(low, self.end - low, self.period is not None, _COEFFICIENTS if many else 1)
-        return learn(self.x[:, None], self.f[:, None], self.e[:, None, None] ** 2, [axis], [True])
-
-    @cached_property
-    def _learned_closed(self) -> Learned:
-        return self.learned.closed()
-
-    def process(self, closed: bool) -> Learned:
-        return self._learned_closed if closed else self.learned
-
-    def values(self, at: FloatArray, closed: bool) -> tuple[FloatArray, FloatArray]:
-        """Free energies up to a constant, and their covariance."""
-        return self.process(closed).posterior((at[:, None], [-1]))
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Profile:
-    """A free energy along one coordinate.
+    """A free energy along one coordinate, -kT ln of the probability density of x.
 
     Attributes
     ----------
-    x : ndarray, shape (m,)
-    F : ndarray, shape (m,)
-        Free energy less that at `zero`. As it comes from mean forces, -kT ln of the probability density of x.
-    error : ndarray, shape (m,)
+    x, F : ndarray, shape (201,)
+        Places from the first window to the last, and the free energy there; 0 at `zero`.
+    error : ndarray, shape (201,)
         Standard errors of these differences.
-    covariance : ndarray, shape (m, m)
+    covariance : ndarray, shape (201, 201)
         Of these differences.
     zero : float
     windows, mean_forces, mean_force_errors : ndarray, shape (n,)
         What it was made of, in order. Mean forces are dF/dx.
+    period : float or None
     closure : Estimate or None
         Integral of dF/dx over the period, which should be 0, before the profile was closed.
     """
@@ -96,9 +66,9 @@ class Profile:
     windows: FloatArray
     mean_forces: FloatArray
     mean_force_errors: FloatArray
+    period: float | None
     closure: Estimate | None
-    _known: _Windows
-    _added: Callable[[FloatArray], FloatArray] | None = None
+    _process: Learned
 
     def __repr__(self) -> str:
         ends = f"{self.windows[0]:.6g} to {self.windows[-1]:.6g}"
@@ -114,69 +84,14 @@ class Profile:
         end = f"from {low:.4g} to {high:.4g} F rises by {rise.value:.4g} +- {rise.error:.2g}"
         return "\n".join([f"{'window':>10} {'dF/dx':>11}{'':13} {'F':>10}", *rows, end])
 
-    def _values(self, at: FloatArray) -> tuple[FloatArray, FloatArray]:
-        F, covariance = self._known.values(at, self._known.period is not None)
-        return F if self._added is None else F + self._added(at), covariance
-
     def difference(self, a: float, b: float) -> Estimate:
         """F(b) - F(a) with its standard error."""
-        return difference(*self._values(_places([a, b], self._known, "ends of the difference")))
+        ends = inside([[a], [b]], self.x[:1], self.x[-1:], [self.period], "ends of the difference")
+        return difference(*self._process.posterior((ends, [-1])))
 
-    def lower_than(self, energy: float, at: FloatArray | None = None) -> NDArray[np.bool_]:
-        """At which places (those of the profile by default) F is at most so much above its lowest value there."""
-        F = self.F if at is None else self._values(at)[0]
-        return np.asarray(F - F.min() <= energy)
-
-    def without_jacobian(
-        self, jacobian: Literal["distance", "angle"] | Callable[[FloatArray], FloatArray], thermal_energy: float
-    ) -> Profile:
-        """The 'geometric' free energy, -kT ln(P(x)/J(x)) = F + kT ln J(x).
-
-        Two definitions are in use. F = -kT ln P(x) has in it how much room there is at x: two particles that do not
-        interact have F = -2 kT ln r. Divided by the Jacobian J, P is a density in Cartesian coordinates, and these
-        particles have a constant W = F + 2 kT ln r (the potential of mean force of the theory of liquids).
-        Differences of F give rates and populations along x; W goes to 0 at large distances.
-
-        Parameters
-        ----------
-        jacobian : {'distance', 'angle'} or callable
-            J = x^2 of a distance in three dimensions; J = sin x of an angle in radian; any other J(x), positive.
-        thermal_energy : float
-            kT in the unit of F.
-
-        Raises
-        ------
-        InputError
-            J is not positive somewhere; kT is not positive; this profile has a Jacobian taken out already.
-        """
-        if self._added is not None:
-            raise InputError("the Jacobian has been taken out of this profile already", item="jacobian")
-        kT = positive(thermal_energy, "thermal_energy")
-        known = {"distance": np.square, "angle": np.sin}
-        J = known.get(jacobian) if isinstance(jacobian, str) else jacobian
-        if J is None:
-            raise InputError(f"unknown jacobian {jacobian!r}; give 'distance', 'angle' or J(x)", item="jacobian")
-
-        def added(x: FloatArray) -> FloatArray:
-            factor = np.asarray(J(x), dtype=float)
-            if not (np.isfinite(factor) & (factor > 0)).all():
-                worst = x[np.argmin(np.where(np.isfinite(factor), factor, -np.inf))]
-                raise InputError(f"the Jacobian is not positive at {worst:g}", item="jacobian")
-            return kT * np.log(factor)
-
-        if jacobian == "distance" and self.x.min() <= 0:
-            raise InputError(
-                f"there is no distance of {self.x.min():g}; give the J(x) of this coordinate", item="jacobian"
-            )
-        shift = added(np.append(self.x, self.zero))
-        return replace(self, F=self.F + shift[:-1] - shift[-1], _added=added)
-
-    def added_slope(self, at: FloatArray) -> FloatArray:
-        """What `without_jacobian` added to dF/dx, shape of `at`; 0 where it was not asked for."""
-        if self._added is None:
-            return np.zeros_like(at)
-        step = 1e-6 * np.ptp(self.windows)
-        return (self._added(at + step) - self._added(at - step)) / (2 * step)
+    def lower_than(self, energy: float) -> NDArray[np.bool_]:
+        """At which places of the profile F is at most so much above its lowest value."""
+        return np.asarray(self.F - self.F.min() <= energy)
 
     def next_windows(self, count: int, *, below: float | None = None) -> list[float]:
         """Where more windows would tell most, if they were sampled as long as those that are there.
@@ -192,15 +107,13 @@ class Profile:
             Only places count where the free energy is this much above its lowest value or less: rates and populations
             do not depend on the others.
         """
-        known = self._known
-        grid = np.linspace(known.x[0], known.end, _POINTS)
-        aims = grid
+        grid = aims = self.x
         if below is not None:
             if not below > 0:
                 raise InputError(f"below is {below}; give a positive energy", item="below")
-            aims = grid[self.lower_than(below, grid)]
-        covariance = known.process(known.period is not None).posterior((aims[:, None], [-1]), (grid[:, None], [0]))[1]
-        noise = np.interp(grid, known.x, known.e**2, period=known.period)
+            aims = grid[self.lower_than(below)]
+        covariance = self._process.posterior((aims[:, None], [-1]), (grid[:, None], [0]))[1]
+        noise = np.interp(grid, self.windows, self.mean_force_errors**2, period=self.period)
         m = len(aims)
         # What is known exactly has a variance of rounding, from which nothing more is to be learned.
         least = _KNOWN * float((np.diag(covariance)[m:] + noise).max())
@@ -218,13 +131,7 @@ class Profile:
 
 @checked
 def integrate(
-    x: ArrayLike,
-    f: ArrayLike,
-    e: ArrayLike,
-    *,
-    period: float | None = None,
-    zero: float | None = None,
-    at: ArrayLike | None = None,
+    x: ArrayLike, f: ArrayLike, e: ArrayLike, *, period: float | None = None, zero: float | None = None
 ) -> Profile:
     """Free energy along a coordinate from the mean forces of windows.
 
@@ -241,8 +148,6 @@ def integrate(
         how far the mean forces were from that.
     zero : float, optional
         Where F is 0; by default where it is lowest.
-    at : array_like, shape (m,), optional
-        Where F is given; by default at 201 points from the first window to the last.
 
     Raises
     ------
@@ -255,29 +160,31 @@ def integrate(
     UserWarning
         The integral over the period is more than 4 standard errors from 0: some mean force is wrong, or its error.
     """
-    known = _windows(x, f, e, period)
-    points = np.linspace(known.x[0], known.end, _POINTS) if at is None else _places(at, known, "at")
-    closure = None
+    places, forces, errors = _windows(x, f, e, period)
+    low, high = float(places[0]), float(places[-1] if period is None else places[0] + period)
+    axis = Axis(low, high - low, period is not None, _COEFFICIENTS if len(places) >= _MANY else 1)
+    process, closure = learn(places[:, None], forces[:, None], errors[:, None, None] ** 2, [axis], [True]), None
     if period is not None:
-        closure = difference(*known.values(np.array([known.x[0], known.end]), False))
-        if abs(closure.value) > _CLOSES * closure.error and abs(closure.value) > 1e-9 * period * np.abs(known.f).max():
+        closure = difference(*process.posterior((np.array([[low], [high]]), [-1])))
+        if abs(closure.value) > _CLOSES * closure.error and abs(closure.value) > 1e-9 * period * np.abs(forces).max():
             warnings.warn(
                 f"the mean force has the integral {closure.value:.4g} ± {closure.error:.2g} over the period, which "
                 "should be 0: a window has not forgotten where it started from, or its error is too small",
                 UserWarning,
                 stacklevel=2,
             )
+        process = process.closed()
+    grid = np.linspace(low, high, _POINTS)
     if zero is None:
-        inner = np.linspace(known.x[0], known.end, _POINTS)
-        zero = float(inner[np.argmin(known.values(inner, period is not None)[0])])
-    places = np.append(points, _places([zero], known, "zero"))
-    F, covariance = known.values(places, period is not None)
+        zero = float(grid[np.argmin(process.mean(grid[:, None], [-1])[0])])
+    at = np.append(grid[:, None], inside([[zero]], grid[:1], grid[-1:], [period], "zero"), axis=0)
+    F, covariance = process.posterior((at, [-1]))
     less = covariance[:-1, :-1] - covariance[:-1, -1:] - covariance[-1:, :-1] + covariance[-1, -1]
     error = np.sqrt(np.maximum(np.diag(less), 0.0))
-    return Profile(points, F[:-1] - F[-1], error, less, zero, known.x, known.f, known.e, closure, known)
+    return Profile(grid, F[:-1] - F[-1], error, less, zero, places, forces, errors, period, closure, process)
 
 
-def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> _Windows:
+def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> list[FloatArray]:
     """Windows in order; those at one place are one, with the weights that their errors give them."""
     arrays = [finite(values, name, "window") for values, name in ((x, "x"), (f, "f"), (e, "e"))]
     for array, name in zip(arrays, "xfe", strict=True):
@@ -286,23 +193,26 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
     place, force, error = arrays
     if (error < 0).any():
         raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
-    if period is not None:
+    count = len(np.unique(place))
+    if period is not None and count:
         positive(period, "period")
-        if len(place) and np.ptp(place) > period * (1 + _SAME):
+        if np.ptp(place) > period * (1 + _SAME):
             raise InputError(
                 f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
                 item="period",
             )
-        place = place.min() + (place - place.min()) % period if len(place) else place
-        place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place) if len(place) else place
-    # Places that differ by rounding are one.
-    order = np.argsort(place, kind="stable")
-    new = np.diff(place[order], prepend=-np.inf) > _SAME * np.ptp(place) if len(place) else np.zeros(0, dtype=bool)
-    places, which = place[order][new], np.zeros(len(place), dtype=np.int64)
-    which[order] = np.cumsum(new) - 1
-    if len(places) < 3:
-        raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
-    for k in np.flatnonzero(np.bincount(which[error == 0], minlength=len(places)) > 1):
+        place = place.min() + (place - place.min()) % period
+        place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
+    if count >= 3:
+        # Places that differ by rounding are one.
+        order = np.argsort(place, kind="stable")
+        new = np.diff(place[order], prepend=-np.inf) > _SAME * np.ptp(place)
+        places, which = place[order][new], np.zeros(len(place), dtype=np.int64)
+        which[order] = np.cumsum(new) - 1
+        count = len(places)
+    if count < 3:
+        raise InputError(f"{count} different windows are too few for a profile; give 3 or more", item="x")
+    for k in np.flatnonzero(np.bincount(which[error == 0], minlength=count) > 1):
         exact = force[(which == k) & (error == 0)]
         if np.ptp(exact) > 1e-9 * np.abs(exact).max():
             raise InputError(
@@ -311,29 +221,35 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
                 item="e",
             )
     # Errors of 0 among others: exact values count alone.
-    weights = (
-        1.0 / np.maximum(error, 1e-12 * max(float(error.max()), np.finfo(float).tiny)) ** 2
-        if error.any()
-        else np.ones(len(error))
-    )
+    weights = 1.0 / np.maximum(error, 1e-12 * float(error.max()) or 1.0) ** 2
     total = np.bincount(which, weights)
     together = np.bincount(which, weights * force) / total
-    errors = np.sqrt(np.bincount(which, (weights * error) ** 2)) / total
-    return _Windows(places, together, errors, period)
+    return [places, together, np.sqrt(np.bincount(which, (weights * error) ** 2)) / total]
 
 
-def _places(at: ArrayLike, known: _Windows, item: str) -> FloatArray:
-    """Places within the range of the windows; into it by periods where there is one."""
-    points = as_float_array(at, item)
-    if points.ndim != 1 or not np.isfinite(points).all():
-        raise InputError(f"{item} must be a list of finite numbers", item=item)
-    low, high = float(known.x[0]), known.end
-    slack = _SAME * (high - low)
-    if known.period is not None:
-        outside = (points < low - slack) | (points > high + slack)
-        points = np.where(outside, low + (points - low) % known.period, points)
-    elif (points < low - slack).any() or (points > high + slack).any():
-        raise InputError(
-            f"{item} goes beyond the windows, which are between {low:g} and {high:g}; add a window there", item=item
-        )
-    return np.clip(points, low, high)
+def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "energy") -> Figure:
+    """The free energy with two standard errors above; below, what it was made of: mean forces of the windows.
+
+    `coordinate` and `energy` are what the axes say.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 6.0), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    for each in (above, below):
+        each.grid(True, alpha=0.3)
+    low, high = profile.F - _BAND * profile.error, profile.F + _BAND * profile.error
+    above.fill_between(profile.x, low, high, color=_BLUE, alpha=0.25, linewidth=0, label=f"± {_BAND:g} standard errors")
+    above.plot(profile.x, profile.F, color=_BLUE, label="F")
+    places = profile.windows[:, None] * np.ones((1, 2))
+    above.plot(places.T, np.tile([[0.0], [0.04]], len(places)), color=_GREY, transform=above.get_xaxis_transform())
+    above.set_ylabel(f"F / {energy}")
+    above.legend(fontsize=8)
+    slope = np.gradient(profile.F, profile.x)
+    below.plot(profile.x, slope, color=_BLUE, linewidth=1.0, label="slope of F")
+    how: dict[str, Any] = {"color": _RED, "fmt": "o", "markersize": 4, "capsize": 2, "label": "windows"}
+    below.errorbar(profile.windows, profile.mean_forces, _BAND * profile.mean_force_errors, **how)
+    below.axhline(0.0, color=_GREY, linewidth=0.8)
+    below.set(xlabel=coordinate, ylabel=f"dF/dx / ({energy}/unit of x)")
+    below.legend(fontsize=8)
+    return figure

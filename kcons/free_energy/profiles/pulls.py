@@ -7,7 +7,7 @@ error (Bennett, J. Comput. Phys. 22, 245 (1976); Shirts et al., Phys. Rev. Lett.
 
 A coordinate that is held rather than pulled by a spring is where its target is: no other ensemble has to be unfolded.
 What is found is the free energy of the held system. That of the coordinate, -kT ln P, has -kT ln <Z^(-1/2)> beside it,
-which `work_profile` adds if the weights of the series are given.
+which `Windows.pull` adds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, logsumexp
 
-from kcons.constraints.arguments import FloatArray, IntArray, Rng, as_float_array, generator_of, positive
+from kcons.constraints.arguments import FloatArray, positive
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite, pymbar
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
@@ -60,9 +60,7 @@ class Pulled:
         return self.jarzynski if self.bar is None else self.bar
 
 
-def pull_free_energy(
-    forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float, rng: Rng = 0
-) -> Pulled:
+def pull_free_energy(forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float) -> Pulled:
     """Difference of free energy from the works of pulls.
 
     Errors are those of a bootstrap over pulls; that of BAR is its asymptotic one.
@@ -75,8 +73,6 @@ def pull_free_energy(
         Work done on the system by pulls from end to start, each from equilibrium at the end.
     thermal_energy : float
         kT in the unit of the works.
-    rng : int, numpy.random.Generator or None
-        Of the bootstrap.
 
     Raises
     ------
@@ -92,8 +88,8 @@ def pull_free_energy(
         or gain work, as those of the wrong sign do.
     """
     kT = positive(thermal_energy, "thermal_energy")
-    ahead, generator = _works(forward, "forward", kT), generator_of(rng)
-    drawn = ahead[generator.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
+    ahead = _works(forward, "forward") / kT
+    drawn = ahead[np.random.default_rng(0).integers(len(ahead), size=(_SAMPLES, len(ahead)))]
     jarzynski = Estimate(kT * float(_jarzynski(ahead)), kT * float(_jarzynski(drawn).std(ddof=1)))
     effective = math.exp(2 * logsumexp(-ahead) - logsumexp(-2 * ahead))
     if backward is None:
@@ -105,7 +101,7 @@ def pull_free_energy(
                 stacklevel=2,
             )
         return Pulled(jarzynski, effective)
-    back = _works(backward, "backward", kT)
+    back = _works(backward, "backward") / kT
     difference, error = _bar(ahead, back)
     overlap = _overlap(ahead, back, difference)
     if overlap < _OVERLAP:
@@ -127,65 +123,6 @@ def pull_free_energy(
     return Pulled(jarzynski, effective, Estimate(kT * difference, kT * error), overlap)
 
 
-def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
-    """Work done up to each place of a path, by the trapezoidal rule: the integral of the force on the target over it.
-
-    Parameters
-    ----------
-    x : array_like, shape (m,)
-        Where the target was.
-    force : array_like, shape (m,) or (n, m)
-        What moves the coordinate, in n pulls: the multiplier with the sign of dF/dx.
-
-    Returns
-    -------
-    ndarray, shape of `force`
-    """
-    path, pushes = as_float_array(x, "x"), as_float_array(force, "force")
-    if path.ndim != 1 or len(path) < 2 or pushes.ndim not in (1, 2) or pushes.shape[-1] != len(path):
-        raise InputError(f"forces of shape {pushes.shape} do not go with a path of shape {path.shape}", item="force")
-    if not (np.isfinite(path).all() and np.isfinite(pushes).all()):
-        raise InputError("a place or a force of the path is not finite", item="force")
-    done = np.cumsum(0.5 * (pushes[..., 1:] + pushes[..., :-1]) * np.diff(path), axis=-1)
-    return np.concatenate([np.zeros((*pushes.shape[:-1], 1)), done], axis=-1)
-
-
-def work_profile(
-    works: ArrayLike, *, thermal_energy: float, log_weights: ArrayLike | None = None, rng: Rng = 0
-) -> tuple[FloatArray, FloatArray]:
-    """Free energy along the path of forward pulls, against its start, with bootstrapped errors.
-
-    F(x) - F(0) = -kT ln(<exp(-W/kT) w>/<w at the start>), place by place.
-
-    Parameters
-    ----------
-    works : array_like, shape (n, m)
-        Work up to each of m places, of n pulls: see `work_along`.
-    thermal_energy : float
-    log_weights : array_like, shape (n, m), optional
-        ln Z^(-1/2) at each place: then F is -kT ln P of the coordinate. Without, it is that of the held system.
-    rng : int, numpy.random.Generator or None
-
-    Returns
-    -------
-    F, errors : ndarray, shape (m,)
-    """
-    done = as_float_array(works, "works")
-    if done.ndim != 2 or not done.shape[1]:
-        raise InputError(f"works must have shape (n, m), not {done.shape}", item="works")
-    reduced = np.stack([_works(column, "works", thermal_energy) for column in done.T], axis=1)
-    weights = np.zeros_like(reduced) if log_weights is None else as_float_array(log_weights, "log_weights")
-    if weights.shape != reduced.shape or not np.isfinite(weights).all():
-        raise InputError(f"log_weights must be finite and have shape {reduced.shape}", item="log_weights")
-
-    def along(chosen: IntArray | slice) -> FloatArray:
-        return np.asarray(logsumexp(weights[chosen, 0], axis=0) - logsumexp(weights[chosen] - reduced[chosen], axis=0))
-
-    generator, n = generator_of(rng), len(reduced)
-    sampled = np.array([along(generator.integers(n, size=n)) for _ in range(_SAMPLES)])
-    return thermal_energy * along(slice(None)), thermal_energy * sampled.std(axis=0, ddof=1)
-
-
 def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
     """Difference and its error, over kT. Works without a spread, where pymbar finds no bounds, are the difference."""
     if max(np.ptp(ahead), np.ptp(back)) > _NO_SPREAD:
@@ -201,12 +138,11 @@ def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
     return float(ahead.mean() - back.mean()) / 2, 0.0
 
 
-def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:
-    """Works over kT."""
+def _works(works: ArrayLike, item: str) -> FloatArray:
     values = finite(works, item, "work")
     if values.ndim != 1 or len(values) < MIN_PULLS:
         raise InputError(f"{item} has works of shape {values.shape}; give {MIN_PULLS} pulls or more", item=item)
-    return values / positive(thermal_energy, "thermal_energy")
+    return values
 
 
 def _jarzynski(works: FloatArray) -> FloatArray:

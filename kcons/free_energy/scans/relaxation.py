@@ -144,11 +144,6 @@ class Internals:
                 table[mine, self._straight[:, 1]] -= slope
         return table.reshape(len(table), 3 * self.n_atoms)
 
-    def hessian(self, x: FloatArray) -> FloatArray:
-        """Of the model with its minimum at `x`, in eV/angstrom^2, shape (3 n_atoms, 3 n_atoms)."""
-        table = self.jacobian(x)
-        return np.asarray(table.T @ (self.constants[:, None] * table))
-
 
 #: Energy in eV and forces in eV/angstrom at positions, shape (n_atoms, 3).
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray]]
@@ -209,11 +204,9 @@ class _Place:
 
     @one_thread()
     def __init__(self, descent: Descent, x: FloatArray, energy: float, forces: FloatArray) -> None:
-        self.x, self.energy = x, energy
+        self.x, self.energy, slope = x, energy, -forces.ravel()
         columns, internals = descent.columns, descent.internals
-        slope = -forces.ravel()
-        held = descent.motion.constraint_set
-        rows = held.jacobian(x).toarray()[:, columns]
+        rows = descent.motion.constraint_set.jacobian(x).toarray()[:, columns]
         size = np.linalg.norm(rows, axis=1, keepdims=True)
         _, weights, basis = np.linalg.svd(rows / np.where(size > 0, size, 1.0))
         #: Orthonormal directions along the constraints, shape (columns, d).
@@ -230,9 +223,15 @@ class _Place:
 
 
 class Descent:
-    """Quasi-Newton steps on constraints, in internal coordinates."""
+    """Quasi-Newton steps on constraints, in internal coordinates of a structure nearby.
 
-    def __init__(self, motion: Motion, evaluate: Evaluate, internals: Internals, memory: FloatArray | None) -> None:
+    `memory` is that of a relaxation nearby, in the same internal coordinates (J. M. Bofill, Int. J. Quantum Chem. 94,
+    324 (2003); E. D. Hermes et al., J. Chem. Theory Comput. 18, 6974 (2022)).
+    """
+
+    def __init__(
+        self, motion: Motion, evaluate: Evaluate, internals: Internals, memory: FloatArray | None = None
+    ) -> None:
         self.motion, self.evaluate, self.internals = motion, evaluate, internals
         #: What was learned, move by move: vectors u and w of internal coordinates and numbers c, see `_learned`.
         self._updates: list[tuple[FloatArray, FloatArray, float]] = []
@@ -246,12 +245,29 @@ class Descent:
                 free[item.atoms.ravel()] = False
         self.columns: IntArray = np.flatnonzero(np.repeat(free, 3))
 
-    def place(self, x: FloatArray) -> _Place:
+    def relaxed(self, x: FloatArray, fmax: float, most: int = 200) -> Relaxed:
+        """Follow the forces on the constraints to a minimum of the energy, by at most so many evaluations.
+
+        Raises
+        ------
+        ConvergenceError
+            Too many evaluations, or forces that are not the gradient of the energy; `error.positions` is the last
+            place.
+        """
+        try:
+            with np.errstate(all="ignore"):
+                return self._relaxed(x, fmax, most)
+        except np.linalg.LinAlgError as error:
+            raise ConvergenceError(
+                "an angle became straight, or two atoms met, where internal coordinates are undefined; start elsewhere"
+            ) from error
+
+    def _place(self, x: FloatArray) -> _Place:
         self.evaluations += 1
         return _Place(self, x, *self.evaluate(x))
 
-    def relaxed(self, x: FloatArray, fmax: float, most: int) -> Relaxed:
-        here, radius = self.place(x), FIRST
+    def _relaxed(self, x: FloatArray, fmax: float, most: int) -> Relaxed:
+        here, radius = self._place(x), FIRST
         while here.largest > fmax:
             if self.evaluations >= most:
                 raise self._given_up(here, fmax, f"{most} evaluations; allow more, or start nearer to the minimum")
@@ -268,7 +284,7 @@ class Descent:
             except KconsError:  # too far for the rows
                 radius /= 4
                 continue
-            there = self.place(x)
+            there = self._place(x)
             move = self.internals.change(there.values, here.values)
             self._learn(np.stack([move, there.slopes - here.slopes]))
             gain = there.energy - here.energy
@@ -303,19 +319,16 @@ class Descent:
         size = np.maximum(np.abs(curvature), FLAT)
         slopes = modes.T @ here.left
 
-        def at(shift: float) -> FloatArray:
-            return np.asarray(-slopes / (size + shift))
+        def too_long(shift: float) -> bool:
+            return _longest(here.along @ (modes @ (-slopes / (size + shift)))) > radius
 
-        def longest(step: FloatArray) -> float:
-            return _longest(here.along @ (modes @ step))
-
-        step = at(0.0)
-        if longest(step) > radius:
-            low, high = 0.0, float(np.linalg.norm(slopes)) / radius
+        shift = 0.0
+        if too_long(shift):
+            low, shift = 0.0, float(np.linalg.norm(slopes)) / radius
             for _ in range(30):
-                middle = 0.5 * (low + high)
-                low, high = (middle, high) if longest(at(middle)) > radius else (low, middle)
-            step = at(high)
+                middle = 0.5 * (low + shift)
+                low, shift = (middle, shift) if too_long(middle) else (low, middle)
+        step = -slopes / (size + shift)
         return here.along @ (modes @ step), float(slopes @ step + 0.5 * step @ (curvature * step))
 
     @one_thread()
@@ -356,49 +369,3 @@ class Descent:
 
 def _longest(move: FloatArray) -> float:
     return float(np.linalg.norm(move.reshape(-1, 3), axis=1).max(initial=0.0))
-
-
-def relax(
-    motion: Motion,
-    evaluate: Evaluate,
-    internals: Internals,
-    x: FloatArray,
-    *,
-    fmax: float,
-    memory: FloatArray | None = None,
-    evaluations: int = 200,
-) -> Relaxed:
-    """Follow the forces on the constraints to a minimum of the energy.
-
-    Parameters
-    ----------
-    motion : Motion
-    evaluate : callable
-        ``evaluate(x)``: energy in eV, forces in eV/angstrom, shape (n_atoms, 3).
-    internals : Internals
-        Of a structure near `x`.
-    x : ndarray, shape (n_atoms, 3)
-        On the constraints.
-    fmax : float
-        The largest force along the constraints that may be left on an atom, in eV/angstrom.
-    memory : ndarray, shape (m, 2, n), optional
-        That of a relaxation nearby, in the same internal coordinates.
-    evaluations : int
-        Give up after so many.
-
-    Raises
-    ------
-    ConvergenceError
-        Too many evaluations, or forces that are not the gradient of the energy; `error.positions` is the last place.
-
-    References
-    ----------
-    J. M. Bofill, Int. J. Quantum Chem. 94, 324 (2003); E. D. Hermes et al., J. Chem. Theory Comput. 18, 6974 (2022).
-    """
-    try:
-        with np.errstate(all="ignore"):
-            return Descent(motion, evaluate, internals, memory).relaxed(x, fmax, evaluations)
-    except np.linalg.LinAlgError as error:
-        raise ConvergenceError(
-            "an angle became straight, or two atoms met, where internal coordinates are undefined; start elsewhere"
-        ) from error

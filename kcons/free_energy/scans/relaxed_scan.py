@@ -35,7 +35,7 @@ from kcons.errors import (
     KconsError,
     NonFiniteError,
 )
-from kcons.free_energy.scans.relaxation import FIRST, Internals, relax
+from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals
 from kcons.free_energy.scans.scan_result import Attempt, Attempts, Grid, Point, Scan
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.minimization import minimize
@@ -129,13 +129,16 @@ class _Surface:
         held = [*translated(atoms, [item for item in atoms.constraints if item not in forces_only]), *held]
         self.atoms.set_constraint(forces_only)
         self.start = self.atoms.get_positions()
+        #: At the start, without calculator and constraints.
+        self.bare = self.atoms.copy()
+        self.bare.set_constraint()
         kept = Constraints(held)
-        rank = self._engine(kept).rank
+        rank = kept.engine(self.bare).rank
         #: With the targets that were left open.
         self.held = list(kept.constraints)
         for n, item in enumerate(grid.coordinates):
             # Says what is undefined at the start, and which atoms there are not.
-            with_it = self._engine(Constraints([*self.held, *(c.with_target(None) for c in grid.coordinates[: n + 1])]))
+            with_it = self._engine([*self.held, *(c.with_target(None) for c in grid.coordinates[: n + 1])])
             if with_it.rank != rank + n + 1:
                 raise ConstraintError(
                     f"{item.row_name(0)} depends on what else is held; it cannot take other values. Leave out "
@@ -145,23 +148,19 @@ class _Surface:
             r = self.start[item.atoms]
             for v in grid.values[n]:
                 item.with_target(float(v)).check(r, 0.0, 0)
-        measured = self._engine(Constraints([c.with_target(None) for c in grid.coordinates])).constraint_set
+        measured = self._engine([c.with_target(None) for c in grid.coordinates]).constraint_set
         self.place = [float(v) for v in measured.measure(self.start)]
         self._bonds = bonds_of(self.atoms)
         warn_of_gaps({item.row_name(0): item for item in grid.coordinates}, self._bonds)
 
-    def _engine(self, constraints: Constraints) -> Motion:
-        bare = self.atoms.copy()
-        bare.set_constraint()
-        bare.positions[:] = self.start
-        return constraints.engine(bare)
+    def _engine(self, rows: list[Constraint]) -> Motion:
+        return Constraints(rows).engine(self.bare)
 
     def evaluate(self, x: FloatArray) -> tuple[float, FloatArray]:
         """Energy and forces."""
         self.atoms.set_positions(x, apply_constraint=False)
         try:
-            energy = float(self.atoms.get_potential_energy())
-            forces = applied_forces(self.atoms)
+            energy, forces = float(self.atoms.get_potential_energy()), applied_forces(self.atoms)
         except InputError:
             raise
         except Exception as error:
@@ -183,31 +182,24 @@ class _Surface:
         if reset is not None:
             # What a calculator remembers, such as a density, would make the bits depend on what was done before.
             reset()
-        constraints = [*self.held, *self.grid.held_at(attempt.point)]
-        motion = self._engine(Constraints(constraints))
+        motion = self._engine([*self.held, *self.grid.held_at(attempt.point)])
         try:
             x = motion.restore_positions(before, bonds=self._bonds)
         except InfeasibleError:
             # In rings, other angles have to change, which the relaxation puts right.
             x = motion.restore_positions(before, bonds=[])
         if len(x) > MOST_ATOMS:
-            calls = 0
-
-            def force(y: FloatArray, _: float) -> FloatArray:
-                nonlocal calls
-                calls += 1
-                return self.evaluate(y)[1]
-
-            found = minimize(motion, force, x, tolerance=fmax, longest=FIRST, steps=evaluations)
-            energy, _ = self.evaluate(found.positions)
-            attempt.positions, attempt.energy, attempt.largest = found.positions, energy, found.largest
-            attempt.evaluations = calls
+            found = minimize(
+                motion, lambda y, _: self.evaluate(y)[1], x, tolerance=fmax, longest=FIRST, steps=evaluations
+            )
+            attempt.positions, attempt.largest = found.positions, found.largest
+            attempt.evaluations, attempt.energy = found.evaluations, self.evaluate(found.positions)[0]
             return
         internals = Internals(self.atoms.numbers, x, motion.lattice)
         memory = None
         if source is not None and len(source.memory):
             memory = internals.remapped(source.memory, source.terms)
-        done = relax(motion, self.evaluate, internals, x, fmax=fmax, memory=memory, evaluations=evaluations)
+        done = Descent(motion, self.evaluate, internals, memory).relaxed(x, fmax, evaluations)
         for name in ("positions", "energy", "largest", "evaluations", "memory"):
             setattr(attempt, name, getattr(done, name))
         attempt.terms = internals.terms
@@ -220,11 +212,8 @@ class _Wavefront:
         self, surface: _Surface, grid: Grid, attempts: Attempts, settings: dict[str, float], progress: Progress | None
     ) -> None:
         self.surface, self.grid, self.attempts, self.progress = surface, grid, attempts, progress
-        self.fmax, self.evaluations = settings["fmax"], int(settings["evaluations"])
-        self.both_ways = bool(settings["both_ways"])
-        bare = surface.atoms.copy()
-        bare.set_constraint()
-        self.scan = Scan(grid, bare, surface.held)
+        self.settings = settings
+        self.scan = Scan(grid, surface.bare, surface.held)
         #: The attempt whose structure a point has handed on to its neighbors.
         self._handed: dict[Point, int] = {}
         self._queue: deque[tuple[Point, int | None]] = deque()
@@ -252,7 +241,7 @@ class _Wavefront:
                 continue
             if source is not None and self._handed[self.scan.attempts[source].point] != source:
                 continue  # a lower one is on its way
-            if not self.both_ways and point in self.scan.best:
+            if not self.settings["both_ways"] and point in self.scan.best:
                 continue
             self._tried.add((point, source))
             self._settle(self._made(point, source))
@@ -263,8 +252,9 @@ class _Wavefront:
         if attempt is None:
             self._tried_now.add(point)
             attempt = Attempt(len(attempts), point, source)
+            how = self.settings["fmax"], int(self.settings["evaluations"])
             try:
-                self.surface.relaxed(attempt, None if source is None else attempts[source], self.fmax, self.evaluations)
+                self.surface.relaxed(attempt, None if source is None else attempts[source], *how)
             except KconsError as error:
                 attempt.error = f"{self.grid.said(point)}: {type(error).__name__}: {error}"
                 self._first = self._first or error

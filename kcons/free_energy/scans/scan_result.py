@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from itertools import product
 from os import PathLike
@@ -38,21 +38,32 @@ KJ, TOLD = units.mol / units.kJ, 0.1
 #: What is in a folder: what the scan is of, its relaxations, and what `Scan.write` makes of them.
 PLAN, PLACE = "plan.json", "relaxations"
 FILES = (f"{PLACE}/*.npz", "scan.json", "scan.csv", "scan.png", "scan.extxyz")
-#: Atoms of a term of the model, filled up with this.
-_NONE = -9
-
+#: Values this near to each other, relative to their range, are the same.
+SAME = 1e-9
 
 #: Number of a value along each coordinate.
 Point = tuple[int, ...]
-
-#: Values this near to each other, relative to their range, are the same.
-SAME = 1e-9
 
 
 class Grid:
     """All combinations of the values of one or two coordinates, in angstrom or radian, up or down.
 
     Of dihedrals over a whole turn the last value, which is the first one again, is left out.
+
+    Attributes
+    ----------
+    coordinates : list of Constraint
+    values : list of ndarray
+    rings : list of bool
+        Whether the first value of a coordinate follows on its last.
+    names, keys : list of str
+        'Dihedral(0, 1, 2, 3)'; without blanks, for files, 'dihedral_0_1_2_3'.
+    in_degrees : list of bool
+        Which coordinates are angles, shown in degrees.
+    units : list of str
+        Of the values as they are shown; formulas and functions have their own.
+    shape : tuple of int
+    points : list of tuple of int
     """
 
     def __init__(self, coordinates: Sequence[Constraint], values: Sequence[ArrayLike]) -> None:
@@ -70,32 +81,14 @@ class Grid:
             if item.moving or not item.holonomic:
                 raise UnsupportedError(f"{item!r} moves with time or holds velocities; scan a coordinate of positions")
         made = [_axis(item, given) for item, given in zip(self.coordinates, values, strict=True)]
-        self.values = [axis for axis, _ in made]
-        #: Whether the first value of a coordinate follows on its last.
-        self.rings = [ring for _, ring in made]
-
-    @property
-    def names(self) -> list[str]:
-        return [item.row_name(0) for item in self.coordinates]
-
-    @property
-    def keys(self) -> list[str]:
-        """Names without blanks for files: 'dihedral_0_1_2_3'."""
-        found = ["_".join([item.family.lower(), *map(str, item.atoms[0].tolist()[:6])]) for item in self.coordinates]
-        return [key + (f"_{n}" if key in found[:n] else "") for n, key in enumerate(found)]
-
-    @property
-    def in_degrees(self) -> list[bool]:
-        """Which coordinates are angles, shown in degrees."""
-        return [item.held == ANGLE for item in self.coordinates]
-
-    @property
-    def shape(self) -> Point:
-        return tuple(len(axis) for axis in self.values)
-
-    @property
-    def points(self) -> list[Point]:
-        return list(product(*map(range, self.shape)))
+        self.values, self.rings = [axis for axis, _ in made], [ring for _, ring in made]
+        self.names = [item.row_name(0) for item in self.coordinates]
+        keys = ["_".join([item.family.lower(), *map(str, item.atoms[0].tolist()[:6])]) for item in self.coordinates]
+        self.keys = [key + (f"_{n}" if key in keys[:n] else "") for n, key in enumerate(keys)]
+        self.in_degrees = [item.held == ANGLE for item in self.coordinates]
+        self.units = [{ANGLE: "degrees", LENGTH: "angstrom"}.get(item.held, "own unit") for item in self.coordinates]
+        self.shape: Point = tuple(len(axis) for axis in self.values)
+        self.points: list[Point] = list(product(*map(range, self.shape)))
 
     def at(self, point: Point) -> list[float]:
         """The values at a point."""
@@ -109,11 +102,6 @@ class Grid:
         """For messages: 'Dihedral(0, 1, 2, 3) = 30'."""
         return ", ".join(f"{name} = {v:.6g}" for name, v in zip(self.names, self.shown(point), strict=True))
 
-    @property
-    def units(self) -> list[str]:
-        """Of the values as they are shown; formulas and functions have their own."""
-        return [{ANGLE: "degrees", LENGTH: "angstrom"}.get(item.held, "own unit") for item in self.coordinates]
-
     def held_at(self, point: Point) -> list[Constraint]:
         """The coordinates with their values at a point as targets."""
         return [item.with_target(v) for item, v in zip(self.coordinates, self.at(point), strict=True)]
@@ -123,18 +111,16 @@ class Grid:
         found = []
         for axis, (n, size, ring) in enumerate(zip(point, self.shape, self.rings, strict=True)):
             for other in (n + 1, n - 1):
-                if ring:
-                    other %= size
+                other = other % size if ring else other
                 if 0 <= other < size and other != n:
                     found.append((*point[:axis], other, *point[axis + 1 :]))
         return list(dict.fromkeys(found))
 
     def apart(self, point: Point, place: Sequence[float]) -> float:
         """How far a point is from values, in steps of the grid."""
-        off = np.subtract(self.at(point), place)
         steps = [float(np.diff(axis).mean()) if len(axis) > 1 else 1.0 for axis in self.values]
         periods = np.array([item.period or 0.0 for item in self.coordinates])
-        return float(np.linalg.norm(nearest_image(off, periods) / steps))
+        return float(np.linalg.norm(nearest_image(np.subtract(self.at(point), place), periods) / steps))
 
 
 def _axis(item: Constraint, given: ArrayLike) -> tuple[FloatArray, bool]:
@@ -158,6 +144,10 @@ def _axis(item: Constraint, given: ArrayLike) -> tuple[FloatArray, bool]:
     return axis, ring
 
 
+#: What of an attempt is no number and no text.
+_ARRAYS = ("positions", "memory")
+
+
 @dataclass
 class Attempt:
     """One relaxation, of energy in eV and the largest force left on an atom in eV/angstrom."""
@@ -178,26 +168,20 @@ class Attempt:
 
     def save(self, path: Path) -> None:
         """Write it; the file is there as a whole, or not at all."""
-        head = {name: getattr(self, name) for name in ("point", "source", "evaluations", "error")}
-        terms = np.full((len(self.terms), 5), _NONE, dtype=np.int64)
-        for row, term in zip(terms, self.terms, strict=True):
-            row[: len(term)] = term
-        numbers = np.array([self.energy, self.largest])
-        arrays = {"positions": self.positions, "memory": self.memory, "numbers": numbers, "terms": terms}
+        head = {name: value for name, value in vars(self).items() if name not in ("number", *_ARRAYS)}
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
         with in_one_piece(path) as file:
-            np.savez(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
+            np.savez(file, head=np.array(json.dumps(head)), **arrays)
 
     @classmethod
     def load(cls, path: Path, number: int) -> Attempt:
         """Read what `save` wrote."""
         try:
             with path.open("rb") as file:
-                data = {name.removesuffix(".npy"): array for name, array in stored_arrays(file).items()}
-            head = json.loads(str(data["head"]))
-            terms = [tuple(a for a in row if a != _NONE) for row in data["terms"].tolist()]
-            head |= {"point": tuple(head["point"]), "positions": data["positions"], "memory": data["memory"]}
-            energy, largest = (float(v) for v in data["numbers"])
-            return cls(number, **head, terms=terms, energy=energy, largest=largest)
+                data = stored_arrays(file)
+            head = json.loads(str(data["head"])) | {name: data[name] for name in _ARRAYS}
+            head |= {"point": tuple(head["point"]), "terms": [tuple(term) for term in head["terms"]]}
+            return cls(number, **head)
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise UnreadableError(f"{path} cannot be read ({error}); remove it", item="folder") from error
 
@@ -214,30 +198,27 @@ class Attempts:
         settings: Mapping[str, Any],
     ) -> None:
         self._results: ResultFolder | None = None
-        if folder is None:
-            return
-        plan = {
-            "symbols": str(atoms.symbols),
-            "positions": atoms.positions.tolist(),
-            "cell": atoms.cell.array.tolist(),
-            "pbc": atoms.pbc.tolist(),
-            "calculator": described(atoms.calc, atoms),
-            "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
-            "values": [axis.tolist() for axis in grid.values],
-            "held": [item.todict() for item in held],
-            "settings": dict(settings),
-        }
-        self._results = ResultFolder(folder, PLAN, plan, FILES, "a scan")
-        self._results.refuse_others()
+        if folder is not None:
+            plan = {
+                "symbols": str(atoms.symbols),
+                "positions": atoms.positions.tolist(),
+                "cell": atoms.cell.array.tolist(),
+                "pbc": atoms.pbc.tolist(),
+                "calculator": described(atoms.calc, atoms),
+                "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
+                "values": [axis.tolist() for axis in grid.values],
+                "held": [item.todict() for item in held],
+                "settings": dict(settings),
+            }
+            self._results = ResultFolder(folder, PLAN, plan, FILES, "a scan")
+            self._results.refuse_others()
 
     @contextmanager
     def taken(self) -> Iterator[None]:
         """Make the folder, and keep other scans out of it."""
-        if self._results is None:
-            yield
-            return
-        with self._results.taken():
-            (self._results.path / PLACE).mkdir(exist_ok=True)
+        with nullcontext() if self._results is None else self._results.taken():
+            if self._results is not None:
+                (self._results.path / PLACE).mkdir(exist_ok=True)
             yield
 
     def _file(self, number: int) -> Path:
@@ -296,7 +277,10 @@ class Scan:
     @property
     def energies(self) -> FloatArray:
         """In eV, shape of the grid; NaN where no relaxation succeeded."""
-        return self._over_the_grid({point: attempt.energy for point, attempt in self.best.items()})
+        table = np.full(self.grid.shape, np.nan)
+        for point, attempt in self.best.items():
+            table[point] = attempt.energy
+        return table
 
     @property
     def _lowest(self) -> float:
@@ -308,15 +292,15 @@ class Scan:
 
         Zero where they ended in the same minimum, or where there was one only.
         """
-        spread: dict[Point, float] = {}
-        for point in self.best:
-            last: dict[Point | None, float] = {}
-            for attempt in self.attempts:
-                if attempt.point == point and attempt.error is None:
-                    origin = None if attempt.source is None else self.attempts[attempt.source].point
-                    last[origin] = attempt.energy
-            spread[point] = max(last.values()) - min(last.values())
-        return self._over_the_grid(spread)
+        last: dict[Point, dict[Point | None, float]] = {}
+        for attempt in self.attempts:
+            if attempt.error is None:
+                origin = None if attempt.source is None else self.attempts[attempt.source].point
+                last.setdefault(attempt.point, {})[origin] = attempt.energy
+        table = np.full(self.grid.shape, np.nan)
+        for point, energies in last.items():
+            table[point] = max(energies.values()) - min(energies.values())
+        return table
 
     @property
     def failed(self) -> dict[Point, str]:
@@ -350,12 +334,6 @@ class Scan:
             found.set_constraint(Constraints([*self.held, *self.grid.held_at(point)]))
         return found
 
-    def _over_the_grid(self, entries: dict[Point, float]) -> FloatArray:
-        table = np.full(self.grid.shape, np.nan)
-        for point, entry in entries.items():
-            table[point] = entry
-        return table
-
     def _values(self, point: Point) -> dict[str, float]:
         return dict(zip(self.grid.keys, self.grid.shown(point), strict=True))
 
@@ -364,16 +342,13 @@ class Scan:
     def rows(self) -> list[dict[str, Any]]:
         """Of each point the values, energies, hysteresis, calls, the force left, and why it failed."""
         energy, spread, lowest = self.energies, self.hysteresis, self._lowest
-        calls = dict.fromkeys(self.grid.points, 0)
-        for attempt in self.attempts:
-            calls[attempt.point] += attempt.evaluations
         return [
             {
                 **self._values(point),
                 "energy_eV": float(energy[point]) if point in self.best else None,
                 "energy_kJ_mol": float(energy[point] - lowest) * KJ,
                 "hysteresis_kJ_mol": float(spread[point]) * KJ,
-                "calls": calls[point],
+                "calls": sum(attempt.evaluations for attempt in self.attempts if attempt.point == point),
                 "force_left_eV_A": self.best[point].largest if point in self.best else float("nan"),
                 "error": self.failed.get(point),
             }

@@ -30,18 +30,16 @@ def read_system(path: Path, item: str) -> openmm.System:
     """
     if not path.is_file():
         raise InputError(f"there is no file {path}", item=item)
+    text = path.read_text(encoding="utf-8", errors="replace")
+    if "PythonForce" in text:
+        raise InputError(
+            f"{path} has a PythonForce in it, whose code would run while the file is read; make the System in Python "
+            "where you trust it (OpenMMWindows, SystemCalculator)",
+            item=item,
+        )
     try:
-        text = path.read_text(encoding="utf-8")
-        if "PythonForce" in text:
-            raise InputError(
-                f"{path} has a PythonForce in it, whose code would run while the file is read; make the System in "
-                "Python where you trust it (OpenMMWindows, SystemCalculator)",
-                item=item,
-            )
         system = openmm.XmlSerializer.deserialize(text)
-    except (OSError, ValueError, openmm.OpenMMException) as error:
-        if isinstance(error, InputError):
-            raise
+    except (ValueError, openmm.OpenMMException) as error:
         raise InputError(f"{path} is no System of OpenMM: {error}", item=item) from error
     if not isinstance(system, openmm.System):
         raise InputError(f"{path} has a {type(system).__name__} in it, no System", item=item)

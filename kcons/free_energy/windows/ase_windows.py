@@ -84,17 +84,17 @@ class AseRecorder:
     def _bound(self) -> HeldCoordinates:
         """The coordinates among what is held now: masses, constraints or periodicity may have been changed."""
         dynamics, atoms = self.dynamics, self.dynamics.atoms
+        found = [item for item in atoms.constraints if isinstance(item, Constraints)]
         if isinstance(dynamics, ConstrainedDynamics):
             motion = dynamics.motion
-        else:
-            found = [item for item in atoms.constraints if isinstance(item, Constraints)]
-            if len(found) != 1:
-                raise InputError(
-                    f"the atoms carry {len(found) or 'no'} kcons.ase.Constraints objects; a coordinate is held by one "
-                    "(kcons.ase.constrain), or by a dynamics class of kcons",
-                    item="dynamics",
-                )
+        elif len(found) == 1:
             motion = found[0].engine(atoms)
+        else:
+            raise InputError(
+                f"the atoms carry {len(found) or 'no'} kcons.ase.Constraints objects; a coordinate is held by one "
+                "(kcons.ase.constrain), or by a dynamics class of kcons",
+                item="dynamics",
+            )
         if motion is not self._motion:
             turns = any(isinstance(item, Dihedral) for item in self.coordinates.values())
             how: dict[str, Any] = {"time": dynamics.get_time(), "bonds": bonds_of(atoms) if turns else None}

@@ -7,6 +7,7 @@ import os
 import time
 import traceback
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED as FIRST
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
@@ -31,7 +32,7 @@ from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
-from kcons.free_energy.profiles.profile import Profile, integrate
+from kcons.free_energy.profiles.profile import Profile, integrate, plot_profile
 from kcons.free_energy.profiles.pulls import MIN_PULLS, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
@@ -48,14 +49,8 @@ BOLTZMANN = 0.00831446261815324
 RETRIES = 3
 #: Files of a folder of windows, those of `FreeEnergy` and of the command line included.
 FILES = (
-    "window-*.npz",
-    "window-*.txt",
-    "pull-*.npz",
-    "pull-*.txt",
-    "free_energy.json",
-    "profile.csv",
-    "profile.png",
-    "pulls.json",
+    *(f"{kind}-*.{ending}" for kind in ("window", "pull") for ending in ("npz", "txt")),
+    *("free_energy.json", "profile.csv", "profile.png", "pulls.json"),
 )
 #: Differences of the two sides that are less probable than this are marked, and widen errors.
 UNLIKELY = 0.01
@@ -135,8 +130,8 @@ class FreeEnergy:
         if len(self.names) != 1:
             raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
         f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("force", "error"))
-        x, periods = self._places()
-        return integrate(x[:, 0], f, e, period=periods[0])
+        x, (period,) = self._places()
+        return integrate(x[:, 0], f, e, period=period)
 
     @cached_property
     def surface(self) -> Surface:
@@ -147,20 +142,20 @@ class FreeEnergy:
 
     def between(self, a: float, b: float) -> Estimate | None:
         """F(b) - F(a) of the profile, in whichever turn the places are given; None where it does not reach both."""
-        profile, period = self.profile, float(self.periods[0])
-        ends = np.array([a, b])
+        profile, period, ends = self.profile, float(self.periods[0]), np.array([a, b])
+        low, high = profile.x[[0, -1]]
         if period:
-            ends += period * np.ceil((profile.x[0] - ends) / period - 1e-9)
-        slack = 1e-9 * np.ptp(profile.x)
-        if ends.min() < profile.x[0] - slack or ends.max() > profile.x[-1] + slack:
+            ends += period * np.ceil((low - ends) / period - 1e-9)
+        slack = 1e-9 * (high - low)
+        if ends.min() < low - slack or ends.max() > high + slack:
             return None
         return profile.difference(*ends.tolist())
 
     def _places(self) -> tuple[FloatArray, list[float | None]]:
         """Where the windows are, shape (n, d), and the period of each coordinate that they go all around."""
         x = np.array([w.value for w in self.windows]).reshape(-1, len(self.names))
-        around = [self._in_one_turn(column, period) for column, period in zip(x.T, self.periods.tolist(), strict=True)]
-        return x, [period if whole else None for whole, period in zip(around, self.periods.tolist(), strict=True)]
+        columns = zip(x.T, self.periods.tolist(), strict=True)
+        return x, [period if self._in_one_turn(column, period) else None for column, period in columns]
 
     @staticmethod
     def _in_one_turn(x: FloatArray, period: float) -> bool:
@@ -182,14 +177,12 @@ class FreeEnergy:
 
     # -- shown ----------------------------------------------------------------------------------
 
-    def _profile(self) -> tuple[Profile | None, str]:
-        """The profile along the only coordinate; otherwise None, and where there could be one, why there is none."""
-        if len(self.names) != 1:
-            return None, ""
+    def _profile(self) -> Profile | str:
+        """The profile along the only coordinate; otherwise, where there could be one, why there is none."""
         try:
-            return self.profile, ""
+            return self.profile if len(self.names) == 1 else ""
         except InputError as error:
-            return None, f"no profile: {error}"
+            return f"no profile: {error}"
 
     def table(self) -> Table:
         """The windows, one in a line; print it by rich."""
@@ -225,25 +218,23 @@ class FreeEnergy:
                 f"fewer than {FEW_INDEPENDENT} independent samples in window {poor}: errors there are not to be relied "
                 "on; sample longer"
             )
-        profile, why = self._profile()
-        if why:
-            lines.append(why)
-        if profile is not None:
-            low, high = int(np.argmin(profile.F)), int(np.argmax(profile.F))
-            gap = profile.difference(float(profile.x[low]), float(profile.x[high]))
+        profile = self._profile()
+        if isinstance(profile, Profile):
+            gap = profile.difference(*(float(profile.x[pick(profile.F)]) for pick in (np.argmin, np.argmax)))
             lines.append(f"from the lowest to the highest point {gap.value:.2f} ± {gap.error:.2f} kJ/mol")
+        elif profile:
+            lines.append(profile)
         lines += [f"{name} failed: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
 
     def beside(self, pulled: Pulled, start: FloatArray, end: FloatArray) -> tuple[dict[str, Any], str]:
         """What pulls gave, as plain data and in a sentence; of one coordinate with the windows between the ends."""
         best, name = pulled.best, "Jarzynski" if pulled.bar is None else "BAR"
-        numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist()}
-        estimates = {key: getattr(pulled, key) for key in ("bar", "jarzynski")}
+        numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist(), "overlap": pulled.overlap}
+        estimates = {"bar": pulled.bar, "jarzynski": pulled.jarzynski}
         numbers |= {key: [*estimate] for key, estimate in estimates.items() if estimate is not None}
-        numbers["overlap"] = pulled.overlap
         said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name})"
-        if self._profile()[0] is not None:
+        if isinstance(self._profile(), Profile):
             windows = self.between(float(start[0]), float(end[0]))
             if windows is None:
                 return numbers, f"{said}; the windows do not reach both ends"
@@ -278,10 +269,8 @@ class FreeEnergy:
         written = [folder / "free_energy.json"]
         with in_one_piece(written[0]) as opened:
             opened.write(text(self.numbers()).encode())
-        profile, _ = self._profile()
-        if profile is not None:
-            from kcons.free_energy.profiles.plots import plot_profile
-
+        profile = self._profile()
+        if isinstance(profile, Profile):
             (name,), (angle,) = self.names, self.angles
             written += [folder / "profile.csv", folder / "profile.png"]
             with in_one_piece(written[1]) as opened:
@@ -298,16 +287,15 @@ def combine_sides(
 ) -> WindowResult:
     """The mean of both sides, and how probable their difference is."""
     per = sampler.kJ / sampler.scales
-    forces = np.array([side.force * per for side in sides.values()])
-    covariances = np.array([side.covariance * np.outer(per, per) for side in sides.values()])
-    covariance, chance = covariances.sum(axis=0) / len(sides) ** 2, math.nan
+    forces, raws = (np.array([getattr(side, name) * per for side in sides.values()]) for name in ("force", "raw"))
+    together = sum(side.covariance for side in sides.values()) * np.outer(per, per)
+    covariance, chance = together / len(sides) ** 2, math.nan
     if len(sides) == 2:
-        chance = agreement(forces[0], covariances[0], forces[1], covariances[1])
+        chance = agreement(forces[0], forces[1], together)
         if chance < UNLIKELY:
             half = (forces[0] - forces[1]) / 2
             covariance = covariance + np.outer(half, half)
-    raw = np.mean([side.raw * per for side in sides.values()], axis=0)
-    return WindowResult(number, target, forces.mean(axis=0), covariance, sides, chance, raw, seconds)
+    return WindowResult(number, target, forces.mean(axis=0), covariance, sides, chance, raws.mean(axis=0), seconds)
 
 
 class Windows:
@@ -413,14 +401,7 @@ class Windows:
         self._failed |= failed
         return self.result()
 
-    def improve(
-        self,
-        error: float,
-        most: int,
-        *,
-        below: float | None = None,
-        at_once: int = 1,
-    ) -> FreeEnergy:
+    def improve(self, error: float, most: int, *, below: float | None = None, at_once: int = 1) -> FreeEnergy:
         """Add windows where they help most until the profile's largest standard error is below `error` (kJ/mol).
 
         Parameters
@@ -460,8 +441,8 @@ class Windows:
             jobs.append(Window(number, side, begin, end, seed))
         return jobs
 
-    def pull(self, start: ArrayLike, end: ArrayLike, count: int = 20, *, both_ways: bool = True) -> Pulled:
-        """F(end) - F(start) from the works of pulls, kJ/mol: Jarzynski, and BAR with pulls both ways.
+    def pull(self, start: ArrayLike, end: ArrayLike, count: int = 20) -> Pulled:
+        """F(end) - F(start) from the works of pulls both ways, kJ/mol, by BAR; and by Jarzynski.
 
         Each pull begins in equilibrium (`Settings.equilibration`), takes `Settings.pull` steps at a constant rate, and
         is recorded at every step. Finished ones are kept.
@@ -472,7 +453,6 @@ class Windows:
             In angstrom and radian.
         count : int
             Pulls in each direction, 5 or more.
-        both_ways : bool
 
         Raises
         ------
@@ -487,7 +467,7 @@ class Windows:
             raise InputError("start and end of the pulls are the same; give two places", item="end")
         ends = ends / self.sampler.scales
         jobs: list[list[Window]] = []
-        for k, direction in enumerate(DIRECTIONS[: 1 + both_ways]):
+        for k, direction in enumerate(DIRECTIONS):
             begin, target = (tuple(place.tolist()) for place in (ends if k == 0 else ends[::-1]))
             seeds = (np.random.SeedSequence([self.seed, number, 2 + k]).generate_state(1)[0] for number in range(count))
             jobs.append([Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)])
@@ -524,15 +504,14 @@ class Windows:
     def _sample(self, jobs: Sequence[Window], total: int) -> dict[str, str]:
         """Run windows or pulls, again where a process was killed; why those failed that did."""
         failed: dict[str, str] = {}
-        tries: dict[str, int] = dict.fromkeys((job.name for job in jobs), 0)
+        tries = Counter[str]()
         left, began, done = list(jobs), time.monotonic(), 0
         while left:
             again: list[Window] = []
             try:
                 with nullcontext(self.executor) if self.executor else _processes(self.workers, len(left)) as pool:
-                    running: dict[Future[None], Window] = {}
-                    for job in left:
-                        running[pool.submit(_sampled, self.sampler, job, self.settings, self.file(job))] = job
+                    how = self.sampler, self.settings
+                    running = {pool.submit(_sampled, *how, job, self.file(job)): job for job in left}
                     while running:
                         for future in wait(running, return_when=FIRST).done:
                             job = running.pop(future)
@@ -543,9 +522,8 @@ class Windows:
                                 continue
                             done += 1
                             note = self.folder / f"{job.name}.failed.txt"
-                            if problem is None:
-                                note.unlink(missing_ok=True)
-                            else:
+                            note.unlink(missing_ok=True)
+                            if problem is not None:
                                 failed[job.name] = problem
                                 note.write_text(problem, encoding="utf-8")
                             if self.progress is not None:
@@ -563,8 +541,7 @@ class Windows:
     def result(self) -> FreeEnergy:
         """Mean forces of the windows that are finished."""
         kT = BOLTZMANN * self.settings.temperature / self.sampler.kJ
-        found = []
-        problems = dict(self._failed)
+        found, problems = [], dict(self._failed)
         for number, target in enumerate(self._targets):
             sides, seconds = dict[str, MeanForce](), 0.0
             for job in self._jobs(number):
@@ -598,25 +575,21 @@ def _problem(future: Future[None]) -> str | None:
     return "".join(traceback.format_exception_only(error)).strip()
 
 
-def _sampled(sampler: Sampler, window: Window, settings: Settings, file: Path) -> None:
+def _sampled(sampler: Sampler, settings: Settings, window: Window, file: Path) -> None:
     """In a worker: one window, unless another run has finished it meanwhile."""
     if not file.exists():
         (sampler.sample if window.side in SIDES else sampler.pull)(window, settings, file)
 
 
 def _pulled(pulls: Sequence[Sequence[Series]], kJ: float, kT: float) -> Pulled:
-    """What the pulls of one or both directions say, with kT in kJ/mol."""
-    works = [
+    """What pulls forward and backward say, with kT in kJ/mol."""
+    forward, backward = (
         np.array([series.work_of(thermal_multipliers(series, kT / kJ))[-1] * kJ for series in each]) for each in pulls
-    ]
-    starts, ends = ([np.array([-0.5 * s.log_det_z[k] for s in each]) for each in pulls] for k in (0, -1))
+    )
     # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
-    if len(pulls) == 2:
-        shift = kT * (_log_mean(starts[0]) - _log_mean(starts[1]))
-        return pull_free_energy(works[0] + shift, works[1] - shift, thermal_energy=kT)
-    counts = -works[0] / kT  # what was pulled here counts as in equilibrium with these weights
-    shift = kT * (_log_mean(starts[0]) - _log_mean(ends[0] + counts) + _log_mean(counts))
-    return pull_free_energy(works[0] + shift, thermal_energy=kT)
+    start, end = (_log_mean(np.array([-0.5 * series.log_det_z[0] for series in each])) for each in pulls)
+    shift = kT * (start - end)
+    return pull_free_energy(forward + shift, backward - shift, thermal_energy=kT)
 
 
 def _log_mean(logarithms: FloatArray) -> float:

@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from functools import partial
 from itertools import product
 from os import PathLike
@@ -186,7 +186,6 @@ class Pulls:
     to: NumberOrNumbers | None = None
     count: Single = 20
     steps: Single = 20_000
-    both_ways: Truth = True
 
 
 @dataclass(kw_only=True)
@@ -197,13 +196,14 @@ class Workers:
 
 #: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
 _OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "rng": Single}
-#: Tables of a file; [sampling] becomes `Settings`.
+_SAMPLING = {each.name: Single for each in fields(Settings)} | _OF_WINDOWS
+#: Tables of a file.
 _TABLES: dict[str, Any] = {
     "structure": Structure,
     "forces": Forces,
     "coordinate": Coordinate,
     "held": HeldRows,
-    "sampling": {f.name: Single for f in fields(Settings)} | _OF_WINDOWS,
+    "sampling": make_dataclass("Sampling", [(key, kind | None, None) for key, kind in _SAMPLING.items()]),
     "improve": Improve,
     "pulls": Pulls,
     "workers": Workers,
@@ -225,7 +225,7 @@ class InputFile:
     improve : dict or None
         Of `Windows.improve`.
     pulls : dict or None
-        Of `Windows.pull`: start and end in angstrom and radian, count, both_ways.
+        Of `Windows.pull`: start and end in angstrom and radian, count.
     pull_steps : int
         Steps of each of these.
     processes : int or None
@@ -293,29 +293,26 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     """
     path = as_path(file, "file")
     data = _toml(path)
-    tables: dict[str, Any] = {"forces": Forces(), "coordinate": [], "sampling": {}, "workers": Workers()}
-    for name, content in data.items():
+    tables: dict[str, Any] = {"forces": Forces(), "coordinate": [], "workers": Workers()}
+    for name, content in {"sampling": {}, **data}.items():
         _refuse_unknown(name, _TABLES, "the input file")
-        if (name == "coordinate") != isinstance(content, list):
-            brackets = "[[coordinate]], once for each" if name == "coordinate" else f"[{name}], once"
-            raise InputError(f"write {brackets}", item=name)
-        kind = _TABLES[name]
-        tables[name] = (
-            [_read(kind, name, each) for each in content] if kind is Coordinate else _read(kind, name, content)
-        )
-    structure: Any = tables.get("structure")
-    sampling, entries = tables["sampling"], tables["coordinate"]
+        many = name == "coordinate"
+        if many != isinstance(content, list):
+            raise InputError(f"write {'[[coordinate]], once for each' if many else f'[{name}], once'}", item=name)
+        read = [_read(_TABLES[name], name, each) for each in (content if many else [content])]
+        tables[name] = read if many else read[0]
     for name, how in (("structure", "[structure] with file = ..."), ("coordinate", "[[coordinate]]")):
         if not tables.get(name):
             raise InputError(f"the input file has no {name}; write {how}", item=name)
     coordinates: dict[str, Constraint] = {}
-    for entry in entries:
+    for entry in tables["coordinate"]:
         if entry.called in coordinates:
             raise InputError(f"two coordinates have the name {entry.called}; give each its own", item="coordinate")
-        coordinates[entry.called] = entry.constraint(structure.count_from)
-    places = [entry.places() for entry in entries]
+        coordinates[entry.called] = entry.constraint(tables["structure"].count_from)
+    places = [entry.places() for entry in tables["coordinate"]]
     _refuse_more(math.prod(map(len, places)), "coordinate")
     targets = np.array(list(product(*places)))
+    sampling = {key: value for key, value in vars(tables["sampling"]).items() if value is not None}
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
@@ -327,7 +324,7 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
             item="improve",
         )
     return InputFile(
-        _sampler(path.parent, structure, tables, coordinates, allow_modules),
+        _sampler(path.parent, tables, coordinates, allow_modules),
         Settings(**sampling),
         targets,
         options,
@@ -355,12 +352,12 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _read(kind: Any, name: str, entry: Any) -> Any:
-    """A table as an object of a dataclass; as a dict where `kind` is one of keys and annotations."""
+    """A table as an object of a dataclass."""
     if not isinstance(entry, dict):
         raise InputError(f"{name} is {short(entry)}; write [{name}] and its keys below", item=name)
-    own = {} if isinstance(kind, dict) else {each.metadata.get("key", each.name): each for each in fields(kind)}
-    hints = get_type_hints(kind, include_extras=True) if own else kind
-    rules = {key: _rule(hints[own[key].name if own else key]) for key in own or hints}
+    hints = get_type_hints(kind, include_extras=True)
+    own = {each.metadata.get("key", each.name): each for each in fields(kind)}
+    rules = {key: _rule(hints[each.name]) for key, each in own.items()}
     for key, value in entry.items():
         _refuse_unknown(key, rules, f"[{name}]")
         if not rules[key].test(value):
@@ -368,7 +365,7 @@ def _read(kind: Any, name: str, entry: Any) -> Any:
     for key, each in own.items():
         if key not in entry and each.default is MISSING:
             raise InputError(f"[{name}] has no {key}; give {rules[key].words}", item=key)
-    return kind(**{own[key].name: value for key, value in entry.items()}) if own else dict(entry)
+    return kind(**{own[key].name: value for key, value in entry.items()})
 
 
 def _rule(hint: Any) -> Rule:
@@ -401,7 +398,7 @@ def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatAr
     )
     if np.array_equal(start, end):
         raise InputError("[pulls] begin where they end; give from and to", item="pulls")
-    return {"start": start, "end": end, "count": entry.count, "both_ways": entry.both_ways}
+    return {"start": start, "end": end, "count": entry.count}
 
 
 def counted(atoms: Sequence[int], first: int) -> list[int]:
@@ -438,13 +435,10 @@ def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]
 
 
 def _sampler(
-    folder: Path,
-    structure: Structure,
-    tables: Mapping[str, Any],
-    coordinates: Mapping[str, Constraint],
-    allow_modules: Collection[str],
+    folder: Path, tables: Mapping[str, Any], coordinates: Mapping[str, Constraint], allow_modules: Collection[str]
 ) -> Sampler:
-    forces, place = tables["forces"], folder / structure.file
+    forces, structure = tables["forces"], tables["structure"]
+    place = folder / structure.file
     _require_file(place)
     if (forces.calculator is None) == (forces.system is None):
         raise InputError(

@@ -31,6 +31,12 @@ from kcons.openmm.topology import bonds_of
 
 #: What a relaxation leaves of the forces, kJ/mol/nm.
 _FORCE = 50.0
+#: Forces that are coordinates, their energies, and how a term is added.
+_FORCES: dict[type[Constraint], tuple[Any, str, str]] = {
+    Distance: (openmm.CustomBondForce, "r", "addBond"),
+    Angle: (openmm.CustomAngleForce, "theta", "addAngle"),
+    Dihedral: (openmm.CustomTorsionForce, "theta", "addTorsion"),
+}
 #: Part of the box by which files round it.
 _SAME_BOX = 1e-3
 
@@ -100,17 +106,13 @@ class HeldCoordinatesReporter:
         beside: Iterable[Constraint] = (),
         append: bool = False,
     ) -> None:
-        interval = whole_number(reportInterval, "reportInterval")
+        self._interval = whole_number(reportInterval, "reportInterval")
         names = list(named(coordinates))
         self._coordinates = dict(zip(names, accepted(coordinates.values()), strict=True))
         self._beside = accepted(beside)
-        self._interval = interval
-        self._own = not hasattr(file, "write")
+        self._own, self._titled, self._work = not hasattr(file, "write"), append, 0.0
         self._file: TextIO = open(file, "a" if append else "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
-        self._titled = append
-        self._work = 0.0
         self._held: HeldCoordinates | None = None
-        self._set: ConstraintSet | None = None
         self.series = Series(names)
 
     def describeNextReport(self, simulation: Any) -> tuple[int, bool, bool, bool, bool, bool]:
@@ -124,7 +126,7 @@ class HeldCoordinatesReporter:
             self._begin(simulation, x, time)
         elif simulation.context is not self._context:
             raise InputError("this reporter belongs to another simulation; make a new one for this", item="simulation")
-        assert self._held is not None and self._set is not None
+        assert self._held is not None
         if self._set.lattice is not None:
             self._set.with_cell(cell_of(state.getPeriodicBoxVectors()))
         ensemble = getattr(simulation.integrator, "ensemble", None)
@@ -132,8 +134,7 @@ class HeldCoordinatesReporter:
             self.series.isokinetic_degrees_of_freedom = ensemble.count(simulation.integrator)
         sample = self._held.sample(x, v, f, time)
         self._work += self.series.append(sample)
-        pairs = [n for pair in zip(sample.value.tolist(), sample.multiplier.tolist(), strict=True) for n in pair]
-        numbers = [time, *pairs, sample.log_det_z, self._work]
+        numbers = [time, *np.stack([sample.value, sample.multiplier], axis=1).ravel(), sample.log_det_z, self._work]
         self._file.write(",".join([str(simulation.currentStep), *(f"{number:.12g}" for number in numbers)]) + "\n")
         self._file.flush()
 
@@ -151,13 +152,11 @@ class HeldCoordinatesReporter:
             )
         # Those of `hold` know how their targets move.
         for row in rows:
-            new = [k for k in range(row.n_rows) if not any(same_rows(item, row, k).any() for item in carried)]
-            if new:
+            if new := [k for k in range(row.n_rows) if not any(same_rows(item, row, k).any() for item in carried)]:
                 carried.append(row.select(new))
         lengths = {frozenset(pair) for row in carried if row.holds_length for pair in row.atoms.tolist()}
         for item in _beside(system, carried, masses):
-            new = [k for k, atoms in enumerate(item.atoms.tolist()) if frozenset(atoms) not in lengths]
-            if new:
+            if new := [k for k, atoms in enumerate(item.atoms.tolist()) if frozenset(atoms) not in lengths]:
                 carried.insert(0, item.select(new))
         wraps = system.usesPeriodicBoundaryConditions()
         cell = cell_of(simulation.context.getState().getPeriodicBoxVectors()) if wraps else None
@@ -217,10 +216,9 @@ class OpenMMWindows(Sampler):
         platform: str | None = None,
         properties: Mapping[str, str] | None = None,
     ) -> None:
-        n = system.getNumParticles()
         _refuse_another(topology, system)
         super().__init__(coordinates, 10.0)
-        self.positions = nanometers(positions, n)
+        self.positions = nanometers(positions, system.getNumParticles())
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
         self._bonds: IntArray = bonds_of(system, self.positions)
@@ -353,19 +351,15 @@ def _force_of(name: str, item: Constraint, periodic: bool) -> openmm.Force:
         raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row")
     atoms = item.atoms[0].tolist()
     force: Any
-    add = "addBond"
     if isinstance(item, Formula):
         return formula_rows(item)[0].force
-    if isinstance(item, Distance):
-        force = openmm.CustomBondForce("r")
-    elif isinstance(item, Angle):
-        force, add = openmm.CustomAngleForce("theta"), "addAngle"
-    elif isinstance(item, Dihedral):
-        force, add = openmm.CustomTorsionForce("theta"), "addTorsion"
-    elif isinstance(item, DistanceDifference):
-        terms = (f"({w!r})*distance(p{i + 1},p{j + 1})" for (i, j), w in zip(item.slots, item.weights, strict=True))
-        force = openmm.CustomCompoundBondForce(item.width, "+".join(terms))
-        atoms = [atoms]
+    if isinstance(item, DistanceDifference):
+        pairs = zip(item.slots, item.weights, strict=True)
+        terms = [f"({weight!r})*distance(p{i + 1},p{j + 1})" for (i, j), weight in pairs]
+        force, add, atoms = openmm.CustomCompoundBondForce(item.width, "+".join(terms)), "addBond", [atoms]
+    elif type(item) in _FORCES:
+        kind, energy, add = _FORCES[type(item)]
+        force = kind(energy)
     else:
         raise UnsupportedError(
             f"{name} is {item!r}; windows in OpenMM hold a Distance, a DistanceDifference, an Angle, a Dihedral or a "

@@ -239,7 +239,7 @@ class Held:
 
     def __post_init__(self) -> None:
         for name, item in self.coordinates.items():
-            if not isinstance(item, Constraint) or item.n_rows != 1 or not item.holonomic:
+            if item.n_rows != 1 or not item.holonomic:
                 raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row that holds positions")
         self.coordinates = {name: item.with_target(None) for name, item in self.coordinates.items()}
         # Refuses what is undefined here, or depends on the other constraints.

@@ -17,6 +17,7 @@ from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import not_negative, whole_number
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -47,6 +48,8 @@ from kcons.topology.rows_by_name import HeldRows
 
 #: Frames, and atoms in each, that a grid of coordinates is looked for in.
 GRID_FRAMES, GRID_ATOMS = 5, 1000
+#: Where targets come from, in words.
+_MODES = {"given": "as given", "first": "the first frame", "mean": "the mean of the frames"}
 #: Positions, of all frames together, up to which one process is quickest: of files that need no unpacking, of others.
 ALONE = {"DCD": 5_000_000, "": 500_000}
 
@@ -60,7 +63,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         With the trajectory; of a group, its Universe.
     constraints : Constraint, iterable of Constraint, or ConstraintSet
         What should be held, in angstrom, on the atoms of the Universe.
-    targets : {'given', 'first', 'mean'}, path or TargetFile
+    targets : {'given', 'first', 'mean'} or path
         Where the lengths come from. 'given': what the constraints say, and the first frame for those that do not
         say. 'first': the first frame looked at. 'mean': the mean over the frames, which are read twice. A path: a
         parameter file, see `kcons.mdanalysis.check.targets`.
@@ -69,15 +72,10 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         1 rad for angles).
     precision : float, optional
         Step of the coordinates in the file, in angstrom, for formats where it cannot be known.
-    target_error : float or ndarray, shape (n_atoms,)
-        Rounding of the targets, in angstrom a coordinate, of each atom or of all; for 'given' targets that were
-        measured in another file.
     rank : bool
         Whether to find the rank, which takes longer than the frames of a short trajectory.
     worst : int
         Number of rows to name.
-    names : tuple of str, optional
-        What to call trajectory and topology.
 
     Raises
     ------
@@ -101,13 +99,11 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         atoms: Any,
         constraints: Constraint | Iterable[Constraint] | ConstraintSet,
         *,
-        targets: Literal["given", "first", "mean"] | str | Path | TargetFile = "given",
+        targets: Literal["given", "first", "mean"] | str | Path = "given",
         tolerance: float = 1e-4,
         precision: float | None = None,
-        target_error: float | FloatArray = 0.0,
         rank: bool = True,
         worst: int = 10,
-        names: tuple[str, str] | None = None,
         verbose: bool = False,
     ) -> None:
         universe = atoms.universe
@@ -123,34 +119,23 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
                 "there are no constraints to check; select others, or look at the bonds of the topology",
                 item="constraints",
             )
-        if not (np.isfinite(tolerance) and tolerance >= 0):
-            raise InputError(f"the tolerance is {tolerance}; give a number such as 1e-4, or 0", item="tolerance")
-        errors = np.asarray(target_error, dtype=np.float64)
-        if errors.shape not in ((), (n_atoms,)) or not (errors >= 0).all() or not np.isfinite(errors).all():
-            raise InputError(
-                f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
-            )
-        if worst < 0:
-            raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         described = topology_of(universe)
         labels = AtomNames(universe, described.elements)
         self._used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
         self._masses, reason = _masses(universe, described.masses, given, self._used, labels)
-        if targets not in ("given", "first", "mean"):
-            file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
-            given, mode, text = tuple(file.apply(given, labels)), "given", str(file.path)
-        else:
-            mode = str(targets)
-            text = {"first": "the first frame", "mean": "the mean of the frames"}.get(mode, "as given")
-        if mode != "given":
+        mode, text = str(targets), _MODES.get(str(targets), "")
+        if not text:
+            given, mode, text = tuple(TargetFile(targets).apply(given, labels)), "given", str(targets)
+        elif mode != "given":
             given = tuple(item if item.moving or not item.holonomic else item.with_target(None) for item in given)
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
-        names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
+        names = self._path or "memory", str(getattr(universe, "filename", None) or "topology")
         remarks = [f"no temperature: {reason}"] if reason else []
-        self.asked = Asked(names, labels, mode, text, int(worst), remarks + _remarks_on(reader))
-        self._given, self._tolerance, self._wants_rank = given, float(tolerance), rank
-        self._target_error = np.broadcast_to(errors, n_atoms)
+        self.asked = Asked(names, labels, mode, text, whole_number(worst, "worst"), remarks + _remarks_on(reader))
+        self._given, self._tolerance, self._wants_rank = given, not_negative(tolerance, "tolerance"), rank
+        #: Rounding of given targets that were measured in another file, in angstrom a coordinate, by atom.
+        self.target_error: FloatArray = np.zeros(n_atoms)
         self._precision = precision_of_reader(reader, precision)
         self._by_frame = None
         if self._precision.exact and precision is None:
@@ -212,23 +197,16 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
     def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
         """Frames to look at, at least one, counted from the beginning."""
         count, name, given = self._trajectory.n_frames, self.asked.names[0], chosen["frames"]
-        if given is None:
-            if chosen["step"] == 0:
-                raise InputError("step is 0; give another whole number", item="step")
-            given = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
-        asked = np.asarray(given)
-        if asked.dtype == bool and asked.shape == (count,):
-            asked = np.flatnonzero(asked)
-        if asked.ndim != 1 or (asked.size and not np.issubdtype(asked.dtype, np.integer)):
+        part = slice(*(chosen[end] for end in ("start", "stop", "step"))) if given is None else np.asarray(given)
+        try:
+            numbers: list[int] = np.arange(count)[part].tolist()
+        except (IndexError, ValueError, TypeError) as error:
             raise InputError(
-                f"frames are {given!r:.60}; give whole numbers, or True and False for each of the {count} frames; for "
-                "a slice start, stop and step",
+                f"{name}: its {count} frames have no {part!r:.60} ({error}); give start, stop and step, or as frames "
+                f"whole numbers, or True and False for each of the {count} frames",
                 item="frames",
-            )
-        for frame in asked[(asked < -count) | (asked >= count)]:
-            raise InputError(f"{name}: there is no frame {frame}; it has {count}", item="frames")
-        numbers: list[int] = (asked % max(count, 1)).tolist()
-        if not len(numbers):
+            ) from None
+        if not numbers:
             raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
         return numbers
 
@@ -258,26 +236,26 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             if ts.dimensions is not None and not np.isfinite(ts.dimensions).all():
                 raise NonFiniteError(f"the cell is {ts.dimensions}")
         except (*READ_ERRORS, NonFiniteError) as error:
-            raise self._nothing(frame, str(error)) from None
+            raise self._nothing(Break(frame, str(error))) from None
         self._largest = float(np.abs(ts.positions[self._used]).max())
         masses = np.ones(ts.n_atoms) if self._masses is None else self._masses
         precision = self._precision_at(frame)
-        self._rows = RowTable(self._given, masses, ts, precision, self._target_error, self._tolerance)
+        self._rows = RowTable(self._given, masses, ts, precision, self.target_error, self._tolerance)
         self._rank: int | None = None
-        if self._wants_rank:
-            try:
+        try:
+            if self._wants_rank:
                 self._rank = Motion(self._rows.set, precision.stored(ts.positions)).rank
-            except KconsError as error:
-                self.asked.remarks.append(f"no rank: {error}")
+        except KconsError as error:
+            self.asked.remarks.append(f"no rank: {error}")
 
     def _precision_at(self, frame: int) -> Any:
         return self._precision if self._by_frame is None else self._by_frame[frame]
 
-    def _nothing(self, frame: int, reason: str) -> UnreadableError:
+    def _nothing(self, broken: Break) -> UnreadableError:
         """Of a trajectory of which nothing can be told."""
         return UnreadableError(
-            f"{self.asked.names[0]}: frame {frame}, the first to be checked, cannot be read ({reason}); start at "
-            "another frame, or write the file again",
+            f"{self.asked.names[0]}: frame {broken.frame}, the first to be checked, cannot be read ({broken.reason}); "
+            "start at another frame, or write the file again",
             item="trajectory",
         )
 
@@ -290,13 +268,12 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             return
         if not len(found.frames):
             assert found.broken is not None
-            raise self._nothing(found.broken.frame, found.broken.reason)
+            raise self._nothing(found.broken)
         if found.broken is None and self._to_the_end:
             found.broken = self._damage or ending_of(self._trajectory)
         text = described([self._precision_at(frame) for frame in self.frames.tolist()], self._largest)
-        masses = self._rows.set.masses
         n_in_file = int(self._trajectory.n_frames)
-        self.results.check = result_of(found, self._rows, self.asked, text, self._rank, masses, n_in_file)
+        self.results.check = result_of(found, self._rows, self.asked, text, self._rank, n_in_file)
 
     @property
     def check(self) -> CheckResult:
@@ -447,8 +424,8 @@ def check_trajectory(
     if workers < 1:
         raise InputError(f"{workers} workers; give 1 or more", item="workers")
     of_topology = str(targets) == "topology"
-    # Complain about the parameter file before anything long.
-    given = "given" if of_topology else targets if str(targets) in ("first", "mean") else TargetFile(targets)
+    if str(targets) not in ("topology", "first", "mean"):
+        TargetFile(targets)  # complain of it before anything long
     held = {name: options.pop(name) for name in Options.__annotations__ if name in options}
     if of_topology:
         universe = open_universe(topology, topology_format=topology_format)
@@ -459,7 +436,7 @@ def check_trajectory(
             )
         with quiet():
             precision = precision_of(topology, format_of(universe.trajectory))
-            options["target_error"] = precision.half_step(universe.atoms.positions)
+            errors = precision.half_step(universe.atoms.positions)
         constraints = _held(universe, constrain, held)
         load_trajectory(universe, trajectory, topology, format=format)
     else:
@@ -468,9 +445,10 @@ def check_trajectory(
         with quiet(), suppress(*READ_ERRORS):
             _ = universe.trajectory[chosen.get("start") or 0]
         constraints = _held(universe, constrain, held)
-    check = ConstraintCheck(universe, constraints, targets=given, names=(str(trajectory), str(topology)), **options)
+    check = ConstraintCheck(universe, constraints, targets="given" if of_topology else targets, **options)
+    check.asked.names = str(trajectory), str(topology)
     if of_topology:
-        check.asked.targets = f"coordinates of {topology}"
+        check.asked.targets, check.target_error = f"coordinates of {topology}", errors
     if guessed := constraints.bonds_guessed:
         check.asked.remarks.append(
             f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "

@@ -26,7 +26,6 @@ class Drift:
 
     slope: float
     error: float
-    change: float
 
     @property
     def significant(self) -> bool:
@@ -41,7 +40,7 @@ def fitted(times: FloatArray, values: FloatArray) -> Drift | None:
     if len(t) < 3 or not np.ptp(t) > 0:
         return None
     found = slope(t, y)
-    return Drift(found.value, found.error, found.value * float(np.ptp(t)))
+    return Drift(found.value, found.error)
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,6 @@ class CheckResult:
     n_rows: int
     n_constrained: int
     status: str
-    verdict: str
     precision: str
     tolerance: float
     targets: str
@@ -164,8 +162,22 @@ class CheckResult:
     temperature: dict[str, float] | None
     broken: Break | None
     series: dict[str, list[float]]
-    gaps: list[str] = field(default_factory=list)
-    remarks: list[str] = field(default_factory=list)
+    gaps: list[str]
+    remarks: list[str]
+    verdict: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        most = ", ".join(f"{unit.largest:.2g} {unit.unit} (rounding: up to {unit.bound:.2g})" for unit in self.units)
+        row, n_frames = self.worst[0], len(self.frames)
+        self.verdict = {
+            "kept": f"kept to the precision of the file: largest deviation {most}",
+            "tolerated": f"kept to the tolerance of {self.tolerance:g}: largest deviation {most}",
+            "incomplete": f"incomplete: {'; '.join(self.gaps)}; no violation otherwise in {n_frames} frames: largest "
+            f"deviation {most}",
+            "violated": f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed)"
+            f": {row.name} in frame {row.frame}; {self.violated_rows} of {self.n_rows} rows; {self.violated_frames} "
+            f"of {n_frames} frames, from frame {self.first_violated_frame}",
+        }[self.status]
 
     @property
     def violated(self) -> bool:
@@ -189,19 +201,18 @@ class Asked:
     #: Number of rows to name.
     worst: int
     #: What there is to say besides, and what is known beforehand to be missing.
-    remarks: list[str] = field(default_factory=list)
+    remarks: list[str]
     gaps: list[str] = field(default_factory=list)
 
 
 def result_of(
-    found: Found, table: RowTable, asked: Asked, precision: str, rank: int | None, masses: FloatArray, n_in_file: int
+    found: Found, table: RowTable, asked: Asked, precision: str, rank: int | None, n_in_file: int
 ) -> CheckResult:
     """All that there is to say of what was found, of a file of `n_in_file` frames and of a `precision` in words."""
     margins, held, numbers = found.rows["margin"], table.set, found.frames["frame"]
     times, remarks = np.array(found.frames["time"]), list(asked.remarks)
     violated = margins > 0
     order = np.lexsort((-np.where(violated, margins, found.rows["largest"]), ~violated))
-    worst = [_row(table, asked.labels, found, int(row)) for row in order[: max(asked.worst, 1)]]
     # Targets that are nothing but rounding.
     untold = table.measured & (table.of_targets > table.sizes)
     gaps = asked.gaps + _gaps(found, table, untold, asked.targets)
@@ -226,7 +237,7 @@ def result_of(
     }
     freedom, temperature = None, None
     if rank is not None:
-        freedom, kelvin = _temperatures(found, rank, masses, remarks)
+        freedom, kelvin = _temperatures(found, rank, held.masses, remarks)
         if kelvin is not None:
             series["temperature K"] = kelvin.tolist()
             line = fitted(times, kelvin)
@@ -244,7 +255,6 @@ def result_of(
         n_rows=held.n_rows,
         n_constrained=len(held.touched),
         status=status,
-        verdict=_verdict(status, table.tolerance, worst[0], units, int(violated.sum()), frames, len(numbers), gaps),
         precision=precision,
         tolerance=table.tolerance,
         targets=asked.targets,
@@ -252,7 +262,7 @@ def result_of(
         times=times.tolist(),
         n_frames_in_file=n_in_file,
         units=units,
-        worst=worst[: asked.worst],
+        worst=[_row(table, asked.labels, found, int(row)) for row in order[: asked.worst]],
         violated_rows=int(violated.sum()),
         violated_frames=len(frames),
         first_violated_frame=int(frames[0]) if len(frames) else None,
@@ -330,31 +340,6 @@ def _first_alone(table: RowTable, found: Found) -> str:
     return (
         f"the first frame alone differs{among}. Programs such as LAMMPS write it before they hold the constraints; "
         f"begin at frame {second} (--frames {second}:)"
-    )
-
-
-def _verdict(
-    status: str,
-    tolerance: float,
-    row: RowResult,
-    units: list[UnitResult],
-    violated: int,
-    frames: NDArray[np.int64],
-    n_frames: int,
-    gaps: list[str],
-) -> str:
-    """The result in a sentence; `violated` rows, in `frames` of `n_frames`; `gaps`: what could not be told."""
-    most = ", ".join(f"{unit.largest:.2g} {unit.unit} (rounding: up to {unit.bound:.2g})" for unit in units)
-    if status == "incomplete":
-        return f"incomplete: {'; '.join(gaps)}; no violation otherwise in {n_frames} frames: largest deviation {most}"
-    if status == "kept":
-        return f"kept to the precision of the file: largest deviation {most}"
-    if status == "tolerated":
-        return f"kept to the tolerance of {tolerance:g}: largest deviation {most}"
-    return (
-        f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed): {row.name} in "
-        f"frame {row.frame}; {violated} of {sum(unit.n_rows for unit in units)} rows; {len(frames)} of {n_frames} "
-        f"frames, from frame {frames[0]}"
     )
 
 

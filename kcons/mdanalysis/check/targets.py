@@ -1,6 +1,6 @@
 """Names of atoms, and lengths and angles that a parameter file gives rows of such names.
 
-A TOML (or JSON) file lists lengths by elements or atom names; the first entry that fits a row gives its target::
+A TOML file lists lengths by elements or atom names; the first entry that fits a row gives its target::
 
     unit = "angstrom"            # or "nm"
 
@@ -20,11 +20,10 @@ A TOML (or JSON) file lists lengths by elements or atom names; the first entry t
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,16 +62,15 @@ class AtomNames:
         residue = f"{self.residues[index]}{self._numbers[index]}"
         return f"{residue}:{name}" if residue else str(name)
 
-    def row(self, atoms: Iterable[int], most: int = 4) -> str:
-        """Atoms of a row; a residue is named once."""
-        numbers = [int(a) for a in atoms]
+    def row(self, atoms: NDArray[np.int64]) -> str:
+        """Atoms of a row, up to four; a residue is named once."""
         shown, previous = [], ""
-        for a in numbers[:most]:
+        for a in atoms[:4].tolist():
             label = self.atom(a)
             head, colon, name = label.rpartition(":")
             shown.append(name if colon and head == previous else label)
             previous = head
-        return "–".join(shown) + ("–…" if len(numbers) > most else "")
+        return "–".join(shown) + ("–…" if len(atoms) > 4 else "")
 
 
 class Rule(NamedTuple):
@@ -108,7 +106,6 @@ class TargetFile:
     Parameters
     ----------
     path : str or Path
-        TOML, or JSON if it ends in .json.
 
     Raises
     ------
@@ -124,12 +121,10 @@ class TargetFile:
                 item="targets",
             )
         try:
-            text = self.path.read_text(encoding="utf-8")
-            data = json.loads(text) if self.path.suffix.lower() == ".json" else tomllib.loads(text)
+            data = tomllib.loads(self.path.read_text(encoding="utf-8"))
         except (ValueError, OSError, RecursionError) as error:
-            raise InputError(f"{path}: no readable TOML or JSON ({error})", item="targets") from None
-        known = {"unit", *(kind for kind, _ in _KINDS.values())}
-        for wrong in sorted(set(data) - known) if isinstance(data, dict) else ["a list"]:
+            raise InputError(f"{path}: no readable TOML ({error})", item="targets") from None
+        for wrong in sorted(set(data) - {"unit", "length", "angle"}):
             raise InputError(f"{path}: {wrong!r} is unknown; there are unit, [[length]] and [[angle]]", item="targets")
         unit = data.get("unit", "angstrom")
         if unit not in _UNITS:

@@ -122,15 +122,19 @@ class Pendulum(HamiltonianFlow):
         """X(t) by Jacobi's elliptic functions, shape (2,) or (k, 2).
 
         With k^2 = H/(2 Omega): sin(theta/2) = k sn(Omega t + u_0 | k^2) for k < 1, and theta/2 = am(k Omega t + u_0 |
-        1/k^2) for k > 1, where the pendulum turns over. On the separatrix, k = 1, sn = tanh.
+        1/k^2) for k > 1, where the pendulum turns over.
+
+        Raises
+        ------
+        InputError
+            A start on the separatrix, k = 1, or so near that elliptic functions lose their digits.
         """
         theta0, rate0 = self._state(X0)
         times = as_float_array(t, "t")
         m = self.energy(X0) / (2.0 * self.omega)
-        # 1 - m without its cancellation, and what rounding makes of a start on the separatrix.
-        up, half, off = np.abs(np.cos(0.5 * theta0)), 0.5 * abs(rate0), 2.2e-16 * max(1.0, abs(theta0))
-        short, rounding = (up - half) * (up + half), (2 * up + off) * off
-        if rounding < abs(short) < NEAR_SEPARATRIX:
+        up, half = np.abs(np.cos(0.5 * theta0)), 0.5 * abs(rate0)
+        short = (up - half) * (up + half)  # 1 - m without its cancellation
+        if abs(short) < NEAR_SEPARATRIX:
             raise InputError(
                 f"the start is so near the separatrix (by {short:.2g} of its energy) that elliptic functions lose "
                 "their digits: take flow.solve(...)",
@@ -142,12 +146,6 @@ class Pendulum(HamiltonianFlow):
         if m == 0.0:
             return np.stack(np.broadcast_arrays(theta0 + 0 * times, 0.0 * times), axis=-1)
         k = np.sqrt(m)
-        if abs(short) <= rounding:
-            # On the separatrix, where the elliptic functions are infinite; at rest at the top, arctanh is.
-            with np.errstate(divide="ignore", over="ignore"):
-                u = np.sign(rate0) * self.omega * times + np.arctanh(sine)
-                half, rate = np.arctan(np.sinh(u)), 2.0 * np.sign(rate0) / np.cosh(u)
-            return np.stack([2.0 * half + 2 * np.pi * turns, rate], axis=-1)
         if m < 1.0:
             start = ellipkinc(np.arctan2(sine, half_rate), m)
             sn, cn, dn, _ = ellipj(self.omega * times + start, m)
@@ -221,37 +219,28 @@ class Thermostat(Flow):
 
         dx/dt = v,   dv/dt = f/m - alpha v,   alpha = v.f/(2K),   2K = v^T M v   (eq. 113)
 
-    On the surface of constant K (and of constant total momentum, where that is zero and conserved) g degrees of freedom
-    move, and the flow compresses phase space at the rate div V = -(g - 1) alpha.
+    On the surface of constant K the flow compresses phase space at the rate div V = -(g - 1) alpha, g the number of
+    components.
 
     Parameters
     ----------
     masses : array_like, shape (n,)
         One for each Cartesian component.
     force : callable (x) -> (n,)
-    momentum_removed : int
-        Number of directions in which the total momentum is zero and stays so (the forces sum to zero there): 0, or the
-        dimension of space, the components running fastest. They do not count as degrees of freedom.
     """
 
-    def __init__(
-        self, masses: ArrayLike, force: Callable[[FloatArray], ArrayLike], *, momentum_removed: int = 0
-    ) -> None:
+    def __init__(self, masses: ArrayLike, force: Callable[[FloatArray], ArrayLike]) -> None:
         m = as_float_array(masses, "masses").copy()
         if m.ndim != 1 or m.size < 2 or not np.all(np.isfinite(m) & (m > 0)):
             raise InputError("masses are positive, one for each of at least two Cartesian components", item="masses")
         check_call("force", force, ("x",))
-        momentum_removed = whole_number(momentum_removed, "momentum_removed", 0)
-        if momentum_removed and (m.size % momentum_removed or m.size == momentum_removed):
-            raise InputError("the components do not divide into particles of this dimension", item="momentum_removed")
-        self.masses, self.root = m, np.sqrt(m)
-        self.force, self.removed = force, momentum_removed
+        self.masses, self.root, self.force = m, np.sqrt(m), force
         super().__init__(self._field, 2 * m.size)
 
     @property
     def degrees_of_freedom(self) -> int:
         """g, before the thermostat takes its one."""
-        return self.masses.size - self.removed
+        return self.masses.size
 
     def state(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
         """X of positions and velocities."""
@@ -260,13 +249,6 @@ class Thermostat(Flow):
             raise InputError(f"x and v have {self.masses.size} components each, as the masses", item="x")
         if not v @ (self.masses * v) > 1e-290:
             raise InputError("an isokinetic thermostat needs non-zero kinetic energy", item="v")
-        if self.removed:
-            total = (self.masses * v).reshape(-1, self.removed).sum(axis=0)
-            if np.max(np.abs(total)) > 1e-12 * np.sum(np.abs(self.masses * v)):
-                raise InputError("the total momentum is not zero: subtract it from the start", item="v")
-            pull = self._force(x).reshape(-1, self.removed)
-            if np.max(np.abs(pull.sum(axis=0))) > 1e-9 * np.sum(np.abs(pull)):
-                raise InputError("the forces do not sum to zero, as momentum_removed has it", item="momentum_removed")
         return self._state(np.concatenate([self.root * x, self.root * v]))
 
     def positions(self, X: FloatArray) -> FloatArray:
@@ -287,16 +269,9 @@ class Thermostat(Flow):
         return np.concatenate([w, self._force(self.positions(X)) / self.root - self.friction(X) * w])
 
     def tangents(self, X: FloatArray) -> FloatArray:
-        """Orthonormal vectors along the surface of constant K and momentum, shape (2n, 2g - 1)."""
+        """Orthonormal vectors along the surface of constant K, shape (2n, 2n - 1)."""
         n = self.masses.size
-        fixed = np.zeros((n, 0))
-        if self.removed:
-            fixed = np.stack([self.root * (np.arange(n) % self.removed == k) for k in range(self.removed)], axis=1)
-        places = scipy.linalg.null_space(fixed.T)
-        speeds = scipy.linalg.null_space(np.column_stack([fixed, X[n:]]).T)
-        T = np.zeros((2 * n, places.shape[1] + speeds.shape[1]))
-        T[:n, : places.shape[1]], T[n:, places.shape[1] :] = places, speeds
-        return T
+        return np.asarray(scipy.linalg.block_diag(np.eye(n), scipy.linalg.null_space(X[None, n:])))
 
     def surface_divergence(self, X: ArrayLike) -> float:
         """div V along the surface, tr(T^T dV/dX T); equal to -(g - 1) alpha."""

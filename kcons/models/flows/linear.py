@@ -21,7 +21,6 @@ Wilkinson, SIAM Review 18, 578 (1976). Kagstrom and Ruhe, ACM Trans. Math. Softw
 
 from __future__ import annotations
 
-import math
 from enum import Enum
 from typing import NamedTuple, TypeAlias
 
@@ -178,8 +177,6 @@ class JordanBlocks(NamedTuple):
     #: Whether the structure stands out from rounding: no other eigenvalue lies so near that it might belong to these,
     #: and no coupling is so weak that it might be none. If not, it is one of several that the matrix may have.
     certain: bool = True
-    #: A matrix with this structure exactly lies so near, in parts of the norm of the (balanced) matrix.
-    distance: float = 0.0
 
 
 class JordanForm(NamedTuple):
@@ -253,12 +250,11 @@ def _structures(
     if stairs is None:
         parts = _clusters(values, found.errors[members] / (CLOSER * closer))
         return [piece for part in parts for piece in _structures(found, members[part], CLOSER * closer)]
-    widths, W, V, neglected, kept = stairs
+    widths, W, V, kept = stairs
     sizes = tuple(sum(w > k for w in widths) for k in range(widths[0]))
     certain = closer == 1.0 and kept > STANDS_OUT * NULL * noise
-    distance = neglected / (float(scipy.linalg.norm(found.triangular)) or 1.0)
     chains = np.split(basis @ V @ _chains(W, widths), np.cumsum(sizes)[:-1], axis=1)
-    return [(JordanBlocks(mean, sizes, certain, distance), np.hstack([_of_unit_length(c) for c in chains]))]
+    return [(JordanBlocks(mean, sizes, certain), np.hstack([_of_unit_length(c) for c in chains]))]
 
 
 def _of_unit_length(chain: ComplexArray) -> ComplexArray:
@@ -267,30 +263,29 @@ def _of_unit_length(chain: ComplexArray) -> ComplexArray:
     return np.asarray(chain * (abs(largest) / largest) / scipy.linalg.norm(chain))
 
 
-def _staircase(N: ComplexArray, zero: float) -> tuple[list[int], ComplexArray, ComplexArray, float, float] | None:
+def _staircase(N: ComplexArray, zero: float) -> tuple[list[int], ComplexArray, ComplexArray, float] | None:
     """Null spaces of a nilpotent matrix and of what is left of it, one after the other.
 
     Returns the dimensions of them, which never grow, as singular values interlace; W, strictly upper triangular by
-    blocks of these sizes, and the unitary V with V W V^H = N but for what was neglected; the norm of that; and the
-    least singular value that was not taken as zero. None if N is not nilpotent to this accuracy.
+    blocks of these sizes, and the unitary V with V W V^H = N but for what was neglected; and the least singular value
+    that was not taken as zero. None if N is not nilpotent to this accuracy.
     """
     W, V = N.copy(), np.eye(len(N), dtype=np.complex128)
     widths: list[int] = []
-    start, neglected, kept = 0, 0.0, np.inf
+    start, kept = 0, np.inf
     while start < len(N):
         _, singular, vh = np.linalg.svd(W[start:, start:])
         null = int(np.sum(singular <= zero))
         if null == 0:
             return None
         kept = min([kept, *singular[:-null]])
-        neglected = math.hypot(neglected, *singular[-null:])
         turn = np.roll(vh, null, axis=0).conj().T
         W[:, start:], V[:, start:] = W[:, start:] @ turn, V[:, start:] @ turn
         W[start:, :] = turn.conj().T @ W[start:, :]
         W[start:, : start + null] = 0.0
         widths.append(null)
         start += null
-    return widths, W, V, neglected, kept
+    return widths, W, V, kept
 
 
 def _chains(W: ComplexArray, widths: list[int]) -> ComplexArray:

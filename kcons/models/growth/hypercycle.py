@@ -61,14 +61,12 @@ class Hypercycle(GrowthModel):
         """(a): sum x fixed (notes eq. 144)."""
         return ConstrainedHypercycle(self, [TotalPopulation(self.n)])
 
-    def with_entropy_production(
-        self, tau: float, budget: float | None = None, *, partial: bool = False
-    ) -> ConstrainedHypercycle:
+    def with_entropy_production(self, tau: float, budget: float | None = None) -> ConstrainedHypercycle:
         """(b): sum x fixed, and entropy produced at a rate that decays with the time tau (notes eq. 149).
 
         The budget T(s_eq - s_0) is computed from the start where it is not given, and checked against it where it is.
         """
-        return self.with_law(Relaxation(tau, budget, partial=partial))
+        return self.with_law(Relaxation(tau, budget))
 
     def without_entropy_production(self) -> ConstrainedHypercycle:
         """(c): sum x fixed, no entropy produced in all (notes eq. 150)."""

@@ -315,30 +315,23 @@ class Relaxation(EntropyLaw):
     ----------
     tau : float
     budget : float, optional
-        T(s_eq - s_0); left out, it is computed from the start, g(x_0) - g_eq.
-    partial : bool
-        Whether a smaller budget is meant: the system then stops short of equilibrium, in a state that keeps moving.
+        T(s_eq - s_0), which has to be that of the start, g(x_0) - g_eq.
     """
 
     @checked
-    def __init__(self, tau: Positive, budget: NotNegative | None = None, *, partial: bool = False) -> None:
-        self.tau, self.budget, self.partial = tau, budget, partial
-        self.relaxation_rate = None if partial else 1.0 / (2.0 * self.tau)
-
-    def _budget(self, excess0: float) -> float:
-        # A budget that agrees with the start is the start's.
-        return self.budget if self.partial and self.budget is not None else excess0
+    def __init__(self, tau: Positive, budget: NotNegative | None = None) -> None:
+        self.tau, self.budget = tau, budget
+        self.relaxation_rate = 1.0 / (2.0 * self.tau)
 
     def produced(self, elapsed: float, excess0: float) -> float:
-        return -self._budget(excess0) * math.expm1(-elapsed / self.tau)
+        return -excess0 * math.expm1(-elapsed / self.tau)
 
     def excess(self, elapsed: float, excess0: float) -> float:
-        budget = self._budget(excess0)
-        return budget * math.exp(-elapsed / self.tau) + (excess0 - budget)
+        return excess0 * math.exp(-elapsed / self.tau)
 
     def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
         # Told by the state instead of the time: the same on the constraint, but errors fade instead of piling up.
-        return -(excess - (excess0 - self._budget(excess0))) / self.tau
+        return -excess / self.tau
 
     def check(self, excess0: float, most: float) -> None:
         budget = self.budget
@@ -358,11 +351,11 @@ class Relaxation(EntropyLaw):
                 f"more than the start can produce, g(x_0) - g_eq = {excess0:.10g}: equilibrium would be reached at "
                 f"t = {time:.6g} with entropy still to be produced. Leave the budget out, it is then computed"
             )
-        elif share < 1.0 - BUDGET_TOLERANCE and not self.partial:
+        elif share < 1.0 - BUDGET_TOLERANCE:
             said = (
                 f"less than what lies between the start and equilibrium, g(x_0) - g_eq = {excess0:.10g}: the system "
                 f"would stop producing at an excess of {excess0 * (1.0 - share):.6g}; s_eq would not be the entropy "
-                "at equilibrium. Leave the budget out, it is then computed, or say partial=True if this is meant"
+                "at equilibrium. Leave the budget out, it is then computed"
             )
         if said and budget is not None:
             raise BudgetError(f"T(s_eq - s_0) = {budget:.10g} is {said}", budget=budget, consistent=excess0, time=time)

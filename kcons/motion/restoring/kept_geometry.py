@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from kcons.constraints import Distance, DistanceDifference
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import minimum_image
+from kcons.constraints.periodic.one_piece import connected, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
@@ -19,7 +19,7 @@ from kcons.motion.restoring.rigid_pieces import MoleculeGraph
 from kcons.plan.independent_blocks import fixed_atoms
 from kcons.solvers.rank_revealing import independent
 from kcons.topology.guessed_bonds import NEAREST, across, bonds_without_elements
-from kcons.topology.topology import BoolArray, bond_angles, connected, sorted_pairs
+from kcons.topology.topology import BoolArray, bond_angles, sorted_pairs
 
 #: Other bonds may change by this part of their length (0.02 angstrom for C-C), other angles by this much in radian.
 BOND_KEPT, ANGLE_KEPT = 0.0125, np.radians(2.0)

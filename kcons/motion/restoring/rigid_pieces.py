@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import make_whole, neighbor_lists, spanning_tree
+from kcons.constraints.periodic.one_piece import connected, make_whole, neighbor_lists, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.plan.independent_blocks import edge_blocks
-from kcons.topology.topology import connected, sorted_pairs
+from kcons.topology.topology import sorted_pairs
 
 #: Origin and unit axis of a motion at given positions; None where they are undefined.
 Frame = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]

@@ -1,17 +1,19 @@
 """Constraint objects of kcons as a part of an integrator: PythonForces carry positions to the engine, corrections back.
 
-A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three of
-them, each in a force group of its own, serve one set of rows:
+A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three or
+four of them, each in a force group of its own, serve one set of rows:
 
 * `remember`: the positions at the start of a drift, where gradients are taken. Returns no force. Left out where the
   last drift has ended there for sure.
 * `land`: positions after free flight. Its 'force' is the change that brings them onto the rows, x = x + f.
 * `project`: positions x + v/1024 ps. Its 'force' is the change of v that makes it tangent to the rows at x. What
   rounding takes from v on this way follows in a second call, except for thermostats.
+* `turn`: where all rows are spheres, drifts may be great circles. `land` computes them, and this tells what they do to
+  v, times their length.
 
 Each returns an 'energy' of 0, or 1 where the engine raised an error: nothing may be raised through OpenMM, so the
-error is kept and the integrator told to take the step back. Outside of steps all three return nothing to speak of:
-rows that are fulfilled need no correction.
+error is kept and the integrator told to take the step back. Outside of steps they return nothing to speak of: rows
+that are fulfilled need no correction.
 
 GPUs keep forces as multiples of 2^-32, and CustomIntegrator reads them divided by 2^32 - 1. In mixed precision
 positions are pairs of single numbers, 48 bits: a PythonForce of all particles gets both, one of some particles only the
@@ -23,7 +25,7 @@ from __future__ import annotations
 
 import uuid
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Self, cast
 
 import numpy as np
@@ -35,7 +37,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.openmm.collective.coordinates import free_groups
@@ -56,7 +58,7 @@ from kcons.openmm.quantities import accepted, masses_of, nanometers, number, wit
 from kcons.openmm.states import forces_at, positions_of
 from kcons.openmm.topology import bonds_of
 from kcons.steppers.operations import Exchange
-from kcons.steppers.state import START_TOLERANCE
+from kcons.steppers.stages.packed_system import spheres_of
 
 #: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbor list, and v is rounded to
 #: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
@@ -71,7 +73,7 @@ CARRY_SCALE = 2.0**20
 #: What GPUs multiply forces with, and what CustomIntegrator divides them by.
 _TO_WHOLE, _FROM_WHOLE = 2.0**32, 2.0**32 - 1
 
-PHASES = ("remember", "land", "project")
+PHASES = ("remember", "land", "project", "turn")
 
 
 def hands_over_all() -> bool:
@@ -138,20 +140,9 @@ class Passage:
             return np.array_equal(x, y)
         return bool(np.abs(x - y).max(initial=0.0) <= 4 * self.precision.place * np.abs(y).max(initial=0.0))
 
-    def grain(self, reach: float) -> float:
-        """Spacing of coordinates at a distance from the origin."""
-        return float(np.spacing(reach)) if self.precision.name == "double" else 2 * self.precision.place * reach
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """What positions, of the scale of a row, and velocities, of their size, may be off."""
-        if self.precision.name == "double":
-            return START_TOLERANCE, START_TOLERANCE
-        return self.precision.tolerance, self.precision.speeds
-
 
 class Engine:
-    """What the three callbacks share: the engine, where the particles are, and how far the step is."""
+    """What the callbacks share: the engine, where the particles are, and how far the step is."""
 
     def __init__(
         self,
@@ -176,18 +167,21 @@ class Engine:
         self._x, self._read = np.zeros(local), np.zeros(local)
         #: To and from OpenMM.
         self.passage = Passage(self.atoms, n)
-        rows = self.motion.constraint_set.n_rows
-        self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
+        self.precision = self.passage.precision
         #: Whether the times of a drift matter, or its length.
         self.timed = self.motion.constraint_set.moving or not self.motion.constraint_set.holonomic.all()
         resting = [c.atoms.ravel() for c in held.constraints if c.fixes_atoms]
         fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
         #: Which of the carried particles do not move.
         self._fixed = np.searchsorted(self.atoms, fixed)
+        #: Center and radius of each carried particle, where all of them are on resting spheres.
+        spheres = spheres_of(self.motion)
+        self.spheres = None if spheres is None or len(fixed) else spheres[self.atoms]
+        #: Whether drifts are great circles on these, and what the last one has done to v times its length.
+        self.exact, self._turned = False, np.zeros(local)
         self._integrator: Callable[[], Integrator | None] = lambda: None
         #: Whether an integrator of kcons knows of the rows; where none does, the step count at the last evaluation.
         self.served, self._count = False, -1
-        self._lean = False
         self._fractions: tuple[float, ...] = (1.0,)
         self._nodes: tuple[float, ...] = (0.0, 1.0)
         #: Whether velocities are projected between the drifts of a step, too.
@@ -196,8 +190,6 @@ class Engine:
         self._between_steps, self._began, self._stage = True, (0.0, 0), 0
         #: Time and step count where the present run of steps began.
         self._ran: tuple[float, int] | None = None
-        #: The step size of that run, ps.
-        self._made_with = 0.0
         #: Whether what is lost in carrying v is carried after it, and whether that comes next.
         self.carries_rest, self._rest_to_come = False, False
         #: Whether it is known where the drift begins.
@@ -205,11 +197,9 @@ class Engine:
         #: Free positions of the drift and what brings them onto the rows.
         self._landing: tuple[FloatArray, FloatArray] | None = None
 
-    def follow(self, integrator: Integrator, lean: bool) -> None:
-        """Take times and step sizes from this integrator; `lean` as for parts."""
-        self._lean = lean
-        self._push.fill(np.nan)
-        self._push_before.fill(np.nan)
+    def follow(self, integrator: Integrator, exact: bool) -> None:
+        """Take times and step sizes from this integrator; `exact` as for parts."""
+        self.exact = exact
         self._integrator, self.served = weakref.ref(integrator), True
         self.carries_rest = not integrator.thermostatted
         operations = integrator.ensemble.operations(integrator.scheme)
@@ -219,16 +209,13 @@ class Engine:
 
     def take_precision(self, precision: Precision) -> None:
         """The Context is known. Where positions have 48 bits, what v loses on its way is less than forces know."""
-        self.passage.precision = precision
+        self.precision = self.passage.precision = precision
         if precision.name != "double":
             self.carries_rest = False
 
     def begin_run(self) -> None:
         """Whatever was asked between steps, the next call belongs to the beginning of one."""
         self._between_steps, self._rest_to_come, self._ran = True, False, None
-        if self._made_with != self._dt:  # impulses of steps of another length are not to be mixed
-            self._made_with = self._dt
-            self._push.fill(np.nan)
 
     # -- callbacks ------------------------------------------------------------------------------
 
@@ -262,6 +249,7 @@ class Engine:
     def _begin_drift(self) -> None:
         self._landing, self._begun = None, True
         self._start[self._held] = self._x
+        self._turned.fill(0.0)
 
     def land(self, state: openmm.State) -> FloatArray | None:
         there, read = self._there, self._read
@@ -273,22 +261,20 @@ class Engine:
         if not self._begun:
             self._begin_drift()  # where the last drift ended: nobody has moved x since
         self._begun = False
-        there[self._held] = read
-        then, now, h = self._times(self._stage)
-        impulse = self._impulse if len(self._fractions) == 1 else None
-        # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
-        moved = self._moved
-        moved.fill(0.0)
-        self.motion.project_positions(
-            there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, flight=h, out=there,
-            multipliers=impulse,
-        )  # fmt: skip
-        change = np.array(moved[self._held])
-        fixed = self._fixed
-        change[fixed] = there[self.atoms[fixed]] - read[fixed]
-        # What the velocity stage before found belongs to the same positions as this impulse.
-        self._push, self._push_before = self._push_before, self._push
-        self._push.fill(0.0)
+        if self.exact:
+            change, self._turned = great_circles(self._x, read, cast(FloatArray, self.spheres))
+        else:
+            there[self._held] = read
+            then, now, h = self._times(self._stage)
+            # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
+            moved = self._moved
+            moved.fill(0.0)
+            self.motion.project_positions(
+                there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, flight=h, out=there
+            )
+            change = np.array(moved[self._held])
+            fixed = self._fixed
+            change[fixed] = there[self.atoms[fixed]] - read[fixed]
         change, arriving = self.passage.carried(change)
         np.add(read, arriving, out=self._x)
         self._landing = (read.copy(), change)
@@ -307,24 +293,26 @@ class Engine:
             return None
         self._rest_to_come = self.carries_rest
         read *= SPEED_SCALE
-        push = self._push if len(self._fractions) == 1 else None
-        return self.passage.carried(self._tangent(read, push) - read)[0]
+        return self.passage.carried(self._tangent(read) - read)[0]
+
+    def turn(self, state: openmm.State) -> FloatArray | None:
+        return None if self._between_steps else self.passage.carried(self._turned)[0]
 
     def _project_rest(self, read: FloatArray) -> FloatArray:
         """The same for what was too small to be carried with v, as large as it comes: any factor will do."""
         read *= SPEED_SCALE
-        change = self._tangent(read, None) - read
+        change = self._tangent(read) - read
         if self.motion.plan.driven:
             # The rate that the rows demand is in v already.
-            change -= self._tangent(np.zeros_like(read), None)
+            change -= self._tangent(np.zeros_like(read))
         return self.passage.carried(change)[0]
 
-    def _tangent(self, read: FloatArray, multipliers: FloatArray | None) -> FloatArray:
+    def _tangent(self, read: FloatArray) -> FloatArray:
         """Velocities of the carried particles, projected."""
         v, x = self._v, self._start
         v[self._held], x[self._held] = read, self._x
         now = self._times(self._stage if self._within else len(self._nodes) - 2)[1]
-        self.motion.project_velocities(x, v, time=now, out=v, multipliers=multipliers)
+        self.motion.project_velocities(x, v, time=now, out=v)
         return np.array(v[self._held])
 
     def _time(self, state: openmm.State) -> float:
@@ -361,7 +349,7 @@ class Engine:
             if phase == "remember":
                 self.remember(state)
             elif self._error is None:
-                change = self.land(state) if phase == "land" else self.project(state)
+                change = getattr(self, phase)(state)
             elif phase == "project":
                 self._between_steps, self._rest_to_come = True, False
         except BaseException as error:
@@ -370,25 +358,19 @@ class Engine:
 
     # -- afterwards -----------------------------------------------------------------------------
 
-    def step_multipliers(self) -> FloatArray:
-        integrator = self._integrator()
-        # A drift of velocities that were not made tangent has pushed for that as well.
-        whole = self._lean and integrator is not None and integrator.getGlobalVariableByName("led") != 0
-        unknown = len(self._fractions) != 1 or (np.isnan(self._push_before).any() and not whole)
-        if integrator is None or integrator.thermostatted or unknown:
-            raise InputError(
-                "multipliers of a step need two steps of a scheme with one drift, at constant energy and with "
-                "device=False; multipliers(context) gives those of any state",
-                item="scheme",
-            )
-        dt = self._made_with
-        return np.asarray(self._impulse / dt**2 - (0.0 if whole else self._push_before / dt))
-
     def explained_error(self, step: int) -> KconsError:
         error = self._error
         self._error = None
         if error is None:
             return ConvergenceError(f"step {step}: the carried rows failed without saying why", step=step)
+        finite = np.isfinite(self._read).all(axis=1)
+        if isinstance(error, InputError) and not finite.all():
+            atom = int(self.atoms[np.argmin(finite)])
+            error = NonFiniteError(
+                f"forces or velocities of atom {atom} are not finite; the time step is too large",
+                item="velocity",
+                atom=atom,
+            )
         cause = "time step too large, or a state off the rows. " if isinstance(error, ConvergenceError) else ""
         if isinstance(error, KconsError):
             error.args = (f"step {step}: {cause}{error}", *error.args[1:])
@@ -414,6 +396,27 @@ class Callback:
         )
 
 
+def great_circles(x: FloatArray, there: FloatArray, spheres: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What takes particles from where they flew freely to the ends of great circles, and changes v, times the time.
+
+    d = x - c turns in the plane of d and u, the way that is tangent, by w = |u|/R: it becomes d cos(w) + u sin(w)/w,
+    and u becomes u cos(w) - d w sin(w). d is brought to the length R on the way, so that rounding does not add up.
+
+    Parameters
+    ----------
+    x, there : ndarray, shape (n, 3)
+        Where the drift begins, and where it leads without the spheres.
+    spheres : ndarray, shape (n, 4)
+        Centers and radii.
+    """
+    radius, d, way = spheres[:, 3:], x - spheres[:, :3], there - x
+    d *= radius / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None]
+    u = way - d * (np.einsum("ij,ij->i", d, way)[:, None] / radius**2)
+    w = np.sqrt(np.einsum("ij,ij->i", u, u))[:, None] / radius
+    end = spheres[:, :3] + d * np.cos(w) + u * np.sinc(w / np.pi)
+    return end - there, u * np.cos(w) - d * (w * np.sin(w)) - way
+
+
 # -- what OpenMM gives ----------------------------------------------------------------------------
 
 
@@ -432,24 +435,9 @@ def cell_of(vectors: Any) -> FloatArray:
 
 
 class CarriedConstraints(Part):
-    """Rows of kcons on the particles of an OpenMM System, for `ProjectedIntegrator(parts=[...])`.
+    """Rows of kcons on the particles of an OpenMM System, for `ProjectedIntegrator(parts=[...])`; `hold` makes them.
 
-    Most often made by `hold`, which also moves constraints of the System that share atoms with the rows.
-
-    Parameters
-    ----------
-    system : openmm.System
-        Masses and periodicity are taken from it; it is not changed before `add_to`. Particles without mass stay
-        where they are.
-    constraints : Constraint or iterable of Constraint
-        What is held: Quantities, or numbers of nm, ps, dalton, radian. Functions get numbers and may return either.
-    positions : Quantity or array_like, shape (n_particles, 3)
-        On or near the constraints, in nm if without unit.
-    periodic : bool, optional
-        Whether rows take minimum images; by default if the System is periodic. Turn it off for rows longer than
-        half the box among molecules that are never cut.
-    time : float
-        Time of `positions` in ps, for targets that move.
+    The arguments are those of `hold`. The System is not changed before `add_to`.
 
     Raises
     ------
@@ -461,7 +449,7 @@ class CarriedConstraints(Part):
     The rows belong to this System: it can be neither copied nor written to XML afterwards.
     """
 
-    evaluates = lands_last = True
+    lands_last = True
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
 
@@ -483,8 +471,12 @@ class CarriedConstraints(Part):
         cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
         self._engine = Engine(with_massless_atoms(given, masses), x, masses, cell, time)
         refuse_virtual_sites(system, self.atoms, masses)
-        groups = free_groups(system, len(PHASES), "rows")[-len(PHASES) :][::-1]
-        self._groups, self.groups = dict(zip(PHASES, groups, strict=True)), frozenset(groups)
+        #: The constraints as they were given, with targets that were found.
+        self.given: Sequence[Constraint] = self.motion.sources[0].constraints
+        self.flies_exactly = self._engine.spheres is not None
+        phases = PHASES if self.flies_exactly else PHASES[:3]
+        groups = free_groups(system, len(phases), "rows")[-len(phases) :][::-1]
+        self._groups, self.groups = dict(zip(phases, groups, strict=True)), frozenset(groups)
         #: How the names of its forces begin.
         self._name = f"{ROW_NAME}s {uuid.uuid4().hex}"
 
@@ -595,13 +587,17 @@ class CarriedConstraints(Part):
         """sigma and A v of the constraints that were given, from the positions and velocities of the context."""
         x, v, time = self._state(context)
         held = self.motion.sources[0]
-        found = held.residuals(x, v if velocities else None, time)
-        near, slow = self._engine.passage.limits
+        with np.errstate(all="ignore"):
+            found = held.residuals(x, v if velocities else None, time)
+        if not np.isfinite(found.norms).all():  # rows that have no gradient here have a name
+            for item, start in zip(held.constraints, held.starts, strict=False):
+                item.check(held.gather(item, x), time, int(start))
+        near, slow = self._engine.precision.limits
         allowed = np.maximum(near * held.scale, found.allowed)
         reach = np.abs(x[held.touched]).max(initial=0.0)
         if self._slopes is None:
             self._slopes = found.norms
-        if self._engine.passage.precision.name != "double" and context.getSystem().usesPeriodicBoundaryConditions():
+        if self._engine.precision.name != "double" and context.getSystem().usesPeriodicBoundaryConditions():
             # OpenMM rounds molecules to single numbers where it moves them back into the box.
             allowed += 2.0**-22 * reach * self._slopes
         miss = Violation.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
@@ -609,7 +605,7 @@ class CarriedConstraints(Part):
             return miss
         size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
         # What is taken from v where it is carried together with x: all there is of a body at rest.
-        lost = 4 * SPEED_SCALE * self._engine.passage.grain(reach) * self._slopes
+        lost = 4 * SPEED_SCALE * self._engine.precision.grain(reach) * self._slopes
         return Violation.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
 
     def apply_positions(self, context: openmm.Context) -> None:
@@ -646,21 +642,6 @@ class CarriedConstraints(Part):
         f = forces_at(context, groups_in(context.getIntegrator()) - self.groups)
         return self.motion.multipliers(x, v, f, time)
 
-    @property
-    def step_multipliers(self) -> FloatArray:
-        """Multipliers at the positions where the last step began, from the step itself, shape (n_rows,).
-
-        2 Lambda/dt^2 of the position stage and -2 mu/dt of the velocity stage before are each of first order in dt;
-        this is their mean, of second order. Costs nothing. For schemes with one drift a step, from the second step
-        on.
-
-        Raises
-        ------
-        InputError
-            No two steps of such a scheme have been made.
-        """
-        return self._engine.step_multipliers()
-
     def report(self, context: openmm.Context, *, condition: bool = True) -> Report:
         """Rank, condition, residuals and solvers at the state of the context."""
         x, v, time = self._state(context)
@@ -673,7 +654,7 @@ class CarriedConstraints(Part):
     # -- the program ----------------------------------------------------------------------------
 
     def declare(self, program: Program) -> None:
-        self._engine.follow(program.integrator, self.lean)
+        self._engine.follow(program.integrator, self.exact)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Refuse single precision; what passes through OpenMM is known now."""
@@ -716,9 +697,14 @@ class CarriedConstraints(Part):
         group = self._groups["land"]
         program.each("x", f"x+{h}*{u}", "move freely (drift)")
         self._guard(program, "land", "carried rows: solve for positions")
+        onto = f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them"
+        if self.exact:
+            program.each("x", *onto)
+            group = self._groups["turn"]
         # Force and energy come from one evaluation, for this moves no x.
         program.each("v", f"{u}+{1 / CARRY_SCALE!r}*f{group}/{h}", "the constraint forces act on v as well")
-        program.each("x", f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them")
+        if not self.exact:
+            program.each("x", *onto)
 
     def project(self, program: Program) -> None:
         change = f"f{self._groups['project']}"

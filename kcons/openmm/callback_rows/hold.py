@@ -78,17 +78,20 @@ def hold(
     system : openmm.System
         Changed in place.
     constraints : Constraint or iterable of Constraint
-        What is held: Quantities, or plain numbers of nm, ps, dalton, radian. Empty if only constraints of the System
-        are to move over.
+        What is held: Quantities, or plain numbers of nm, ps, dalton, radian; functions get numbers and may return
+        either. Empty if only constraints of the System are to move over.
     positions : Quantity or array_like, shape (n_particles, 3)
-        On or near the constraints; targets left at None are taken from them.
+        On or near the constraints, in nm if without unit; targets left at None are taken from them.
     take : {'touched', 'all'}
         Which of the System's constraints move over: those that share atoms with the rows, directly or through others,
         or all.
     keep_water
         As for `move_constraints`; water that a row touches moves over.
-    periodic, time
-        As for `CarriedConstraints`.
+    periodic : bool, optional
+        Whether rows take minimum images; by default if the System is periodic. Turn it off for rows longer than
+        half the box among molecules that are never cut.
+    time : Quantity or float
+        Time of `positions` in ps, for targets that move.
     join : bool
         Whether molecules that a row connects count as one from now on, for barostats and wrapping. Needed where
         a barostat would move them apart.
@@ -105,11 +108,10 @@ def hold(
     """
     given = constraints_in(constraints, "constraints")
     table = _table(system)
-    n = system.getNumParticles()
     if take not in ("touched", "all"):
         raise InputError(f"take is {take!r}; give 'touched' or 'all'", item="take")
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
-    chosen = _sharing(table, touched[touched < n])
+    chosen = _sharing(table, touched)
     if take == "all":
         chosen |= table.all_but_water if keep_water else table.all
     taken = _as_rows(table, chosen)
@@ -177,8 +179,8 @@ def _table(system: openmm.System) -> _Table:
 
 
 def _sharing(table: _Table, atoms: IntArray) -> NDArray[np.bool_]:
-    """Constraints of the clusters that these atoms belong to."""
-    return np.asarray(np.isin(table.cluster, table.clusters[atoms]))
+    """Constraints of the clusters that these atoms belong to; what is no particle is told later."""
+    return np.asarray(np.isin(table.cluster, table.clusters[atoms[atoms < len(table.clusters)]]))
 
 
 def _as_rows(table: _Table, chosen: NDArray[np.bool_]) -> list[Constraint]:

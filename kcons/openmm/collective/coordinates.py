@@ -6,7 +6,6 @@ import ast
 import math
 import re
 from collections.abc import Iterable, Sequence
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -185,40 +184,6 @@ def _terms(force: openmm.Force) -> list[Any]:
 
 def _variables(force: openmm.CustomCVForce) -> list[openmm.Force]:
     return [force.getCollectiveVariable(k) for k in range(force.getNumCollectiveVariables())]
-
-
-def forces_by_term(force: openmm.Force) -> list[openmm.Force]:
-    """One Force for each variable of a CustomCVForce, or for each term of a Force made of terms.
-
-    So a CustomBondForce with three bonds becomes three rows.
-
-    Parameters
-    ----------
-    force : openmm.Force
-        CustomCVForce (its energy expression plays no part), CustomBond-, CustomAngle-, CustomTorsion-,
-        CustomCompoundBond-, CustomCentroidBond-, CustomExternalForce, HarmonicBond-, HarmonicAngle-,
-        PeriodicTorsion- or RBTorsionForce. It is left as it is.
-
-    Raises
-    ------
-    UnsupportedError
-        The Force is none of these.
-    """
-    if isinstance(force, openmm.CustomCVForce):
-        return [deepcopy(variable) for variable in _variables(force)]
-    kind = type(force).__name__
-    if kind not in _TERMS:
-        raise UnsupportedError(f"a {kind} has no terms to hold one by one; make a Force for each row")
-    # OpenMM has no method to take terms away, but its XML has a list of them.
-    term, xml = _TERMS[kind][0], openmm.XmlSerializer.serialize(force)
-    emptied = re.sub(rf"<{term}s>.*?</{term}s>", f"<{term}s/>", xml, count=1, flags=re.DOTALL)
-    found = []
-    for parameters in _terms(force):
-        one = openmm.XmlSerializer.deserialize(emptied)
-        assert not _terms(one)
-        getattr(one, f"add{term}")(*parameters)
-        found.append(one)
-    return found
 
 
 def _atoms_of(force: openmm.Force) -> set[int] | None:

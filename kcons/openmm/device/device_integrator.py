@@ -8,7 +8,6 @@ import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import openmm
@@ -16,6 +15,7 @@ import openmm
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
@@ -25,7 +25,7 @@ from kcons.openmm.device.kernel_rows import KernelRows, as_parts
 from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
-from kcons.openmm.ensembles.nose_hoover_ensemble import CHAIN_ORDER, NoseHoover, NoseHooverMiddle
+from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
@@ -34,11 +34,12 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import to_scheme
 from kcons.openmm.integrator.steps import write_step
+from kcons.openmm.quantities import nanometers
 from kcons.openmm.states import box_of, positions_of
-from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, listed
+from kcons.openmm.surface_integrator import SurfaceIntegrator
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.nose_hoover import chain_fractions
+from kcons.thermostats.nose_hoover import FRACTIONS
 
 #: Ensembles whose operations kernels have.
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
@@ -103,7 +104,7 @@ def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> lis
             now = ends[-1]
         elif isinstance(operation, Chain):
             assert isinstance(ensemble, NoseHoover)
-            flights = tuple(operation.fraction * f for f in chain_fractions(CHAIN_ORDER, 1))
+            flights = tuple(operation.fraction * f for f in FRACTIONS)
         done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
         if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
             done.append(Op("rescale"))
@@ -404,12 +405,6 @@ class DeviceIntegrator(ProjectedIntegrator):
     def getRandomNumberSeed(self) -> int:
         return self._seed
 
-    def _has_written(self, xml: str) -> bool:
-        found = json.loads(ElementTree.fromstring(xml).attrib["description"])
-        mine = json.loads(self._described)
-        self.setRandomNumberSeed(found["seed"])
-        return all(found[name] == mine[name] for name in ("operations", "memory", "noisy", "spheres", "parts"))
-
 
 def _refuse_of_programs(name: str) -> Any:
     def refuse(self: DeviceIntegrator, *args: Any, **options: Any) -> None:
@@ -493,7 +488,10 @@ class DeviceSurfaceIntegrator(SurfaceIntegrator, DeviceIntegrator):
     """`SurfaceIntegrator` whose steps are kernels of a plugin."""
 
     def _surface_parts(self, surfaces: Any, system: openmm.System | None, positions: Any) -> Sequence[Any]:
-        return listed(surfaces, positions, 2**31 if positions is None else len(positions))
+        if positions is None:
+            return list(surfaces)
+        x = nanometers(positions, len(positions))
+        return ConstraintSet(surfaces, x, np.ones(len(x))).constraints
 
 
 def choose(
@@ -502,6 +500,7 @@ def choose(
     scheme: str | Splitting = "rattle",
     *,
     parts: Sequence[Any] = (),
+    surfaces: Any = (),
     ensemble: Ensemble | None = None,
     classes: tuple[type[ProjectedIntegrator], type[DeviceIntegrator]] = (ProjectedIntegrator, DeviceIntegrator),
     **others: Any,
@@ -513,9 +512,10 @@ def choose(
     UnsupportedError
         `device` is True, and there is no plugin or it has no kernels for this step.
     """
-    why = refusal(to_scheme(scheme), parts, ConstantEnergy() if ensemble is None else ensemble) or build.refusal()
-    listed = parts if isinstance(parts, Iterable) else (parts,)
-    nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in listed)
+    given, around = (tuple(some) if isinstance(some, Iterable) else (some,) for some in (parts, surfaces))
+    kind = ConstantEnergy() if ensemble is None else ensemble
+    why = refusal(to_scheme(scheme), [*around, *given], kind) or build.refusal()
+    nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in given)
     if not why and device is None and not nowhere_else:
         why = build.reluctance()
     if not why:

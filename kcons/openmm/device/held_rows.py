@@ -18,7 +18,6 @@ from kcons.constraints.functions.straight_line import Function, function_of
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
 from kcons.openmm.device.c_writer import c_functions
 from kcons.plan.clusters_alike import alike
 
@@ -56,10 +55,8 @@ def constraints_of(parts: Any) -> list[Constraint]:
     for part in parts if isinstance(parts, Iterable) else (parts,):
         if isinstance(part, Constraint):
             found.append(part)
-        elif hasattr(part, "given"):  # all of an integrator, as it has them
+        elif hasattr(part, "given"):
             found += part.given
-        elif isinstance(part, CarriedConstraints):
-            found += part.motion.sources[0].constraints
         else:
             raise UnsupportedError(
                 f"{part!r} is not held on the device; give constraint objects of kcons, or leave it to the host "

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import openmm
 
-from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.motion import Motion
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Passage, cell_of, refuse_virtual_sites
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, cell_of, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
 from kcons.openmm.device.rows import DeviceRows, rows_of
 from kcons.openmm.integrator.part import Part, Solver
@@ -32,7 +31,7 @@ class _Engine:
     def __init__(self, motion: Motion, masses: FloatArray, cell: FloatArray | None) -> None:
         self.motion, self.masses, self.cell = motion, masses, cell
         self.atoms: IntArray = motion.sources[0].touched
-        self.passage = Passage(self.atoms, len(masses))
+        self.precision = Precision("", "double")
 
     def follow_cell(self, state: openmm.State) -> None:
         cell = cell_of(state.getPeriodicBoxVectors())
@@ -56,12 +55,10 @@ class KernelRows(CarriedConstraints):
     may read a context parameter.
     """
 
-    evaluates = lands_last = False
-
     def __init__(self, parts: Sequence[Any]) -> None:
         self._parts = parts
         carried = [part for part in parts if isinstance(part, CarriedConstraints)]
-        self.given: list[Constraint] = list(accepted(constraints_of(parts)))
+        self.given = list(accepted(constraints_of(parts)))
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
         for part in carried:
             part._engine.served = True
@@ -156,14 +153,14 @@ class KernelRows(CarriedConstraints):
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
         self.bind(context)
-        self._engine.passage.precision = Precision.of(context)
+        self._engine.precision = Precision.of(context)
         return super()._state(context)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Whatever the precision is: residuals are what it can hold."""
 
     def _check_system(self, system: openmm.System, precision: Precision) -> None:
-        self._engine.passage.precision = precision
+        self._engine.precision = precision
 
     def check_masses(self, system: openmm.System) -> None:
         """Kernels are made for the masses of a Context."""

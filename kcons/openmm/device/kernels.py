@@ -107,7 +107,8 @@ _COMMON = """
 #define FAIL(row, residual) \\
   {if (CLAIM(&failure[0], launch+1) == 0) {failure[1] = step+1; failure[2] = row; failure_residual[0] = residual;}}
 /* Four normal numbers of a particle, a step and a use within it (Philox 4x32, Box and Muller): an angle is a quarter of
-   the circle and what is left of it, from -pi/4 to pi/4, of which sine and cosine are polynomials. */
+   the circle and what is left of it, from -pi/4 to pi/4, of which sine and cosine are polynomials. CUDA's fast
+   logarithm of a number just below 1 may be positive. */
 DEVICE void gaussians(mixed* g, int particle, int step, int use, int seed) {
   unsigned int c0 = particle, c1 = step, c2 = use, c3 = 0, key0 = seed, key1 = 0x6b636f6eu;
   for (int k = 0; k < 10; k++) {
@@ -118,7 +119,8 @@ DEVICE void gaussians(mixed* g, int particle, int step, int use, int seed) {
   }
   for (int k = 0; k < 4; k += 2) {
     unsigned int turn = k ? c3 : c1;
-    float size = sqrt(-2.0f*log(((k ? c2 : c0)+0.5f)*2.3283064e-10f)), t = (int) (turn<<2)*3.6572952e-10f, t2 = t*t;
+    float size = sqrt(max(-2.0f*log(((k ? c2 : c0)+0.5f)*2.3283064e-10f), 0.0f));
+    float t = (int) (turn<<2)*3.6572952e-10f, t2 = t*t;
     float sine = size*t*(1+t2*(-1.6666667e-1f+t2*(8.3333333e-3f-t2*1.9841270e-4f)));
     float cosine = size*(1+t2*(-0.5f+t2*(4.1666667e-2f+t2*(-1.3888889e-3f+t2*2.4801587e-5f))));
     if (turn>>31) cosine = -cosine;
@@ -543,20 +545,23 @@ class Kernels:
         self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] += {_of_dt(op.share)}*{self._force(op)}*w[a];\n")
 
     def _fly(self, op: Op) -> None:
-        flights = [(length, end, 1) for length, end in zip(op.flights, op.ends, strict=True)]
-        if len(set(op.flights)) == 1:
-            flights = [(*flights[0][:2], len(flights))]
-        for length, end, count in flights:
-            h, time = _of_dt(length), f"{_time(op, end)}+flight*h"
-            loop = f" for (int flight = 0; flight < {count}; flight++)"
-            free = f"{loop} EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += {h}*v[3*a+c];\n"
-            start = f"{loop} {{ROOM const mixed h = {h}, per_h = 1/h;\n"
-            aim = " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
-            moved = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++)"
-            moved += " {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }\n"
-            solve = f" SYNC positions_NAME(ROWS_PASS CLUSTER, h, {time}, x, d, w);\n if (failure[0] == 0)\n"
-            self._add(free, start + aim + solve + moved)
-            self._moves = True
+        lengths, ends = (
+            ", ".join(f"(mixed) {each!r}" for each in some)
+            for some in (op.flights, (end + op.begun for end in op.ends))
+        )
+        count = len(op.flights)
+        loop = f" {{const mixed lengths[{count}] = {{{lengths}}}, ends[{count}] = {{{ends}}};\n"
+        loop += f" for (int flight = 0; flight < {count}; flight++) {{ROOM const mixed h = lengths[flight]*dt;\n"
+        free = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += h*v[3*a+c];\n }}\n"
+        held = (
+            " const mixed per_h = 1/h;\n"
+            " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
+            " SYNC positions_NAME(ROWS_PASS CLUSTER, h, time+ends[flight]*dt, x, d, w);\n"
+            " if (failure[0] == 0) EACH if (w[a] != 0) for (int c = 0; c < 3; c++)"
+            " {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }}\n"
+        )
+        self._add(loop + free, loop + held)
+        self._moves = True
 
     def _project(self, op: Op) -> None:
         self._add("", f" SYNC velocities_NAME(ROWS_PASS CLUSTER, 1, {_time(op, op.ends[0])}, x, v, w);\n")

@@ -176,7 +176,7 @@ class LargeClusters:
         used = sorted({row.function for pattern in patterns for row in pattern.rows})
         functions = "".join(c_functions(f"rows_g{f}", held.functions[f], "GLOBAL ") for f in used)
         cases = "".join(f" case {f}: rows_g{f}(r, p, t, out); break;\n" for f in used)
-        timed = [f for f in used if held.functions[f].second is not None]
+        timed = [f for f in used if held.functions[f].rate is not None]
         rates = "".join(f" if (f == {f}) return rows_g{f}_rate(r, p, t);\n" for f in timed)
         return (
             f"{functions}DEVICE void rows_function(int f, GLOBAL const mixed* r, GLOBAL const mixed* p, mixed t, "

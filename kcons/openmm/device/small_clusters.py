@@ -252,7 +252,7 @@ class ItemWriter:
 
         def demanded(k: int, row: Row) -> str:
             rate = self._wanted(k, row, "time", 0 if row.rolls else 1)
-            if self.held.functions[row.function].second is not None:
+            if self.held.functions[row.function].rate is not None:
                 rate += f"-rows_f{row.function}_rate(r{k}, n+{self.record.parameters[k]}, time)"
             return f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
 

@@ -18,10 +18,8 @@ from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.openmm.states import energy_of
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.nose_hoover import HALF, ChainOrder, chain_fractions
+from kcons.thermostats.nose_hoover import FRACTIONS, HALF
 
-#: Of the motion of the chain at fixed velocities.
-CHAIN_ORDER: ChainOrder = 4
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
 _FASTEST = 1.4
 
@@ -127,8 +125,7 @@ class NoseHoover(CountsMomenta):
             ("chain_h", "its length"),
         ):
             p.number(name, words)
-        shares = chain_fractions(CHAIN_ORDER, 1)
-        p.table("chain_share", (*shares, *shares), "length of part k as a fraction of the time, twice")
+        p.table("chain_share", (*FRACTIONS, *FRACTIONS), "length of part k as a fraction of the time, twice")
         if "between" in p.numbers:
             use(p, "behind")
 

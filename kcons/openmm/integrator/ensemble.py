@@ -16,7 +16,7 @@ What begins and ends a step, and what may be left out of it, goes by a few varia
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -57,7 +57,6 @@ VARIABLES = {
     "loose": Variable("number", "1 where v was taken back to a step at whose end nobody looked: it is not tangent"),
     "between": Variable("control", "1 if nobody looks at the velocities after this step"),
     "behind": Variable("control", "1 where v lacks what ends a step"),
-    "led": Variable("number", "the same when the last drift began"),
     "looked": Variable("control", "1 if somebody may have looked since the last step", 1.0),
     "coarse": Variable("setting", "1 in single precision: rounding of x over a time step is much beside a kick"),
     "moving": Variable("setting", "1 where barostats may move x between steps"),
@@ -83,36 +82,8 @@ def use(program: Program, *names: str) -> str:
     return names[-1]
 
 
-class Integrator(openmm.CustomIntegrator):
-    """What ensembles and checks may ask of an integrator; `ProjectedIntegrator` answers, and says what each is."""
-
-    scheme: Splitting
-    parts: tuple[Part, ...]
-    program: Program
-    row_groups: frozenset[int]
-    spare: bool
-    check_every: int
-    _guard: Any
-    _watch: Callable[..., Any]
-    take_precision: Callable[..., None]
-    refresh: Callable[[], None]
-    applyConstraints: Callable[..., None]
-    applyVelocityConstraints: Callable[..., None]
-    independent_momenta: Callable[..., int]
-    degrees_of_freedom: Callable[..., int]
-    kinetic_energy: Callable[..., Any]
-
-    @property
-    def ensemble(self) -> Ensemble:
-        raise NotImplementedError
-
-    @property
-    def thermostatted(self) -> bool:
-        raise NotImplementedError
-
-    @property
-    def context(self) -> openmm.Context:
-        raise NotImplementedError
+#: A `ProjectedIntegrator`, whose module imports this one.
+Integrator = Any
 
 
 class Ensemble:
@@ -302,9 +273,6 @@ class Step:
         Whether a bath acts between two halves of the only drift.
     phases : int
         Executions of the program that a step takes where virtual sites are placed at the end of each only.
-    kept : bool
-        Whether the applied forces are kept in a variable within a call: where parts evaluate row groups, OpenMM
-        remembers the forces of the last groups only.
     sited : bool
         Whether parts stand beside virtual sites.
     single : bool
@@ -313,8 +281,6 @@ class Step:
         Whether velocity Verlet with parts leaves out what only a reader of velocities needs.
     lazy : bool
         Whether `between` is of use.
-    observed : int
-        How many steps at the end of a call must be complete: two where a part tells the mean over a step.
     force : str
         Name of the applied forces.
     """
@@ -336,8 +302,6 @@ class Step:
         #: Without parts: the kick that ends a step is made with that which begins the next.
         self.joined = ensemble.adds_up and not self.parts and verlet
         self.lazy = self.lean or self.joined or (not self.parts and ensemble.owes)
-        self.observed = 2 if self.lean and any(hasattr(part, "mean_multipliers") for part in self.parts) else 1
-        self.kept = any(part.evaluates for part in self.parts) and not self.lean
         self.force = "f"
         #: Whether drifts change v by impulses without the rounding errors of positions.
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)

@@ -112,9 +112,6 @@ class Part(ABC):
     ----------
     code : int
         Number of the part in its integrator, from 1; set by the integrator before `declare`.
-    evaluates : bool
-        Whether `remember` or `project` evaluate force groups or move x, after which the applied forces must be
-        computed again or kept.
     meets_system : bool
         Whether the rows may touch atoms that the System constrains. Such a part calls `program.hold_positions`
         within its own `land`; at most one part of an integrator may.
@@ -138,7 +135,6 @@ class Part(ABC):
     """
 
     code: int = 0
-    evaluates: bool = False
     meets_system: bool = False
     lands_last: bool = False
     groups: frozenset[int] = frozenset()

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import openmm
+
+from kcons.steppers.state import START_TOLERANCE
 
 #: The tolerance of the System's constraints unless another is asked for, by precision. In single precision velocities
 #: cannot be brought closer than to some 1e-6: OpenMM's solver would go on to its last iteration.
@@ -53,6 +56,15 @@ class Precision:
         """Unit roundoff of a coordinate: in mixed precision positions are pairs of single numbers."""
         return {"double": 2.0**-53, "mixed": 2.0**-48, "single": SINGLE}[self.name]
 
+    def grain(self, reach: float) -> float:
+        """Spacing of coordinates at a distance from the origin."""
+        return float(np.spacing(reach)) if self.name == "double" else 2 * self.place * reach
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """What positions, of the scale of a row, and velocities, of their size, may be off."""
+        return (START_TOLERANCE, START_TOLERANCE) if self.name == "double" else (self.tolerance, self.speeds)
+
     @property
     def solvers(self) -> float:
         """What the arithmetic of OpenMM's solvers adds to a relative distance."""
@@ -62,11 +74,6 @@ class Precision:
     def speeds(self) -> float:
         """What is left of velocities along constraints, of their size: SHAKE on GPUs makes 15 iterations at most."""
         return 1e-6 if self.rounds_lengths else 0.0
-
-    @property
-    def force_step(self) -> float:
-        """Resolution of forces in kJ/mol/nm: GPUs add them up as integers."""
-        return 2.0**-32 if self.rounds_lengths else 0.0
 
     @property
     def forces(self) -> float:

@@ -8,15 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-import numpy as np
 import openmm
-
-from kcons.constraints.target import FloatArray
 
 _GIVEN = "x, v, m, f, dt: positions, velocities, masses, applied forces, time step"
 _FORCES = re.compile(r"\b(f|energy)(\d*)\b")
-#: Name of the variable that tells whether vector settings are those of this integrator.
-_SUM_OF_VECTORS = "sum_of_vectors"
 
 
 class Line(NamedTuple):
@@ -65,8 +60,8 @@ class Program:
         Those that control the program, as they are where nothing is asked of it; written at each call as well.
     memory : set of str
         Variables that belong to a state as x and v do.
-    vectors : dict
-        Variables with a value for each degree of freedom; those that are settings with their values, else None.
+    vectors : list of str
+        Variables with a value for each degree of freedom.
     tables : dict
         Constants, written name(k) in expressions.
     kinetic_energy : str
@@ -84,7 +79,7 @@ class Program:
         self.settings: dict[str, float] = {}
         self.idle: dict[str, float] = {}
         self.memory: set[str] = set()
-        self.vectors: dict[str, FloatArray | None] = {}
+        self.vectors: list[str] = []
         self.tables: dict[str, tuple[float, ...]] = {}
         self.kinetic_energy = "m*v*v/2"
         self._words: dict[str, str] = {}
@@ -125,13 +120,7 @@ class Program:
         """Declare a variable with a value for each degree of freedom; returns its name."""
         if name not in self._words:
             self._words[name] = f"{words} (each degree of freedom)"
-            self.vectors[name] = None
-        return name
-
-    def vector_setting(self, name: str, words: str, values: FloatArray) -> str:
-        """Declare a variable that the integrator was made with, values of shape (n_particles, 3); returns its name."""
-        self.vector(name, words)
-        self.vectors[name] = np.array(values, dtype=np.float64)
+            self.vectors.append(name)
         return name
 
     def table(self, name: str, values: Sequence[float], words: str) -> str:
@@ -191,17 +180,10 @@ class Program:
     def hand_over(self) -> None:
         """Give variables and lines to the integrator: the only place where a program of OpenMM is made."""
         integrator = self.integrator
-        held = [values for values in self.vectors.values() if values is not None]
-        if held:
-            # Any numbers but these make another sum, but for chance.
-            total = sum(float(np.vdot(values, np.sin(np.arange(1.0, values.size + 1)))) for values in held)
-            self.setting(_SUM_OF_VECTORS, "a checksum of settings with a value for each degree of freedom", total)
         for name, value in self.numbers.items():
             integrator.addGlobalVariable(name, value)
-        for name, values in self.vectors.items():
+        for name in self.vectors:
             integrator.addPerDofVariable(name, 0)
-            if values is not None:
-                integrator.setPerDofVariableByName(name, values.tolist())
         for name, table in self.tables.items():
             integrator.addTabulatedFunction(name, openmm.Discrete1DFunction(list(table)))
         integrator.setKineticEnergyExpression(self.kinetic_energy)
@@ -231,30 +213,17 @@ class Program:
 
     def push(self) -> None:
         """Write all settings into the Context, and end what was under way there."""
-        if _SUM_OF_VECTORS in self.settings:
-            found = self.integrator.getGlobalVariableByName(_SUM_OF_VECTORS)
-            if found != self.settings[_SUM_OF_VECTORS]:
-                self.push_vectors()
-        for name, value in self.settings.items():
+        for name, value in (*self.settings.items(), *self.idle.items()):
             self.write(name, value)
-        for name, value in self.idle.items():
-            self.write(name, value)
-
-    def push_vectors(self) -> None:
-        """Write the settings of each degree of freedom into the Context."""
-        for name, values in self.vectors.items():
-            if values is not None:
-                self.integrator.setPerDofVariableByName(name, values.tolist())
 
     def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
-        one, each = self.integrator.getGlobalVariableByName, self.integrator.getPerDofVariableByName
-        return {name: (each if name in self.vectors else one)(name) for name in sorted(self.memory)}
+        return {name: self.integrator.getGlobalVariableByName(name) for name in sorted(self.memory)}
 
     def recall(self, values: Mapping[str, Any]) -> None:
         """Write what `remembered` gave back into the Context."""
         for name, value in values.items():
-            (self.integrator.setPerDofVariableByName if name in self.vectors else self.write)(name, value)
+            self.write(name, value)
 
     def listing(self) -> str:
         """The variables, and the steps with their words in a column beside."""

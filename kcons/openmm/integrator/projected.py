@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from types import MethodType
-from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import openmm
@@ -16,7 +14,7 @@ from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
 from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
-from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Integrator, Step
+from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context
 from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
@@ -35,30 +33,8 @@ _LONG = 0.02
 #: What `failed` is where others have moved x between two calls.
 _MOVED = -1
 
-_Given = ParamSpec("_Given")
-_Found = TypeVar("_Found")
 
-
-class _OfEnsembles(Generic[_Given, _Found]):
-    """A method that an integrator has where its ensemble has what it is about, as integrators of OpenMM do.
-
-    So programs can ask by `hasattr` whether there is a thermostat.
-    """
-
-    def __init__(self, method: Callable[Concatenate[Any, _Given], _Found]) -> None:
-        self.method = method
-        functools.update_wrapper(cast(Any, self), method)
-
-    def __get__(self, integrator: ProjectedIntegrator | None, owner: type | None = None) -> Callable[_Given, _Found]:
-        if integrator is None:
-            return self.method  # type: ignore[return-value]
-        what = self.method.__name__[3:].lower()
-        if self.method.__name__ != "setTemperature" or not integrator.thermostatted:
-            integrator._given(what)
-        return MethodType(self.method, integrator)
-
-
-class ProjectedIntegrator(Integrator):
+class ProjectedIntegrator(openmm.CustomIntegrator):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -321,7 +297,7 @@ class ProjectedIntegrator(Integrator):
 
     def _run_block(self, guard: Guard, steps: int, ends: bool) -> None:
         """Make steps, with the shorter program for those after which the state is not read."""
-        unseen = steps - self._step.observed if self._step.lazy and not guard.in_parts else 0
+        unseen = steps - 1 if self._step.lazy and not guard.in_parts else 0
         if unseen > 0 and guard.undisturbed and not (self._step.joined and guard.moving):
             with self._control("between"):
                 self._run(guard, unseen, False)
@@ -573,56 +549,44 @@ class ProjectedIntegrator(Integrator):
         """Whether velocities change by more than forces and constraints."""
         return not isinstance(self.ensemble, ConstantEnergy)
 
-    @_OfEnsembles
-    def setTemperature(self, temperature: unit.Quantity | float) -> None:
-        """Change the temperature (K if a float) of the ensemble.
+    # As integrators of OpenMM do, this one has such a method where there is what it is about: programs ask by hasattr.
 
-        Raises
-        ------
-        InputError
-            It is below zero; with `Isokinetic`, zero.
-        MissingSettingError
-            At constant energy.
+    @property
+    def setTemperature(self) -> Callable[[unit.Quantity | float], None]:
+        """Method that changes the temperature (K if a float) of the ensemble; `MissingSettingError` at constant energy.
+
+        The method raises `InputError` if it is below zero; with `Isokinetic`, zero.
         """
+        if not self.thermostatted:
+            self._given("temperature")
+        return self._set_temperature
+
+    def _set_temperature(self, temperature: unit.Quantity | float) -> None:
         self._take(self.ensemble.at(kelvins(temperature)))
         guard = self._guard
         if guard is not None and guard.alive is not None and guard.started:
             warn_of_barostat(guard.context, self._given("temperature"), stacklevel=3)
 
-    @_OfEnsembles
-    def getTemperature(self) -> unit.Quantity:
-        """The temperature of the ensemble.
+    @property
+    def getTemperature(self) -> Callable[[], unit.Quantity]:
+        """Method that returns the temperature of the ensemble; `MissingSettingError` where it has none."""
+        value = self._given("temperature")
+        return lambda: value * unit.kelvin
 
-        Raises
-        ------
-        MissingSettingError
-            It has none; so `hasattr` is False.
+    @property
+    def setFriction(self) -> Callable[[unit.Quantity | float], None]:
+        """Method that changes the friction (1/ps if a float) of the ensemble; `MissingSettingError` where it has none.
+
+        The method raises `InputError` if it is below zero.
         """
-        return self._given("temperature") * unit.kelvin
+        self._given("friction")
+        return lambda friction: self._take(self.ensemble.with_friction(friction))
 
-    @_OfEnsembles
-    def setFriction(self, friction: unit.Quantity | float) -> None:
-        """Change the friction (1/ps if a float) of the ensemble.
-
-        Raises
-        ------
-        InputError
-            It is below zero.
-        MissingSettingError
-            The ensemble has none.
-        """
-        self._take(self.ensemble.with_friction(friction))
-
-    @_OfEnsembles
-    def getFriction(self) -> unit.Quantity:
-        """The friction of the ensemble.
-
-        Raises
-        ------
-        MissingSettingError
-            It has none; so `hasattr` is False.
-        """
-        return self._given("friction") / unit.picosecond
+    @property
+    def getFriction(self) -> Callable[[], unit.Quantity]:
+        """Method that returns the friction of the ensemble; `MissingSettingError` where it has none."""
+        value = self._given("friction")
+        return lambda: value / unit.picosecond
 
     def _given(self, what: str) -> float:
         value = getattr(self.ensemble, what, None)
@@ -724,42 +688,6 @@ class ProjectedIntegrator(Integrator):
 
     # -- copies ---------------------------------------------------------------------------------
 
-    @classmethod
-    def from_xml(cls, xml: str, scheme: str | Splitting = "rattle", **arguments: Any) -> Self:
-        """The integrator whose program XmlSerializer has written, with the time step, tolerance and seed of the file.
-
-        Parameters
-        ----------
-        xml : str
-            The text of the file.
-        scheme, **arguments
-            With which it was made: no file contains parts and ensembles.
-
-        Raises
-        ------
-        InputError
-            The file has another program.
-        """
-        device = 'type="KconsProgram"' in xml
-        if device and "_on_device" in vars(cls):
-            cls = cls._on_device(True, 0.0, scheme, **arguments)[0]  # loads what the file is read by
-        plain = openmm.XmlSerializer.deserialize(xml)
-        given = {"tolerance": plain.getConstraintTolerance(), "device": False, **arguments}
-        made = cls(plain.getStepSize(), scheme, **given)
-        if not (made._has_written(xml) if device else _computations(plain) == _computations(made)):
-            raise InputError(
-                f"the file has another program than {made!r}; give the scheme, ensemble and parts it was made with",
-                item="integrator",
-            )
-        if not device:
-            made.setRandomNumberSeed(plain.getRandomNumberSeed())
-        openmm.Integrator.setIntegrationForceGroups(made, plain.getIntegrationForceGroups())
-        return made
-
-    def _has_written(self, xml: str) -> bool:
-        """Whether a file of steps on the device has the step of this integrator; takes the seed of it."""
-        return False
-
     def _making(self) -> tuple[Any, ...]:
         every = None if self.spare else self.check_every
         made_with = (self.getStepSize(), self.scheme, self.parts, self.asked_tolerance, every, self.ensemble)
@@ -799,12 +727,6 @@ def _remade(
     return made
 
 
-def _computations(integrator: openmm.Integrator) -> list[tuple[Any, ...]]:
-    if not isinstance(integrator, openmm.CustomIntegrator):
-        return []
-    return [tuple(integrator.getComputationStep(k)) for k in range(integrator.getNumComputations())]
-
-
 def picoseconds(timestep: Any) -> float:
     """A time step; a long one without a unit, which may be meant in fs, draws a warning where the caller was called."""
     dt = number(timestep, unit.picosecond, "timestep")
@@ -829,7 +751,7 @@ def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
         if not isinstance(part, Part):
             raise InputError(
                 f"parts has {part!r:.80}, which is no part of an integrator; kcons.openmm.hold(system, constraints, "
-                "positions) makes one of constraints, CollectiveRows of Forces, surface_parts of surfaces",
+                "positions) makes one of constraints, CollectiveRows of Forces",
                 item="parts",
             )
     return given

@@ -133,11 +133,9 @@ def _joined_step(step: Step) -> None:
 def _declare_guards(step: Step) -> None:
     """Variables of steps with parts, and their stages."""
     p = step.program
-    use(p, "failed", "good_steps", "stage", "stale")
+    use(p, "failed", "good_steps", "stage", "stale", "call", "moved")
     p.table("drift_share", step.drifts, "length of drift k as a fraction of the step")
     p.table("kick_share", step.kicks, "length of the kick before drift k as a fraction of the step")
-    if step.kept or step.lean:
-        use(p, "call", "moved")
 
 
 def _see_who_moved(step: Step) -> None:
@@ -154,8 +152,8 @@ def _guarded_step(step: Step) -> None:
     divided = step.sited and step.one_drift
     _declare_guards(step)
     use(p, "h", *["per_h"] * step.one_drift, *["phase"] * divided, "x_last", "v_last")
-    if step.kept:
-        step.force = use(p, "force")
+    # Parts evaluate row groups, and OpenMM remembers the forces of the last groups only.
+    step.force = use(p, "force")
     for part in step.parts:
         part.lean = False
         part.declare(p)
@@ -173,25 +171,21 @@ def _up_to_forces(step: Step, then: Callable[[Step], None]) -> None:
     p, ensemble = step.program, step.ensemble
     with p.when("failed = 0", "a step, and nothing failed before"):
         p.let_others_act()
-    if step.kept:
-        _see_who_moved(step)
+    _see_who_moved(step)
     with p.when("failed = 0", "after a failure nothing moves"):
-        if step.kept:
-            with p.when("moved+stale != 0", "others did"):
-                p.each("x_last", "x", "start here")
-            with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):
-                p.each("force", "f", "applied forces")
-            if ensemble.noisy:
-                # Reference and CPU draw random numbers with each computation: how steps are divided into calls must
-                # not change the noise.
-                with p.when("moved+stale+abs(call-2) = 0", "forces are known"):
-                    p.each("force", "force", "as many random numbers are drawn")
-            p.let("call", "select(call, 2, 0)", "forces are known in this call")
-            with p.when("moved+stale != 0", "others did"):
-                for part in step.parts:
-                    part.begin(p)
-        else:
-            p.each("x_last", "x", "to come back to")
+        with p.when("moved+stale != 0", "others did"):
+            p.each("x_last", "x", "start here")
+        with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):
+            p.each("force", "f", "applied forces")
+        if ensemble.noisy:
+            # Reference and CPU draw random numbers with each computation: how steps are divided into calls must not
+            # change the noise.
+            with p.when("moved+stale+abs(call-2) = 0", "forces are known"):
+                p.each("force", "force", "as many random numbers are drawn")
+        p.let("call", "select(call, 2, 0)", "forces are known in this call")
+        with p.when("moved+stale != 0", "others did"):
+            for part in step.parts:
+                part.begin(p)
         p.let("stale", "0", "what is kept belongs to x")
         p.each("v_last", "v", "to come back to")
         ensemble.open(p)
@@ -240,8 +234,7 @@ def _all_drifts(step: Step) -> None:
 
 def _kick_after(step: Step, impulse: str = "") -> None:
     """The kick that follows drift `stage`, with the forces at x."""
-    if step.kept:
-        step.program.each("force", "f", "applied forces")
+    step.program.each("force", "f", "applied forces")
     step.kick("dt*kick_share(stage)", impulse)
 
 
@@ -256,8 +249,7 @@ def _with_forces(step: Step) -> None:
         step.note_end()
         step.ensemble.close(p)
         p.let("good_steps", "good_steps+delta(failed)", "count it")
-        if step.kept:
-            p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
+        p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
     with p.when("failed > 0", "a solve failed"):
         p.each("x", "x_last", "back to where the step began")
         p.each("v", "v_last", "back to where the step began")
@@ -274,7 +266,7 @@ def _lean_step(step: Step) -> None:
     """
     p = step.program
     _declare_guards(step)
-    use(p, "h", "per_h", "x_last", "v_last", "u", "force", "moving", "looked", "behind", "led", "loose")
+    use(p, "h", "per_h", "x_last", "v_last", "u", "force", "moving", "looked", "behind", "loose")
     for part in step.parts:
         part.lean = True
         part.declare(p)
@@ -304,7 +296,6 @@ def _lean_step(step: Step) -> None:
             for part in step.parts:
                 part.renew(p)
         p.let("stale", "0", "what is kept belongs to x")
-        p.let("led", "behind", "for multipliers")
         p.let("stage", "0", "the drift")
         p.let("per_h", "0", "no drift yet")
         with p.when("failed = 0", "rows are independent"):

@@ -27,7 +27,7 @@ from kcons.plan.plan import make_plan
 IntArray = NDArray[np.int64]
 
 #: How the names of Forces begin that carry rows.
-ROW_NAME, SURFACE_NAME = "kcons row", "kcons surface"
+ROW_NAME = "kcons row"
 
 #: Forces that need an integrator of their own.
 _FOREIGN = {
@@ -322,10 +322,10 @@ def refuse_forgotten_parts(system: openmm.System, row_groups: Iterable[int]) -> 
     """
     known = set(row_groups)
     for force in forces_of(system):
-        if force.getName().startswith((ROW_NAME, SURFACE_NAME)) and force.getForceGroup() not in known:
+        if force.getName().startswith(ROW_NAME) and force.getForceGroup() not in known:
             raise InputError(
                 f"the System has a force {force.getName()!r}, which carries rows that are held, and the integrator has "
-                "no part for it: pass what hold, CollectiveRows or surface_parts returned, "
+                "no part for it: pass what hold or CollectiveRows returned, "
                 "ProjectedIntegrator(..., parts=[rows])",
                 item="parts",
             )

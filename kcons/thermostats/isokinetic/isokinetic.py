@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import Positive, checked
 from kcons.constraints.target import FloatArray
@@ -27,7 +26,6 @@ from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import (
     LOOK_AT,
     Momentum,
-    atom_numbers,
     carried,
     freedom,
     may_be,
@@ -36,7 +34,7 @@ from kcons.thermostats.freedom import (
     warn_of_conserved_momenta,
 )
 from kcons.thermostats.isokinetic import kick as closed_form
-from kcons.thermostats.isokinetic.kick import INTEGRAL, SIZE, SQUARE, TWICE
+from kcons.thermostats.isokinetic.kick import INTEGRAL, SIZE, SQUARE, TWICE, square_sum
 
 Convention = Literal["exact", "notes"]
 
@@ -77,45 +75,19 @@ def programs(operations: Sequence[Operation]) -> tuple[Program, Program]:
     return Program(parts, functions), Program(parts)
 
 
-class ThermostattedAtoms:
-    """The atoms that a thermostat acts on, and sums over them."""
-
-    def __init__(self, system: System, atoms: ArrayLike | None) -> None:
-        inside = system.inverse_masses[:, 0] > 0
-        if atoms is not None:
-            chosen = np.zeros(system.n_atoms, dtype=bool)
-            chosen[atom_numbers(atoms, system.n_atoms)] = True
-            inside = inside & chosen
-        self.n_moving = int(inside.sum())
-        #: Masses of the thermostatted atoms for each coordinate; 0 for the others.
-        self.masses: FloatArray = np.repeat(np.where(inside, system.masses, 0.0)[:, None], 3, axis=1)
-        #: Coordinates of other atoms that move, None if there are none.
-        others = (self.masses == 0) & (system.weights > 0)
-        self.others = others if others.any() else None
-
-    def square(self, v: FloatArray) -> float:
-        """v^T M v."""
-        return float(closed_form.square_sum(v, self.masses))
-
-    def scaled(self, v: FloatArray, square: float) -> FloatArray:
-        """v with the length that v^T M v = `square` demands, other atoms as they are."""
-        has = self.square(v)
-        factor = math.sqrt(square / has) if has > 0 else math.nan
-        return np.where(self.masses > 0, v * factor, v)
-
-    def push_square(self, system: System, state: State) -> float:
-        """f . M_par^+ f at the state."""
-        assert state.forces is not None
-        pace = constrained_acceleration(system, system.near_origin(state)[0], state.forces, state.time)
-        return float(closed_form.square_sum(pace, self.masses))
-
-
 @np.errstate(over="ignore")  # velocities are checked
 def constrained_acceleration(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
     """M_par^+ f."""
     motion = system.motion
     pace = forces * system.weights
     return motion.project_velocities(x, pace, time=time, out=pace) if motion.rank else pace
+
+
+def push_square(system: System, state: State) -> float:
+    """f . M_par^+ f at the state."""
+    assert state.forces is not None
+    pace = constrained_acceleration(system, system.near_origin(state)[0], state.forces, state.time)
+    return float(square_sum(pace, system.moving_masses))
 
 
 class Isokinetic(Splitting):
@@ -139,8 +111,6 @@ class Isokinetic(Splitting):
     convention : {'exact', 'notes'}
         2K = (g - 1) k_B T, or 2K = 3 n k_B T of the notes (eq. 111), n atoms that can move; their configurations are
         hotter than T.
-    atoms : array_like of int or bool, optional
-        Thermostat these only. No row may couple them to others.
     momentum : {'auto', 'conserved', 'free'}
         See `kcons.thermostats.freedom`.
 
@@ -172,15 +142,12 @@ class Isokinetic(Splitting):
         *,
         order: Literal[2, 4, 6] = 2,
         convention: Convention = "exact",
-        atoms: ArrayLike | None = None,
         momentum: Momentum = "auto",
     ) -> None:
         super().__init__(*SCHEMES[order])
         self.order, self.thermal_energy = order, thermal_energy
         self.convention: Convention = convention
-        self.atoms = None if atoms is None else np.atleast_1d(atoms)
         self.momentum: Momentum = momentum
-        self._shares: tuple[System, ThermostattedAtoms] | None = None
         operations: list[Operation] = []
         for operation in splitting(*SCHEMES[order]):
             # Velocities are on the constraints whenever they turn.
@@ -196,8 +163,6 @@ class Isokinetic(Splitting):
             given.append(f"order={self.order}")
         if self.convention != "exact":
             given.append(f"convention={self.convention!r}")
-        if self.atoms is not None:
-            given.append(f"atoms=<{len(self.atoms)} atoms>")
         return f"Isokinetic({', '.join(given)})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
@@ -217,7 +182,7 @@ class Isokinetic(Splitting):
         """The state with its forces, and with the kinetic energy that the thermostat keeps.
 
         Velocities off the constraints are projected, then scaled; those that are right to rounding stay as they are to
-        the last bit. A state with variables of another temperature or energy, or of other atoms, begins anew.
+        the last bit. A state with variables of another temperature or energy begins anew.
 
         Raises
         ------
@@ -225,52 +190,49 @@ class Isokinetic(Splitting):
             All velocities are zero; the state carries variables of another thermostat.
         OverdeterminedError
             g is 1 (a temperature asked for), or 0.
-        UnsupportedError
-            A row couples the thermostatted atoms to others.
         """
         self.check(system)
         if not state.is_of(system):
             state = replace(state, forces=None, thermostat=None)  # degrees of freedom are those of another system, too
         elif not state.has_forces_of(system):
             state = replace(state, forces=None)
-        share = self._share(system)
-        if carried(state, 4, "Isokinetic") and self._goes_on_from(system, share, state):
+        if carried(state, 4, "Isokinetic") and self._goes_on_from(system, state):
             if state.forces is None or self._left is None or state.positions is not self._left[3]:
-                state = self._pushed(system, share, system.with_forces(state))
+                state = self._pushed(system, system.with_forces(state))
             return state
         state = system.with_forces(state)
         assert state.forces is not None
         velocities = system.motion.project_velocities(state.positions, state.velocities, time=state.time)
-        found = share.square(velocities)
+        found = square_sum(velocities, system.moving_masses)
         if not found > SMALLEST:
             raise InputError(
                 "the isokinetic thermostat needs non-zero kinetic energy: draw velocities first "
                 "(kcons.thermostats.thermal_velocities)",
                 item="velocities",
             )
-        free = freedom(system, state, state.forces, self.atoms, self.momentum)
-        twice = self._twice_kinetic(share, free.count, found)
+        free = freedom(system, state, state.forces, self.momentum)
+        twice = self._twice_kinetic(system, free.count, found)
         turns = free.turns and self.thermal_energy is not None
         warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8)
         off = float(np.abs(velocities - state.velocities).max())
         if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:
             velocities = state.velocities
         else:
-            velocities = share.scaled(velocities, twice)
-        variables = np.array([twice, 0.0, share.push_square(system, state), free.count])
+            velocities = velocities * math.sqrt(twice / found)
+        variables = np.array([twice, 0.0, push_square(system, state), free.count])
         return replace(state, velocities=velocities, thermostat=variables)
 
-    def _pushed(self, system: System, share: ThermostattedAtoms, state: State) -> State:
+    def _pushed(self, system: System, state: State) -> State:
         """The state with f.M_par^+ f of its forces, which is kept where it is that but for rounding."""
         assert state.thermostat is not None
-        variables, square = state.thermostat.copy(), share.push_square(system, state)
+        variables, square = state.thermostat.copy(), push_square(system, state)
         if abs(variables[2] - square) <= KEPT * square:
             return state
         variables[2] = square
         return replace(state, thermostat=variables)
 
-    def _goes_on_from(self, system: System, share: ThermostattedAtoms, state: State) -> bool:
-        """Whether the variables of the state are those of this temperature or energy, and of these atoms and rows."""
+    def _goes_on_from(self, system: System, state: State) -> bool:
+        """Whether the variables of the state are those of this temperature or energy, and of these rows."""
         left = self._left
         same = left is not None and state.thermostat is left[0] and self.thermal_energy == left[1]
         if same and left is not None and state.velocities is left[2]:
@@ -278,17 +240,17 @@ class Isokinetic(Splitting):
         assert state.thermostat is not None
         twice, _, _, count = state.thermostat.tolist()
         if not same:
-            if abs(self._twice_kinetic(share, count, twice) - twice) > ROUNDING * twice:
+            if abs(self._twice_kinetic(system, count, twice) - twice) > ROUNDING * twice:
                 return False
-            if not may_be(count, system, state, self.atoms, self.momentum):
+            if not may_be(count, system, state, self.momentum):
                 return False
-        return abs(share.square(state.velocities) - twice) <= KEPT * twice
+        return bool(abs(square_sum(state.velocities, system.moving_masses) - twice) <= KEPT * twice)
 
-    def _twice_kinetic(self, share: ThermostattedAtoms, count: float, found: float) -> float:
+    def _twice_kinetic(self, system: System, count: float, found: float) -> float:
         if self.thermal_energy is None:
             return found
         if self.convention == "notes":
-            return 3 * share.n_moving * self.thermal_energy
+            return int((system.inverse_masses > 0).sum()) * 3 * self.thermal_energy
         if count < 2:
             raise OverdeterminedError(
                 "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; leave thermal_energy out "
@@ -296,17 +258,11 @@ class Isokinetic(Splitting):
             )
         return (count - 1) * self.thermal_energy
 
-    def _share(self, system: System) -> ThermostattedAtoms:
-        known = self._shares
-        if known is None or known[0] is not system:
-            known = self._shares = (system, ThermostattedAtoms(system, self.atoms))
-        return known[1]
-
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         begin = self.start(system, state)
-        if begin.step == LOOK_AT and self.thermal_energy is not None and self.atoms is None:
+        if begin.step == LOOK_AT and self.thermal_energy is not None:
             warn_of_bodies_apart(system, begin, stacklevel=7)
-        return IsokineticStep(system, self._share(system), begin, dt, self._programs, steps)
+        return IsokineticStep(system, begin, dt, self._programs, steps)
 
     def at_once(self, state: State, steps: int) -> int:
         return min(steps, LOOK_AT - state.step) if state.step < LOOK_AT else steps
@@ -317,18 +273,8 @@ class Isokinetic(Splitting):
     def note(self, state: State) -> None:
         self._left = state.thermostat, self.thermal_energy, state.velocities, state.positions
 
-    # -- what can be read -----------------------------------------------------------------------
-
-    def friction(self, system: System, state: State) -> float:
-        """alpha = v.f/(2K) at the state (notes, eq. 113)."""
-        state = self.start(system, state)
-        assert state.forces is not None
-        share = self._share(system)
-        v = system.motion.project_velocities(state.positions, state.velocities, time=state.time)
-        return float(closed_form.raw_sums(v, state.forces, system.weights, share.masses)[0]) / share.square(v)
-
     def conserved_energy(self, system: System, state: State) -> float:
-        """U + 2K int(alpha dt), which the exact motion conserves where all atoms are thermostatted.
+        """U + 2K int(alpha dt), which the exact motion conserves.
 
         Needs `System.potential`.
         """
@@ -341,31 +287,21 @@ class Isokinetic(Splitting):
 class IsokineticStep(Interpreter):
     """Steps on their way."""
 
-    def __init__(
-        self,
-        system: System,
-        share: ThermostattedAtoms,
-        start: State,
-        dt: float,
-        made: tuple[Program, Program],
-        steps: int,
-    ) -> None:
+    def __init__(self, system: System, start: State, dt: float, made: tuple[Program, Program], steps: int) -> None:
         assert start.thermostat is not None
-        program = made[1 if system.packed is None else 0]
-        masses = share.masses.ravel()
-        numbers = np.concatenate((start.thermostat, masses, masses))
-        super().__init__(system, start, dt, program, steps, numbers)
-        self.share = share
+        self.masses = system.moving_masses
+        numbers = np.concatenate((start.thermostat, self.masses, self.masses))
+        super().__init__(system, start, dt, made[system.packed is None], steps, numbers)
         #: How long v must be, squared.
         self.left = float(start.thermostat[TWICE])
 
     def first_turn(self, row: Row, begun: bool) -> None:
         """With forces as they are: the drift takes out what they would do across the constraints."""
-        t, system, share = row.length * self.dt, self.system, self.share
+        t, system = row.length * self.dt, self.system
         check_finite(self.forces, "force", self.number)
         if not begun:
             growth, done = closed_form.before_drift(
-                self.v, self.forces, system.weights, share.masses, float(self.numbers[SQUARE]), self.left, t
+                self.v, self.forces, system.weights, self.masses, float(self.numbers[SQUARE]), self.left, t
             )
             if done:
                 self.numbers[INTEGRAL] += growth
@@ -379,14 +315,13 @@ class IsokineticStep(Interpreter):
         check_finite(self.v, "velocity", self.number)
 
     def _turn_by_projected_forces(self, row: Row, t: float) -> None:
-        share = self.share
         check_finite(self.forces, "force", self.number)
         pace = constrained_acceleration(self.system, self.place(row.here), self.forces, self.at(row.end))
-        square, factor, growth, done = closed_form.after_drift(self.v, pace, share.masses, self.left, t)
+        square, factor, growth, done = closed_form.after_drift(self.v, pace, self.masses, self.left, t)
         if not done:
             # The force is strong, and v runs against it.
-            turned, more = closed_form.turned(factor * self.v, pace, share.masses, self.left, t)
-            self.v[:] = turned if share.others is None else np.where(share.others, self.v + t * pace, turned)
+            masses = self.masses.reshape(pace.shape)
+            self.v[:], more = closed_form.turned(factor * self.v, pace, masses, self.left, t)
             growth += more
         self.numbers[SQUARE] = square
         self.numbers[INTEGRAL] += growth

@@ -27,7 +27,7 @@ _CANCELS = 0.01
 #: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.
 MANY = 1e4
 #: What the numbers of a program begin with, as `State.thermostat`: 2K, the integral of alpha, f.M_par^+ f, and g; after
-#: them the masses of the thermostatted atoms for each coordinate, 0 for others, and room for accelerations.
+#: them the masses for each coordinate, 0 for fixed atoms, and room for accelerations.
 TWICE, INTEGRAL, SQUARE, COUNT, SIZE = range(5)
 
 
@@ -60,17 +60,14 @@ def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t:
     turns round; with e = F/|F|, p = u.e/|u|, and q that part:
 
         u(t) = (q e^{-z} + e |u| [(1 + p) - (1 - p) e^{-2z}]/2)/g,    g = [(1 + p) + (1 - p) e^{-2z}]/2.
-
-    Masses, shape (n_atoms, 3), are 0 for atoms that do not take part.
     """
-    inside = np.where(masses > 0, pace, 0.0)
-    largest = float(np.abs(inside).max())
-    axis = inside / largest  # squares of the strongest forces overflow
+    largest = float(np.abs(pace).max())
+    axis = pace / largest  # squares of the strongest forces overflow
     length = math.sqrt(float((masses * axis * axis).sum()))
     axis *= math.copysign(1.0, t) / length
     speed = math.sqrt(twice)
     along = float((masses * u * axis).sum())
-    across = np.where(masses > 0, u, 0.0) - along * axis
+    across = u - along * axis
     across -= float((masses * across * axis).sum()) * axis  # what rounding left along the force
     q2 = min(float((masses * across * across).sum()) / twice, 1.0)
     p = math.copysign(math.sqrt(1.0 - q2), along)
@@ -79,11 +76,11 @@ def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t:
     decay = math.exp(-z)
     growth = 0.5 * (one_plus + (1.0 - p) * decay * decay)
     if growth == 0:  # exactly against the force, for longer than any rounding
-        return np.where(masses > 0, -speed * axis, u), -z
+        return -speed * axis, -z
     lead = 0.5 * (one_plus - (1.0 - p) * decay * decay) * speed
     after = (decay * across + lead * axis) / growth
     after *= math.sqrt(twice / float((masses * after * after).sum()))
-    return np.where(masses > 0, after, u), z + math.log(growth)
+    return after, z + math.log(growth)
 
 
 # -- sums over the atoms ----------------------------------------------------------------------------
@@ -114,7 +111,7 @@ def square_sum(u, masses):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=_SUMS)
 def raw_sums(u, f, weights, masses):  # type: ignore[no-untyped-def]
-    """u.f and f.M^-1 f of the atoms whose mass is not 0 here; `weights` is 1/m."""
+    """u.f and f.M^-1 f of the atoms that move; `weights` is 1/m."""
     a, b, w, m = u.ravel(), f.ravel(), weights.ravel(), masses.ravel()
     uf = ff = 0.0
     for i in range(a.size):
@@ -131,17 +128,15 @@ def raw_sums(u, f, weights, masses):  # type: ignore[no-untyped-def]
 def before_drift(u, f, weights, masses, square, twice, t):  # type: ignore[no-untyped-def]
     """u = keep u + push M^-1 f, with forces that are not projected; log of the growth, and whether it was done.
 
-    It is not where digits would be lost, or where a drift would have to take out more than `MANY` times 2K. Atoms that
-    are not thermostatted are pushed.
+    It is not where digits would be lost, or where a drift would have to take out more than `MANY` times 2K.
     """
     aligned, raw = raw_sums(u, f, weights, masses)
     keep, push, log_growth, cancels = weights_of(aligned, square, twice, t)
     if cancels or not push * push * raw <= MANY * twice:
         return 0.0, False
-    a, b, w, m = flat(u), flat(f), flat(weights), flat(masses)
+    a, b, w = flat(u), flat(f), flat(weights)
     for i in range(a.size):
-        some = m[i] > 0
-        a[i] = (keep if some else 1.0) * a[i] + (push if some else t) * (w[i] * b[i])
+        a[i] = keep * a[i] + push * (w[i] * b[i])
     return log_growth, True
 
 
@@ -161,10 +156,9 @@ def after_drift(u, pace, masses, twice, t):  # type: ignore[no-untyped-def]
     got = keep * (keep * twice + 2 * push * aligned) + push * push * square
     right = math.sqrt(twice / got) if got > 0 else math.nan
     left, more = right * factor * keep, right * push
-    a, b, m = flat(u), flat(pace), flat(masses)
+    a, b = flat(u), flat(pace)
     for i in range(a.size):
-        some = m[i] > 0
-        a[i] = (left if some else 1.0) * a[i] + (more if some else t) * b[i]
+        a[i] = left * a[i] + more * b[i]
     return square, factor, log_growth - math.log(factor), True
 
 

@@ -8,7 +8,6 @@ middle of a step, and states are those halfway between two kicks.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,12 +25,9 @@ from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, 
 from kcons.steppers.program import Row
 from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import carried
-from kcons.thermostats.langevin import Langevin, LangevinStep, listed_and_made
+from kcons.thermostats.langevin import Langevin, LangevinStep, SeededBath, listed_and_made
 
 ForceFunction = Callable[[FloatArray, float], ArrayLike]
-
-#: Forces of a state that differ from the sum of its groups by at most this fraction are taken for the same.
-SAME = 1e-12
 
 
 class ForceGroups:
@@ -143,66 +139,39 @@ def group_names(force: object, names: tuple[str, ...]) -> None:
             f"the System has no groups of forces, and {', '.join(names)} were given steps; make it with "
             "System(motion, ForceGroups({...}))"
         )
-    for name in names:
-        if name not in force.groups:
-            raise InputError(f"there is no group {name!r} of forces; there are {', '.join(force.groups)}", item="steps")
-    for name in force.groups:
-        if name not in names:
-            raise InputError(f"group {name!r} of the forces has no number of steps; add it to steps", item="steps")
+    if set(names) != set(force.groups):
+        raise InputError(
+            f"steps are given to {', '.join(names)}; give them to the groups of the forces: {', '.join(force.groups)}",
+            item="steps",
+        )
 
 
-@dataclass
 class GroupedForces:
     """Forces that were last evaluated, by the names of their groups; one empty name where they come in no groups.
 
-    A state carries them, if there are two or more, in the order of their names behind the variables of its thermostat
-    and a number that stands for the names, so that a run that is continued evaluates nothing anew. Where the slowest
-    group, the first, kicks in the middle of steps it carries none, and each step begins with an evaluation of the
-    others.
+    Where the slowest group, the first, kicks in the middle of steps, each step begins with an evaluation of the others.
+    `left` is what a bath remembers of the steps before: where they ended, and their forces.
     """
 
-    system: System
-    names: tuple[str, ...]
-    now: dict[str, FloatArray]
-    middle: bool = False
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         system: System,
         state: State,
         names: tuple[str, ...],
-        variables: int,
-        name: str,
-        *,
-        marked: bool = False,
         middle: bool = False,
-    ) -> tuple[GroupedForces, FloatArray | None]:
-        """Forces at a state, evaluated where it has none, and the variables of its thermostat (see `carried`)."""
-        size = 3 * system.n_atoms
-        stored = len(names) * size + 1 if len(names) > 1 and not middle else 0
-        known = carried(state, variables + stored, name, marked=marked)
+        left: tuple[FloatArray, GroupedForces] | None = None,
+    ) -> None:
+        self.system, self.names, self.middle = system, names, middle
+        self.now: dict[str, FloatArray] = {}
         x, _, forces = system.kernel_arrays(state)
-        found = cls(system, names, {}, middle)
-        if forces is not None and not stored and not middle:
-            found.now[names[0]] = forces
-        elif forces is not None and known and stored:
-            assert state.thermostat is not None
-            if state.thermostat[variables] != _number_of(names):
-                raise InputError(
-                    f"the state carries forces of groups of other names than {', '.join(names)}; name the groups as "
-                    "they were, or begin from its positions and velocities: State(state.positions, state.velocities)",
-                    item="groups",
-                )
-            parts = state.thermostat[variables + 1 :].reshape(len(names), *x.shape)
-            found.now.update(zip(sorted(names), parts, strict=True))
-            # Positions and their forces may have been put together with variables of another place.
-            if not np.all(np.abs(parts.sum(axis=0) - forces) <= SAME * np.abs(parts).max()):
-                found.now.clear()
+        if forces is not None and not middle:
+            if len(names) == 1:
+                self.now[names[0]] = forces
+            elif left is not None and left[0] is state.positions and left[1].system is system:
+                self.now.update(left[1].now)
         for group in names[1:] if middle else names:
-            if group not in found.now:
-                found.evaluate(group, x, state.time, state.step)
-        return found, None if state.thermostat is None else state.thermostat[:variables]
+            if group not in self.now:
+                self.evaluate(group, x, state.time, state.step)
 
     def evaluate(self, name: str, x: FloatArray, time: float, step: int) -> None:
         """Forces of one group at positions as the force function sees them; errors have the number of the step."""
@@ -229,17 +198,6 @@ class GroupedForces:
         first, *others = (self.now[name] for name in self.names)
         return first if not others else first + sum(others[1:], start=others[0])
 
-    def closed(self, variables: FloatArray) -> FloatArray:
-        """What a state carries: the variables of the thermostat, and forces."""
-        if len(self.names) == 1 or self.middle:
-            return variables
-        forces = [self.now[name].ravel() for name in sorted(self.names)]
-        return np.concatenate([variables, [_number_of(self.names)], *forces])
-
-
-def _number_of(names: tuple[str, ...]) -> float:
-    return float(zlib.crc32("\n".join(sorted(names)).encode()))
-
 
 #: Where the slowest forces kick: half at each end of the step, or once in its middle.
 SlowKicks = Literal["ends", "middle"]
@@ -265,32 +223,14 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
         return (Level("", 1),)
     if not isinstance(steps, Mapping) or not steps:
         raise InputError("steps must name each group of forces, as {'slow': 1, 'fast': 4}", item="steps")
-    counts: list[int] = []
-    for name, count in steps.items():
-        try:
-            counts.append(whole_number(count, "steps"))
-        except InputError:
-            raise InputError(
-                f"group {name!r} takes {count!r} steps; give a whole number, 1 or more", item="steps"
-            ) from None
+    counts = [whole_number(count, "steps") for count in steps.values()]
     levels = sorted(map(Level, steps, counts), key=lambda level: level.steps)
-    if levels[0].steps != 1:
+    if levels[0].steps != 1 or any(b.steps == a.steps or b.steps % a.steps for a, b in pairwise(levels)):
         raise InputError(
-            f"group {levels[0].group!r}, the slowest, takes {levels[0].steps} steps; it takes 1, the step itself",
+            f"one of the steps {dict(steps)} does not divide the next: give 1 to the slowest group, and to each other "
+            "one a multiple of the number before; groups of the same number are one group",
             item="steps",
         )
-    for outer, inner in pairwise(levels):
-        if outer.steps == inner.steps:
-            raise InputError(
-                f"groups {outer.group!r} and {inner.group!r} both take {inner.steps} steps; add their forces to one",
-                item="steps",
-            )
-        if inner.steps % outer.steps:
-            raise InputError(
-                f"the step of group {inner.group!r} does not divide that of {outer.group!r}: {inner.steps} steps are "
-                f"no multiple of {outer.steps}",
-                item="steps",
-            )
     return tuple(levels)
 
 
@@ -362,42 +302,78 @@ def _level(levels: tuple[Level, ...], at: int, flights: Iterator[Fly], turns: bo
     yield from (Evaluate(group), kick)
 
 
-class Nesting:
-    """Steps of all groups of forces, from the arguments of a stepper with several time steps.
+class SeveralSteps(SeededBath):
+    """Base of the baths with several time steps.
 
     Attributes
     ----------
     names : tuple of str
-        Groups from the slowest to the fastest.
+        Groups of forces from the slowest to the fastest.
     middle : bool
-        Whether the slowest kicks in the middle.
-    in_flights, on_circles : tuple of Operation
-        A step, and one whose flights are great circles.
-    evaluations : int
-        Of forces in a step, those of all groups.
-    words : tuple of str
-        Steps, and where slow forces kick, as arguments where these are not the defaults.
+        Whether the slowest kicks in the middle of a step.
     """
 
-    @checked
-    def __init__(
+    def nest(
         self,
         steps: Mapping[str, int] | None,
-        substeps: int,
         slow_kicks: SlowKicks,
+        listed: Callable[[tuple[Operation, ...], tuple[str, ...]], Any],
         turns: bool = False,
     ) -> None:
+        """Make the operations of a step from the arguments of a bath, and its programs by `listed`."""
         levels = levels_of(steps)
         self.names = tuple(level.group for level in levels)
         self.middle = middle_of(levels, slow_kicks)
-        self.in_flights = nested(levels, (1.0 / substeps,) * substeps, turns=turns, middle=self.middle)
-        self.on_circles = nested(levels, (1.0,), turns=turns, exact=True, middle=self.middle)
-        self.evaluations = sum(isinstance(operation, Evaluate) for operation in self.in_flights)
+        flight = (1.0 / self.substeps,) * self.substeps
+        in_flights = nested(levels, flight, turns=turns, middle=self.middle)
+        self._in_flights = listed(in_flights, self.names)
+        self._great_circles = listed(nested(levels, (1.0,), turns=turns, exact=True, middle=self.middle), self.names)
+        self.force_evaluations = sum(isinstance(operation, Evaluate) for operation in in_flights)
         counts = {level.group: level.steps for level in levels}
-        self.words = "" if steps is None else f", steps={counts}", ", slow_kicks='middle'" if self.middle else ""
+        self._words = "" if steps is None else f", steps={counts}", ", slow_kicks='middle'" if self.middle else ""
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""
+        super().check(system)
+        group_names(system.force, self.names)
+
+    def depends_on(self, system: System, state: State) -> Any:
+        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
+        return None if self.middle else super().depends_on(system, state)
+
+    def groups(self, system: System, state: State) -> GroupedForces:
+        """Forces at a state that steps begin with; remembered, they are not evaluated anew where steps go on."""
+        found = GroupedForces(system, state, self.names, self.middle, self._left)
+        self._left = None, found
+        return found
+
+    def note(self, state: State) -> None:
+        self._left = state.positions, self._left[1]
 
 
-class LangevinRespa(Langevin):
+class GroupedSteps(Interpreter):
+    """Steps on their way with forces in groups, `groups`."""
+
+    groups: GroupedForces
+
+    @property
+    def simple(self) -> bool:  # type: ignore[override]
+        """Whether forces are those of the System's function, all at once."""
+        return self.groups.names == ("",)
+
+    def evaluate(self, row: Row, begun: bool) -> None:
+        if self.simple:
+            return super().evaluate(row, begun)
+        assert isinstance(row.operation, Evaluate)
+        self.show(row)
+        self.groups.evaluate(row.operation.group, self.whole(self.x), self.at(row.end), self.number)
+        self.forces = self.groups.stacked()
+
+    def applied(self, here: int) -> FloatArray | None:
+        return super().applied(here) if self.simple else self.groups.total()
+
+
+class LangevinRespa(SeveralSteps, Langevin):
     """Langevin dynamics on constraints with several time steps: kicks of slow forces about steps of fast ones.
 
     Each group of forces kicks at the ends of its own step, and the fastest one moves the atoms by geodesic BAOAB, with
@@ -431,7 +407,7 @@ class LangevinRespa(Langevin):
 
     Notes
     -----
-    `State.thermostat` holds the heat, as for `Langevin`, and the forces of the groups.
+    `State.thermostat` holds the heat, as for `Langevin`.
 
     References
     ----------
@@ -439,6 +415,7 @@ class LangevinRespa(Langevin):
     (2016).
     """
 
+    @checked
     def __init__(
         self,
         thermal_energy: float,
@@ -450,48 +427,21 @@ class LangevinRespa(Langevin):
         slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(thermal_energy, friction, rng, substeps=substeps)
-        self.nesting = Nesting(steps, self.substeps, slow_kicks)
-        both = self.nesting.in_flights, self.nesting.on_circles
-        self._in_flights, self._great_circles = (listed_and_made(each, self.nesting.names) for each in both)
-        self.force_evaluations = self.nesting.evaluations
+        self.nest(steps, slow_kicks, listed_and_made)
 
     def __repr__(self) -> str:
-        given = "".join(self.nesting.words)
-        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{given})"
-
-    def check(self, system: System) -> None:
-        """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""
-        super().check(system)
-        group_names(system.force, self.nesting.names)
-
-    def depends_on(self, system: System, state: State) -> Any:
-        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
-        return None if self.nesting.middle else super().depends_on(system, state)
+        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{''.join(self._words)})"
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)
         return RespaStep(system, state, dt, self, steps)
 
 
-class RespaStep(LangevinStep):
+class RespaStep(GroupedSteps, LangevinStep):
     """Steps on their way."""
 
-    simple = False
-
     def __init__(self, system: System, start: State, dt: float, thermostat: LangevinRespa, steps: int) -> None:
-        nesting = thermostat.nesting
-        self.groups, _ = GroupedForces.of(system, start, nesting.names, 1, "LangevinRespa", middle=nesting.middle)
-        super().__init__(system, start, dt, thermostat, 1 if nesting.middle else steps)
+        carried(start, 1, "LangevinRespa")
+        self.groups = thermostat.groups(system, start)
+        super().__init__(system, start, dt, thermostat, 1 if thermostat.middle else steps)
         self.forces = self.groups.stacked()
-
-    def evaluate(self, row: Row, begun: bool) -> None:
-        assert isinstance(row.operation, Evaluate)
-        self.show(row)
-        self.groups.evaluate(row.operation.group, self.whole(self.x), self.at(row.end), self.number)
-        self.forces = self.groups.stacked()
-
-    def applied(self, here: int) -> FloatArray | None:
-        return self.groups.total()
-
-    def variables(self) -> FloatArray:
-        return self.groups.closed(super().variables())

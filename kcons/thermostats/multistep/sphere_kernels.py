@@ -11,6 +11,17 @@ import math
 import numpy as np
 
 from kcons.constraints.compilation import njit
+from kcons.solvers.addressable_solvers import MORE, packed_tangents
+from kcons.solvers.kernels.array_views import integers, table_array
+from kcons.steppers.stages.compiled_operations import all_finite
+from kcons.thermostats.noise import fill_normal
+
+#: The arrays of a program's numbers, in `in_one_array`: those of `HEAD`, R^2, w, those of `SphereLayout`, 1/sqrt(m) for
+#: each coordinate, and room for accelerations or noise.
+HEAD, SQUARES, OWN, CLUSTER, SPHERES, MASSES, TOTALS, ROOTS, ROOM = range(9)
+#: In the head: gamma and k_B T, the seed's halves, the number of the step, how often noise has been drawn in it, and
+#: how often it is in each.
+FRICTION, KT, SEED, NUMBER, PART, PARTS = 0, 1, 2, 4, 5, 6
 
 
 @njit(cache=True, nogil=True)
@@ -127,3 +138,72 @@ def stir(v, w, noise, own_noise, keep, spread, squares, cluster, spheres, masses
         for k in range(w.shape[1]):
             w[s, k] = keep * w[s, k] + spread * own_noise[s, k]
     rescale(v, w, squares, True, cluster, spheres, masses, totals)
+
+
+# -- the same as operations of a program -------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def unpacked(numbers):  # type: ignore[no-untyped-def]
+    """w, R^2 and the arrays of the layout, as the kernels take them."""
+    header = integers(numbers)
+    squares, spheres = table_array(numbers, header, SQUARES), table_array(header, header, SPHERES)
+    w = table_array(numbers, header, OWN)
+    layout = table_array(header, header, CLUSTER), spheres.reshape(spheres.size // 4, 4)
+    more = table_array(numbers, header, MASSES), table_array(numbers, header, TOTALS)
+    return w.reshape(squares.size, w.size // squares.size), squares, *layout, *more
+
+
+@njit(cache=True, nogil=True)
+def restore(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """Velocities and auxiliary variables get the lengths of their spheres."""
+    w, squares, cluster, spheres, masses, totals = unpacked(numbers)
+    rescale(v, w, squares, True, cluster, spheres, masses, totals)
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def shorten(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """Velocities get the length they had before the drift."""
+    w, squares, cluster, spheres, masses, totals = unpacked(numbers)
+    rescale(v, w, squares, False, cluster, spheres, masses, totals)
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def turn_along(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """`turn` by forces, which are projected first; 1 where they cannot be."""
+    w, squares, cluster, spheres, masses, totals = unpacked(numbers)
+    pace, weights = table_array(numbers, integers(numbers), ROOM)[: v.size], table_array(tables, integers(tables), MORE)
+    for i in range(v.size):
+        pace[i] = weights[i] * forces[i]
+    a = pace.reshape(v.shape)
+    if not (all_finite(pace) and packed_tangents(x, a, tables)):
+        return 1
+    turn(v, w, a, time, squares, cluster, spheres, masses, totals)
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def exchange(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """Friction and noise; 1 where noise cannot be projected."""
+    w, squares, cluster, spheres, masses, totals = unpacked(numbers)
+    header, n = integers(numbers), v.size
+    head, roots = table_array(numbers, header, HEAD), table_array(numbers, header, ROOTS)
+    drawn = table_array(numbers, header, ROOM)
+    seed = (np.uint64(head[SEED]) << np.uint64(32)) | np.uint64(head[SEED + 1])
+    fill_normal(seed, np.uint64(head[NUMBER]), np.uint64(head[PART]), drawn)
+    head[PART] += 1.0
+    if head[PART] == head[PARTS]:
+        head[PART] = 0.0
+        head[NUMBER] += 1.0
+    for i in range(n):
+        drawn[i] *= roots[i]
+    noise = drawn[:n].reshape(v.shape)
+    if not packed_tangents(x, noise, tables):
+        return 1
+    decay = head[FRICTION] * time
+    keep, spread = math.exp(-decay), math.sqrt(-math.expm1(-2 * decay) * head[KT])
+    own = drawn[n:].reshape(w.shape)
+    stir(v, w, noise, own, keep, spread, squares, cluster, spheres, masses, totals)
+    return 0

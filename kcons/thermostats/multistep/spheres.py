@@ -15,7 +15,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -24,16 +24,16 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.solvers.kernels.aligned_memory import in_one_array
 from kcons.solvers.rank_revealing import rank
 from kcons.steppers import State, System
 from kcons.steppers.interpreter import Interpreter
-from kcons.steppers.operations import Evaluate, Operation, Project, Turn
+from kcons.steppers.operations import Operation, Project
 from kcons.steppers.program import Program, Row
 from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.freedom import MARK, placed_rows
-from kcons.thermostats.langevin import SeededBath
+from kcons.thermostats.freedom import MARK, carried, placed_rows
 from kcons.thermostats.multistep import sphere_kernels as kernels
-from kcons.thermostats.multistep.respa import GroupedForces, Nesting, SlowKicks, group_names
+from kcons.thermostats.multistep.respa import GroupedSteps, SeveralSteps, SlowKicks
 
 Spheres = Literal["split", "axes", "cluster", "global"]
 
@@ -173,7 +173,7 @@ def _ranks(system: System, count: int, positions: FloatArray) -> IntArray:
     return ranks
 
 
-class IsokineticSpheres(SeededBath):
+class IsokineticSpheres(SeveralSteps):
     """Canonical configurations at long steps: a stochastic isokinetic bath on spheres, with several time steps.
 
     Dynamics are lost: diffusion, relaxation times and spectra mean nothing. Beside several time steps it needs a
@@ -208,8 +208,8 @@ class IsokineticSpheres(SeededBath):
 
     Notes
     -----
-    `State.thermostat` holds a mark, the auxiliary variables, sphere by sphere, and the forces of the groups. Velocities
-    of the start are scaled to their spheres. Kinetic energies average g (G - 1)/G k_B T/2 on a sphere of G = g + L
+    `State.thermostat` holds a mark and the auxiliary variables, sphere by sphere. Velocities of the start are scaled to
+    their spheres. Kinetic energies average g (G - 1)/G k_B T/2 on a sphere of G = g + L
     (`kinetic_energy`), and say nothing of the temperature.
 
     References
@@ -234,24 +234,20 @@ class IsokineticSpheres(SeededBath):
         super().__init__(thermal_energy, friction, rng, substeps)
         self.spheres: Spheres = spheres
         self.auxiliary = auxiliary
-        self.nesting = Nesting(steps, self.substeps, slow_kicks, turns=True)
-        both = self.nesting.in_flights, self.nesting.on_circles
-        self._in_flights, self._great_circles = (_listed_and_made(each, self.nesting.names) for each in both)
-        self.force_evaluations = self.nesting.evaluations
+        self.nest(steps, slow_kicks, _listed_and_made, turns=True)
         self._known: tuple[System, SphereLayout, FloatArray, float] | None = None
         self._told = False
 
     def __repr__(self) -> str:
-        steps, others = self.nesting.words
+        steps, others = self._words
         given = f"{steps}, spheres={self.spheres!r}, auxiliary={self.auxiliary}{others}"
         return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{given})"
 
     def check(self, system: System) -> None:
         """Raise where the groups of forces are not those that have steps, for targets that move and velocity rows."""
-        super().check(system)
         if self._known is None or self._known[0] is not system:
+            super().check(system)
             refuse_driven(system)
-            group_names(system.force, self.nesting.names)
 
     def layout(self, system: System, positions: FloatArray) -> SphereLayout:
         """The spheres of a system."""
@@ -267,17 +263,13 @@ class IsokineticSpheres(SeededBath):
         whole = g + self.auxiliary
         return 0.5 * self.thermal_energy * float((g * (whole - 1) / whole).sum())
 
-    def depends_on(self, system: System, state: State) -> Any:
-        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
-        return None if self.nesting.middle else super().depends_on(system, state)
-
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         self.refuse_back(system, dt)
         _, layout, squares, _ = self._found(system, state.positions)
         if not self._told:
             self._told = True
             logger.warning("isokinetic spheres sample configurations only: no transport, relaxation times or spectra")
-        return SphereStep(system, state, dt, self, layout, squares, 1 if self.nesting.middle else steps)
+        return SphereStep(system, state, dt, self, layout, squares, 1 if self.middle else steps)
 
     def _found(self, system: System, positions: FloatArray) -> tuple[System, SphereLayout, FloatArray, float]:
         known, kt = self._known, self.thermal_energy
@@ -299,17 +291,18 @@ class _Restore(Operation):
     verb, meaning = "restore", "onto the spheres"
 
 
-def _listed_and_made(operations: tuple[Operation, ...], names: tuple[str, ...]) -> tuple[Any, Program]:
+def _listed_and_made(operations: tuple[Operation, ...], names: tuple[str, ...]) -> tuple[Any, tuple[Program, Program]]:
+    """Operations, and the programs that are compiled, and that leave to Python what needs projections."""
     parts: list[Operation] = [_Restore()]
     for operation in operations:
         parts += [operation, _Rescale()] if isinstance(operation, Project) else [operation]
-    return operations, Program(parts, None, names)
+    moved = {"restore": kernels.restore, "rescale": kernels.shorten}
+    whole = moved | {"turn": kernels.turn_along, "exchange": kernels.exchange}
+    return operations, (Program(parts, whole, names), Program(parts, moved, names))
 
 
-class SphereStep(Interpreter):
+class SphereStep(GroupedSteps):
     """Steps on their way; velocities are on the constraints and on their spheres but between a drift and `project`."""
-
-    simple = False
 
     def __init__(
         self,
@@ -321,37 +314,43 @@ class SphereStep(Interpreter):
         squares: FloatArray,
         steps: int,
     ) -> None:
-        n, auxiliary, nesting = len(squares), bath.auxiliary, bath.nesting
-        self.groups, known = GroupedForces.of(
-            system, start, nesting.names, 1 + n * auxiliary, "IsokineticSpheres", marked=True, middle=nesting.middle
-        )
-        super().__init__(system, start, dt, bath.listed(system)[1], steps)
-        self.bath, self.squares = bath, squares
-        self.tables = layout.cluster, layout.spheres, layout.masses, layout.totals
-        if known is not None:
-            known = known[1:]
+        drawn, made = len(squares) * bath.auxiliary, cast(tuple[Program, Program], bath.listed(system)[1])
+        known = carried(start, 1 + drawn, "IsokineticSpheres", marked=True)
+        self.groups = bath.groups(system, start)
+        if known:
+            assert start.thermostat is not None
+            own = start.thermostat[1:]
         else:
-            known = math.sqrt(bath.thermal_energy) * bath.drawn(start.step, (n * auxiliary,), _BEGIN)
+            own = math.sqrt(bath.thermal_energy) * bath.drawn(start.step, (drawn,), _BEGIN)
+        program = made[system.packed is None]
+        parts = sum(row.name == "exchange" for row in program.rows)
+        head = bath.friction, bath.thermal_energy, *divmod(bath.seed, 2**32), start.step + 1, 0, parts
+        atoms = layout.cluster, layout.spheres.ravel(), layout.masses, layout.totals
+        roots = system.root_weights.ravel()
+        numbers = in_one_array((np.array(head, dtype=float), squares, own, *atoms, roots, np.zeros(roots.size + drawn)))
+        super().__init__(system, start, dt, program, steps, numbers)
+        self.forces, self.bath = self.groups.stacked(), bath
+        self.w, self.squares, *self.tables = kernels.unpacked(self.numbers)
+        #: Accelerations along the constraints, by groups, of forces that Python has evaluated.
+        self.paces: dict[int, FloatArray] = {}
+        if not known:
             self.along(self.v, self.place(0), self.time)
-        self.w: FloatArray = known.reshape(n, auxiliary).copy()
-        #: Accelerations along the constraints, by groups, where they are known.
-        self.paces: dict[str, FloatArray] = {}
+
+    @property
+    def simple(self) -> bool:  # type: ignore[override]
+        return super().simple and self.system.packed is not None
+
+    def evaluate(self, row: Row, begun: bool) -> None:
+        self.paces.clear()
+        super().evaluate(row, begun)
 
     def turn(self, row: Row, begun: bool) -> None:
-        assert isinstance(row.operation, Turn)
-        group = row.operation.group
-        if group not in self.paces:
-            pace = self.groups.now[group] * self.system.weights
-            self.paces[group] = self.along(pace, self.place(row.here), self.at(row.end))
-        kernels.turn(self.v, self.w, self.paces[group], row.length * self.dt, self.squares, *self.tables)
-
-    def restore(self, row: Row, begun: bool) -> None:
-        """Velocities and auxiliary variables get the lengths of their spheres."""
-        kernels.rescale(self.v, self.w, self.squares, True, *self.tables)
-
-    def rescale(self, row: Row, begun: bool) -> None:
-        """Velocities get the length they had before the drift."""
-        kernels.rescale(self.v, self.w, self.squares, False, *self.tables)
+        check_finite(self.force_of(row), "force", self.number)
+        pace = None if self.simple else self.paces.get(row.group)
+        if pace is None:
+            pace = self.force_of(row) * self.system.weights
+            self.paces[row.group] = self.along(pace, self.place(row.here), self.at(row.end))
+        kernels.turn(self.v, self.w, pace, row.length * self.dt, self.squares, *self.tables)
 
     def exchange(self, row: Row, begun: bool) -> None:
         """Friction and noise on the spheres."""
@@ -365,15 +364,6 @@ class SphereStep(Interpreter):
         own = drawn[n:].reshape(self.w.shape)
         kernels.stir(self.v, self.w, noise, own, keep, spread, self.squares, *self.tables)
 
-    def evaluate(self, row: Row, begun: bool) -> None:
-        assert isinstance(row.operation, Evaluate)
-        self.paces.clear()
-        self.show(row)
-        self.groups.evaluate(row.operation.group, self.whole(self.x), self.at(row.end), self.number)
-
-    def applied(self, here: int) -> FloatArray | None:
-        return self.groups.total()
-
     def variables(self) -> FloatArray:
         check_finite(self.v, "velocity", self.number)
-        return self.groups.closed(np.append(MARK, self.w))
+        return np.append(MARK, self.w)

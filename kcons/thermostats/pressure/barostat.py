@@ -15,19 +15,30 @@ import math
 import zlib
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
-from weakref import WeakKeyDictionary, ref
+from typing import Any, Literal
+from weakref import ref
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import Count, Finite, Positive, Rng, check_pairs, checked, finite_number, seed_from
+from kcons.constraints.arguments import (
+    Count,
+    Finite,
+    Positive,
+    Rng,
+    check_pairs,
+    checked,
+    finite_number,
+    refuse_other,
+    seed_from,
+)
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.steppers.stepper import DropsSystemCaches
 from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import (
@@ -132,55 +143,41 @@ class Press(Operation):
     """A trial cell, in one step of so many."""
 
     verb = "press"
-
-    every: int
-    what: str
-
-    @property
-    def meaning(self) -> str:  # type: ignore[override]
-        """In words."""
-        return f"{self.what}, every {self.every} steps"
+    meaning: str = ""  # type: ignore[misc]
 
 
-@dataclass(frozen=True, eq=False)
 class Place:
-    """Where the system is before or after a trial, with forces and stress where the barostat asks for them."""
+    """Where a system is before or after a trial.
 
-    cell: FloatArray
-    positions: FloatArray
-    energy: float
-    forces: FloatArray | None = None
-    stress: FloatArray | None = None
+    Attributes
+    ----------
+    pieces : BarostatBodies
+    cell : ndarray, shape (3, 3)
+    energy, volume, area : float
+        Area of the face spanned by the first two vectors.
+    rise : ndarray, shape (3, 3), or None
+        dU/d strain, see `energy_by_strain`, where the barostat asks for it.
+    forces : ndarray or None
+        Where they are known by then.
+    thermal_energy, dt : float
+    """
 
-    @cached_property
-    def volume(self) -> float:
-        return float(abs(np.linalg.det(self.cell)))
-
-    @property
-    def area(self) -> float:
-        """Of the face spanned by the first two vectors."""
-        return float(np.linalg.norm(np.cross(self.cell[0], self.cell[1])))
-
-
-class Trial(NamedTuple):
-    """A strain e, the mode that it counts for, and ln of the density by which it is proposed."""
-
-    e: FloatArray
-    mode: int
-    forward: float = 0.0
-
-
-class Attempt(NamedTuple):
-    """What a trial is made from."""
-
-    system: CellSystem
-    pieces: BarostatBodies
-    state: State
-    thermal_energy: float
-    dt: float
+    def __init__(
+        self, system: CellSystem, pieces: BarostatBodies, state: State, thermal_energy: float, dt: float, rises: bool
+    ) -> None:
+        x, self.rise, self.forces = state.positions, None, None
+        if rises:
+            stress = system.stress(x, state.time)  # first: most calculators find all else on the way
+            self.forces = system.with_forces(state).forces
+            assert self.forces is not None
+            self.rise = energy_by_strain(system, pieces, x, self.forces, stress)
+        self.pieces, self.cell, self.thermal_energy, self.dt = pieces, system.cell, thermal_energy, dt
+        self.energy = system.energy(x, state.time, state.step)
+        self.volume = float(abs(np.linalg.det(self.cell)))
+        self.area = float(np.linalg.norm(np.cross(self.cell[0], self.cell[1])))
 
 
-class Barostat:
+class Barostat(DropsSystemCaches):
     """Base of the barostats: pieces, trial cells, acceptance. Give one to `ConstantPressure`, or to dynamics of ASE.
 
     Pieces - clusters tied by constraints, molecules where bonds are given, free atoms - move by their centers, with
@@ -245,32 +242,26 @@ class Barostat:
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
         self.cutoff = cutoff
-        self._pieces: WeakKeyDictionary[CellSystem, BarostatBodies] = WeakKeyDictionary()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_pieces"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _pieces=WeakKeyDictionary())  # found anew by a copy
+        self._known: tuple[CellSystem, BarostatBodies] | None = None
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.pressure!r}, every={self.every}, kind={self.strains.kind!r})"
 
     @property
     def operation(self) -> Press:
-        return Press(self.every, f"{self.what} ({self.strains.kind})")
+        return Press(f"{self.what} ({self.strains.kind}), every {self.every} steps")
 
     def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> BarostatBodies:
         """What moves as one; errors as of `find_pieces`."""
-        known = self._pieces.get(system)
-        if known is None:
+        known = self._known
+        if known is None or known[0] is not system:
             require_periodic(system, self.strains.axes, self.strains.kind)
             self._check_width(system, system.cell)
-            known = find_pieces(system, positions, self.strains.axes, self.molecules, self.held, time)
-            if self.strains.flexible and not known.open.all():
+            found = find_pieces(system, positions, self.strains.axes, self.molecules, self.held, time)
+            if self.strains.flexible and not found.open.all():
                 raise UnsupportedError("a cell that changes its angles turns what is held in space; use another kind")
-            self._pieces[system] = known
-        return known
+            known = self._known = system, found
+        return known[1]
 
     @cached_property
     def _owner(self) -> float:
@@ -319,20 +310,18 @@ class Barostat:
         """
         assert state.barostat is not None and state.cell is not None
         pieces = self.pieces(system, state.positions, state.time)
-        before = self._place(system, state.cell, state.positions, state)
+        before = Place(system, pieces, state, thermal_energy, dt, self.needs_stress)
         if not math.isfinite(before.energy):
             raise NonFiniteError(
                 f"the potential energy is {before.energy} at step {state.step}, by which no trial cell can be judged: "
                 "atoms overlap, or the force field returns what is no energy"
             )
         numbers = noise_generator((self.seed, 1), state.step)
-        attempt = Attempt(system, pieces, state, thermal_energy, dt)
-        trial, drawn = self._trial(attempt, before, numbers), numbers.random()
         variables = state.barostat.copy()
         tried, taken, adapted = self._modes(variables)
-        kept = np.abs(trial.e) <= self.strains.most
-        frame = self.strains.frame(before.cell)
-        matrix = self.strains.matrix(trial.e, frame)
+        e, mode, forward = self._trial(before, adapted, numbers)
+        drawn, kept = numbers.random(), np.abs(e) <= self.strains.most
+        matrix = self.strains.matrix(e, self.strains.frame(before.cell))
         chance, positions, remainder, after = 0.0, state.positions, state.remainder, before
         if kept.all():
             d = pieces.moved(state.positions, matrix - np.eye(3), lattice_of(system))
@@ -342,15 +331,14 @@ class Barostat:
                 self._check_width(system, before.cell @ matrix)
                 system.set_cell(before.cell @ matrix, positions)
                 there = replace(state, positions=positions, forces=None, barostat=None)
-                after = self._place(system, system.cell, positions, there)
-                log = self._log_chance(pieces, before, after, trial, thermal_energy)
-                log += self._reverse(attempt, after, trial) - trial.forward
+                after = Place(system, pieces, there, thermal_energy, dt, self.needs_stress)
+                log = self._log_chance(before, after, e) + self._reverse(after, e) - forward
                 chance = math.exp(min(0.0, log))
             except BaseException:
                 system.set_cell(before.cell, state.positions)
                 raise
         accepted = drawn < chance
-        self._adapt(trial.mode, chance, tried, taken, adapted)
+        self._adapt(mode, chance, tried, taken, adapted)
         if not accepted:
             if after is not before:
                 system.set_cell(before.cell, state.positions)
@@ -371,32 +359,23 @@ class Barostat:
                     item="cell",
                 )
 
-    def _place(self, system: CellSystem, cell: FloatArray, positions: FloatArray, state: State) -> Place:
-        stress = forces = None
-        if self.needs_stress:
-            stress = system.stress(positions, state.time)  # first: most calculators find all else on the way
-            forces = system.with_forces(state).forces
-        return Place(cell, positions, system.energy(positions, state.time, state.step), forces, stress)
-
-    def _log_chance(
-        self, pieces: BarostatBodies, before: Place, after: Place, trial: Trial, thermal_energy: float
-    ) -> float:
+    def _log_chance(self, before: Place, after: Place, e: FloatArray) -> float:
         """ln of the ratio of the distribution at the two places."""
         rise = after.energy - before.energy + self.pressure * (after.volume - before.volume)
         if self.tension:
             rise -= self.tension * (after.area - before.area)
-        return -rise / thermal_energy + self.strains.log_measure(trial.e, pieces.moving)
+        return -rise / before.thermal_energy + self.strains.log_measure(e, before.pieces.moving)
 
-    def _modes(self, variables: FloatArray | None) -> FloatArray:
-        assert variables is not None
+    def _modes(self, variables: FloatArray) -> FloatArray:
         return variables[MODES:].reshape(3, -1)
 
     # -- what the kinds of barostat differ in ---------------------------------------------------
 
-    def _trial(self, attempt: Attempt, before: Place, rng: np.random.Generator) -> Trial:
+    def _trial(self, before: Place, adapted: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, int, float]:
+        """A strain e, the mode that it counts for, and ln of the density by which it is proposed."""
         raise NotImplementedError
 
-    def _reverse(self, attempt: Attempt, after: Place, trial: Trial) -> float:
+    def _reverse(self, after: Place, e: FloatArray) -> float:
         """ln of the density by which the trial back is proposed."""
         return 0.0
 
@@ -452,10 +431,10 @@ class MonteCarloBarostat(Barostat):
         self._modes(variables)[2] = np.log(np.minimum(self.width, self.strains.most))
         return variables
 
-    def _trial(self, attempt: Attempt, before: Place, rng: np.random.Generator) -> Trial:
+    def _trial(self, before: Place, adapted: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, int, float]:
         mode, e = int(rng.integers(len(self.strains))), np.zeros(len(self.strains))
-        e[mode] = math.exp(self._modes(attempt.state.barostat)[2, mode]) * (2 * rng.random() - 1)
-        return Trial(e, mode)
+        e[mode] = math.exp(adapted[mode]) * (2 * rng.random() - 1)
+        return e, mode, 0.0
 
     def _adapt(self, mode: int, chance: float, tried: FloatArray, taken: FloatArray, adapted: FloatArray) -> None:
         super()._adapt(mode, chance, tried, taken, adapted)
@@ -497,53 +476,52 @@ class CellRescaling(Barostat):
         super().__init__(pressure, **kwargs)
         self.tau, self.compressibility = tau, compressibility
 
-    def _drift(self, attempt: Attempt, place: Place) -> tuple[FloatArray, FloatArray]:
+    def _drift(self, place: Place) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of each mode's change until the next trial."""
-        system, pieces, _, thermal_energy, dt = attempt
-        strains, volume = self.strains, place.volume
+        assert place.rise is not None
+        strains, volume, thermal_energy = self.strains, place.volume, place.thermal_energy
         generators = strains.generators_in(strains.frame(place.cell))
-        rise = energy_by_strain(system, pieces, place)
-        enthalpy = generators.reshape(-1, 9) @ rise.ravel() + self.pressure * volume * strains.traces
+        enthalpy = generators.reshape(-1, 9) @ place.rise.ravel() + self.pressure * volume * strains.traces
         if self.tension:
             enthalpy -= self.tension * place.area * strains.diagonals[:, :2].sum(axis=1)
         # What the measure of the states and the changing width of the noise ask for leaves N, not N + 1.
-        slope = strains.diagonals @ pieces.moving - enthalpy / thermal_energy
-        spread = self.compressibility * thermal_energy / (3 * strains.sizes * volume * self.tau) * self.every * abs(dt)
+        slope = strains.diagonals @ place.pieces.moving - enthalpy / thermal_energy
+        spread = (
+            self.compressibility * thermal_energy / (3 * strains.sizes * volume * self.tau) * self.every * abs(place.dt)
+        )
         spread = np.minimum(spread, 0.5 * (strains.most / _WITHIN) ** 2)
         wide = np.sqrt(2 * spread)
         # Bounded, so that from far away trials can still be taken back, and be accepted.
         return np.clip(spread * slope, -wide, wide), wide
 
-    def _trial(self, attempt: Attempt, before: Place, rng: np.random.Generator) -> Trial:
-        mean, wide = self._drift(attempt, before)
+    def _trial(self, before: Place, adapted: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, int, float]:
+        mean, wide = self._drift(before)
         e = mean + wide * rng.standard_normal(len(mean))
-        return Trial(e, 0, _log_normal(e, mean, wide))
+        return e, 0, _log_normal(e, mean, wide)
 
-    def _reverse(self, attempt: Attempt, after: Place, trial: Trial) -> float:
-        return _log_normal(-trial.e, *self._drift(attempt, after))
+    def _reverse(self, after: Place, e: FloatArray) -> float:
+        return _log_normal(-e, *self._drift(after))
 
     def acceptance(self, state: State) -> FloatArray:
         """Mean probability of acceptance so far, the same for all modes, which change together; NaN without trials."""
         return np.full(len(self.strains), super().acceptance(state)[0])
 
 
-def energy_by_strain(system: CellSystem, pieces: BarostatBodies, place: Place) -> FloatArray:
+def energy_by_strain(
+    system: CellSystem, pieces: BarostatBodies, x: FloatArray, forces: FloatArray, stress: FloatArray
+) -> FloatArray:
     """dU/d strain, shape (3, 3), where the cell is strained and pieces move by their centers.
 
     The stress is that of all atoms moving along; what they would move relative to the center of their piece does work
     against the forces, and is taken out again.
     """
-    assert place.forces is not None and place.stress is not None
-    shapes = pieces.work_of_shapes(place.positions, place.forces, lattice_of(system))
-    return place.volume * place.stress + shapes
+    return system.volume * stress + pieces.work_of_shapes(x, forces, lattice_of(system))
 
 
 def _log_normal(e: FloatArray, mean: FloatArray, wide: FloatArray) -> float:
     return float(-0.5 * (((e - mean) / wide) ** 2).sum() - np.log(wide).sum())
 
 
-def require_barostat(given: object) -> Barostat:
-    """What is given, if it is a barostat; `InputError` otherwise."""
-    if isinstance(given, Barostat):
-        return given
-    raise InputError(f"barostat is {given!r}; give MonteCarloBarostat(pressure) or CellRescaling(...)", item="barostat")
+def require_barostat(given: object) -> None:
+    """Raise `InputError` for what is no barostat."""
+    refuse_other(given, Barostat, "barostat", "MonteCarloBarostat(pressure) or CellRescaling(...)")

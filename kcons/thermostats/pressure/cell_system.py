@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, as_float_array, check_call
+from kcons.constraints.arguments import as_array, check_call
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -50,7 +50,7 @@ class CellSystem(System):
         self,
         motion: Motion,
         force: InCellFunction | None = None,
-        potential: InCellFunction | None = None,
+        potential: Callable[[FloatArray, float, FloatArray], float] | None = None,
         stress: InCellFunction | None = None,
         *,
         far: float = 8.0,
@@ -71,7 +71,7 @@ class CellSystem(System):
         super().__init__(
             motion,
             None if force is None else (lambda x, t: force(x, t, self.cell)),
-            potential=None if potential is None else (lambda x, t: _number(potential(x, t, self.cell))),
+            potential=None if potential is None else (lambda x, t: potential(x, t, self.cell)),
             far=far,
         )
 
@@ -137,7 +137,7 @@ class CellSystem(System):
 
     def energy(self, x: FloatArray, time: float, step: int) -> float:
         """The potential energy, infinite where atoms overlap; `NonFiniteError` if it is NaN, or minus infinity."""
-        found = 0.0 if self.potential is None else float(self.potential(x, time))
+        found = self.potential_energy(x, time)
         if not found > -np.inf:
             error = NonFiniteError(
                 f"the potential energy is {found} at step {step}, by which no trial cell can be judged: look at what "
@@ -159,12 +159,3 @@ class CellSystem(System):
         if not np.isfinite(found).all():
             raise NonFiniteError("the stress is not finite: look at what the force field returned")
         return 0.5 * (found + found.T)
-
-
-def _number(energy: ArrayLike) -> float:
-    found = as_float_array(energy, "potential")
-    if found.ndim:
-        raise InputError(
-            f"the potential function returned shape {found.shape}; it must return one number", item="potential"
-        )
-    return float(found)

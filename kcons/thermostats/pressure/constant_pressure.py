@@ -43,7 +43,8 @@ class ConstantPressure(Listed):
 
     def __init__(self, stepper: Stepper, barostat: Barostat) -> None:
         require_stepper(stepper)
-        self.stepper, self.barostat = stepper, require_barostat(barostat)
+        require_barostat(barostat)
+        self.stepper, self.barostat = stepper, barostat
 
     def __repr__(self) -> str:
         return f"ConstantPressure({self.stepper!r}, {self.barostat!r})"
@@ -56,11 +57,6 @@ class ConstantPressure(Listed):
     def force_evaluations(self) -> int:
         """Of the stepper; a trial takes one more, and two energies."""
         return self.stepper.force_evaluations
-
-    @property
-    def holds(self) -> bool:
-        """Whether states can be certified."""
-        return bool(getattr(self.stepper, "holds", True))
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
         inner = self.stepper.operations(system) if isinstance(self.stepper, Listed) else ()
@@ -77,8 +73,6 @@ class ConstantPressure(Listed):
                 "the cell has changed; use Langevin, NoseHooverChain or Isokinetic"
             )
         self.stepper.check(system)
-        if isinstance(self.stepper, Isokinetic) and self.stepper.atoms is not None:
-            raise UnsupportedError("an isokinetic thermostat on some atoms gives the others no temperature; take all")
 
     def start(self, system: System, state: State) -> State:
         """The state in its cell, with variables of the barostat."""
@@ -92,9 +86,6 @@ class ConstantPressure(Listed):
             if self.barostat.needs_stress:
                 system.stress(state.positions, state.time)
         return state
-
-    def time_reversed(self, state: State) -> State:
-        return self.stepper.time_reversed(state) if isinstance(self.stepper, Listed) else state
 
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.

@@ -13,7 +13,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError
 from kcons.motion.motion import Motion
 from kcons.steppers import State
-from kcons.thermostats.pressure.barostat import Place, energy_by_strain
+from kcons.thermostats.pressure.barostat import energy_by_strain
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import BarostatBodies, find_pieces, lattice_of
 
@@ -122,8 +122,9 @@ def instantaneous_pressure(
         kinetic = positive(thermal_energy, "thermal_energy") * np.diag(pieces.moving).astype(float)
     if virial == "difference":
         return kinetic / volume - np.eye(3) * _slope(system, state, pieces, cell) / (pieces.axes.sum() * volume)
-    stress = system.stress(x, state.time)
-    rise = energy_by_strain(system, pieces, Place(cell, x, 0.0, system.with_forces(state).forces, stress))
+    stress, forces = system.stress(x, state.time), system.with_forces(state).forces
+    assert forces is not None
+    rise = energy_by_strain(system, pieces, x, forces, stress)
     return (kinetic - 0.5 * (rise + rise.T)) / volume
 
 

@@ -11,13 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import check_pairs
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import follow_parents, spanning_tree
+from kcons.constraints.periodic.one_piece import connected, follow_parents, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.thermostats.freedom import UNCHANGED, placed_rows, row_changes, rows_where, shifts
 from kcons.thermostats.pressure.cell_system import CellSystem
-from kcons.topology.topology import connected
 
 Held = Literal["refuse", "stay"]
 

@@ -77,12 +77,6 @@ def _polar_gradient(r):
     return np.array([[-y, x, 0.0]]) / (x * x + y * y)
 
 
-def test_minimum_image_where_only_differences_count():
-    x = np.array([[0.2, 0.0, 0.0], [9.9, 0.0, 0.0]])
-    item = Custom([0, 1], gap, gap_gradient, translation_invariant=True)
-    assert ConstraintSet([item], x, np.ones(2), cell=[10.0] * 3).target() == pytest.approx([0.3])
-
-
 def test_a_wrong_gradient_is_found_before_it_moves_anything():
     with pytest.raises(InputError, match=r"row 1, Custom\(0, 1\): gradient gives .* but differences .* give"):
         ConstraintSet([Distance([2, 3]), Custom([0, 1], gap, lambda r: 2 * gap_gradient(r))], scattered(0), MASSES)

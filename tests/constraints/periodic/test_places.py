@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ase import Atoms
-from ase.calculators.calculator import Calculator, all_changes
-from ase.md.verlet import VelocityVerlet
 
 from kcons import ConstraintSet, Motion, System, run
-from kcons.ase import constrain
 from kcons.constraints import (
     Angle,
     CenterDistance,
@@ -28,7 +24,6 @@ from kcons.constraints import (
     RadiusOfGyration,
     Sphere,
     Torus,
-    projection,
 )
 
 CELL = np.array([[10.0, 0, 0], [1.0, 9.0, 0], [-2.0, 1.0, 11.0]])
@@ -126,14 +121,6 @@ def test_a_molecule_is_the_same_in_the_cell_as_in_open_space(place, tie):
     np.testing.assert_allclose(ends[0].positions, ends[1].positions - moved, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("tie", ["angle", "centers", "distances"])
-def test_a_place_of_several_atoms_does_not_hang_on_what_ties_them(tie):
-    row = CenterOfMass([[0, 1, 2]], axes=(0,))
-    stored = [np.average(STORED[:3, 0], weights=MASSES[:3])]
-    for rows in ([row], [row, *_list(TIES[tie])]):
-        assert ConstraintSet(rows, STORED, MASSES, cell=CELL).measure(STORED)[0] == pytest.approx(stored[0], abs=1e-12)
-
-
 def test_another_image_from_one_call_to_the_next():
     """A plane along the way an atom is wrapped: where it is stored does not matter, nor what ties it."""
     rows = [Plane([0, 1], [0, 0, 1.0]), Angle([[0, 1, 2]])]
@@ -150,38 +137,3 @@ def test_another_image_from_one_call_to_the_next():
         np.testing.assert_allclose(
             motion.project_velocities(WHOLE + behind, v), motion.project_velocities(WHOLE, v), rtol=0, atol=1e-12
         )
-
-
-@pytest.mark.parametrize("place", ["Sphere", "Formula", "Line", "CenterOfMass of three", "Custom of two"])
-def test_the_oracle_and_the_engine_mean_the_same(place):
-    _, (motion, _) = _systems(place, "gyration")
-    rng = np.random.default_rng(3)
-    held, f = motion.constraint_set, rng.normal(size=STORED.shape)
-    v = motion.project_velocities(STORED, rng.normal(size=STORED.shape))
-    b = held.acceleration_target(STORED, v)
-    a = projection.acceleration(held.jacobian(STORED).toarray(), np.repeat(MASSES, 3), f.ravel(), b)
-    np.testing.assert_allclose(motion.acceleration(STORED, v, f).ravel(), a, rtol=0, atol=1e-9)
-
-
-class _Pull(Calculator):
-    implemented_properties = ["energy", "forces"]
-
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        super().calculate(atoms, properties, system_changes)
-        forces = 0.5 * (STORED + 0.3 - atoms.positions)
-        self.results = {"energy": float((forces**2).sum()), "forces": forces}
-
-
-@pytest.mark.parametrize("place", ["Sphere", "Plane", "Torus", "Formula", "CenterOfMass of three"])
-def test_ase(place):
-    """Atoms of a molecule that ASE stores in many images stay at their places."""
-    moved = STORED - WHOLE
-    atoms = Atoms("CHONF", positions=STORED, cell=CELL, pbc=True, calculator=_Pull())
-    atoms.set_masses(MASSES)
-    rows = [*_list(PLACES[place](moved)), Angle([[0, 1, 2]])]
-    before = ConstraintSet(rows, STORED, MASSES, cell=CELL).measure(STORED)
-    constrain(atoms, rows)
-    VelocityVerlet(atoms, 0.1).run(20)
-    after = ConstraintSet(rows, atoms.positions, MASSES, cell=CELL).measure(atoms.positions)
-    assert np.abs(atoms.positions - STORED).max() > 1e-3
-    np.testing.assert_allclose(after, before, rtol=0, atol=1e-10)

@@ -25,12 +25,6 @@ MUTANTS = {
             "test_device_integrator.py::test_which_steps_are_made_on_the_device",
         ),
     ],
-    "openmm/device/c_writer.py": [
-        (
-            're.sub(r"pow\\((.*), (.*)\\)", r"(\\«1→2»)^(\\2)", text)',
-            "test_surface_rows.py::test_formulas_are_read_by_openmm",
-        ),
-    ],
     "plan/clusters_alike.py": [
         (
             "key=lambda k: («k in last, →»k)",

@@ -61,7 +61,7 @@ MUTANTS = {
         ),
         (
             "return «x→whole»[item.atoms] if self.moved is None",
-            "test_places.py::test_a_place_of_several_atoms_does_not_hang_on_what_ties_them",
+            "test_places.py::test_a_molecule_is_the_same_in_the_cell_as_in_open_space",
         ),
     ],
     "constraints/contradictions.py": [

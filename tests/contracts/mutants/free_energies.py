@@ -75,7 +75,7 @@ MUTANTS = {
             "test_correlated_series.py::test_errors_are_as_large_as_they_say",
         ),
         (
-            "return «factors[:, None]→1.0» * (series",
+            "fluctuation = «factors[:, None]→1.0» * (series",
             "free_energy/test_averages.py::test_weights_that_belong_to_the_values",
         ),
     ],
@@ -94,8 +94,7 @@ MUTANTS = {
         ),
     ],
     "free_energy/profiles/profile.py": [
-        ("F=self.F «+ shift[:-1] -→- shift[:-1] +» shift[-1]", "test_profile.py::test_jacobians"),
-        ("return «self._learned_closed if closed else →»self.learned", "test_profile.py::test_a_period_closes"),
+        ("process = process«.closed()→»", "test_profile.py::test_a_period_closes"),
     ],
     "free_energy/profiles/mean_force_surface.py": [
         (

@@ -75,10 +75,6 @@ MUTANTS = {
             "«        for name, value in self.settings.items():\n            self.write(name, value)\n→»",
             "test_settings.py::test_a_setting_has_a_method_of_its_own",
         ),
-        (
-            "if «found != self.settings[_SUM_OF_VECTORS]→False»:",
-            "test_surface_integrator.py::test_a_checkpoint_of_other_surfaces_does_not_bring_them_along",
-        ),
     ],
     "openmm/integrator/system_checks.py": [
         (
@@ -187,8 +183,6 @@ MUTANTS = {
             "(*held[:k], *«held[n:]→()») for k",
             "test_rows_in_context.py::test_row_that_repeats_a_constraint_of_the_system_is_named",
         ),
-    ],
-    "openmm/collective/row_program.py": [
         (
             "weight{c}*({of('more', i)}«-→+»{of('expected', i)})",
             "test_row_program.py::test_the_iteration_learns_from_each_push",
@@ -202,14 +196,10 @@ MUTANTS = {
             "test_row_program.py::test_many_steps_look_less_often",
         ),
     ],
-    "openmm/surfaces/surface_rows.py": [
+    "openmm/surface_integrator.py": [
         (
-            'f"select(failed, v, {u}«+→-»i_push/{h})"',
-            "test_surface_steps.py::test_the_steps_are_those_of_the_core",
-        ),
-        (
-            "«*step(dot(i_slope, i_gradient))→»",
-            "test_surface_rows.py::test_a_landing_where_the_surface_looks_the_other_way_is_none",
+            "«positions is None→False»:",
+            "test_surface_integrator.py::test_great_circles_at_any_time_step",
         ),
     ],
     "openmm/callback_rows/carried_constraints.py": [
@@ -228,6 +218,14 @@ MUTANTS = {
         (
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "test_part.py::test_integrators_in_turn_hold_the_same_part",
+        ),
+        (
+            "u * np.cos(w) - d * (w * np.sin(w))« - way→»",
+            "test_surface_integrator.py::test_great_circles_at_any_time_step",
+        ),
+        (
+            '«d *= radius / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None]→pass»',
+            "test_surface_integrator.py::test_the_steps_are_those_of_the_core",
         ),
         (
             "return self.motion.rank« - 3 * fixed→»",

@@ -13,15 +13,17 @@ MUTANTS = {
     ],
     "constraints/functions/expressions.py": [
         (
-            "    what = «undefined_part(tree, known)→None»\n",
+            "    what = «undefined_part(tree, _PI)→None»\n",
             "test_expressions.py::test_formulas_without_bound_are_refused_at_once",
         ),
         (
-            'sympy.S«ymbol(f"sign of {inner}")→.NegativeOne»',
-            "test_expressions.py::test_shifts_are_found_out_where_multiplying_out_has_no_end",
+            "lambda _, x: «next(some)→-np.ones(40)»",
+            "test_expressions.py::test_shifts_are_found_out",
         ),
+    ],
+    "constraints/constraint.py": [
         (
-            "second = [bend, value.diff(t), «2 * →»along.diff(t) + value.diff(t, 2)]",
+            "self._bent(r + 0j, v, time + step) «+→- 0 *» changes",
             "test_constraint_set.py::test_acceleration_target_is_the_second_derivative_along_any_curve",
         ),
     ],

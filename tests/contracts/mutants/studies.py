@@ -41,7 +41,7 @@ MUTANTS = {
     "comparison/report.py": [
         ("height = max(height« + least→», float(", "comparison/test_report.py::test_no_name_is_cut_or_covers_another"),
     ],
-    "openmm/collective/row_program.py": [
+    "openmm/collective/collective_rows.py": [
         (
             "if not self._single« or _halved(integrator, scheme)→»:",
             "test_row_program.py::test_the_second_half_of_a_drift_begins_in_the_middle",
@@ -86,6 +86,6 @@ MUTANTS = {
         ),
     ],
     "free_energy/profiles/profile.py": [
-        ("aims = grid[«→~»self.lower_than(below, grid)]", "test_profile.py::test_windows_that_help_what_is_low"),
+        ("aims = grid[«→~»self.lower_than(below)]", "test_profile.py::test_windows_that_help_what_is_low"),
     ],
 }

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import quad_vec
 
 from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, Points, learn
 
@@ -28,23 +27,6 @@ def process(axes, seed=0, n=4, trends=None, rough=True):
     return GradientProcess(Points(x, axes), rng.standard_normal((n, d)), covariances, axes, logs, trends or [False] * d)
 
 
-@pytest.mark.parametrize("name", AXES)
-def test_u_is_the_integral_of_its_slope_and_grows(name):
-    axis = AXES[name]
-    factors = np.exp(np.random.default_rng(1).standard_normal(axis.coefficients))
-    x = np.linspace(-1.0, 2.0, 7)
-    u, _ = (design @ factors for design in axis.design(x))
-    slope = lambda t: axis.design(np.array([t]))[1] @ factors  # noqa: E731
-    for left, right, grown in zip(x, x[1:], np.diff(u), strict=False):
-        # The slope is as smooth as a spline is: the adaptive rule halves at the knots.
-        assert grown == pytest.approx(quad_vec(slope, left, right, epsabs=1e-12)[0][0], rel=1e-9)
-        assert grown > 0
-    if axis.periodic:
-        turn, one = (axis.design(np.array([z]))[0] @ factors for z in (2.0 - 1e-13, 0.3))
-        assert turn == pytest.approx(factors.mean(), rel=1e-9)
-        assert axis.design(np.array([3.3]))[0] @ factors - one == pytest.approx(turn, rel=1e-9)
-
-
 @pytest.mark.parametrize("names", [[name] for name in AXES] + [["warped line", "circle"], ["line", "warped circle"]])
 def test_covariances_of_gradients_are_derivatives_of_those_of_the_free_energy(names):
     axes = [AXES[name] for name in names]
@@ -63,17 +45,6 @@ def test_covariances_of_gradients_are_derivatives_of_those_of_the_free_energy(na
             scale = np.abs(prior(x, p, y, q)).max()
             assert prior(x, p, y, q) == pytest.approx(slope, abs=1e-5 * max(scale, 1.0))
             assert prior(y, q, x, p) == pytest.approx(prior(x, p, y, q).T, rel=1e-12)
-
-
-@pytest.mark.parametrize("names", [["warped line"], ["line", "circle"]])
-def test_prior_is_a_covariance(names):
-    known = process([AXES[name] for name in names], n=12)
-    d = len(names)
-    x = np.random.default_rng(3).uniform(-1, 2, (9, d))
-    points = Points(x, known.axes)
-    everything = (points, [-1, *range(d)])
-    values = np.linalg.eigvalsh(known._covariance(everything, everything))
-    assert values.min() > -1e-10 * values.max()
 
 
 def test_a_period_further_nothing_is_different():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from kcons.free_energy.profiles.profile import integrate
+from kcons.free_energy import integrate, plot_profile
 
 
 class Case(NamedTuple):
@@ -176,11 +176,12 @@ def test_a_period_that_does_not_close_is_warned_of():
 def test_windows_of_a_circle_may_be_given_in_any_turn_and_order():
     case = CASES["torsion"]
     x = case.grid(16)
-    one = integrate(x, case.f(x), np.full(16, 0.1), period=case.period, at=[0.3, 1.0], zero=0.0)
+    one = integrate(x, case.f(x), np.full(16, 0.1), period=case.period)
     order = np.random.default_rng(6).permutation(16)
     turned = np.where(x < -0.1, x + 2 * math.pi, x)[order]
-    other = integrate(turned, case.f(turned), np.full(16, 0.1), period=case.period, at=[0.3, 1.0], zero=0.0)
-    assert pytest.approx(one.F, abs=1e-4) == other.F  # lengths are learned on a grid that begins at the first window
+    other = integrate(turned, case.f(turned), np.full(16, 0.1), period=case.period)
+    # Lengths are learned on a grid that begins at the first window.
+    assert one.difference(0.0, 1.0).value == pytest.approx(other.difference(0.0, 1.0).value, abs=1e-4)
 
 
 def test_windows_at_one_place_are_put_together():
@@ -189,22 +190,6 @@ def test_windows_at_one_place_are_put_together():
     assert profile.windows.tolist() == [0.0, 1.0, 2.0]
     assert profile.mean_forces[0] == pytest.approx((1.0 + 4 * 2.0) / 5)
     assert profile.mean_force_errors[0] == pytest.approx(1 / math.sqrt(5))
-
-
-def test_jacobians():
-    """Particles that do not interact: -kT ln P is -2 kT ln r, and W is constant. Of an angle, -kT ln sin."""
-    kT, r = 2.5, np.linspace(1.0, 4.0, 25)
-    free = integrate(r, -2 * kT / r, np.full(25, 1e-6), zero=2.0)
-    flat = free.without_jacobian("distance", kT)
-    assert pytest.approx(-2 * kT * np.log(free.x / 2.0), abs=1e-3) == free.F
-    assert pytest.approx(np.zeros(201), abs=1e-3) == flat.F
-    assert flat.difference(1.0, 4.0).value == pytest.approx(0.0, abs=1e-3)
-    assert (flat.covariance == free.covariance).all()
-    angle = np.linspace(0.5, 2.5, 25)
-    of_angle = integrate(angle, -kT / np.tan(angle), np.full(25, 1e-6)).without_jacobian("angle", kT)
-    assert np.ptp(of_angle.F) < 1e-3
-    own = free.without_jacobian(lambda x: x**3, kT)
-    assert pytest.approx(kT * np.log(own.x / 2.0), abs=1e-3) == own.F
 
 
 def rms(profile, case):
@@ -273,13 +258,6 @@ def test_windows_that_help_what_is_low():
     assert profile.next_windows(2, below=np.inf) == profile.next_windows(2)
 
 
-def test_what_is_low_without_the_jacobian():
-    """F of two particles that do not interact falls all the way; W is the same everywhere."""
-    r = np.linspace(1.0, 4.0, 10)
-    flat = integrate(r, -5.0 / r, np.full(10, 1e-3), zero=4.0).without_jacobian("distance", 2.5)
-    assert flat.lower_than(1.0).all() and flat.lower_than(1.0, r).all()
-
-
 @pytest.mark.parametrize("error", [0.0, 1e-14])
 def test_windows_beside_exact_ones_are_not_proposed_twice(error):
     x = np.linspace(0.0, 3.0, 6)
@@ -294,6 +272,8 @@ def test_a_profile_prints_its_windows_and_not_its_arrays():
     first, *lines, last = str(profile).splitlines()
     assert first.split() == ["window", "dF/dx", "F"] and len(lines) == 5
     assert [float(word) for word in lines[-1].replace("+-", "").split()[:3]] == [2.0, 4.0, 0.01]
+    shown = [float(line.split()[4]) for line in lines]
+    np.testing.assert_allclose(shown, [profile.difference(profile.zero, place).value for place in x], atol=1e-4)
     assert last.startswith("from 1 to 2 F rises by 3")
 
 
@@ -306,17 +286,20 @@ def test_windows_that_rounding_moves_apart_are_at_one_place(off):
     assert abs(moved.value - integrate(x, f, e).difference(0, 1).value) < 0.1
 
 
-@pytest.mark.parametrize("at", [None, [1.0, 3.0]])
-def test_a_printed_profile_has_the_free_energy_of_each_window(at):
-    case = CASES["Lennard-Jones"]
-    x = case.grid(12)
-    found = integrate(x, case.f(x), np.full(12, 1e-3), at=at)
-    shown = [float(line.split()[4]) for line in str(found).splitlines()[1:-1]]
-    np.testing.assert_allclose(shown, [found.difference(found.zero, place).value for place in x], atol=1e-4)
-
-
-def test_slopes_without_the_jacobian_do_not_depend_on_where_the_profile_is_given():
-    x = np.linspace(1.0, 3.0, 8)
-    for at in (None, np.linspace(3.0, 1.0, 50), [2.0]):
-        flat = integrate(x, 1 / x, np.full(8, 1e-3), at=at).without_jacobian("distance", 2.5)
-        np.testing.assert_allclose(flat.added_slope(x[1:-1]), 5 / x[1:-1], rtol=1e-6)
+def test_a_profile_with_its_band_and_windows(tmp_path):
+    x = np.linspace(0.0, 2.0, 6)
+    profile = integrate(x, np.cos(3 * x), np.full(6, 0.05))
+    figure = plot_profile(profile, coordinate="r / Å", energy="eV")
+    above, below = figure.axes
+    assert above.get_ylabel() == "F / eV" and below.get_xlabel() == "r / Å"
+    F = next(line for line in above.lines if line.get_label() == "F")
+    assert (F.get_ydata() == profile.F).all()
+    band = above.collections[0].get_paths()[0].get_extents()
+    assert band.y1 == pytest.approx((profile.F + 2 * profile.error).max())
+    windows = next(each for each in below.containers if each.get_label() == "windows")
+    assert (windows.lines[0].get_xdata() == profile.windows).all()
+    # The slope that is drawn goes through the windows, within what two standard errors of them leave.
+    slope = next(line for line in below.lines if line.get_label() == "slope of F")
+    assert np.abs(np.interp(x, slope.get_xdata(), slope.get_ydata()) - profile.mean_forces)[1:-1].max() < 0.1
+    figure.savefig(tmp_path / "profile.png")
+    assert (tmp_path / "profile.png").stat().st_size > 10000

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
-from ase import Atoms
 from ase.build import molecule
 
 from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.free_energy.scans.relaxation import Internals
+
+
+def hessian(internals, x):
+    table = internals.jacobian(x)
+    return table.T @ (internals.constants[:, None] * table)
 
 
 @pytest.mark.parametrize("name", ["CH3CH2OH", "C2H2", "CH3SiH3", "2-butyne", "H2O"])
@@ -30,7 +32,7 @@ def test_only_shifts_and_turns_cost_nothing(name, free):
     """And the turn of butyne's ends against each other, between which a straight line leaves no dihedral."""
     atoms = molecule(name)
     x = atoms.positions
-    curvature = np.linalg.eigvalsh(Internals(atoms.numbers, x).hessian(x))
+    curvature = np.linalg.eigvalsh(hessian(Internals(atoms.numbers, x), x))
     assert np.sum(np.abs(curvature) < 1e-8 * curvature.max()) == free
     assert curvature.min() > -1e-10 * curvature.max()
 
@@ -41,8 +43,8 @@ def test_a_cell_changes_nothing():
     cell = np.diag([8.0, 9.0, 10.0])
     moved = x + 4.2
     wrapped = moved - np.floor(moved / np.diag(cell)) * np.diag(cell)
-    whole = Internals(atoms.numbers, x).hessian(x)
-    cut = Internals(atoms.numbers, wrapped, lattice_of(cell, True)).hessian(wrapped)
+    whole = hessian(Internals(atoms.numbers, x), x)
+    cut = hessian(Internals(atoms.numbers, wrapped, lattice_of(cell, True)), wrapped)
     np.testing.assert_allclose(cut, whole, atol=1e-9)
 
 
@@ -78,25 +80,4 @@ def test_a_dihedral_changes_by_the_shorter_way():
 
 def test_single_atoms_have_no_terms():
     apart = Internals([2, 2], np.array([[0.0, 0, 0], [0, 0, 30.0]]))
-    assert apart.terms == [] and not apart.hessian(Atoms("He2", [[0, 0, 0], [0, 0, 30.0]]).positions).any()
-
-
-@pytest.mark.skipif(find_spec("tblite") is None, reason="tblite is an extra")
-def test_it_is_near_the_hessian_of_gfn2():
-    """Stiff directions within a factor of two."""
-    from tblite.ase import TBLite
-
-    atoms = molecule("CH3OH")
-    atoms.calc = TBLite(method="GFN2-xTB", verbosity=0)
-    x = atoms.positions.copy()
-    h, true = 1e-3, []
-    for k in range(x.size):
-        ends = []
-        for sign in (1, -1):
-            atoms.positions[:] = x
-            atoms.positions.flat[k] += sign * h
-            ends.append(-atoms.get_forces().ravel())
-        true.append((ends[0] - ends[1]) / (2 * h))
-    model = np.linalg.eigvalsh(Internals(atoms.numbers, x).hessian(x))[8:]
-    found = np.linalg.eigvalsh(0.5 * (np.array(true) + np.array(true).T))[8:]
-    assert np.all((model / found > 0.5) & (model / found < 2.0))
+    assert apart.terms == [] and len(apart.constants) == 0

@@ -11,7 +11,7 @@ from kcons import ConstraintSet, Motion
 from kcons.constraints import Dihedral, Distance, FixedAtoms
 from kcons.errors import ConvergenceError
 from kcons.free_energy.scans import relaxation
-from kcons.free_energy.scans.relaxation import Internals, relax
+from kcons.free_energy.scans.relaxation import Descent, Internals
 from kcons.motion import minimize
 
 
@@ -21,6 +21,10 @@ def forces_of(atoms):
         return atoms.get_potential_energy(), atoms.get_forces()
 
     return evaluate
+
+
+def relax(motion, evaluate, internals, x, *, fmax, memory=None, evaluations=200):
+    return Descent(motion, evaluate, internals, memory).relaxed(x, fmax, evaluations)
 
 
 def setting(rows, n=5):

@@ -236,14 +236,6 @@ def test_large_structures_need_no_table(monkeypatch):
     np.testing.assert_allclose(found.energies, 0.2 * (1 + np.cos(3 * np.array([0.5, 0.8]))), atol=1e-6)
 
 
-def test_a_molecule_with_emt():
-    atoms = molecule("H2O2")
-    atoms.calc = EMT()
-    found = scan(atoms, Dihedral([[2, 0, 1, 3]]), np.radians(np.arange(0, 360, 60)), fmax=0.02)
-    assert found.failed == {}
-    np.testing.assert_allclose(found.energies[1:3], found.energies[:3:-1], atol=1e-3)  # mirror images
-
-
 @pytest.mark.skipif(find_spec("tblite") is None, reason="tblite is an extra")
 def test_ethane_by_gfn2():
     """Threefold, and few calls."""

@@ -9,12 +9,11 @@ from functools import cache
 import ase.io
 import numpy as np
 import pytest
-from ase.calculators.lj import LennardJones
 from scan_systems import chain, threefold, two_wells
 
 from kcons.cli.terminal import rendered
 from kcons.constraints import Custom, Dihedral, Distance
-from kcons.errors import InputError, OccupiedError, UnreadableError
+from kcons.errors import InputError, UnreadableError
 from kcons.free_energy import scan
 from kcons.free_energy.scans.scan_result import KJ, PLACE, Attempt, Attempts, Grid
 
@@ -95,21 +94,6 @@ def begun(*arguments):
         return attempts
 
 
-def test_an_attempt_comes_back(tmp_path):
-    rng = np.random.default_rng(1)
-    attempt = Attempt(3, (1,), 2, memory=rng.normal(size=(2, 2, 3)), terms=[(0, 1), (0, 1, 2), (1, 2, 3, -1, 0)])
-    attempt.positions, attempt.energy, attempt.largest, attempt.evaluations = rng.normal(size=(4, 3)), -1.5, 0.003, 7
-    made(tmp_path).keep(attempt)
-    again = made(tmp_path).kept(3, (1,), 2)
-    assert np.array_equal(again.positions, attempt.positions) and np.array_equal(again.memory, attempt.memory)
-    assert (again.energy, again.largest, again.evaluations, again.error) == (-1.5, 0.003, 7, None)
-    assert again.terms == attempt.terms
-    assert made(tmp_path).kept(4, (1,), 2) is None
-    failed = Attempt(5, (0,), None, error="no")
-    made(tmp_path).keep(failed)
-    assert made(tmp_path).kept(5, (0,), None).error == "no"
-
-
 def test_nothing_half_written_is_read(tmp_path):
     attempts = made(tmp_path)
     (tmp_path / PLACE / "00000.npz.unfinished").write_bytes(b"PK\x03\x04")
@@ -125,12 +109,6 @@ def test_an_attempt_of_another_scan_is_refused(tmp_path):
         made(tmp_path).kept(0, (1,), None)
 
 
-def test_without_a_folder_nothing_is_kept():
-    attempts = made(None)
-    attempts.keep(Attempt(0, (0,), None))
-    assert attempts.kept(0, (0,), None) is None
-
-
 def test_python_functions_need_no_folder(tmp_path):
     row = Custom([[0]], lambda r: r[0, 0], lambda r: np.array([[1.0, 0, 0]]))
     grid = Grid([row], [[0.1]])
@@ -138,16 +116,3 @@ def test_python_functions_need_no_folder(tmp_path):
     with pytest.raises(InputError, match="Python function"):
         Attempts(tmp_path / "new", chain(4, threefold), grid, [], {})
     assert not (tmp_path / "new").exists()
-
-
-def test_the_calculator_has_to_be_the_same(tmp_path):
-    """Not only of the same kind."""
-    atoms = chain(4, threefold)
-    grid = Grid([TURN], [[0.1, 0.2]])
-    for epsilon in (0.1, 0.1, 0.2):
-        atoms.calc = LennardJones(epsilon=epsilon)
-        if epsilon == 0.2:
-            with pytest.raises(OccupiedError, match=r"of another calculator;"):
-                begun(tmp_path, atoms, grid, [], {})
-        else:
-            begun(tmp_path, atoms, grid, [], {})

@@ -108,11 +108,11 @@ def test_a_difference_of_distances(folder):
 
 def test_pulls(folder):
     assert read(folder).pulls is None
-    found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8\nboth_ways = false\nsteps = 300\n")
+    found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8\nsteps = 300\n")
     assert found.pulls["start"] == pytest.approx([-np.pi / 3]) and found.pulls["end"] == pytest.approx(
         found.targets[-1]
     )
-    assert found.pulls["count"] == 8 and found.pulls["both_ways"] is False and found.pull_steps == 300
+    assert found.pulls["count"] == 8 and found.pull_steps == 300
     text = INPUT + "\n[[coordinate]]\ndistance = [0, 1]\nvalues = [1.4, 1.5]\n[pulls]\nto = [90.0, 1.6]\n"
     found = read(folder, text.replace(IMPROVE, ""))
     assert found.pulls["end"] == pytest.approx([np.pi / 2, 1.6]) and found.pull_steps == 20000

@@ -53,7 +53,7 @@ def test_a_torsion_held_as_a_collective_variable(bonds):
     simulation.reporters.append(reporter)
     for _ in range(4):
         simulation.step(5)
-        assert reporter.series.multiplier[-1, 0] == pytest.approx(rows.multipliers_at(simulation.context)[0], rel=1e-6)
+        assert reporter.series.multiplier[-1, 0] == pytest.approx(rows.multipliers(simulation.context)[0], rel=1e-6)
     simulation.step(80)
     assert len(reporter.series) == 20
     assert reporter.series.off.max() < 1e-10

@@ -10,7 +10,7 @@ import water_files as files
 from water_files import mda
 
 from kcons.constraints import Distance
-from kcons.errors import InputError, UnreadableError
+from kcons.errors import UnreadableError
 from kcons.mdanalysis import ConstraintCheck
 
 N = 30
@@ -300,22 +300,6 @@ def test_what_lies_behind_the_only_frame_that_is_read(tmp_path, x, name):
     assert "MDAnalysis reads one frame of" in result.verdict and words in result.verdict
     assert "ends too early" not in result.verdict and "write the frames as XTC, DCD or PDB" in result.gaps[0]
     assert checked(path, stop=1).status == "kept"
-
-
-@pytest.mark.parametrize("ending", ["crd", "pqr"])
-def test_two_frames_that_are_read_as_twice_the_atoms(tmp_path, x, ending):
-    path = tmp_path / f"w.{ending}"
-    made = files.universe(N)
-    for name in ("charges", "radii"):
-        made.add_TopologyAttr(name, np.ones(3 * N))
-    made.atoms.positions = files.whole(x)[0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        made.atoms.write(str(path))
-    assert checked(path).status == "kept"
-    path.write_bytes(2 * path.read_bytes())
-    with pytest.raises(InputError, match=rf"w\.{ending}"):
-        checked(path)
 
 
 # -- chains -----------------------------------------------------------------------------------------

@@ -119,24 +119,6 @@ def test_a_wild_molecule_of_the_topology_excuses_no_other(tmp_path):
     assert [row.allowed > 0.1 for row in result.worst].count(True) == 2
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 1e-4])
-def test_rounding_of_targets_from_a_frame_counts(tmp_path, tolerance):
-    """Far from the origin both the target and what is compared with it are coarse: twice the rounding."""
-    x = whole(40) + np.array([3000.0, 0, 0])
-    path = files.write(tmp_path / "a.dcd", x, side=None)
-    result = checked(path, Distance(files.pairs(N)), targets="first", tolerance=tolerance)
-    given = checked(path, tolerance=tolerance)
-    assert result.status in ("kept", "tolerated") and given.status in ("kept", "tolerated")
-    stored = files.dcd_frames(path)
-    i, j = files.pairs(N).T
-    once = np.sqrt(3) * (half_units(stored)[:, i] + half_units(stored)[:, j])
-    lengths = np.linalg.norm(stored[0, i] - stored[0, j], axis=1)
-    for row in result.worst:
-        allowed = once[:, row.row] + once[0, row.row] + tolerance * lengths[row.row]
-        assert np.isclose(row.allowed, allowed, rtol=1e-4).any()
-    assert result.units[0].bound == pytest.approx(2 * given.units[0].bound, rel=1e-3)
-
-
 def test_the_tolerance_is_a_part_of_the_length(tmp_path):
     """Rows of 1 and 4 angstrom, off by 2e-4 each: only the short one by more than 1e-4 of its length."""
     x = np.zeros((3, 3 * N, 3))
@@ -145,7 +127,8 @@ def test_the_tolerance_is_a_part_of_the_length(tmp_path):
     x[:, 1] = x[:, 0] + [1.0002, 0, 0]
     x[:, 3] = x[:, 2] + [4.0002, 0, 0]
     path = files.write(tmp_path / "a.dcd", x, side=None)
-    assert checked(path, Distance([long], 4.0)).status == "tolerated"
+    tolerated = checked(path, Distance([long], 4.0))
+    assert tolerated.status == "tolerated" and tolerated.verdict.startswith("kept to the tolerance of 0.0001: largest")
     assert checked(path, Distance([short], 1.0)).status == "violated"
     both = checked(path, Distance([short, long], [1.0, 4.0]))
     assert both.status == "violated" and both.violated_rows == 1 and both.worst[0].row == 0
@@ -251,15 +234,11 @@ def test_xtc_files_put_together_from_two_precisions(tmp_path):
     assert other.violated_frames == 1 and other.worst[0].frame == 2 and other.worst[0].row == BROKEN
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 5])
-def test_an_atom_that_no_row_has_may_be_anything(tmp_path, n):
-    """Compiled code looks at rows four by four: what fills up must not look at other atoms."""
+def test_an_atom_that_no_row_has_may_be_anything(tmp_path):
     x = whole()
     x[:, 0], x[:, 2] = np.nan, np.inf
-    table = files.pairs(N)[3 : 3 + n]
-    result = checked(files.write(tmp_path / "a.dcd", x, side=None), Distance(table, files.targets(N)[3 : 3 + n]))
+    result = checked(files.write(tmp_path / "a.dcd", x, side=None), BOND.select(range(3, 8)))
     assert result.status == "kept" and result.gaps == [] and len(result.frames) == 8
-    assert result.n_rows == n
 
 
 @pytest.mark.parametrize("what", ["velocity", "cell"])

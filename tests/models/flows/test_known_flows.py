@@ -137,27 +137,12 @@ def test_pendulum_reference(name):
     assert abs(velocities - np.array(given["reference"]["velocities"])[:, 0]).max() < 1e-10
 
 
-@pytest.mark.parametrize("X0", [[0.3, 0.0], [2.0, -1.0], [-1.0, 2.5], [7.0, 0.4], [0.0, 2.0], [0.0, 0.0], [1.0, -2.6]])
+@pytest.mark.parametrize("X0", [[0.3, 0.0], [2.0, -1.0], [-1.0, 2.5], [7.0, 0.4], [0.0, 0.0], [1.0, -2.6]])
 def test_pendulum_exact_from_any_start(X0):
     flow = Pendulum(1.4)
     found = flow.solve((0.0, 6.0), X0, t_eval=[0.0, 2.0, 6.0], rtol=1e-12, atol=1e-13)
     assert flow.exact(found.t, X0) == pytest.approx(found.y.T, abs=1e-9)
     assert flow.exact(0.0, X0) == pytest.approx(X0, abs=1e-14)
-
-
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_pendulum_on_its_separatrix(direction):
-    flow, times = Pendulum(1.3), np.array([-1.0, 0.0, 2.5])
-    theta = 2 * np.arctan(np.sinh(1.3 * times * direction))
-    expected = np.stack([theta, 2 * direction / np.cosh(1.3 * times)], axis=-1)
-    assert flow.exact(times, [0.0, 2.0 * direction]) == pytest.approx(expected, abs=1e-13)
-    assert flow.exact(times, [3 * np.pi, 0.0]) == pytest.approx(np.tile([3 * np.pi, 0.0], (3, 1)), abs=1e-13)
-    assert flow.exact(1.0, [direction * np.pi, 0.0]) == pytest.approx([direction * np.pi, 0.0], abs=1e-13)
-
-
-def test_small_swings_are_harmonic():
-    t = np.linspace(0.0, 10.0, 5)
-    assert Pendulum(2.0).exact(t, [1e-4, 0.0])[:, 0] == pytest.approx(1e-4 * np.cos(2.0 * t), abs=1e-11)
 
 
 def test_free_particle_on_a_sphere():
@@ -194,7 +179,9 @@ def test_acceleration_on_the_sphere_is_the_projected_one():
     assert flow.acceleration(x, v) == pytest.approx(wanted, rel=1e-12)
 
 
-@pytest.mark.parametrize("start", [[0.0, 2.0 * (1 - 5e-13)], [0.0, 2.0 * (1 + 5e-13)], [np.pi, 1e-9]])
+@pytest.mark.parametrize(
+    "start", [[0.0, 2.0], [0.0, 2.0 * (1 - 5e-13)], [0.0, 2.0 * (1 + 5e-13)], [np.pi, 1e-9], [np.pi, 0.0]]
+)
 def test_a_pendulum_next_to_its_separatrix_is_refused(start) -> None:
     """Far beyond the first turn elliptic functions gave 1e32; at the top it stayed where it was for ever."""
     with pytest.raises(InputError, match="near the separatrix"):
@@ -232,31 +219,19 @@ def quartic(x):
     return -np.array([1.0, 2.0, 0.5, 1.5, 1.0, 0.7]) * x**3 - 0.3 * np.roll(x, 1) * x[::-1]
 
 
-def springs(x):
-    r = x.reshape(3, 2)
-    d = r[:, None] - r[None, :]
-    return -0.3 * (d * (1 + np.sum(d * d, axis=2, keepdims=True))).sum(axis=1).ravel()
-
-
-def start(masses, *, removed=0, seed=6):
-    rng = np.random.default_rng(seed)
-    x, v = rng.normal(size=len(masses)), rng.normal(size=len(masses))
-    if removed:
-        p = (masses * v).reshape(-1, removed).sum(axis=0)
-        v = v - np.tile(p, len(v) // removed) / masses.reshape(-1, removed).sum(axis=0)[0]
-    return x, v
-
-
 MASSES = np.repeat([1.0, 3.0, 0.4], 2)
 
 
-@pytest.mark.parametrize(("force", "removed"), [pytest.param(quartic, 0, marks=pytest.mark.validation), (springs, 2)])
-def test_compression_is_minus_g_minus_one_times_alpha(force, removed):
-    flow = Thermostat(MASSES, force, momentum_removed=removed)
-    x, v = start(MASSES, removed=removed)
-    X = flow.state(x, v)
+def start(seed=6):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=6), rng.normal(size=6)
+
+
+def test_compression_is_minus_g_minus_one_times_alpha():
+    flow = Thermostat(MASSES, quartic)
+    X = flow.state(*start())
     g = flow.degrees_of_freedom
-    assert g == 6 - removed
+    assert g == 6
     assert abs(flow.friction(X)) > 0.1
     assert flow.surface_divergence(X) == pytest.approx(-(g - 1) * flow.friction(X), rel=1e-8)
     found = flow.compression(X, [0.0, 0.3])
@@ -266,12 +241,10 @@ def test_compression_is_minus_g_minus_one_times_alpha(force, removed):
     assert abs(found.log_volume[-1] * g / (g - 1) - found.predicted[-1]) > 1e-3
 
 
-def test_kinetic_energy_and_momentum_are_kept():
-    flow = Thermostat(MASSES, springs, momentum_removed=2)
-    x, v = start(MASSES, removed=2)
+def test_kinetic_energy_is_kept():
+    flow, (x, v) = Thermostat(MASSES, quartic), start()
     end = flow.solve((0.0, 3.0), flow.state(x, v)).y[:, -1]
     assert end[6:] @ end[6:] == pytest.approx(v @ (MASSES * v), rel=1e-9)
-    assert (flow.root * end[6:]).reshape(3, 2).sum(axis=0) == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
 def test_reference_of_constant_force():
@@ -293,26 +266,13 @@ def test_reference_of_constant_force():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Thermostat(np.ones(4), lambda x: -x, momentum_removed=-2), "momentum_removed is -2"),
-        (lambda: Thermostat(np.ones(5), lambda x: -x, momentum_removed=2.5), "momentum_removed is 2.5"),
         (lambda: Thermostat([1.0, 0.0], quartic), "masses"),
-        (lambda: Thermostat([1.0, 1.0, 1.0], quartic, momentum_removed=2), "divide"),
         (lambda: Thermostat(MASSES, quartic).state(np.zeros(6), np.zeros(6)), "non-zero kinetic energy"),
-        (
-            lambda: Thermostat(MASSES, springs, momentum_removed=2).state(np.zeros(6), np.ones(6)),
-            "momentum is not zero",
-        ),
         (lambda: Thermostat(np.ones(2), lambda x: -x).state([1.0, 2.0, 0.3], [0.4]), "2 components each"),
         (lambda: Thermostat(np.ones(2), lambda x: [1.0, 2.0, 3.0]).friction(np.ones(4)), "force returned shape"),
         (
             lambda: Thermostat(np.ones(2), lambda x: -x).compression([1.0, 0.2, 0.3, 0.4], [0.0, 1.0], pieces=0),
             "pieces is 0",
-        ),
-        (
-            lambda: Thermostat(np.ones(4), lambda x: [1.0, 0.0, 0.0, 0.0], momentum_removed=2).state(
-                [0.0, 0.0, 1.0, 1.0], [0.3, 0.1, -0.3, -0.1]
-            ),
-            "forces do not sum to zero",
         ),
     ],
 )

@@ -84,11 +84,9 @@ def test_of_some_particles_mixed_precision_hands_over_single_numbers(platform, m
 
 
 def test_the_grain_of_coordinates():
-    passage = Passage(ATOMS, len(X))
-    assert passage.grain(5.0) == np.spacing(5.0)
-    passage.precision = Precision("CUDA", "mixed")
-    assert passage.grain(5.0) == pytest.approx(5 * 2.0**-47)
-    assert passage.limits[0] > 1e-9
+    assert Precision("CPU", "double").grain(5.0) == np.spacing(5.0)
+    assert Precision("CUDA", "mixed").grain(5.0) == pytest.approx(5 * 2.0**-47)
+    assert Precision("CUDA", "mixed").limits[0] > 1e-9
 
 
 def test_positions_come_back_to_the_last_bit():

@@ -23,7 +23,7 @@ from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula, VelocityFormula
 from kcons.constraints.functions.expressions import FUNCTIONS, parsed
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, forces_by_term, hold
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold
 from kcons.openmm.collective.coordinates import (
     as_constraint,
     expression,
@@ -72,48 +72,6 @@ def test_units_of_the_user(value, expected):
         assert number(value / unit.femtosecond, "rate", per=unit.picosecond) == pytest.approx(1e3 * expected, rel=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("force", "of"),
-    [
-        (lambda: openmm.CustomBondForce("r"), unit.nanometer),
-        (lambda: openmm.CustomExternalForce(" z "), unit.nanometer),
-        (lambda: openmm.CustomCompoundBondForce(2, "distance(p1, p2)"), unit.nanometer),
-        (lambda: openmm.CustomCentroidBondForce(2, "distance(g1,g2)"), unit.nanometer),
-        (lambda: openmm.RGForce([0, 1]), unit.nanometer),
-        (lambda: with_variable("q", q=openmm.RGForce([0, 1])), unit.nanometer),
-        (lambda: openmm.CustomAngleForce("theta"), unit.radian),
-        (lambda: openmm.CustomCompoundBondForce(4, "dihedral(p1,p2,p3,p4)"), unit.radian),
-        (openmm.HarmonicBondForce, unit.kilojoule_per_mole),
-        (lambda: openmm.CustomBondForce("r^2"), None),
-        (lambda: with_variable("q^2", q=openmm.RGForce([0, 1])), None),
-    ],
-)
-def test_unit_of_a_coordinate(force, of):
-    assert unit_of(force()) == of
-
-
-@pytest.mark.parametrize(
-    ("value", "of"),
-    [
-        (3 * unit.kelvin, None),
-        (3 * unit.picosecond, None),
-        (3 * unit.kelvin, unit.nanometer),
-        (90 * unit.degree, unit.nanometer),
-        (3 * unit.angstrom, unit.radian),
-        (3 * unit.angstrom / unit.picosecond, unit.nanometer),
-    ],
-)
-def test_a_target_of_another_kind_is_refused(value, of):
-    with pytest.raises(InputError, match=r"target is .* another kind"):
-        number(value, "target", of)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, "three", None, math.inf * unit.nanometer])
-def test_what_is_no_finite_number_is_refused(value):
-    with pytest.raises(InputError, match="target"):
-        number(value, "target")
-
-
 def test_rows_are_in_units_of_openmm():
     system = particles(2)
     rows = CollectiveRows(system, [Row(bond(0, 1), 3 * unit.angstrom, rate=1 * unit.nanometer / unit.nanosecond)])
@@ -126,66 +84,17 @@ def test_rows_are_in_units_of_openmm():
 
 # -- terms and atoms --------------------------------------------------------------------------------
 
-MANY = {
-    "CustomAngleForce": (["theta"], "Angle", [(0, 1, 2), (1, 2, 3)]),
-    "CustomTorsionForce": (["cos(theta)"], "Torsion", [(0, 1, 2, 3), (3, 1, 0, 2)]),
-    "CustomCompoundBondForce": (
-        [4, "distance(p1, p2)*angle(p2, p3, p4)"],
-        "Bond",
-        [([3, 2, 1, 0],), ([0, 1, 2, 3],)],
-    ),
-    "CustomCentroidBondForce": ([2, "distance(g1, g2)"], "Bond", [([0, 1],), ([1, 2],)]),
-    "CustomExternalForce": (["x+y"], "Particle", [(1,), (2,)]),
-    "HarmonicBondForce": ([], "Bond", [(0, 1, 0.3, 5), (2, 3, 0.1, 7)]),
-    "HarmonicAngleForce": ([], "Angle", [(0, 1, 2, 1.0, 5), (1, 2, 3, 1.0, 5)]),
-    "PeriodicTorsionForce": ([], "Torsion", [(0, 1, 2, 3, 2, 0.3, 5), (0, 1, 2, 3, 3, 0.1, 5)]),
-    "RBTorsionForce": ([], "Torsion", [(0, 1, 2, 3, 1, 2, 3, 4, 5, 6), (3, 1, 2, 0, 1, 2, 3, 4, 5, 6)]),
-}
-
-
-def many(kind):
-    """A Force of two terms."""
-    arguments, term, parameters = MANY[kind]
-    force = getattr(openmm, kind)(*arguments)
-    if kind == "CustomCentroidBondForce":
-        for group in ([0, 1], [2, 3], [1, 2]):
-            force.addGroup(group)
-    for each in parameters:
-        getattr(force, f"add{term}")(*each)
-    return force
-
-
-@pytest.mark.parametrize("kind", MANY)
-def test_the_energies_of_the_terms_add_up(kind):
-    force = many(kind)
-    whole = found_values(particles(), [force], X)
-    parts = found_values(particles(), forces_by_term(force), X)
-    assert len(parts) == 2
-    assert parts.sum() == pytest.approx(whole[0], rel=1e-14)
-    assert np.all(parts != 0.0)
-
-
-def test_terms_keep_their_parameters():
-    force = openmm.CustomBondForce("k*r")
-    force.addPerBondParameter("k")
-    force.setUsesPeriodicBoundaryConditions(True)
-    force.addBond(0, 1, [2.0])
-    force.addBond(2, 3, [3.0])
-    terms = forces_by_term(force)
-    assert [term.getBondParameters(0) for term in terms] == [[0, 1, (2.0,)], [2, 3, (3.0,)]]
-    assert all(term.usesPeriodicBoundaryConditions() and term.getNumBonds() == 1 for term in terms)
-    assert force.getNumBonds() == 2
-    with pytest.raises(UnsupportedError, match="no terms"):
-        forces_by_term(openmm.RGForce([0, 1]))
-
 
 def test_atoms_of_each_kind():
-    centroid = many("CustomCentroidBondForce")
-    centroid.addGroup([3])  # in no bond
+    centroid = centers([0, 1], [2, 3])
+    centroid.addGroup([5])  # in no bond
+    place = openmm.CustomExternalForce("x+y")
+    place.addParticle(1)
+    place.addParticle(2)
     of = lambda force: moved_atoms(particles(6), force)  # noqa: E731
     assert of(bond(0, 1)) == {0, 1}
-    assert of(torsion()) == of(many("CustomAngleForce")) == of(centroid) == {0, 1, 2, 3}
-    assert of(many("CustomExternalForce")) == {1, 2}
+    assert of(torsion()) == of(points("angle(p1, p2, p3)*z4", (0, 1, 2, 3))) == of(centroid) == {0, 1, 2, 3}
+    assert of(place) == {1, 2}
     assert of(openmm.RGForce([2, 0])) == {0, 2}
     assert of(openmm.RMSDForce(X, [1, 3])) == {1, 3}
     assert of(with_variable("a+b", a=bond(0, 1), b=openmm.RGForce([3]))) == {0, 1, 3}
@@ -196,20 +105,36 @@ def test_atoms_of_each_kind():
 # -- plain coordinates --------------------------------------------------------------------------------
 
 
+def _two_terms():
+    force = bond(4, 14)
+    force.addBond(4, 16)
+    return force
+
+
+NM, RADIAN, TURN = unit.nanometer, unit.radian, 2 * math.pi
+
+
 @pytest.mark.parametrize(
-    ("force", "period"),
+    ("force", "of", "period"),
     [
-        (torsion, 2 * math.pi),
-        (lambda: torsion("2*theta"), 0.0),
-        (lambda: points("dihedral(p1, p2, p3, p4)", [3, 2, 1, 0]), 2 * math.pi),
-        (lambda: points("sin(dihedral(p1, p2, p3, p4))", [3, 2, 1, 0]), 0.0),
-        (lambda: with_variable("phi", phi=torsion()), 2 * math.pi),
-        (lambda: with_variable("phi+d", phi=torsion(), d=bond(0, 1)), 0.0),
-        (lambda: bond(0, 1), 0.0),
+        (_two_terms(), NM, 0),
+        (openmm.CustomExternalForce(" z "), NM, 0),
+        (centers([0, 1, 2], [14, 15], (1.0, 2.0, 1.0)), NM, 0),
+        (openmm.RGForce([0, 1]), NM, 0),
+        (with_variable("q", q=openmm.RGForce([0, 1])), NM, 0),
+        (torsion("2*theta"), None, 0),
+        (torsion("cos(theta)"), None, 0),
+        (points("sin(dihedral(p1, p2, p3, p4))", [3, 2, 1, 0]), None, 0),
+        (points("distance(p1,p2)-distance(p2,p3)", (3, 9, 12)), None, 0),
+        (with_variable("phi+d", phi=torsion(), d=bond(0, 1)), None, 0),
+        (bond(4, 14, "r^2"), None, 0),
+        (openmm.HarmonicBondForce(), unit.kilojoule_per_mole, 0),
     ],
 )
-def test_plain_dihedrals_are_periodic(force, period):
-    assert period_of(force()) == period
+def test_what_is_known_of_other_coordinates(force, of, period):
+    assert unit_of(force) == of
+    assert period_of(force) == period
+    assert as_constraint(force, 0.5) is None
 
 
 @pytest.mark.parametrize(
@@ -229,33 +154,14 @@ def test_the_constraint_measures_what_the_force_does(force, kind):
     system, x, _ = loose_alanine()
     rows = CollectiveRows(system, [Row(force, 0.5)])
     context = started(system, ProjectedIntegrator(1e-3, parts=[rows]), x)
-    row = as_constraint(next(f for f in system.getForces() if f.getForceGroup() in rows.groups), 0.5)
+    held_by = next(f for f in system.getForces() if f.getForceGroup() in rows.groups)
+    row = as_constraint(held_by, 0.5)
     assert type(row) is kind
+    assert unit_of(held_by) == (NM if "Distance" in kind.__name__ else RADIAN)
+    assert period_of(held_by) == (TURN if kind is Dihedral else 0)
     held = ConstraintSet([row], x, [system.getParticleMass(k)._value for k in range(len(x))])
     off = held.residuals(x, None, 0.0).sigma[0]
     np.testing.assert_allclose(off, rows.residuals(context)[0])
-
-
-def _two_terms():
-    force = bond(4, 14)
-    force.addBond(4, 16)
-    return force
-
-
-@pytest.mark.parametrize(
-    "force",
-    [
-        bond(4, 14, "r^2"),
-        torsion("cos(theta)"),
-        points("distance(p1,p2)-distance(p2,p3)", (3, 9, 12)),
-        centers([0, 1, 2], [14, 15], (1.0, 2.0, 1.0)),
-        with_variable("sqrt(q)", q=bond(4, 14)),
-        openmm.HarmonicBondForce(),
-        _two_terms(),
-    ],
-)
-def test_others_are_no_plain_rows(force):
-    assert as_constraint(force, 0.5) is None
 
 
 # -- formulas -----------------------------------------------------------------------------------------

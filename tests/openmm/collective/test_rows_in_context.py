@@ -73,21 +73,6 @@ def test_an_angle_is_held_far_from_the_origin_of_a_wide_box(platform):
         assert part.tolerance == part.finest(context)
 
 
-def test_where_rows_are_and_how_fast():
-    system, x, v = chain_system(), CHAIN, some_velocities()
-    part = CollectiveRows(system, [Row(bond(0, 3), 0.3, rate=0.5)])
-    context = context_of(system, ProjectedIntegrator(0.001, parts=[part]), x, v)
-    arm = x[3] - x[0]
-    length = float(np.linalg.norm(arm))
-    assert part.values(context) == pytest.approx([length], rel=1e-12)
-    assert part.targets(context) == pytest.approx([0.3]) and part.driven
-    assert part.residuals(context) == pytest.approx([length - 0.3], rel=1e-10)
-    assert part.rates(context) == pytest.approx([arm @ (v[3] - v[0]) / length - 0.5], rel=1e-10)
-    assert part.rank(context) == 1
-    miss = part.worst_violation(context)
-    assert miss is not None and miss.row == 0 and miss.off == pytest.approx(length - 0.3, rel=1e-10)
-
-
 def test_dependent_rows_are_named():
     context, integrator, part = _held_without_check([bond(0, 3), Row(bond(0, 3), name="again")])
     assert part.rank(context) == 1

@@ -7,7 +7,7 @@ import numpy as np
 import openmm as mm
 import pytest
 from openmm import app, unit
-from openmm_systems import GPUS, alanine, started
+from openmm_systems import GPUS, started
 
 from kcons import ConstraintSet, Motion, State, System
 from kcons.constraints import Angle, Custom, Dihedral, Distance, Formula, LinearRelation, Plane, Sphere
@@ -118,10 +118,9 @@ def protein(constraints):
     return system, np.array(model.positions.value_in_unit(unit.nanometer))
 
 
-@pytest.mark.parametrize("constraints", [app.HBonds, app.AllBonds])
-def test_a_protein_goes_the_way_of_the_engine_on_arrays(constraints):
+def test_a_protein_goes_the_way_of_the_engine_on_arrays():
     """582 atoms in the field of one force; all bonds are one cluster of 589 rows in 12 levels."""
-    whole, x = protein(constraints)
+    whole, x = protein(app.AllBonds)
     system = mm.System()
     masses = np.array([whole.getParticleMass(k)._value for k in range(len(x))])
     for mass in masses:
@@ -149,19 +148,9 @@ def test_a_protein_goes_the_way_of_the_engine_on_arrays(constraints):
         state = stepper.step(arrays, state, 0.002)
     found, context = run(system, x, v, "CPU", 20, tolerance=1e-12)
     levels = [array for array in context.getIntegrator().rows.arrays if array.name == "rows_level"]
-    assert [len(array.values) - 1 for array in levels] == ([12] if constraints is app.AllBonds else [])
+    assert [len(array.values) - 1 for array in levels] == [12]
     assert np.abs(found - state.positions).max() < 1e-10
     assert np.abs(held.value(found) / held.scale).max() < 2e-12
-
-
-def test_a_peptide_with_dihedrals_held():
-    """Alanine dipeptide: hydrogens by the System, phi and psi by rows, as the callbacks of the host do it."""
-    torsions = Dihedral([[4, 6, 8, 14], [6, 8, 14, 16]])
-    system, x, v = alanine("HBonds")
-    part = hold(system, torsions, x, take="all")
-    host = run(system, x, v, "Reference", 50, [part], device=False)[0]
-    system, x, v = alanine("HBonds")
-    assert np.abs(run(system, x, v, "Reference", 50, torsions)[0] - host).max() < 1e-9
 
 
 # -- targets, places, images ------------------------------------------------------------------------

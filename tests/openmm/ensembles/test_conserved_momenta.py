@@ -18,7 +18,6 @@ from kcons.openmm import (
     ProjectedIntegrator,
     Row,
     hold,
-    surface_parts,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -60,10 +59,6 @@ CALM = "0.1*r^-1"
 FOUR = [0, 1, 2, 3]
 
 
-def surfaces(*rows):
-    return lambda system, x: surface_parts(rows, system=system)
-
-
 def carried(*rows):
     return lambda system, x: [hold(system, rows, x)]
 
@@ -92,17 +87,17 @@ LOPSIDED = "30*(x-0.1)^2+40*y^2+20*(z+0.3)^2+9*x*y*z"
 @pytest.mark.parametrize(
     ("parts", "field", "warned"),
     [
-        (surfaces(SPHERE), "", True),
-        (surfaces(SPHERE), "20*z^2", True),
-        (surfaces(SPHERE), LOPSIDED, False),
+        (carried(SPHERE), "", True),
+        (carried(SPHERE), "20*z^2", True),
+        (carried(SPHERE), LOPSIDED, False),
         (carried(SPHERE), "", True),
         (carried(SPHERE), LOPSIDED, False),
-        (surfaces(BALL), "", True),
-        (surfaces(BALL), LOPSIDED, False),
-        (surfaces(CYLINDER), "20*z^2", True),
-        (surfaces(CYLINDER), "20*x^2", False),
-        (surfaces(FLAT), "", True),
-        (surfaces(Ellipsoid(FOUR, [0, 0, 0], [0.6, 0.5, 0.4])), "", False),
+        (carried(BALL), "", True),
+        (carried(BALL), LOPSIDED, False),
+        (carried(CYLINDER), "20*z^2", True),
+        (carried(CYLINDER), "20*x^2", False),
+        (carried(FLAT), "", True),
+        (carried(Ellipsoid(FOUR, [0, 0, 0], [0.6, 0.5, 0.4])), "", False),
         (from_a_fixed_place, "", True),
         (from_a_fixed_place, "20*(x^2+y^2+z^2)", True),
         (from_a_fixed_place, LOPSIDED, False),
@@ -125,7 +120,7 @@ def test_angular_momentum_about_the_axes_of_what_is_held_is_said(parts, field, w
 
 def test_thermostats_without_noise_say_so_where_a_temperature_is_asked_for():
     system, x = tied([20.0] * 4, CALM, PLACES)
-    parts = surface_parts(SPHERE, system=system)
+    parts = [hold(system, SPHERE, x)]
     assert said(system, x, Isokinetic(300.0), parts)
     assert said(system, x, NoseHooverMiddle(300.0, 5.0), parts)
     assert not said(system, x, Isokinetic(), parts)
@@ -217,7 +212,7 @@ def test_a_box_is_not_turned(monkeypatch):
     monkeypatch.setattr("kcons.openmm.ensembles.conserved_momenta._totals", None)
     assert not said(system, x, Isokinetic(300.0))
     held = copy.deepcopy(system)
-    assert not said(held, x, Isokinetic(300.0), surface_parts(SPHERE, system=held))
+    assert not said(held, x, Isokinetic(300.0), [hold(held, SPHERE, x)])
     field = openmm.CustomExternalForce("x^2")
     field.addParticle(0, [])
     system.addForce(field)

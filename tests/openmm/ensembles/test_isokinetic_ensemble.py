@@ -1,7 +1,5 @@
 """Isokinetic motion in OpenMM: trajectories, constants, and what is held."""
 
-import copy
-
 import numpy as np
 import openmm
 import pytest
@@ -65,8 +63,9 @@ def test_one_bond_as_the_core_stepper(scheme):
         assert np.abs(u - state.velocities).max() <= 100 * limit
 
 
-@pytest.mark.parametrize("platform", ["Reference", "CPU"])
-@pytest.mark.parametrize("scheme", [*ORDERS, "geodesic"])
+@pytest.mark.parametrize(
+    ("scheme", "platform"), [("rattle", "CPU"), ("geodesic", "Reference"), ("isokinetic4", "Reference")]
+)
 def test_kinetic_energy_stays(scheme, platform):
     system, x = water_box()
     ensemble = Isokinetic(300 * unit.kelvin)
@@ -85,19 +84,6 @@ def test_kinetic_energy_stays(scheme, platform):
     assert ensemble.count(integrator) == 6 * 27 - 3
     kelvin = integrator.computeSystemTemperature().value_in_unit(unit.kelvin)
     assert kelvin == pytest.approx(300, rel=1e-12)
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize("scheme", ["rattle", "isokinetic4"])
-def test_kinetic_energy_stays_for_a_million_steps(scheme):
-    system, x, v = dumbbell()
-    integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-12, ensemble=Isokinetic())
-    context = started(system, integrator, x, v)
-    integrator.step(1)
-    first = twice_kinetic(system, state_of(context)[1])
-    for _ in range(1000):
-        integrator.step(1000)
-        assert abs(twice_kinetic(system, state_of(context)[1]) / first - 1) <= 1e-13
 
 
 def test_calls_of_any_length_make_the_same_motion():
@@ -121,40 +107,6 @@ def test_rigid_bodies_take_two_sums_and_make_the_same_motion():
     assert integrator.getGlobalVariableByName("ww") == pytest.approx(
         integrator.getGlobalVariableByName("two_k"), rel=1e-13
     )
-
-
-@pytest.mark.usefixtures("without_device")
-def test_half_a_kick_is_not_owed_after_a_failure():
-    """A NaN within a call: the state of the last check, and the next step begins there with half a kick."""
-    system, x, v = alanine()
-    mine = copy.deepcopy(system)
-    bomb = openmm.CustomExternalForce("select(step(x-edge), sqrt(edge-x), 0)")
-    bomb.addGlobalParameter("edge", 1e6)
-    bomb.addParticle(0, [])
-    mine.addForce(bomb)
-
-    def begun(x, v, sign=1.0):
-        integrator = ProjectedIntegrator(1e-3, check_every=10, tolerance=1e-8, ensemble=Isokinetic())
-        return integrator, started(mine, integrator, x, sign * v, "CPU")
-
-    integrator, context = begun(x, v, 1.0)
-    forth = context.getState(positions=True).getPositions(asNumpy=True)._value[0, 0]
-    integrator.step(5)
-    moved = state_of(context)[0][0, 0]
-    sign = 1.0 if moved > forth else -1.0
-    (integrator, context), (other, twin) = begun(x, v, sign), begun(x, v, sign)
-    other.step(5)
-    context.setParameter("edge", 0.5 * (forth + state_of(twin)[0][0, 0]))
-    before = state_of(context)
-    with pytest.raises(NonFiniteError):
-        integrator.step(10)
-    np.testing.assert_array_equal(state_of(context), before)
-    context.setParameter("edge", 1e6)
-    twin.setPositions(before[0])
-    twin.setVelocities(before[1])
-    for one in (integrator, other):
-        one.step(10)
-    np.testing.assert_allclose(state_of(context), state_of(twin), rtol=0, atol=1e-6)
 
 
 def test_pseudo_energy_converges_with_the_order():
@@ -293,18 +245,6 @@ def test_weak_forces_are_not_lost_in_single_precision(platform, ensemble):
         ends.append(state_of(context)[1])
     assert ends[0][:, 0].mean() > v[:, 0].mean() + 0.02
     assert np.abs(ends[1] - ends[0]).max() < 1e-4
-
-
-@pytest.mark.parametrize("platform", on_gpus("mixed"))
-def test_gpus_wait_for_two_sums_a_step(platform):
-    system, x, v = alanine()
-    integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0))
-    context = started(system, integrator, x, v, platform)
-    integrator.step(50)
-    double = platform.endswith("double")
-    assert integrator.getGlobalVariableByName("exact") == double
-    rounded = 1e-5 if platform.endswith("single") else 1e-7
-    assert twice_kinetic(system, state_of(context)[1]) == pytest.approx(41 * GAS_CONSTANT * 300, rel=rounded)
 
 
 # -- isokinetic: with what is held -------------------------------------------------------------------

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 from ensemble_runs import run, twice_kinetic
-from openmm import unit
-from openmm_systems import alanine, context_of, loose_alanine, potential_energy, state_of, water_box
+from openmm_systems import alanine, context_of, state_of, water_box
 
 from kcons.errors import UnsupportedError
-from kcons.openmm import Langevin, ProjectedIntegrator, hold
+from kcons.openmm import Langevin, ProjectedIntegrator
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -51,20 +50,3 @@ def test_langevin_velocities_have_the_temperature_of_the_tangent_plane():
     assert abs(np.mean(values) - 300) <= 3 * error
     # The variance of a chi-square distribution with g degrees of freedom.
     assert np.var(values) == pytest.approx(300**2 * 2 / (6 * 27), rel=0.3)
-
-
-def test_langevin_with_parts():
-    system, x, _ = loose_alanine()
-    carried = hold(system, [], positions=x, take="all")
-    integrator = ProjectedIntegrator(2e-3, parts=[carried], ensemble=Langevin(300.0, 5.0))
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    integrator.setVelocitiesToTemperature(context, 300, 1)
-    integrator.step(200)
-    report = carried.report(context)
-    r, u = state_of(context)
-    assert np.abs(carried.motion.constraint_set.value(r, 0.0)).max() < 1e-13
-    assert np.abs(carried.motion.constraint_set.jacobian(r, 0.0) @ u.ravel()).max() < 1e-11
-    assert report is not None
-    assert 100 < integrator.computeSystemTemperature().value_in_unit(unit.kelvin) < 700
-    assert np.isfinite(potential_energy(context))

@@ -77,17 +77,6 @@ def test_it_makes_the_steps_of_the_core(steps, slow_kicks):
     assert "forces of group 1 act" in integrator.listing()
 
 
-def test_without_friction_it_makes_the_steps_of_openmm_s_own_integrator():
-    system, x, v = trapped()
-    own = openmm.MTSLangevinIntegrator(300, 0.0, 0.01, [(0, 1), (1, 4)])
-    ends = [
-        state_of(run(system, integrator, x, v, 20))
-        for integrator in (own, ProjectedIntegrator(0.01, ensemble=LangevinRespa(300, 0.0, TWO)))
-    ]
-    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("platform", [*PLATFORMS, *GPUS[-2:-1]])
 def test_constraints_are_held_and_a_seed_repeats(platform):
     system, x, v = grouped()
@@ -109,7 +98,7 @@ def test_constraints_are_held_and_a_seed_repeats(platform):
         ({"steps": {0: 1}}, "give two or more"),
         ({"steps": {0: 1, 32: 4}}, "force group 32 is no number from 0 to 31"),
         ({"steps": {0: 1, "fast": 4}}, "force group 'fast' is no number"),
-        ({"steps": {0: 1, 1: 0}}, "takes 0 steps"),
+        ({"steps": {0: 1, 1: 0}}, "steps is 0"),
         ({"steps": {0: 1, 1: 4, 2: 6}}, "does not divide"),
         ({"friction": -1.0}, "friction"),
         ({"slow_kicks": "middle", "steps": {0: 1, 1: 3}}, "no middle"),

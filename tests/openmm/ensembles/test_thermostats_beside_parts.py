@@ -6,12 +6,11 @@ import copy
 
 import numpy as np
 import pytest
-from ensemble_runs import on_their_rows, run, three_on_a_sphere, three_parts, twice_kinetic, warm
+from ensemble_runs import on_their_rows, run, twice_kinetic, two_parts, warm
 from openmm_ensembles import ENSEMBLES
 from openmm_systems import loose_alanine, state_of
 
-from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import ProjectedIntegrator, SurfaceIntegrator, hold
+from kcons.openmm import ProjectedIntegrator, hold
 from kcons.openmm.quantities import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
@@ -44,7 +43,7 @@ def test_rows_that_are_carried_move_as_those_of_the_system(bath):
 
 @pytest.mark.parametrize("bath", ["Isokinetic", "NoseHoover"])
 def test_parts_keep_their_rows(bath):
-    system, x, parts = three_parts()
+    system, x, parts = two_parts()
     ensemble = ENSEMBLES[bath](300.0)
     integrator = ProjectedIntegrator(1e-3, parts=parts, ensemble=ensemble)
     context = warm(system, integrator, x, 4)
@@ -63,26 +62,3 @@ def test_parts_keep_their_rows(bath):
     assert ensemble.count(integrator) == 15
     if bath == "NoseHoover":
         assert np.ptp(values) < 0.05 < abs(integrator.getGlobalVariableByName("chain_place"))
-    with pytest.raises(UnsupportedError, match="multipliers_at"):
-        parts[1].multipliers(integrator)
-    with pytest.raises(InputError, match="constant energy"):
-        parts[0].step_multipliers()
-
-
-@pytest.mark.parametrize("bath", ["Isokinetic", "NoseHoover"])
-def test_surfaces_alone(bath):
-    system, x, spheres = three_on_a_sphere()
-    ensemble = ENSEMBLES[bath](300.0, 10.0)
-    integrator = SurfaceIntegrator(1e-3, surfaces=spheres, system=system, ensemble=ensemble)
-    context = warm(system, integrator, x, 1)
-    values = []
-    for _ in range(10):
-        integrator.step(10)
-        values.append(ensemble.conserved_energy(integrator))
-    r, u = state_of(context)
-    np.testing.assert_allclose(np.linalg.norm(r, axis=1), 0.5, atol=1e-13)
-    assert ensemble.count(integrator) == 6
-    if bath == "Isokinetic":
-        assert abs(twice_kinetic(system, u) / (5 * GAS_CONSTANT * 300) - 1) <= 1e-13
-    else:
-        assert np.ptp(values) < 1e-3

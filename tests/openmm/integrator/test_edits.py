@@ -10,18 +10,15 @@ import pytest
 from openmm import app
 from openmm_systems import potential_energy, started, state_of, water_box
 from tied_cluster import (
-    CENTER,
-    RADIUS,
     X,
     bond,
     carried_at,
     cluster,
-    on_a_sphere,
     row_at,
     thermostatted,
 )
 
-from kcons.constraints import Distance, Sphere
+from kcons.constraints import Distance
 from kcons.errors import CertificateError, InputError, KconsError
 from kcons.openmm import (
     CollectiveRows,
@@ -29,13 +26,9 @@ from kcons.openmm import (
     ProjectedIntegrator,
     Row,
     hold,
-    surface_parts,
 )
-from kcons.openmm.integrator.system_checks import SURFACE_NAME
 
-REFERENCE = openmm.Platform.getPlatformByName("Reference")
-PARTS = {"collective": row_at, "carried": carried_at, "surface": on_a_sphere}
-parts = pytest.mark.parametrize("make", PARTS.values(), ids=PARTS)
+parts = pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective", "carried"])
 
 
 # -- the System is read again ---------------------------------------------------------------------------
@@ -64,22 +57,6 @@ def test_rows_after_reinitialize(preserved):
         integrator.step(1)
 
 
-def test_forces_and_parts_after_reinitialize():
-    made = row_at(0.3)
-    made.run(3)
-    force = made.context.getSystem().getForce(0)
-    force.setBondParameters(0, 1, 0, 0.3, 5000.0)
-    made.context.reinitialize(preserveState=True)
-    state = made.context.getState(positions=True, velocities=True)
-    made.run(1)
-    fresh = row_at(0.3)
-    fresh.context.getSystem().getForce(0).setBondParameters(0, 1, 0, 0.3, 5000.0)
-    fresh.context.reinitialize()
-    fresh.context.setState(state)
-    fresh.run(1)
-    np.testing.assert_allclose(state_of(made.context), state_of(fresh.context), rtol=0, atol=1e-12)
-
-
 # -- forces change --------------------------------------------------------------------------------------
 
 
@@ -98,18 +75,18 @@ def test_a_state_of_other_forces_does_not_bring_them(make):
 # -- positions and velocities change ----------------------------------------------------------------------
 
 
-def length_of(make, context):
+def length_of(context):
     x = state_of(context)[0]
-    return np.linalg.norm(x[0] - CENTER) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
+    return np.linalg.norm(x[0] - x[7])
 
 
 @pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
-@pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective", "carried"])
+@parts
 def test_positions_off_the_rows_are_not_pulled_back_in_silence(make, scheme, caplog):
     """Near ones are brought back with a note in the log, far ones refused."""
     made = make(scheme=scheme)
     made.run(5)
-    wanted = length_of(make, made.context)
+    wanted = length_of(made.context)
     x, v = state_of(made.context)
     moved = x.copy()
     moved[0] += 0.5 * (x[7] - x[0]) + 0.05
@@ -119,13 +96,13 @@ def test_positions_off_the_rows_are_not_pulled_back_in_silence(make, scheme, cap
     np.testing.assert_array_equal(state_of(made.context), [moved, v])
     made.integrator.applyConstraints(made.context)
     made.run(3)
-    assert length_of(make, made.context) == pytest.approx(wanted, abs=1e-12)
+    assert length_of(made.context) == pytest.approx(wanted, abs=1e-12)
     x, _ = state_of(made.context)
     x[0] += 0.01
     made.context.setPositions(x)
     with caplog.at_level(logging.WARNING, "kcons"):
         made.run(1)
-    assert "put right" in caplog.text and length_of(make, made.context) == pytest.approx(wanted, abs=1e-12)
+    assert "put right" in caplog.text and length_of(made.context) == pytest.approx(wanted, abs=1e-12)
 
 
 def _chain():
@@ -144,11 +121,9 @@ def _chain():
     return topology, chain, np.cumsum(np.random.default_rng(1).normal(size=(10, 3)) * 0.09, axis=0)
 
 
-@pytest.mark.parametrize("how", ["collective", "carried"])
-def test_the_minimizer_of_openmm_does_not_know_rows(how):
+def test_the_minimizer_of_openmm_does_not_know_rows():
     topology, chain, x = _chain()
-    part = CollectiveRows(chain, [bond(0, 9)], positions=x) if how == "collective" else None
-    part = part or hold(chain, [Distance([[0, 9]])], x)
+    part = hold(chain, [Distance([[0, 9]])], x)
     integrator = ProjectedIntegrator(0.001, parts=[part])
     made = app.Simulation(topology, chain, integrator, openmm.Platform.getPlatformByName("Reference"))
     made.context.setPositions(x)
@@ -195,14 +170,12 @@ def _held(how):
     system = cluster()
     if how == "hold":
         hold(system, [Distance([[0, 7]])], X)
-    elif how == "collective":
-        CollectiveRows(system, [bond()], positions=X)
     else:
-        surface_parts(Sphere([0], CENTER, RADIUS), system=system)
+        CollectiveRows(system, [bond()], positions=X)
     return system
 
 
-@pytest.mark.parametrize("how", ["hold", "collective", "surface"])
+@pytest.mark.parametrize("how", ["hold", "collective"])
 def test_forgotten_parts_are_refused(how):
     context = started(_held(how), integrator := ProjectedIntegrator(1e-3), X)
     with pytest.raises(InputError, match=r"parts=\[rows\]"):
@@ -235,12 +208,6 @@ def _lie(make, made):
     program = made.integrator.program
     if make is row_at:
         program.set("tolerance1", 1e-3)
-    elif make is on_a_sphere:
-        for force in made.context.getSystem().getForces():
-            if force.getName() == SURFACE_NAME:
-                atom, (target, *others) = force.getParticleParameters(0)
-                force.setParticleParameters(0, atom, [target * (1 + 1e-4), *others])
-                force.updateParametersInContext(made.context)
     else:
         solve = made.part.motion.project_positions
 
@@ -252,7 +219,7 @@ def _lie(make, made):
         made.part.motion.project_positions = astray
 
 
-@pytest.mark.parametrize("make", [row_at, carried_at, on_a_sphere])
+@parts
 def test_velocities_are_certified(make):
     made = make()
     made.run(5)

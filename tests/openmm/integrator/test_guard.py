@@ -30,7 +30,6 @@ from kcons.openmm import (
     ProjectedIntegrator,
     Row,
     hold,
-    surface_parts,
 )
 from kcons.openmm.integrator import guard
 
@@ -178,13 +177,13 @@ def dihedral_row():
 def on_a_sphere():
     system, x, v = unconstrained_alanine()
     sphere = Sphere([3], center=(0.0, 0.0, 0.0), radius=float(np.linalg.norm(x[3])))
-    return system, x, v, *surface_parts([sphere], system=system)
+    return system, x, v, hold(system, sphere, x)
 
 
 def on_a_plane():
     system, x, v = unconstrained_alanine()
     plane = Plane([3], normal=(0.0, 0.0, 1.0), offset=float(x[3, 2]))
-    return system, x, v, *surface_parts([plane], system=system)
+    return system, x, v, hold(system, plane, x)
 
 
 @pytest.mark.parametrize("make", [distance_row, dihedral_row, on_a_sphere, on_a_plane])
@@ -203,7 +202,7 @@ def test_rows_that_are_near_are_put_right_in_the_first_step(make, off, near, cap
         assert part.worst_violation(context) is None
         assert np.abs(state_of(context)[0] - x).max() < 3 * off
         return
-    with pytest.raises(KconsError, match=r"call restore|applyConstraints"):
+    with pytest.raises(KconsError, match=r"call restore|apply_positions"):
         integrator.step(1)
     np.testing.assert_array_equal(state_of(context), [x, v])
 
@@ -224,10 +223,10 @@ def test_rows_that_constraints_of_the_system_pull_off_are_put_right_too():
 def test_a_part_that_is_far_off_keeps_the_others_where_they_are():
     system, x, v, near = on_a_plane()
     x[3, 2] += 0.004
-    far = surface_parts([Plane([9], normal=(0.0, 0.0, 1.0), offset=float(x[9, 2]) + 0.5)], system=system)
-    integrator = ProjectedIntegrator(1e-3, parts=[near, *far])
+    far = hold(system, Plane([9], normal=(0.0, 0.0, 1.0), offset=float(x[9, 2]) + 0.5), x)
+    integrator = ProjectedIntegrator(1e-3, parts=[near, far])
     context = started(system, integrator, x, v)
-    with pytest.raises(InputError, match="applyConstraints"):
+    with pytest.raises(InputError, match="apply_positions"):
         integrator.step(1)
     np.testing.assert_array_equal(state_of(context), [x, v])
 
@@ -342,8 +341,13 @@ def collective(n):
     return pull
 
 
-@pytest.mark.parametrize("force", [external, compound, collective])
-@pytest.mark.parametrize("kind", ["constant energy", "Isokinetic", "Langevin", "NoseHoover", "carried"])
+@pytest.mark.parametrize(
+    ("kind", "force"),
+    [
+        *((kind, external) for kind in ("constant energy", "Isokinetic", "Langevin", "NoseHoover", "carried")),
+        *(("Langevin", force) for force in (compound, collective)),
+    ],
+)
 def test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place(kind, force):
     """Half a kick has momentum there, and how steps are divided into calls would decide what is removed."""
     system, x, v = alanine()

@@ -12,15 +12,12 @@ import pytest
 from openmm import unit
 from openmm_systems import holding, loose_alanine, potential_energy, started, state_of
 from tied_cluster import (
-    CENTER,
     EVERYTHING,
     KINDS,
     MASSES,
     X,
-    bond,
     carried_at,
     cluster,
-    on_a_sphere,
     row_at,
     thermostatted,
 )
@@ -28,17 +25,14 @@ from tied_cluster import (
 from kcons.constraints import Plane
 from kcons.errors import InputError, KconsError, OverdeterminedError, UnsupportedError
 from kcons.openmm import (
-    CollectiveRows,
     HamiltonianMonteCarlo,
     Isokinetic,
     Langevin,
     NoseHooverMiddle,
     ProjectedIntegrator,
-    Row,
     hold,
 )
 from kcons.openmm.quantities import GAS_CONSTANT
-from kcons.steppers.splitting import Splitting
 
 #: The trap of `cluster` is round.
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -46,7 +40,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 #: Parts beside more ensembles and schemes: what each keeps between steps has to follow the state.
 PAIRS = {
     f"{held}, {name}": functools.partial(make, **chosen)
-    for held, make in (("sphere", on_a_sphere), ("collective", row_at), ("carried", carried_at))
+    for held, make in (("collective", row_at), ("carried", carried_at))
     for name, chosen in {
         "Isokinetic": {"ensemble": Isokinetic(300)},
         "NoseHooverMiddle": {"ensemble": NoseHooverMiddle(300, 5.0)},
@@ -162,7 +156,7 @@ def test_a_temperature_that_is_refused_changes_nothing():
 
 
 @ways
-@pytest.mark.parametrize("make", [row_at, carried_at, on_a_sphere], ids=["collective", "carried", "surface"])
+@pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective", "carried"])
 def test_targets_stay(make, way):
     """A State of another target is put right in the next step, for it is nearer than a tenth of the length."""
     made, other = make(0.20), make(0.22)
@@ -171,8 +165,7 @@ def test_targets_stay(make, way):
     give(made, other, way)
     other.run(1)
     x = state_of(other.context)[0]
-    length = np.linalg.norm(x[0] - CENTER) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
-    assert abs(length - 0.22) < 1e-12
+    assert abs(np.linalg.norm(x[0] - x[7]) - 0.22) < 1e-12
 
 
 def test_set_target_outlives_a_state():
@@ -203,17 +196,16 @@ def test_a_setting_has_a_method_of_its_own():
     assert integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
 
 
-@pytest.mark.parametrize(("make", "more"), [(row_at, 5000), (lambda **given: thermostatted(**given)(), 5000)])
-def test_zero_kelvin_brings_to_rest(make, more):
+def test_zero_kelvin_brings_to_rest():
     """Friction without noise: all energy goes, the certificate holds with velocities of rounding alone."""
-    made = make(ensemble=Langevin(0, 6.0))  # as the field damps fastest
+    made = row_at(ensemble=Langevin(0, 6.0))  # as the field damps fastest
     first = potential_energy(made.context)
     made.run(4000)
     assert np.abs(state_of(made.context)[1]).max() < 5e-3
     assert potential_energy(made.context) < first
     assert made.integrator.getTemperature() == 0 * unit.kelvin
     made.integrator.check(made.context)
-    made.run(more)
+    made.run(5000)
     assert np.abs(state_of(made.context)[1]).max() < 1e-4
 
 
@@ -278,8 +270,9 @@ def test_a_tolerance_that_was_left_open_stays_so_where_it_is_copied():
     assert ProjectedIntegrator(0.002, tolerance=1e-10).asked_tolerance == 1e-10
 
 
-@pytest.mark.parametrize("make", [ProjectedIntegrator, HamiltonianMonteCarlo.reversing_integrator])
-@pytest.mark.parametrize("step", [4, 0.0201, 2.0])
+@pytest.mark.parametrize(
+    ("make", "step"), [(ProjectedIntegrator, 4), (HamiltonianMonteCarlo.reversing_integrator, 0.0201)]
+)
 def test_a_long_time_step_without_a_unit_is_asked_about(make, step):
     with pytest.warns(UserWarning, match=f"the time step is {step:g} ps, that is .* fs: is it meant in fs") as seen:
         integrator = make(step)
@@ -294,14 +287,14 @@ def test_a_long_time_step_without_a_unit_is_asked_about(make, step):
 
 # -- copies and files ---------------------------------------------------------------------------------
 
-copies = pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, lambda i: pickle.loads(pickle.dumps(i))])
+copies = pytest.mark.parametrize("how", [copy.copy, lambda i: pickle.loads(pickle.dumps(i))], ids=["copy", "pickle"])
 
 
 @copies
 @pytest.mark.parametrize("kind", KINDS)
 def test_copies_have_the_settings_of_now(kind, how):
     made = KINDS[kind]()
-    if kind.startswith("carried") and how not in (copy.copy, copy.deepcopy):
+    if kind.startswith("carried") and how is not copy.copy:
         with pytest.raises(UnsupportedError, match="belong to their System"):
             how(made.integrator)
         return
@@ -340,12 +333,11 @@ def test_copies_make_the_same_steps(scheme, how):
     assert other.getStepCount() == 3
 
 
-@copies
-def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context(how):
+def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context():
     """Although the original has run: the new one acts at the first step, and an unchanged copy goes on as it was."""
     made = thermostatted(Isokinetic(300, momentum="free"))()
     made.run(5)
-    warmer, same = (how(made.integrator) for _ in range(2))
+    warmer, same = (copy.copy(made.integrator) for _ in range(2))
     warmer.setTemperature(310)
     contexts = [started(cluster(bonded=True), one, *state_of(made.context)) for one in (warmer, same)]
     for one in (made.integrator, warmer, same):
@@ -355,42 +347,7 @@ def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context(how):
     np.testing.assert_allclose(state_of(contexts[1]), state_of(made.context), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6", Splitting((0.3, 0.4, 0.3), (0.5, 0.5))], ids=str)
-@pytest.mark.parametrize("parts", [False, True])
-def test_xml_has_the_bare_program(scheme, parts):
-    """What reads it makes the same steps; `from_xml` takes what no file contains."""
-    system, x, v = loose_alanine()
-
-    def held():
-        return [holding()] if parts else []
-
-    integrator = ProjectedIntegrator(2e-3, scheme, parts=held(), tolerance=1e-12)
-    integrator.setRandomNumberSeed(5)
-    integrator.setIntegrationForceGroups({0, 1, 2})
-    text = openmm.XmlSerializer.serialize(integrator)
-    assert "kcons" not in text
-    bare = openmm.XmlSerializer.deserialize(text)
-    assert type(bare) is openmm.CustomIntegrator
-    again = ProjectedIntegrator.from_xml(text, scheme, parts=held())
-    assert again.getStepSize() == integrator.getStepSize()
-    assert (again.getConstraintTolerance(), again.getRandomNumberSeed()) == (1e-12, 5)
-    assert again.getIntegrationForceGroups() == bare.getIntegrationForceGroups() == 7
-    with pytest.raises(InputError, match="another program"):
-        ProjectedIntegrator.from_xml(text, "rattle" if scheme != "rattle" else "suzuki4", parts=held())
-    contexts = [started(system, one, x, v) for one in (integrator, again, bare)]
-    integrator.applyConstraints(contexts[0])
-    integrator.applyVelocityConstraints(contexts[0])
-    for context in contexts:
-        context.setPositions(state_of(contexts[0])[0])
-        context.setVelocities(state_of(contexts[0])[1])
-    for one in (integrator, again, bare):
-        for _ in range(2):
-            one.step(3)
-    np.testing.assert_array_equal(state_of(contexts[0]), state_of(contexts[1]))
-    np.testing.assert_allclose(state_of(contexts[0]), state_of(contexts[2]), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", ["constant energy", "Isokinetic", "Langevin", "sphere", "collective"])
+@pytest.mark.parametrize("kind", ["constant energy", "suzuki4", "Isokinetic", "Langevin", "carried", "collective"])
 def test_the_bare_program_makes_the_same_steps(kind):
     """Of an integrator that has run, with all that it was made with, and without Python."""
     made, again = KINDS[kind](), KINDS[kind]()
@@ -398,23 +355,13 @@ def test_the_bare_program_makes_the_same_steps(kind):
         one.integrator.setFriction(0)
     made.run(2)
     again.run(2)
-    bare = openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(again.integrator))
+    text = openmm.XmlSerializer.serialize(again.integrator)
+    assert "kcons" not in text
+    bare = openmm.XmlSerializer.deserialize(text)
+    assert type(bare) is openmm.CustomIntegrator
     context = openmm.Context(again.context.getSystem(), bare, openmm.Platform.getPlatformByName("Reference"))
     context.setPositions(state_of(made.context)[0])
     context.setVelocities(state_of(made.context)[1])
     bare.step(6)
     made.run(6)
     np.testing.assert_allclose(state_of(context), state_of(made.context), rtol=0, atol=1e-9)
-
-
-def test_files_of_something_else_are_refused():
-    for other in (openmm.VerletIntegrator(1e-3), openmm.CustomIntegrator(1e-3)):
-        with pytest.raises(InputError, match="another program"):
-            ProjectedIntegrator.from_xml(openmm.XmlSerializer.serialize(other))
-    rows = CollectiveRows(cluster(), [Row(bond(), 0.3)])
-    text = openmm.XmlSerializer.serialize(ProjectedIntegrator(0.002, parts=[rows]))
-    with pytest.raises(InputError, match="parts it was made with"):
-        ProjectedIntegrator.from_xml(text)
-    others = CollectiveRows(cluster(), [Row(bond(), 0.35)])
-    again = ProjectedIntegrator.from_xml(text, parts=[others], ensemble=None)
-    assert again.getGlobalVariableByName("target1_0") == 0.35

@@ -6,7 +6,6 @@ import numpy as np
 import openmm
 import pytest
 from openmm_systems import (
-    PLATFORMS,
     context_of,
     dumbbell,
     started,
@@ -16,9 +15,6 @@ from openmm_systems import (
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Langevin, ProjectedIntegrator, worst_length
 from kcons.openmm.integrator.system_checks import SystemRows
-
-platforms = pytest.mark.parametrize("platform", PLATFORMS)
-
 
 # -- what cannot be propagated ----------------------------------------------------------------------
 

@@ -7,7 +7,6 @@ import pytest
 import small_test_systems as small_test_systems  # a system that moves
 from peer_packages import check_order_two, measured, need
 from peers import dae, lammps_shake, mici_leapfrog
-from peers.shake import TOLERANCES
 from peers.smallness import dense_rows
 
 from kcons.comparison import test_systems
@@ -66,29 +65,6 @@ def test_dense_rows_are_those_of_the_set():
 
 
 # -- sweeps, solvers of differential-algebraic equations ----------------------------------------------
-
-
-def test_what_sweeps_leave_follows_the_tolerance():
-    """No more than the tolerance, and not far less: sweeps end where it is reached."""
-    rotor = test_systems.build("rotor").shortened(2)
-    (dt, *_) = rotor.time_steps
-    left = {}
-    for tolerance in TOLERANCES:
-        found = measured(rotor.with_time_steps([dt]), f"shake-{tolerance:.0e}".replace("e-0", "e-")).iloc[0]
-        left[tolerance] = found.sigma
-    assert all(residual <= 2 * tolerance for tolerance, residual in left.items())
-    assert left[1e-4] > 1e3 * left[1e-10]
-
-
-def test_a_run_goes_back_to_its_start_and_repeats():
-    butane = test_systems.build("butane")
-    run = METHODS["shake-1e-8"].start(butane, min(butane.time_steps))
-    ends = []
-    for _ in range(2):
-        run.advance(20)
-        ends.append(run.observe())
-        run.rewind()
-    np.testing.assert_array_equal(ends[0], ends[1])
 
 
 @pytest.mark.parametrize("name", ["dae-radau", "dae-ida"])

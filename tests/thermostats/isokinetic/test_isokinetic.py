@@ -64,7 +64,7 @@ def test_reference_trajectories_to_their_tolerance(name):
             break
         state = run(held, state, span / round(steps * span), round(steps * span), stepper=thermostat)
         assert error(state, target) <= target.tolerance, target.time
-        assert thermostat.friction(held, state) == pytest.approx(target.alpha, abs=1e-10)
+        assert state.velocities.ravel() @ state.forces.ravel() / (2 * kinetic) == pytest.approx(target.alpha, abs=1e-10)
         assert held.kinetic_energy(state.velocities) == pytest.approx(kinetic, rel=3e-15)
 
 
@@ -127,19 +127,6 @@ def check_order(made, order, counts):
         errors.append(max(np.abs(after.positions - exact[0]).max(), np.abs(after.velocities - exact[1]).max()))
         assert held.kinetic_energy(after.velocities) == pytest.approx(kinetic, rel=1e-14)
     assert slope(counts, errors) == pytest.approx(order, abs=0.15), errors
-
-
-@ORDERS
-def test_a_run_from_reversed_velocities_returns(order):
-    """No variable of the thermostat turns: the integral of alpha runs back by itself."""
-    held, x = dumbbells(2)
-    thermostat = Isokinetic(0.5, order=order)
-    begun = thermostat.start(held, held.initial_state(x, thermal_velocities(held, x, 0.5, 3)))
-    there = run(held, begun, 0.02, 50, stepper=thermostat)
-    back = run(held, there.reversed(thermostat), 0.02, 50, stepper=thermostat).reversed(thermostat)
-    np.testing.assert_allclose(back.positions, begun.positions, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(back.velocities, begun.velocities, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(back.thermostat, begun.thermostat, rtol=0, atol=1e-11)
 
 
 # -- constants --------------------------------------------------------------------------------------
@@ -230,22 +217,20 @@ def test_a_loaded_run_of_other_degrees_of_freedom_begins_anew(momentum, expected
     assert (held.masses[:, None] * after.velocities**2).sum() == pytest.approx(expected - 1, rel=1e-12)
 
 
-@pytest.mark.parametrize("changed", ["temperature", "attribute", "convention", "atoms"])
+@pytest.mark.parametrize("changed", ["temperature", "attribute", "convention"])
 def test_a_run_that_goes_on_with_other_settings_takes_them(changed):
     held, x = dumbbells(3)
     thermostat = Isokinetic(1.0)
     state = run(held, State(x, thermal_velocities(held, x, 1.0, 1)), 0.01, 5, stepper=thermostat)
-    g, others = int(state.thermostat[3]), held.masses > 0
+    g = int(state.thermostat[3])
     if changed == "temperature":
         thermostat, wanted = Isokinetic(2.0), 2.0 * (g - 1)
     elif changed == "attribute":
         thermostat.thermal_energy, wanted = 2.0, 2.0 * (g - 1)
-    elif changed == "convention":
-        thermostat, wanted = Isokinetic(1.0, convention="notes"), 18.0
     else:
-        thermostat, wanted, others = Isokinetic(1.0, atoms=[2, 3]), 4.0, np.isin(np.arange(6), [2, 3])
+        thermostat, wanted = Isokinetic(1.0, convention="notes"), 18.0
     after = run(held, state, 0.01, 5, stepper=thermostat)
-    assert (held.masses[others, None] * after.velocities[others] ** 2).sum() == pytest.approx(wanted, rel=1e-12)
+    assert 2 * held.kinetic_energy(after.velocities) == pytest.approx(wanted, rel=1e-12)
 
 
 @pytest.mark.parametrize("by_hand", [False, True])

@@ -59,18 +59,6 @@ def test_any_strength(strength, t):
     assert math.isfinite(growth)
 
 
-def test_sums():
-    u, f = RNG.standard_normal((2, 4, 3))
-    some = MASSES * [[1.0], [0.0], [1.0], [1.0]]
-    np.testing.assert_allclose(
-        kick.sums(u, f, some), [(some * u * u).sum(), (some * u * f).sum(), (some * f * f).sum()], rtol=1e-14
-    )
-    inside = some > 0
-    np.testing.assert_allclose(
-        kick.raw_sums(u, f, 1 / MASSES, some), [(u * f)[inside].sum(), (f * f / MASSES)[inside].sum()], rtol=1e-14
-    )
-
-
 @pytest.mark.parametrize("tilt", [0.0, 1e-12, 1e-6, 1e-3, 0.1])
 @pytest.mark.parametrize("z", [1e-3, 1.0, 10.0, 30.0, 800.0])
 def test_against_the_force(tilt, z):
@@ -110,17 +98,6 @@ def test_the_equation_itself():
         after, growth = kicked(u, pace, t)
         np.testing.assert_allclose(after.ravel(), found[:-1], atol=1e-10)
         assert growth == pytest.approx(found[-1], abs=1e-10)
-
-
-def test_other_atoms_stay():
-    pace = RNG.standard_normal((4, 3))
-    masses = MASSES.copy()
-    masses[2] = 0.0
-    u_inside = np.where(masses > 0, -pace, 7.0)
-    uu, _, pp = kick.sums(u_inside, pace, masses)
-    after, _ = kick.turned(u_inside, pace, masses, uu, 40 * math.sqrt(uu / pp))
-    assert (after[2] == 7.0).all()
-    assert kick.square_sum(after, masses) == pytest.approx(uu, rel=1e-13)
 
 
 def test_nan_is_not_hidden():

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from thermostat_systems import ROWS, distance, isokinetics, molecules, springs
 
-from kcons.constraints import Angle, Distance
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError
-from kcons.motion import Motion
-from kcons.steppers import State, System
+from kcons.steppers import State
 from kcons.steppers.stages.compiled_operations import PYTHON
 from kcons.thermostats import Isokinetic
 from kcons.thermostats.isokinetic.isokinetic import IsokineticStep, programs
@@ -43,24 +40,6 @@ def test_steps_are_those_made_operation_by_operation(name, options, order) -> No
         np.testing.assert_allclose(following.forces, expected.forces, rtol=0, atol=close)
         np.testing.assert_allclose(following.thermostat, expected.thermostat, rtol=1e-12 + close, atol=close)
         state = following
-
-
-@ORDERS
-def test_a_part_of_the_atoms(order) -> None:
-    """The others, held ones too, are only pushed."""
-    system, state = molecules("triangles", ions=5)
-    compiled, calls = isokinetics(system, order=order, atoms=np.arange(15))
-    state = compiled.start(system, state)
-    before = system.masses[:15] @ np.einsum("ij,ij->i", state.velocities[:15], state.velocities[:15])
-    for _ in range(3):
-        following, expected = compiled.step(system, state, 0.05), calls.step(system, state, 0.05)
-        assert distance(following, expected) <= 2e-14
-        if order == 2:  # free atoms that are not thermostatted feel their forces, and nothing else
-            push = 0.025 * (state.forces + following.forces)[-5:] / 23.0
-            np.testing.assert_allclose(following.velocities[-5:], state.velocities[-5:] + push, rtol=0, atol=1e-15)
-        state = following
-    inside = system.masses[:15] @ np.einsum("ij,ij->i", state.velocities[:15], state.velocities[:15])
-    assert inside == pytest.approx(before, rel=1e-14)
 
 
 # -- where a kernel cannot go on --------------------------------------------------------------------
@@ -152,25 +131,3 @@ def test_turns_by_python_are_those_of_the_kernel(method) -> None:
     after = thermostat.step(system, start, 0.05)
     assert distance(after, start) > 0 and distance(after, expected) <= 1e-14
     np.testing.assert_allclose(after.thermostat, expected.thermostat, rtol=1e-12, atol=1e-13)
-
-
-def test_rows_of_mixed_kinds() -> None:
-    """Called by address, from kernels that know nothing of them; a step without solution is the engine's."""
-    x = np.array([[0.0, 0, 0], [1.5, 0, 0], [2.0, 1.4, 0], [0.3, 0.2, 4.0], [1.0, 1.0, 5.0]])
-    rows = [Distance([[0, 1], [1, 2], [3, 4]]), Angle([[0, 1, 2]])]
-    system = System(Motion(ConstraintSet(rows, x, [16.0, 1.0, 2.0, 3.0, 4.0]), x), springs)
-    state = system.initial_state(x, 0.3 * np.random.default_rng(2).normal(size=x.shape), project=True)
-    compiled, calls = isokinetics(system)
-    one = two = compiled.start(system, state)
-    energy = system.kinetic_energy(one.velocities)
-    for _ in range(5):
-        one, two = compiled.step(system, one, 0.02), calls.step(system, two, 0.02)
-    assert distance(one, two) <= 1e-14 < distance(one, state)
-    assert system.kinetic_energy(one.velocities) == pytest.approx(energy, rel=1e-14)
-    assert np.abs(system.motion.constraint_set.value(one.positions)).max() <= 1e-14
-    errors = []
-    for each in (compiled, calls):
-        with pytest.raises(ConvergenceError, match="step 6") as caught:
-            each.step(system, one, 60.0)
-        errors.append((caught.value.row, caught.value.atoms))
-    assert errors[0] == errors[1]

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Project, Turn, drifts_of
-from kcons.thermostats.multistep.respa import Level, levels_of, nested
+from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Project, Turn
+from kcons.thermostats.multistep.respa import levels_of, nested
 
 THREE = levels_of({"fast": 12, "slow": 1, "medium": 4})
 
@@ -21,42 +21,6 @@ def shares(operations, kind):
         if isinstance(operation, kind):
             found[getattr(operation, "group", "")] += operation.fraction
     return found
-
-
-def test_levels_from_slow_to_fast():
-    assert [*THREE] == [Level("slow", 1), Level("medium", 4), Level("fast", 12)]
-    assert levels_of(None) == (Level("", 1),)
-
-
-def test_two_levels_in_full():
-    flights = drifts_of((0.25,) * 4)
-    middle = [
-        (Kick(0.25, "f"), a, Exchange(0.5), b, Evaluate("f"), Kick(0.25, "f")) for a, b in (flights[:2], flights[2:])
-    ]
-    assert nested(levels_of({"s": 1, "f": 2}), (1.0,)) == (
-        Kick(0.5, "s"),
-        *middle[0],
-        *middle[1],
-        Evaluate("s"),
-        Kick(0.5, "s"),
-        Project(),
-    )
-
-
-@pytest.mark.parametrize("turns", [False, True])
-def test_every_group_kicks_and_every_drift_flies_for_the_whole_step(turns):
-    done = nested(THREE, (0.5, 0.5), turns=turns)
-    push = Turn if turns else Kick
-    assert shares(done, push) == pytest.approx({"slow": 1, "medium": 1, "fast": 1}, rel=1e-14)
-    assert shares(done, Fly)[""] == pytest.approx(1, rel=1e-14)
-    assert shares(done, Exchange)[""] == pytest.approx(1, rel=1e-14)
-    assert Counter(o.group for o in done if isinstance(o, Evaluate)) == {
-        "slow": 1,
-        "medium": 4,
-        "fast": 12,
-    }
-    ends = [o.ends[-1] for o in done if isinstance(o, Fly)]
-    assert ends[-1] == 1.0 and math.fsum(o.fraction for o in done if isinstance(o, Fly)) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("turns", [False, True])

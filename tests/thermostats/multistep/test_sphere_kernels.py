@@ -85,15 +85,6 @@ def test_from_rest_and_exactly_against_the_force():
         assert u @ f == pytest.approx(np.linalg.norm(u) * np.linalg.norm(f), rel=1e-12) and u @ f > 0
 
 
-def test_after_a_drift_velocities_have_their_length_again_and_w_stays():
-    _, _, tables, squares, v, w, _ = made("split")
-    kept, lengths = w.copy(), [u @ u for u in parts(v, tables)]
-    v *= 1.001
-    kernels.rescale(v, w, squares, False, *tables)
-    np.testing.assert_array_equal(w, kept)
-    np.testing.assert_allclose([u @ u for u in parts(v, tables)], lengths, rtol=1e-13)
-
-
 def test_the_bath_leaves_the_uniform_distribution():
     """On the sphere of one free atom: y stays uniform, and forgets at the rate asked for."""
     n = 30_000

@@ -191,17 +191,3 @@ def test_shapes_of_a_flexible_cell():
         assert p_value(cells[:, i, i], expected) > 0.01
     for i, j in ((1, 0), (2, 0), (2, 1)):
         assert p_value(cells[:, i, j], stats.norm()) > 0.01
-
-
-def test_a_turned_cell_is_strained_in_its_own_frame():
-    rng = np.random.default_rng(3)
-    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    strains = Strains("flexible")
-    h, e = np.tril(rng.standard_normal((3, 3))) + 3 * np.eye(3), 0.05 * rng.standard_normal(6)
-    assert strains.frame(h) is None
-    frame = strains.frame(h @ turn)
-    assert frame == pytest.approx(turn, abs=1e-14)
-    assert h @ turn @ strains.matrix(e, frame) == pytest.approx(h @ strains.matrix(e, None) @ turn, abs=1e-13)
-    turned = np.tensordot(e, strains.generators_in(frame), 1)
-    assert turned == pytest.approx(turn.T @ np.tensordot(e, strains.generators, 1) @ turn, abs=1e-15)

@@ -26,12 +26,6 @@ def test_functions_see_the_present_cell():
     assert system.stress(x, 0.0)[0, 1] == system.stress(x, 0.0)[1, 0] == 1.0
 
 
-def test_a_cell_is_the_same_however_it_is_given():
-    system, x = gas(n=3)
-    system.set_cell([11, 12, 13], x)
-    assert np.array_equal(system.cell, np.diag([11.0, 12, 13])) and system.volume == pytest.approx(11 * 12 * 13)
-
-
 def test_a_pressure_is_an_energy_over_an_area_in_a_slab():
     """Whatever length the vector has that is not periodic."""
     x = np.array([[0.0, 0, 0], [1, 0, 0]])

@@ -82,14 +82,6 @@ def test_all_states_shown_have_a_cell():
     assert np.array_equal(kept.last.cell, system.cell)
 
 
-def test_listing():
-    lines = made("langevin", 25, kind="anisotropic").listing().splitlines()
-    assert lines[0].startswith("a step of ConstantPressure(Langevin(")
-    assert lines[-1].split()[0] == "press"
-    assert "(anisotropic), every 25 steps" in lines[-1]
-    assert lines[1:-1] == Langevin(1.0, 0.5, rng=2).listing().splitlines()[1:]
-
-
 def test_zero_and_negative_steps():
     system, state = begun()
     stepper = made("langevin")
@@ -104,8 +96,6 @@ def test_what_is_refused():
     barostat = MonteCarloBarostat(PRESSURE)
     with pytest.raises(UnsupportedError, match="keeps no temperature"):
         ConstantPressure(Rattle(), barostat).step(system, state, 0.1)
-    with pytest.raises(UnsupportedError, match="some atoms"):
-        ConstantPressure(Isokinetic(1.0, atoms=[0, 1, 2]), barostat).step(system, state, 0.1)
     plain, x = dumbbells()
     with pytest.raises(UnsupportedError, match="CellSystem"):
         ConstantPressure(Langevin(1.0, 1.0, 0), barostat).step(plain, plain.initial_state(x), 0.1)

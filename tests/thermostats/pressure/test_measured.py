@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pressure_systems import METHANE, TRIANGLE, gas
@@ -19,7 +21,7 @@ from kcons.thermostats.pressure import (
     find_pieces,
     instantaneous_pressure,
 )
-from kcons.thermostats.pressure.barostat import Place, Trial
+from kcons.thermostats.pressure.barostat import Place
 from kcons.thermostats.pressure.measured import mean_pressure
 from kcons.thermostats.pressure.pieces import lattice_of
 
@@ -131,7 +133,7 @@ def test_the_mean_stress_along_each_axis_is_the_pressure(kind):
     pressure, thermal, h = 0.02, 1.3, 1e-5
     barostat = MonteCarloBarostat(pressure, kind=kind)
     pieces = barostat.pieces(system, state.positions)
-    before = Place(system.cell, state.positions, system.energy(state.positions, 0.0, 0))
+    before = Place(system, pieces, state, thermal, 1.0, False)
     stress = np.diag(instantaneous_pressure(system, state, thermal_energy=thermal))
     found = []
     for mode in range(len(barostat.strains)):
@@ -141,8 +143,8 @@ def test_the_mean_stress_along_each_axis_is_the_pressure(kind):
             matrix = barostat.strains.matrix(e, None)
             y = state.positions + pieces.moved(state.positions, matrix - np.eye(3), lattice_of(system))
             system.set_cell(before.cell @ matrix, y)
-            after = Place(system.cell, y, system.energy(y, 0.0, 0))
-            slopes.append(barostat._log_chance(pieces, before, after, Trial(e, mode), thermal))
+            after = Place(system, pieces, replace(state, positions=y), thermal, 1.0, False)
+            slopes.append(barostat._log_chance(before, after, e))
             system.set_cell(before.cell, state.positions)
         found.append((slopes[0] - slopes[1]) / (2 * h))
     if kind == "isotropic":

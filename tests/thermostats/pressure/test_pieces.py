@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pressure_systems import METHANE, gas, placed
 
-from kcons.constraints import Angle, CenterOfMass, Distance, DistanceDifference, FixedAtoms, Plane, Sphere
+from kcons.constraints import CenterOfMass, Distance, DistanceDifference, FixedAtoms, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion import Motion
@@ -74,12 +74,6 @@ def test_bonds_tie_what_constraints_do_not():
     assert len(set(pieces.label[:5].tolist())) == 1
     with pytest.raises(InputError, match="pair"):
         find_pieces(system, x, ALL, [[0, 99]])
-
-
-def test_rows_tie_whatever_they_are():
-    x = placed(METHANE, 2, 12.0, 3)
-    system = system_of([Angle([[1, 0, 2]]), Distance([[4, 5]])], x)
-    assert len(find_pieces(system, x, ALL)) == 10 - 2 - 1
 
 
 def test_lengths_of_a_difference_tie_their_own_atoms():

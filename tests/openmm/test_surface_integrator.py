@@ -1,0 +1,337 @@
+"""Particles on surfaces in OpenMM: on them to rounding, equal to independent solutions, what is taken and refused."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import openmm
+import pytest
+from openmm import unit
+from openmm_systems import PLATFORMS, on_gpus
+from reference import cases
+from surface_cases import (
+    CENTER,
+    KINDS,
+    MASSES,
+    POSITIONS,
+    VELOCITIES,
+    core_run,
+    force_of,
+    on_surface,
+    started,
+    state_of,
+    system_of,
+    worst,
+)
+
+from kcons.constraints import Distance, Ellipsoid, Formula, Plane, Sphere, Torus
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
+from kcons.motion import Motion
+from kcons.openmm import SurfaceIntegrator
+from kcons.openmm.integrator.schemes import SCHEMES
+
+# -- what is refused --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("surfaces", "error", "words"),
+    [
+        ([], InputError, "no surface"),
+        (Sphere([7], [0, 0, 0], 1.0), InputError, "7"),
+        (Sphere([0], [0, 0, 0]), InputError, "positions="),
+        (Torus([0], [0, 0, 0], [0, 0, 1], 1.0, 0.0), InputError, "radius"),
+        (Distance([0, 1], 1.0), UnsupportedError, r"kcons\.openmm\.hold"),
+    ],
+)
+def test_refused(surfaces, error, words):
+    system = system_of()
+    forces = system.getNumForces()
+    with pytest.raises(error, match=words):
+        SurfaceIntegrator(0.001, surfaces=surfaces, system=system, device=False)
+    assert system.getNumForces() == forces
+
+
+def test_constraints_beside_surfaces_need_positions():
+    system = system_of()
+    system.addConstraint(0, 1, 1.0)
+    with pytest.raises(InputError, match="constrains its particles: give positions="):
+        SurfaceIntegrator(0.001, surfaces=Sphere([0], [0, 0, 0], 1.0), system=system, device=False)
+    assert system.getNumConstraints() == 1
+
+
+def test_needs_the_system():
+    with pytest.raises(InputError, match="give system="):
+        SurfaceIntegrator(0.001, surfaces=Sphere([0], [0, 0, 0], 1.0), device=False)
+
+
+def test_a_particle_at_the_center_is_refused():
+    system = system_of([1.0], "0", 0)
+    integrator = SurfaceIntegrator(0.001, surfaces=Sphere([0], [1, 1, 1], 0.5), system=system, device=False)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[1, 1, 1]])
+    with pytest.raises(SingularGeometryError, match="center of the sphere"):
+        integrator.step(1)
+
+
+# -- motion -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("scheme", "steps"), [("rattle", 20), ("geodesic", 20), ("suzuki4", 8), ("blanes-moan6a", 4)])
+def test_the_steps_are_those_of_the_core(kind, scheme, steps):
+    """On the surface and along it."""
+    integrator, context = on_surface(kind, scheme, 0.04, atoms=(0, 2))
+    integrator.step(steps)
+    x, v = state_of(context)
+    x_core, v_core = core_run(kind, SCHEMES[scheme](), 0.04, steps, atoms=(0, 2))
+    assert np.abs(x - x_core).max() <= 1e-12
+    assert np.abs(v - v_core).max() <= 1e-12
+    assert max(worst(integrator, context)) <= 1e-14
+
+
+@pytest.mark.parametrize("platform", on_gpus("mixed"))
+def test_on_a_gpu_without_the_plugin(platform):
+    integrator, context = on_surface("torus", "rattle", 0.02, platform)
+    integrator.step(20)
+    off, across = worst(integrator, context)
+    assert off <= 1e-9
+    assert across <= 1e-6
+
+
+def reference_context(name, scheme, dt):
+    case = cases.load(name)
+    system = openmm.System()
+    field = openmm.CustomExternalForce("fx*x+fy*y+fz*z")
+    for axis in "xyz":
+        field.addPerParticleParameter(f"f{axis}")
+    for k, mass in enumerate(case.masses):
+        system.addParticle(mass)
+        field.addParticle(k, (-case.force(case.initial.positions, case.initial.velocities)[k]).tolist())
+    system.addForce(field)
+    integrator = SurfaceIntegrator(dt, scheme, surfaces=case.constraints, system=system, device=False)
+    start = case.initial
+    return case, integrator, started(system, integrator, start.positions, start.velocities)
+
+
+@pytest.mark.parametrize(
+    ("name", "dt", "allowed"),
+    [
+        ("A01_sphere_free", 1 / 64, 2e-13),
+        ("A02_spherical_pendulum_generic", 1 / 256, 1e-11),
+        ("A02_spherical_pendulum_near_top_Lz", 1 / 256, 1e-10),
+        ("A03_planar_pendulum_150deg", 1 / 256, 1e-10),
+        ("A08_torus_geodesic", 1 / 128, 1e-10),
+    ],
+)
+def test_reference_solution(name, dt, allowed):
+    scheme = "geodesic" if "free" in name else "blanes-moan6"
+    case, integrator, context = reference_context(name, scheme, dt)
+    for there in [s for s in case.solution if (s.time / dt).is_integer()][:2]:
+        integrator.step(round(there.time / dt) - context.getStepCount())
+        x, v = state_of(context)
+        assert np.abs(x - there.positions).max() <= max(allowed, there.tolerance)
+        assert np.abs(v - there.velocities).max() <= 10 * max(allowed, there.tolerance)
+        forces = integrator.constraint_forces(context)
+        assert forces == pytest.approx(there.constraint_forces, abs=100 * max(allowed, there.tolerance))
+    assert context.getStepCount() > 0
+
+
+def free_on_sphere(scheme, dt, radius=2.0, center=(0.0, 0.0, 0.0), speed=1.0, platform="Reference"):
+    """One particle without forces; turns by speed/radius in the xy plane."""
+    system = openmm.System()
+    system.addParticle(3.0)
+    surface, step = Sphere([0], center, radius), dt * unit.picosecond
+    integrator = SurfaceIntegrator(step, scheme, surfaces=surface, system=system, device=False)
+    start = np.array([[radius, 0.0, 0.0]]) + center
+    return integrator, started(system, integrator, start, [[0.0, speed, 0.0]], platform)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_great_circles_at_any_time_step(platform):
+    for dt in (0.1, 3.0, 50.0):
+        integrator, context = free_on_sphere("geodesic", dt, platform=platform)
+        integrator.step(40)
+        angle = 40 * dt / 2
+        x, v = state_of(context)
+        assert x == pytest.approx(2 * np.array([[np.cos(angle), np.sin(angle), 0]]), abs=2e-16 * 40 * angle + 1e-14)
+        assert np.linalg.norm(v) == pytest.approx(1.0, abs=1e-13)
+
+
+def test_great_circles_leave_resting_and_free_particles_alone():
+    system = system_of(potential="0", springs=0)
+    integrator = SurfaceIntegrator(
+        0.1 * unit.picosecond, "geodesic", surfaces=Sphere([0, 1], [0, 0, 0], 1.0), system=system, device=False
+    )
+    x = np.array([[1.0, 0, 0], [0, 1.0, 0], [5.0, 0, 0]])
+    context = started(system, integrator, x, [[0, 0, 0], [0, 0, 0.5], [0.1, 0.2, 0.3]])
+    integrator.step(10)
+    there, v = state_of(context)
+    assert there[0] == pytest.approx([1, 0, 0], abs=1e-15)
+    assert there[1] == pytest.approx([0, np.cos(0.5), np.sin(0.5)], abs=1e-14)
+    assert there[2] == pytest.approx([5.1, 0.2, 0.3], abs=1e-14)
+    assert v[2] == pytest.approx([0.1, 0.2, 0.3], abs=1e-15)
+
+
+@pytest.mark.parametrize("radius", [1e-4, 1e4])
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic"])
+def test_small_and_large_radii(radius, scheme):
+    integrator, context = free_on_sphere(scheme, 0.01, radius=radius, speed=radius)
+    integrator.step(100)
+    off, across = worst(integrator, context)
+    assert off <= 1e-14 * radius
+    assert across <= 1e-14
+    angle = 100 * (np.arcsin(0.01) if scheme == "rattle" else 0.01)
+    x, _ = state_of(context)
+    assert np.arctan2(x[0, 1], x[0, 0]) == pytest.approx(angle, abs=1e-13)
+
+
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic"])
+@pytest.mark.parametrize("far", [1e3, 1e6])
+@pytest.mark.filterwarnings("ignore:held particles are")
+def test_far_from_the_origin(far, scheme):
+    integrator, context = free_on_sphere(scheme, 0.05, center=(far, -far, far))
+    integrator.step(200)
+    x, v = state_of(context)
+    # As near as numbers of this size come; the velocity does not suffer.
+    assert abs(np.linalg.norm(x - [far, -far, far]) - 2) <= 4 * np.spacing(far)
+    assert abs(np.linalg.norm(v) - 1) <= 1e-12 + 200 * np.spacing(far)
+
+
+def test_surfaces_free_particles_and_bonds_do_not_disturb_each_other():
+    """All in one System, and each kind alone: the same motion."""
+    dt, steps = 0.01, 100
+    x = np.array([[1.2, 0, 0], [0, 2.5, 0], [1, 1, 1], [0.5, 0, 0], [3, 3, 3], [5, 0, 0], [5, 1, 0], [0, 0, 0.5]])
+    v = np.array([[0, 1, 0.5], [1, 0, 1], [1, -1, 0], [0, 0.3, 1], [1, 2, 3], [0, 0, 1], [0, 0, -1], [0.3, 0.7, 0]])
+    surfaces = {
+        0: Sphere([0], [0, 0, 0], 1.2),
+        1: Torus([1], [0, 0, 0], [0, 0, 1], 2.0, 0.5),
+        2: Plane([2], [0, 0, 1], 1.0),
+        3: Formula("4*x1**2+y1**2+z1**2-1", [3]),
+        7: Ellipsoid([7], [0, 0, 0], [0.3, 0.4, 0.5]),
+    }
+    masses = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
+
+    def run(held):
+        system = system_of(masses, potential="0.5*(x^2+y*z)", springs=0)
+        system.addConstraint(5, 6, 1.0)
+        integrator = SurfaceIntegrator(dt, surfaces=[surfaces[k] for k in held], system=system, device=False)
+        context = started(system, integrator, x, v)
+        integrator.step(steps)
+        assert max(worst(integrator, context)) <= 1e-13
+        there, velocity = state_of(context)
+        assert abs(np.linalg.norm(there[5] - there[6]) - 1) <= 1e-10
+        assert abs((there[5] - there[6]) @ (velocity[5] - velocity[6])) <= 1e-9
+        return there
+
+    together = run(surfaces)
+    for k in surfaces:
+        alone = run([k])
+        assert np.abs(together[[k, 4]] - alone[[k, 4]]).max() <= 1e-13
+        assert np.abs(together[5:7] - alone[5:7]).max() <= 1e-9
+
+
+def test_a_curve_and_a_surface_that_moves():
+    """Two surfaces for a particle, also one that a constraint of the System ties; a radius that grows."""
+    system = system_of(potential="0.1*x*z", springs=0)
+    system.addConstraint(0, 1, 1.0)
+    surfaces = [
+        Sphere([0], [0, 0, 0], 1.0),
+        Plane([0], [0, 0, 1], 0.0),
+        Sphere([2], [0, 0, 0], lambda t: 1 + 0.1 * t),
+    ]
+    x = np.array([[1.0, 0, 0], [1.0, 0, 1.0], [0, 1.0, 0]])
+    integrator = SurfaceIntegrator(0.01, surfaces=surfaces, system=system, positions=x, device=False)
+    context = started(system, integrator, x, [[0, 0.5, 0], [0.2, 0.3, 0.1], [0.3, 0, 0]])
+    integrator.step(100)
+    there, _ = state_of(context)
+    assert np.linalg.norm(there[0]) == pytest.approx(1, abs=1e-14)
+    assert there[0, 2] == pytest.approx(0, abs=1e-15)
+    assert np.linalg.norm(there[0] - there[1]) == pytest.approx(1, abs=1e-14)
+    assert np.linalg.norm(there[2]) == pytest.approx(1.1, abs=1e-13)
+    assert integrator.multipliers(context).shape == (3,)
+    assert integrator.constraint_forces(context)[1] == pytest.approx(np.zeros(3))
+
+
+# -- outside of steps -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["sphere", "torus", "formula"])
+def test_positions_and_velocities_are_checked_and_can_be_put_right(kind):
+    integrator, context = on_surface(kind, "rattle", 0.01)
+    context.setPositions(POSITIONS + np.array([[0, 0, 0], [0.05, 0.02, -0.03], [0, 0, 0]]))
+    with pytest.raises(InputError, match=r"positions are off row .*\(1\)") as caught:
+        integrator.check(context)
+    assert caught.value.atoms == (1,)
+    integrator.applyConstraints(context)
+    context.setVelocities(VELOCITIES)
+    with pytest.raises(InputError, match="velocities are off row"):
+        integrator.check(context)
+    integrator.applyVelocityConstraints(context)
+    integrator.check(context)
+    assert max(worst(integrator, context)) <= 1e-13
+
+
+@pytest.mark.parametrize(("kind", "scheme"), [("torus", "rattle"), ("cylinder", "suzuki4"), ("sphere", "geodesic")])
+def test_forces_that_are_not_finite(kind, scheme):
+    # The root of a negative number once particle 1 has moved.
+    system = system_of(potential="1e-30*sqrt(10+y-1e6*step(0.9-x)*step(y-0.72))", springs=0)
+    surfaces = KINDS[kind](np.arange(3), POSITIONS)
+    integrator = SurfaceIntegrator(
+        50 * unit.femtosecond, scheme, surfaces=surfaces, system=system, device=False, positions=POSITIONS
+    )
+    context = started(system, integrator, POSITIONS, VELOCITIES)
+    with pytest.raises(NonFiniteError) as caught:
+        integrator.step(200)
+    assert caught.value.step is not None
+    x, v = state_of(context)
+    assert np.isfinite(x).all()
+    assert np.isfinite(v).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_constraint_forces(kind):
+    integrator, context = on_surface(kind, "rattle", 0.01)
+    integrator.step(10)
+    x, v = state_of(context)
+    motion = Motion(ConstraintSet(integrator.surfaces, x, MASSES), x)
+    expected = motion.constraint_force(x, v, force_of(x))
+    assert integrator.constraint_forces(context) == pytest.approx(expected, abs=1e-11)
+    assert integrator.multipliers(context) == pytest.approx(motion.multipliers(x, v, force_of(x)), abs=1e-11)
+    assert integrator.degrees_of_freedom(context) == 6
+
+
+def test_open_targets_are_those_of_the_start():
+    held = [Sphere([0], CENTER), Plane([2], [0, 0, 1]), Torus([1], CENTER, [0, 0, 1], 2.0)]
+    quantity = unit.Quantity(POSITIONS * 10, unit.angstrom)
+    integrator = SurfaceIntegrator(0.001, surfaces=held, system=system_of(), positions=quantity, device=False)
+    for item in integrator.surfaces:
+        assert item.measure(POSITIONS[item.atoms], 0.0) == pytest.approx(item.target_at(0.0), abs=1e-15)
+
+
+def test_multipliers_know_which_forces_act():
+    """Forces of a group that was left out entered them."""
+    system = openmm.System()
+    system.addParticle(10.0)
+    idle = openmm.CustomExternalForce("100*x")
+    idle.addParticle(0, [])
+    idle.setForceGroup(3)
+    system.addForce(idle)
+    integrator = SurfaceIntegrator(2e-3, surfaces=Sphere([0], [0, 0, 0], 2.0), system=system, device=False)
+    integrator.setIntegrationForceGroups({0})
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions([[2, 0, 0]])
+    context.setVelocities([[0, 3, 0]])
+    assert integrator.multipliers(context) == pytest.approx([-45])
+    np.testing.assert_allclose(integrator.constraint_forces(context), [[-45, 0, 0]], atol=1e-12)
+
+
+def test_copies_hold_the_same_surfaces():
+    integrator, context = on_surface("torus", "rattle", 0.01)
+    integrator.step(20)
+    other = copy.deepcopy(integrator)
+    assert isinstance(other, SurfaceIntegrator)
+    there = started(context.getSystem(), other, POSITIONS, VELOCITIES)
+    other.step(20)
+    assert np.array_equal(state_of(there)[0], state_of(context)[0])
