@@ -76,7 +76,7 @@ MUTANTS = {
     ],
     "openmm/integrator/program.py": [
         (
-            "«        for name, value in self.settings.items():\n            self.write(name, value)\n→»",
+            "for name, value in («*self.settings.items(), →»*self.idle.items()):",
             "test_settings.py::test_a_setting_has_a_method_of_its_own",
         ),
     ],
