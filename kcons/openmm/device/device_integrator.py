@@ -81,7 +81,7 @@ def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
         return f"{type(ensemble).__name__} has no kernels"
     if parts and isinstance(ensemble, LangevinRespa):
         return f"{type(ensemble).__name__} holds no parts"
-    if why := rows_refusal(parts):
+    if parts and (why := rows_refusal(parts)):
         return why
     for operation in ensemble.operations(scheme):
         if operation.verb not in VERBS or (isinstance(operation, Fly) and operation.exact):

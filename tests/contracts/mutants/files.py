@@ -76,6 +76,10 @@ MUTANTS = {
             "test_rows_by_name.py::test_bodies_that_a_missing_cell_tears_are_refused",
         ),
     ],
+    "topology/other_units.py": [
+        ('powers.get("length", «0→1»)', "test_other_units.py::test_the_same_points_fulfil_it"),
+        ('not powers.keys() <= {«→"unknown", »', "test_other_units.py::test_what_has_no_known_units_is_refused"),
+    ],
     "topology/angle_rows.py": [
         (
             "flat = volume < «→-»np.sin(np.radians(FLAT_CENTER))",

@@ -104,6 +104,10 @@ MUTANTS = {
         ),
     ],
     "openmm/ensembles/isokinetic_ensemble.py": [
+        (
+            "return (count« - 1→») * GAS_CONSTANT * self.temperature",
+            "test_thermostats_beside_parts.py::test_a_run_has_the_temperature",
+        ),
         ('"max(qq«-wq→», wq^2/ww)"', "test_isokinetic_ensemble.py::test_two_sums_do_where_velocities_are_not_read"),
         (
             'program.set("exact", «float(precision == "double" and not rigid)→0.0»)',
