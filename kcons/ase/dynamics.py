@@ -294,8 +294,10 @@ class ConstrainedDynamics(MolecularDynamics):
             if equal_pairs(x, last.positions, p, self._momenta):
                 if last.step == self.nsteps and last.time == self.time:
                     return last
-                remainder = last.time_remainder if last.time == self.time else 0.0
-                return replace(last, time=self.time, step=self.nsteps, time_remainder=remainder)
+                if last.time == self.time:
+                    return replace(last, step=self.nsteps)
+                require_on_surface(system.motion.constraint_set, x, self.time)
+                return replace(last, time=self.time, step=self.nsteps, time_remainder=0.0)
             same = bool((last.positions == x).all())
         v = np.divide(p, self._masses, out=np.zeros_like(p), where=self._masses != 0.0)
         require_on_surface(system.motion.constraint_set, x, self.time)

@@ -13,7 +13,8 @@ from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError
 from kcons.plan.clusters import Shape, classify, cluster_labels
-from kcons.plan.rank import mark_dependent_rows, rank_of_shape, small_enough
+from kcons.plan.rank import mark_dependent_rows, rank_of_small, small_enough
+from kcons.solvers.addressable_solvers import AddressableSolver
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -232,7 +233,13 @@ def make_plan(
             rank = shape.rows.size
         else:
             lattice = None if whole else constraint_set.lattice
-            rank = seen = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time, moved)
+            if isinstance(solver, GeneralClusters):
+                rank = solver.rank(whole_positions, time, moved)
+            elif isinstance(solver, AddressableSolver):
+                rank = solver.rank(whole_positions, lattice, time, moved)
+            else:
+                rank = rank_of_small(shape, inverse_masses, whole_positions, lattice)
+            seen = rank
         if shape.kind == "SingleRows" and rank < shape.rows.size:
             shape = replace(shape, kind="SparseRows")
         alone = shape.independent or shape.kind == "SingleRows"

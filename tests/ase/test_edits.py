@@ -110,6 +110,18 @@ def test_what_a_file_rounds_is_put_right_without_heat(name):
     assert np.abs(ends[1] - ends[0]).max() <= 1e-4 * np.abs(ends[0]).max()
 
 
+def test_time_that_is_set_is_no_way_of_moving_targets():
+    """In one step, which would be made into velocity of all that hangs on them."""
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    length = atoms.get_distance(0, 1)
+    run = ConstrainedDynamics(atoms, FS, constraints=[Distance([[0, 1]], lambda t: length + 0.001 * t)])
+    run.run(2)
+    run.time += 200
+    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0\.2"):
+        run.run(1)
+
+
 # -- the cell ---------------------------------------------------------------------------------------
 
 

@@ -3,6 +3,10 @@
 MUTANTS = {
     "ase/dynamics.py": [
         (
+            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                return replace",
+            "ase/test_edits.py::test_time_that_is_set_is_no_way_of_moving_targets",
+        ),
+        (
             'step == self.nsteps« and np.array_equal(self.atoms.arrays["momenta"], self._momenta)→»',
             "test_logger.py::test_with_noise_the_log_is_of_the_middle_of_the_step",
         ),
