@@ -36,17 +36,19 @@ class Constraints(SystemConstraint):
     def __init__(self, motions: Sequence[Motion], system_idx: torch.Tensor) -> None:
         super().__init__(system_idx)
         self.motions = tuple(motions)
-        self._made: tuple[torch.Tensor, Batch, torch.Tensor | None] | None = None
+        #: Tensors that the engine was made for, with their versions, the engine, and its atoms.
+        self._made: tuple[list[tuple[torch.Tensor, int]], Batch, torch.Tensor | None] | None = None
 
     def batch(self, state: SimState) -> tuple[Batch, torch.Tensor | None]:
         """The engine for all systems of a state, and its atoms, None if these are all of the state."""
-        # TorchSim sets another system_idx where it reorders systems.
-        if self._made is None or self._made[0] is not self.system_idx or self._made[1].dtype != state.dtype:
+        # TorchSim sets another system_idx where it reorders systems; masses and cells can be edited in a run.
+        seen = [(each, each._version) for each in (self.system_idx, state.masses, state.cell)]
+        if self._made is None or any(a is not b or n != m for (a, n), (b, m) in zip(self._made[0], seen, strict=True)):
             self.check_fits(state)
             motions = [self.motions[k] for k in torch.argsort(self.system_idx).tolist()]
             part = torch.isin(state.system_idx, self.system_idx)
             batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=1)
-            self._made = self.system_idx, batch, None if bool(part.all()) else part.nonzero().ravel()
+            self._made = seen, batch, None if bool(part.all()) else part.nonzero().ravel()
         return self._made[1:]
 
     def check_fits(self, state: SimState) -> None:

@@ -18,13 +18,15 @@ from torch_sim.integrators.md import InverseTimeArg, NoseHooverChain, TimeArg, c
 from torch_sim.models.interface import ModelInterface
 from torch_sim.units import unit_factor_from_annotation
 
-from kcons.errors import ConvergenceError, NonFiniteError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.torchsim.constraints_object import Constraints, constraints_of
 
 __all__ = ["Integrator", "NoseHooverState", "langevin", "nose_hoover", "nve"]
 
 #: Without other settings, as in TorchSim: tau over time step, and friction times time step.
 PERIODS, FRICTION = 10.0, 0.01
+#: Farther from the constraints (in TorchSim's unit) atoms are not brought onto them without a word.
+FAR = 1e-3
 
 State = TypeVar("State", bound=MDState)
 
@@ -75,6 +77,14 @@ def _start(state: SimState, model: ModelInterface, kT: Any, at_rest: bool) -> MD
     held.check_fits(state)
     start = copy.copy(state)
     start.positions = held.move(state, state.positions)[0]
+    away = (start.positions - state.positions).abs().amax(1)
+    if bool(away.max() > FAR):
+        atom = int(away.argmax())
+        raise InputError(
+            f"system {int(state.system_idx[atom])} has atom {atom} {float(away[atom]):.3g} off its constraints, moved "
+            "since these were made; put it back, or set state.constraints = [] and hold again",
+            item="state",
+        )
     masses = state.masses[:, None]
     given = getattr(state, "momenta", None)
     if given is None:

@@ -121,8 +121,9 @@ class WithStress(Drops):
     [
         (lambda state: setattr(state, "masses", 2 * state.masses), "mass"),
         (lambda state: setattr(state, "cell", 1.1 * state.cell), "cell"),
+        (lambda state: state.positions[1].add_(0.1), "atom [012] 0.0.* off its constraints"),
     ],
-    ids=["masses", "cell"],
+    ids=["masses", "cell", "positions"],
 )
 def test_a_state_that_has_become_another_is_refused(change, says):
     x = drop(2).positions.numpy()
@@ -131,6 +132,13 @@ def test_a_state_that_has_become_another_is_refused(change, says):
     change(state)
     with pytest.raises(InputError, match=rf"system 0 .*{says}.*hold again"):
         nve.init(state, Drops(), kT=300 * K)
+
+
+def test_masses_that_are_edited_in_a_run_are_refused():
+    state = nve.init(held(), Drops(), kT=300 * K)
+    state.masses.mul_(2)
+    with pytest.raises(InputError, match="system 0 has masses"):
+        nve.step(state, Drops(), dt=torch.tensor(0.01), kT=300 * K)
 
 
 def test_rows_that_are_singular_are_converted():

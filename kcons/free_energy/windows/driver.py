@@ -129,6 +129,9 @@ class FreeEnergy:
         """Free energy along the only coordinate, kJ/mol."""
         if len(self.names) != 1:
             raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
+        if self.failed and not self.windows:
+            name, why = next(iter(self.failed.items()))
+            raise InputError(f"all windows failed, so that there is no profile; {name}: {why}", item="failed")
         f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("force", "error"))
         x, (period,) = self._places()
         return integrate(x[:, 0], f, e, period=period)

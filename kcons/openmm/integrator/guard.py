@@ -208,7 +208,12 @@ class Guard:
         context = self._context()
         if context is None or self._size != _size(self.system):
             return False
-        return self._left is None or self._left == (context.getStepCount(), box_of(context))
+        return self._left is None or self._left == self._place(context)
+
+    def _place(self, context: openmm.Context) -> tuple[Any, ...]:
+        """Where a call ends: step count, box, and the time, where targets depend on it."""
+        driven = any(part.driven for part in self.integrator.parts)
+        return context.getStepCount(), box_of(context), context.getTime()._value if driven else 0.0
 
     @property
     def in_run(self) -> bool:
@@ -225,7 +230,7 @@ class Guard:
     def leave(self) -> None:
         """A call of `step` ends."""
         context = self.context
-        self._left = context.getStepCount(), box_of(context)
+        self._left = self._place(context)
         if self.integrator.parts:
             self._parameters = dict(context.getParameters())
 

@@ -3,6 +3,10 @@
 MUTANTS = {
     "ase/dynamics.py": [
         (
+            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                return replace",
+            "ase/test_edits.py::test_time_that_is_set_is_no_way_of_moving_targets",
+        ),
+        (
             'step == self.nsteps« and np.array_equal(self.atoms.arrays["momenta"], self._momenta)→»',
             "test_logger.py::test_with_noise_the_log_is_of_the_middle_of_the_step",
         ),
@@ -19,7 +23,7 @@ MUTANTS = {
             "test_binding.py::test_forces_of_the_same_calculator_that_changed",
         ),
         (
-            "if «now < befor→Fals»e and (self._more",
+            "if «now < before→False» and self._more:",
             "test_binding.py::test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these",
         ),
     ],

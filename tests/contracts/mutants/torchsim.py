@@ -6,6 +6,10 @@ STATES, DYNAMICS, REFUSALS = (
 
 MUTANTS = {
     "torchsim/constraints_object.py": [
+        (
+            "if self._made is None or any(a is not b «or n != m→»",
+            REFUSALS + "masses_that_are_edited_in_a_run_are_refused",
+        ),
         ("(torch.cumsum(system_mask, 0) - «1→0»)", STATES + "slices_take_the_right_rows_along"),
         (
             "for k in torch.«argsort(self.system_idx)→arange(len(self.motions))»",
@@ -19,6 +23,7 @@ MUTANTS = {
         ("[FixedAtoms(fixed)] if «len(fixed)→False»", STATES + "fixed_atoms_are_taken_over"),
     ],
     "torchsim/dynamics.py": [
+        ("if bool(away.max() > «FAR→1e9»)", REFUSALS + "a_state_that_has_become_another_is_refused[positions]"),
         ("state.momenta + masses * push / «dt→(2 * dt)»", DYNAMICS + "constant_energy_is_the_trajectory_of_the_engine"),
         ("(1 - keep**«2→1»)", DYNAMICS + "short_runs_have_the_temperature_of_the_bath[langevin]"),
         ("- 3 * «_free(self)→1»", STATES + "fixed_atoms_are_taken_over"),

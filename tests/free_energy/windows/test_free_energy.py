@@ -105,6 +105,11 @@ def test_surfaces_of_torsions_beyond_their_period():
         _ = both.profile
 
 
+def test_where_all_windows_failed_a_profile_says_why():
+    with pytest.raises(InputError, match=r"all windows failed.*window-0000-up: no force"):
+        _ = FreeEnergy(("a",), np.full(1, PERIOD), [], {"window-0000-up": "no force"}).profile
+
+
 @pytest.fixture
 def sampled(tmp_path):
     windows = Windows(

@@ -21,7 +21,7 @@ from openmm import app, unit
 from openmm_systems import forces_at, masses_of
 
 from kcons.constraints import Angle, CenterOfMass, Distance, FixedAtoms, RadiusOfGyration, Sphere
-from kcons.errors import ConvergenceError
+from kcons.errors import ConvergenceError, InputError
 from kcons.openmm import ProjectedIntegrator, hold
 from kcons.steppers import System, run
 
@@ -75,6 +75,15 @@ def test_targets_move_with_the_time_after_a_new_step_size(calls):
     for steps in calls:
         integrator.step(steps)
         assert off_target(context) < 1e-12
+
+
+def test_time_that_is_set_is_no_way_of_moving_targets():
+    """What a step would have to go is made into velocity of all that hangs on the rows."""
+    integrator, context = begun(*driven())
+    integrator.step(2)
+    context.setTime(3.0)
+    with pytest.raises(InputError, match="positions are off row"):
+        integrator.step(1)
 
 
 @pytest.mark.usefixtures("without_device")
