@@ -68,8 +68,7 @@ def test_one_bond_as_the_core_stepper(options):
     listed = "\n".join(f"  {operation}" for operation in stepper.operations())
     assert listed in integrator.listing()
     state, n = State(x, v), ensemble.length
-    # Velocities are differences of positions over a drift, an eighth of a step with 'geodesic'.
-    limit = 1e-12 if scheme == "rattle" else 2e-11
+    limit = 1e-12
     for steps in (1, 1, 48, 250):
         for _ in range(steps):
             state = stepper.step(core, state, dt)
