@@ -24,10 +24,9 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parents[1] / "tests"), str(HERE)]
 
 import harness  # noqa: E402
-from hard_cases.contract import CannotExpressError, Frame, NotIntactError, Program  # noqa: E402
 from hard_cases.long_runs import secular_drift  # noqa: E402
 from hard_cases.problem import Array, Problem  # noqa: E402
-from hard_cases.programs import Core, PlainAse, PlainOpenMM  # noqa: E402
+from hard_cases.programs import CannotExpressError, Core, Frame, NotIntactError, PlainAse, PlainOpenMM, Program  # noqa: E402
 
 from kcons import ConstraintSet, Motion, State, System, steppers  # noqa: E402
 from kcons.comparison.projected_equation import ProjectedEquation  # noqa: E402

@@ -266,12 +266,15 @@ class ConstrainedDynamics(MolecularDynamics):
             self._cell = surroundings(self.atoms)
 
     def _refresh_properties(self) -> None:
-        # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
         if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
-            state = self._start(self._systems())
             with in_step(self.nsteps):
-                self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
+                self._ask_calculators()
             self._asked = self._calculators_now()
+
+    def _ask_calculators(self) -> None:
+        """Have forces at the last positions, with which some steppers do not end, for someone who looks."""
+        state = self._start(self._systems())
+        self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
 
     def _start(self, system: System) -> State:
         """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""

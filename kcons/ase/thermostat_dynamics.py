@@ -15,7 +15,7 @@ from ase import Atoms, units
 from ase.calculators.mixing import SumCalculator
 
 from kcons.ase.binding import FORCES_ONLY, unchanged_on_failure
-from kcons.ase.dynamics import ConstrainedDynamics, in_step
+from kcons.ase.dynamics import ConstrainedDynamics
 from kcons.ase.pressure import AtomsSystem
 from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.constraints import Constraint
@@ -430,7 +430,15 @@ class MultipleTimeSteps(ThermostattedDynamics):
                 item="slow",
             )
         for name, calculator in (("fast", fast), ("slow", slow)):
-            _check_calculator(name, calculator, atoms)
+            if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
+                raise InputError(f"{name} is {calculator!r:.80}; give an ASE calculator", item=name)
+            forces = as_float_array(calculator.get_forces(atoms), f"forces of {name}")
+            if forces.shape != (len(atoms), 3):
+                raise InputError(
+                    f"{name} computes forces of shape {forces.shape}, not of these {len(atoms)} atoms "
+                    f"({atoms.get_chemical_formula()}); fast and slow must be of the same atoms",
+                    item=name,
+                )
         self._calculators = fast, slow
         cheap, expensive = self._forces_of(fast, True), self._forces_of(slow, difference)
         if difference:
@@ -497,29 +505,10 @@ class MultipleTimeSteps(ThermostattedDynamics):
             raise UnsupportedError("nothing like an energy is conserved on spheres; look at averages instead")
         return super().get_conserved_energy()
 
-    def _refresh_properties(self) -> None:
+    def _ask_calculators(self) -> None:
         """A step ends with both forces where the atoms are, which are added up for someone who looks."""
-        if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
-            with in_step(self.nsteps):
-                self.atoms.get_potential_energy(apply_constraint=False)
-                self.atoms.get_forces(apply_constraint=False)
-            self._asked = self._calculators_now()
-
-
-def _check_calculator(name: str, calculator: Any, atoms: Atoms) -> None:
-    """Refuse what is no calculator of these atoms; it is called once where they are."""
-    if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
-        raise InputError(f"{name} is {calculator!r}; give an ASE calculator", item=name)
-    forces = as_float_array(calculator.get_forces(atoms), f"forces of {name}")
-    known = getattr(calculator, "atoms", None)
-    other = isinstance(known, Atoms) and not np.array_equal(known.numbers, atoms.numbers)
-    if forces.shape != (len(atoms), 3) or other:
-        found = f"{len(known)} atoms ({known.get_chemical_formula()})" if isinstance(known, Atoms) else "other atoms"
-        raise InputError(
-            f"{name} computes forces of shape {forces.shape} of {found}, not of these {len(atoms)} "
-            f"({atoms.get_chemical_formula()}); fast and slow must be of the same atoms",
-            item=name,
-        )
+        self.atoms.get_potential_energy(apply_constraint=False)
+        self.atoms.get_forces(apply_constraint=False)
 
 
 def draw_velocities(

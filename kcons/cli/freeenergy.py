@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from kcons.cli.parser import Command, Option
 from kcons.cli.scan import INCOMPLETE
 from kcons.cli.terminal import say_written, show
-from kcons.errors import InputError
 
 if TYPE_CHECKING:
     from kcons.free_energy.windows.input_file import InputFile
@@ -20,18 +19,12 @@ def _free_energy(chosen: argparse.Namespace) -> int:
 
     from kcons.comparison.progress import Watcher
     from kcons.free_energy import Windows, read_input
+    from kcons.free_energy.windows.input_file import executor_at
     from kcons.steppers.files import in_one_piece, text
 
     given = read_input(chosen.input, allow_modules=chosen.allow_module or ())
     if chosen.list:
         return _list(given)
-    if given.scheduler is not None and chosen.scheduler is None:
-        raise InputError(
-            f"the input file is to run at {given.scheduler}, a scheduler whose answers may run code here; if you "
-            f"trust it, say so: --scheduler {given.scheduler}",
-            item="scheduler",
-        )
-    given = replace(given, scheduler=chosen.scheduler)
     folder: Path = chosen.out or Path(chosen.input.stem)
     how = {**given.options, "workers": given.processes if chosen.workers is None else chosen.workers}
     windows = Windows(given.sampler, folder, given.settings, **how)
@@ -39,7 +32,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
     slow = replace(given.settings, pull=given.pull_steps)
     pulls = Windows(given.sampler, folder / "pulls", slow, **how) if given.pulls else None
     watcher = Watcher(shown=True)
-    with windows.taken(), watcher, watcher.piece("windows", 1.0), given.executor() as executor:
+    with windows.taken(), watcher, watcher.piece("windows", 1.0), executor_at(chosen.scheduler) as executor:
 
         def progress(done: int, total: int, seconds: float) -> None:
             watcher.advance(done / total)
@@ -87,7 +80,7 @@ COMMAND = Command(
         Option("input", "structure, forces, coordinates and sampling, in TOML", type=Path, metavar="INPUT"),
         Option("--out", "folder of the windows and results (default ./INPUT without its ending)", type=Path),
         Option("--workers", "processes of this machine (default: of the file, or one a core)", type=int),
-        Option("--scheduler", "address of a Dask scheduler, such as tcp://host:8786, in place of processes"),
+        Option("--scheduler", "address of a Dask scheduler that you trust, such as tcp://host:8786"),
         Option(
             "--allow-module",
             "let the input file take a calculator of this Python module, whose code then runs; may be repeated",

@@ -4,8 +4,7 @@
 - `solver_sequence`: all solvers of a plan, one after another, and what helps where one of them fails
 - `certificate`: results checked by the constraints as they were given
 - `failures`: what to tell the user where a solve failed
-- `report`: what is held, and how well
-- `condition`: condition numbers of clusters
+- `report`: what is held, how well, and condition numbers of clusters
 - `restoring`: positions that are off, brought onto the constraints
 - `minimization`: statics
 """

@@ -120,10 +120,9 @@ class Failures:
         )
 
     def start(
-        self, x: FloatArray, start: FloatArray, outcome: Outcome, solver: ClusterSolver, time: float
+        self, x: FloatArray, start: FloatArray, row: int, residual: float, iterations: int, time: float
     ) -> KconsError:
         """The error for start positions that cannot be brought onto the constraints; the search ended at `x`."""
-        row = global_row(outcome, solver)
         error = self.unusable(row, positions=start)
         if error is not None:
             return error
@@ -132,8 +131,8 @@ class Failures:
         return InfeasibleError(
             f"infeasible: residual cannot go below {sum_of_squares:.6g} (sum of squares) from these positions; "
             f"worst row {name}. Check its target against its neighbors', or start nearer to a solution",
-            residual=outcome.residual,
-            iterations=outcome.iterations,
+            residual=residual,
+            iterations=iterations,
             row=row,
             atoms=atoms,
         )

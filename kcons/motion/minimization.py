@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,15 +10,9 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import Positive, as_array, check_call, checked
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, KconsError, NonFiniteError
+from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.motion.motion import Motion
-
-#: Steps that are remembered for the curvature.
-MEMORY = 20
-#: Of the slope at the start, what a step must gain at least.
-GAIN = 1e-4
-#: Shortenings of one step.
-SHORTENINGS = 20
+from kcons.motion.restoring.descent import Descent, largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +37,7 @@ class Minimum:
     @property
     def largest(self) -> float:
         """The largest force left on an atom."""
-        return _largest(self.forces)
+        return largest(self.forces)
 
 
 @checked
@@ -95,111 +88,46 @@ def minimize(
     Manifolds, ch. 4 and 8 (retraction and transport by projection).
     """
     check_call("force", force, ("x", "t"))
-    descent = _Descent(motion, force, time)
+    shape, evaluations = (motion.n_atoms, 3), 0
+    finite = np.isfinite(motion.masses) & (motion.masses > 0)
+    mass = np.where(finite, motion.masses, 1.0)[:, None]
+
+    def acceleration(x: FloatArray) -> FloatArray:
+        nonlocal evaluations
+        evaluations += 1
+        f = as_array(force(x.copy(), time), shape, "force")
+        if not np.all(np.isfinite(f)):
+            atom = int(np.argmin(np.isfinite(f).all(axis=1)))
+            raise NonFiniteError(f"the force on atom {atom} is not finite: {f[atom]}", item="force", atom=atom)
+        return f / mass
+
+    descent = Descent(
+        acceleration,
+        lambda x, move: motion.project_forces(x, mass * move, time=time) / mass,
+        lambda x, reference: motion.project_positions(x, reference, time=time),
+        mass,
+    )
     x = motion.restore_positions(positions, time=time)
-    f = descent.forces(x)
+    a = descent.downhill(x)
     for step in range(steps + 1):
-        if _largest(f) <= tolerance:
-            return Minimum(x, f, step, descent.evaluations)
+        if largest(mass * a) <= tolerance:
+            return Minimum(x, mass * a, step, evaluations)
         if step == steps:
             break
-        x, f, gained = descent.advanced(x, f, longest)
+        x, a, gained = descent.advanced(x, a, longest)
         if not gained:
             break
+    left = largest(mass * a)
     error = ConvergenceError(
-        f"the largest force along the constraints is {_largest(f):.3g} after {step} steps, and not {tolerance:g}; "
+        f"the largest force along the constraints is {left:.3g} after {step} steps, and not {tolerance:g}; "
         + (
             "give more steps"
             if step == steps
             else "no step along the forces lowers their potential any further: they are no gradient, or not so exact"
         ),
-        residual=_largest(f),
+        residual=left,
         tolerance=tolerance,
         iterations=step,
     )
     error.positions = x
     raise error
-
-
-class _Descent:
-    """Steps with a memory, in coordinates weighted by the square roots of the masses."""
-
-    def __init__(self, motion: Motion, force: Callable[[FloatArray, float], ArrayLike], time: float) -> None:
-        self.motion, self.force, self.time = motion, force, time
-        self.evaluations = 0
-        self._shape = (motion.n_atoms, 3)
-        finite = np.isfinite(motion.masses) & (motion.masses > 0)
-        self._mass = np.where(finite, motion.masses, 1.0)[:, None]
-        #: Moves and changes of the force along them, both along the constraints.
-        self._memory: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=MEMORY)
-
-    def forces(self, x: FloatArray) -> FloatArray:
-        """Along the constraints."""
-        self.evaluations += 1
-        f = as_array(self.force(x.copy(), self.time), self._shape, "force")
-        if not np.all(np.isfinite(f)):
-            atom = int(np.argmin(np.isfinite(f).all(axis=1)))
-            raise NonFiniteError(f"the force on atom {atom} is not finite: {f[atom]}", item="force", atom=atom)
-        return self.motion.project_forces(x, f, time=self.time)
-
-    def advanced(self, x: FloatArray, f: FloatArray, longest: float) -> tuple[FloatArray, FloatArray, bool]:
-        """Positions and forces after a step that gains; those given, and False, if there is none."""
-        while True:
-            move = self._along(x, self._newton(f))
-            slope = float(np.vdot(f, move))
-            if not slope > 0 or not self._memory:
-                self._memory.clear()
-                move = self._along(x, f / self._mass)
-                move *= longest / _largest(move)
-                slope = float(np.vdot(f, move))
-            move *= min(1.0, longest / _largest(move))
-            slope = float(np.vdot(f, move))
-            size = 1.0
-            for _ in range(SHORTENINGS):
-                try:
-                    there = self.motion.project_positions(x + size * move, x, time=self.time)
-                except KconsError:  # too far for this place
-                    size *= 0.25
-                    continue
-                if np.array_equal(there, x):  # all that is left is rounding
-                    break
-                after = self.forces(there)
-                left = float(np.vdot(after, move))
-                # The potential falls by the mean of the slopes, to third order.
-                if slope + left > GAIN * slope:
-                    self._remember(there, size * move, f - after)
-                    return there, after, True
-                size *= max(0.1, min(0.7, slope / (slope - left)))
-            if not self._memory:
-                return x, f, False
-            self._memory.clear()  # it led nowhere: once more along the forces
-
-    def _along(self, x: FloatArray, move: FloatArray) -> FloatArray:
-        """What of a move is along the constraints."""
-        return self.motion.project_forces(x, self._mass * move, time=self.time) / self._mass
-
-    def _remember(self, x: FloatArray, move: FloatArray, change: FloatArray) -> None:
-        move = self._along(x, move)
-        change = self.motion.project_forces(x, change, time=self.time)
-        weight = np.sqrt(self._mass)
-        curvature = float(np.vdot(move, change))
-        if curvature > 1e-10 * float(np.linalg.norm(weight * move) * np.linalg.norm(change / weight)):
-            self._memory.append((move, change))
-
-    def _newton(self, f: FloatArray) -> FloatArray:
-        """The move that the memory suggests (two-loop recursion)."""
-        if not self._memory:
-            return f / self._mass
-        q, parts = f.copy(), []
-        for move, change in reversed(self._memory):
-            parts.append(float(np.vdot(move, q) / np.vdot(move, change)))
-            q -= parts[-1] * change
-        move, change = self._memory[-1]
-        found = q / self._mass * float(np.vdot(move, change) / np.vdot(change, change / self._mass))
-        for (move, change), part in zip(self._memory, reversed(parts), strict=True):
-            found += (part - float(np.vdot(change, found) / np.vdot(move, change))) * move
-        return found
-
-
-def _largest(f: FloatArray) -> float:
-    return float(np.sqrt(np.max(np.einsum("ij,ij->i", f, f), initial=0.0)))

@@ -1,4 +1,9 @@
-"""What is held at given positions, and how well."""
+"""What is held at given positions, how well, and how well posed it is: condition numbers of clusters.
+
+The condition of a cluster is the largest over the smallest non-zero singular value of its mass-weighted
+A M^-1/2 with rows of unit length. Dependent rows do not count: singular values of zero are left out. Forces
+and multipliers lose about as many digits as the condition has.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +11,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.motion.condition import worst_condition
+from kcons.constraints.vectors import row_norms
 from kcons.plan.independent_blocks import fixed_atoms
 from kcons.plan.plan import ClusterKind, Plan
+from kcons.solvers.rank_revealing import independent
 
 #: Conversions that a printed report names.
 SHOWN = 4
+#: Largest cluster, in rows, that goes through dense singular values.
+DENSE_ROWS = 300
+#: With dependent rows, for which the sparse way has no cheap answer, dense ones go this far.
+DENSE_DEPENDENT_ROWS = 1500
+#: Numbers in the dense matrices of one portion of clusters.
+PORTION = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -24,7 +38,7 @@ class KindReport(ClusterKind):
     Attributes
     ----------
     condition : float
-        Of the worst cluster, see `kcons.motion.condition`; NaN where it was not asked for or is out of reach.
+        Of the worst cluster; NaN where it was not asked for or is out of reach.
     iterations : int
         Newton iterations of the worst cluster in the last position projection; 0 before the first.
     """
@@ -131,3 +145,92 @@ def make_report(
         kinds=kinds,
         conversions=[str(body) for body in constraint_set.conversions],
     )
+
+
+def worst_condition(
+    jacobian: sp.csr_array, inverse_masses: FloatArray, rows: IntArray, labels: IntArray, *, deficiency: int
+) -> float:
+    """Largest condition among the clusters that `rows` form.
+
+    Parameters
+    ----------
+    jacobian : csr_array, shape (n_rows, 3 n_atoms)
+        A of the whole set.
+    inverse_masses : ndarray, shape (n_atoms,)
+        0 for fixed atoms.
+    rows : ndarray of int
+        Whole clusters.
+    labels : ndarray of int, shape (n_rows,)
+        Cluster of every row of the set.
+    deficiency : int
+        Rows of these clusters that depend on others.
+
+    Returns
+    -------
+    float
+        NaN where a gradient vanishes, or a cluster is too large for dense algebra and has dependent rows.
+    """
+    rows = np.sort(rows)
+    rows = rows[np.argsort(labels[rows], kind="stable")]
+    unit = sp.csr_array(jacobian[rows])
+    unit.data = unit.data * np.repeat(np.sqrt(inverse_masses), 3)[unit.indices]
+    norms = row_norms(unit)
+    if not np.all(np.isfinite(norms) & (norms > 0)):
+        return float("nan")
+    unit.data *= np.repeat(1.0 / norms, np.diff(unit.indptr))
+    first = np.flatnonzero(np.diff(labels[rows], prepend=-1))
+    sizes = np.diff(first, append=len(rows))
+    worst = 1.0
+    for size in np.unique(sizes):
+        starts = first[sizes == size]
+        if size <= (DENSE_DEPENDENT_ROWS if deficiency else DENSE_ROWS):
+            found = _dense(unit, starts, int(size))
+        elif deficiency:
+            return float("nan")
+        else:
+            found = max(_sparse(unit[start : start + size]) for start in starts)
+        worst = max(worst, found)
+    return worst
+
+
+def _dense(unit: sp.csr_array, starts: IntArray, size: int) -> float:
+    """Clusters of `size` rows side by side, in portions that fit into the memory."""
+    worst = 1.0
+    widths = [np.diff(unit.indptr)[starts + k] for k in range(size)]
+    most = int(sum(w.max() for w in widths))
+    portion = max(1, PORTION // (size * most))
+    for begin in range(0, len(starts), portion):
+        some = starts[begin : begin + portion]
+        n = len(some)
+        low, high = unit.indptr[some], unit.indptr[some + size]
+        entry = np.repeat(low - np.concatenate([[0], np.cumsum(high - low)[:-1]]), high - low)
+        entry = entry + np.arange(len(entry))
+        cluster = np.repeat(np.arange(n), high - low)
+        line = np.searchsorted(unit.indptr, entry, side="right") - 1 - some[cluster]
+        # Columns numbered within each cluster; which number is whose does not matter.
+        key = cluster * unit.shape[1] + unit.indices[entry]
+        distinct, place = np.unique(key, return_inverse=True)
+        column = place - np.searchsorted(distinct, np.arange(n) * unit.shape[1])[cluster]
+        dense = np.zeros((n, size, int(column.max()) + 1))
+        np.add.at(dense, (cluster, line, column), unit.data[entry])
+        s = np.linalg.svd(dense, compute_uv=False)
+        smallest = np.min(np.where(independent(s), s, np.inf), axis=1)
+        worst = max(worst, float(np.max(s[:, 0] / smallest)))
+    return worst
+
+
+def _sparse(unit: sp.csr_array) -> float:
+    """One large cluster of independent rows: Lanczos for both ends of the spectrum of B B^T."""
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
+
+    gram = sp.csc_array(unit @ unit.T)
+    n = gram.shape[0]
+    start = np.random.default_rng(0).normal(size=n)
+    try:
+        factor = splu(gram, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        inverse = LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
+        largest = eigsh(gram, k=1, v0=start, tol=1e-4, return_eigenvectors=False)[0]
+        slowest = eigsh(inverse, k=1, v0=start, tol=1e-4, return_eigenvectors=False)[0]
+    except (RuntimeError, ArpackNoConvergence):  # singular to the last bit
+        return float("nan")
+    return float(np.sqrt(largest * slowest))

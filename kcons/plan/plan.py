@@ -11,9 +11,10 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import ContradictionError, UnsupportedError
+from kcons.errors import ContradictionError
 from kcons.plan.clusters import Shape, classify, cluster_labels
-from kcons.plan.rank import mark_dependent_rows, rank_of_shape, small_enough
+from kcons.plan.rank import mark_dependent_rows, rank_of_small, small_enough
+from kcons.solvers.addressable_solvers import AddressableSolver
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -165,25 +166,6 @@ class Plan:
         name, atoms = self.named.row_name(row), self.named.row_atoms(row)
         return ContradictionError(f"row {name} lies between fixed atoms{said}", rows=[int(row)], atoms=atoms)
 
-    def general_for_all(self, limit: int, *, equal: bool = False) -> GeneralClusters:
-        """The damped solver for every cluster, for positions that are far off; with equal masses if that is enough.
-
-        Raises
-        ------
-        UnsupportedError
-            A cluster has more than `limit` rows, too many for dense algebra.
-        """
-        rows = np.flatnonzero(self.labels >= 0)
-        sizes = np.bincount(self.labels[rows])
-        if len(sizes) and sizes.max() > limit:
-            name = self.named.row_name(int(rows[np.argmax(self.labels[rows] == np.argmax(sizes))]))
-            raise UnsupportedError(
-                f"these positions are too far off for the cluster of {sizes.max()} rows around {name}: start nearer "
-                "to the constraints (minimize with harmonic bonds first), or hold fewer rows"
-            )
-        inverse_masses = (self.inverse_masses > 0).astype(np.float64) if equal else self.inverse_masses
-        return GeneralClusters(self.constraint_set, rows, self.labels[rows], inverse_masses)
-
     def least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:
         """Multipliers of least norm with the same constraint force, where rows depend on each other."""
         if not self.dependent:
@@ -251,7 +233,13 @@ def make_plan(
             rank = shape.rows.size
         else:
             lattice = None if whole else constraint_set.lattice
-            rank = seen = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time, moved)
+            if isinstance(solver, GeneralClusters):
+                rank = solver.rank(whole_positions, time, moved)
+            elif isinstance(solver, AddressableSolver):
+                rank = solver.rank(whole_positions, lattice, time, moved)
+            else:
+                rank = rank_of_small(shape, inverse_masses, whole_positions, lattice)
+            seen = rank
         if shape.kind == "SingleRows" and rank < shape.rows.size:
             shape = replace(shape, kind="SparseRows")
         alone = shape.independent or shape.kind == "SingleRows"

@@ -9,9 +9,6 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
-from kcons.solvers.addressable_solvers import AddressableSolver
-from kcons.solvers.cluster_solver import ClusterSolver
-from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rank_revealing import independent, rank
 
 #: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
@@ -68,20 +65,3 @@ def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArra
     b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
     b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
     return rank(b.reshape(n, k, -1))
-
-
-def rank_of_shape(
-    shape: Shape,
-    inverse_masses: FloatArray,
-    positions: FloatArray,
-    lattice: FloatArray | None,
-    solver: ClusterSolver,
-    time: float,
-    moved: FloatArray | None,
-) -> int:
-    """Independent rows of a shape whose graph does not tell; `moved` as in `Request`."""
-    if isinstance(solver, GeneralClusters):
-        return solver.rank(positions, time, moved)
-    if isinstance(solver, AddressableSolver):
-        return solver.rank(positions, lattice, time, moved)
-    return rank_of_small(shape, inverse_masses, positions, lattice)

@@ -175,12 +175,15 @@ class _Stack:
         rows = np.take_along_axis(self.rows, order, axis=1)
         excess = np.abs(length[:, 0] + length[:, 1] - length[:, 2])
         done = plain & (excess <= length[:, 2] * np.where(suspects, MISFIT, _FLAT_TARGETS))
-        bodies = []
-        for k in np.flatnonzero(done):
-            ends, side = constraint_set.row_atoms(int(rows[k, 2])), constraint_set.row_atoms(int(rows[k, 0]))
-            c = length[k, 0 if ends[0] in side else 1] / (length[k, 0] + length[k, 1])
-            middle, weights = self.atoms[k].sum(keepdims=True) - ends.sum(), np.array([[1.0 - c, c]])
-            bodies.append(FlatBody(self.atoms[k], self.rows[k], ends, ends[None], length[k, 2:], middle, weights))
+        found = np.flatnonzero(done)
+        ends, side = (constraint_set.incidence[rows[found, k]].indices.reshape(-1, 2).astype(np.int64) for k in (2, 0))
+        nearer = np.where((ends[:, :1] == side).any(axis=1), 0, 1)
+        c = length[found, nearer] / (length[found, 0] + length[found, 1])
+        middle = self.atoms[found].sum(axis=1) - ends.sum(axis=1)
+        bodies = [
+            FlatBody(self.atoms[k], self.rows[k], pair, pair[None], length[k, 2:], m[None], np.array([[1.0 - w, w]]))
+            for k, pair, m, w in zip(found, ends, middle, c, strict=True)
+        ]
         return bodies, done
 
     def off_target(self, constraint_set: ConstraintSet, x: FloatArray, sigma: FloatArray, time: float) -> BoolArray:

@@ -17,7 +17,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
-from kcons.solvers.rank_revealing import damped, independent, least_norm, rank
+from kcons.solvers.rank_revealing import independent, least_norm, rank
 from kcons.solvers.tolerances import (
     DENSE_SPEED_TOLERANCE,
     EPS,
@@ -27,7 +27,6 @@ from kcons.solvers.tolerances import (
     MAX_ITERATIONS,
     ROUNDING,
     ROUNDINGS,
-    STALLED,
 )
 
 
@@ -263,67 +262,6 @@ class GeneralClusters:
             flat_moves[batch.columns] += factor[:, None] * shift
             sigma, error = trial, trial_error
         return _failed(batch, held & ~done[:, None], MAX_ITERATIONS, np.abs(sigma) / scale)
-
-    def restore(self, x: FloatArray, *, time: float) -> Outcome:
-        """Bring far-off positions onto the surface in place: damped Gauss-Newton in the mass metric."""
-        state = x[self.atoms]
-        worst = Outcome(True, 0.0, 0, -1)
-        with np.errstate(all="ignore"):
-            for batch in self._batches:
-                outcome = self._gauss_newton(batch, state, time)
-                if not outcome.converged:
-                    x[self.atoms] = state  # for the report on how far it came
-                    return outcome
-                worst = _worse(worst, outcome)
-        x[self.atoms] = state
-        return worst
-
-    def _gauss_newton(self, batch: _Batch, state: FloatArray, time: float) -> Outcome:
-        """Minimize |sigma| with the gradients at the current point; Levenberg-Marquardt where that stalls."""
-        held = self._held[batch.rows]
-        scale = self._scale[batch.rows]
-        root_w = self._root_w[batch.columns]
-        flat = state.reshape(-1)
-        sigma = self._sigma(batch, state, time) * held
-        error = _rms(sigma)
-        damping = np.zeros(len(batch.rows))
-        before = np.full(len(batch.rows), np.inf)
-        for iteration in range(1, 4 * MAX_ITERATIONS + 1):
-            data = self._data(state, time)
-            b = self._weighted(batch, data)
-            relative = np.abs(sigma) / scale
-            settled = _each(relative <= ROUNDINGS * self._rounding(batch, data, state))
-            if settled.all():
-                where = np.unravel_index(int(np.argmax(relative)), relative.shape)
-                return Outcome(True, float(relative[where]), iteration, int(batch.rows[where]))
-            size = np.linalg.norm(b, axis=2)
-            bad = held & ~(np.isfinite(size) & (size > 0) & np.isfinite(sigma))
-            if bad.any():
-                return _failed(batch, bad, iteration)
-            b = np.where(held[..., None], b, 0.0)
-            here = flat[batch.columns]
-            active = ~settled
-            for _ in range(MAX_HALVINGS):
-                step = -root_w * damped(b, sigma, damping)
-                flat[batch.columns] = here + np.where(active[:, None], step, 0.0)
-                trial = self._sigma(batch, state, time) * held
-                trial_error = _rms(trial)
-                worse = active & ~(trial_error < error)
-                if not worse.any():
-                    break
-                damping = np.where(worse, np.maximum(4 * damping, 1e-3), damping)
-            else:
-                flat[batch.columns] = here
-                return _failed(batch, held & worse[:, None], iteration, relative)
-            damping = np.where(active, 0.1 * damping, damping)
-            damping[damping < 1e-8] = 0.0
-            sigma, error = trial, trial_error
-            if iteration % STALLED == 0:
-                stalled = active & (error > (1 - 1e-8) * before)
-                if stalled.any():
-                    return _failed(batch, held & stalled[:, None], iteration, relative)
-                before = error
-        return _failed(batch, held & ~settled[:, None], 4 * MAX_ITERATIONS, np.abs(sigma) / scale)
 
     # -- tangents -------------------------------------------------------------------------------
 

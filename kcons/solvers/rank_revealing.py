@@ -33,13 +33,5 @@ def least_norm(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nrk,nr->nk", vt, _inverse(s) * np.einsum("nkr,nk->nr", u, right)))
 
 
-def damped(matrix: FloatArray, right: FloatArray, damping: FloatArray) -> FloatArray:
-    """B^+ right, or (B^T B + damping)^-1 B^T right where `damping`, in parts of |B|^2, is positive."""
-    u, s, vt = np.linalg.svd(matrix, full_matrices=False)
-    filtered = s / (s**2 + damping[:, None] * s[:, :1] ** 2)
-    weight = np.where(damping[:, None] > 0, filtered, _inverse(s))
-    return np.asarray(np.einsum("nrc,nr->nc", vt, weight * np.einsum("nkr,nk->nr", u, right)))
-
-
 def _inverse(singular: FloatArray) -> FloatArray:
     return np.where(independent(singular), 1 / np.where(singular > 0, singular, 1.0), 0.0)

@@ -11,7 +11,15 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import Kernels
-from kcons.solvers.distance_clusters import PackedLanes, SimdClusterSolver
+from kcons.solvers.distance_clusters import (
+    SAVED,
+    PackedLanes,
+    SimdClusterSolver,
+    dot,
+    lane_tables,
+    restore_points,
+    worst_row,
+)
 from kcons.solvers.kernels.aligned_memory import copied, in_one_array, room
 from kcons.solvers.kernels.array_views import at_first, halves, integers, none_of, table_array
 from kcons.solvers.kernels.eight_wide import (
@@ -28,7 +36,6 @@ from kcons.solvers.kernels.eight_wide import (
     square_root,
     store_triple,
 )
-from kcons.solvers.kernels.groups_of_eight import SAVED, dot, lane_tables, restore_points, worst_row
 from kcons.solvers.kernels.lattices import OPEN, lattice_numbers, minimum_image
 from kcons.solvers.tolerances import MAX_ITERATIONS, NEWTON_TOLERANCE, SPEED_TOLERANCE, TINY
 

@@ -28,9 +28,8 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_double,
 )
 from kcons.solvers.sparse.elimination import FAST
-from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, GivenRows, call_row
+from kcons.solvers.sparse.row_functions import BLOCK, FUNCTION, ROOM, GivenRows, call_row, call_rows
 from kcons.solvers.sparse.row_values import cell_of, miss, near
-from kcons.solvers.sparse.rows_at_once import BLOCK, call_rows
 from kcons.solvers.tolerances import (
     EPS,
     FLAT,

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.distance_clusters import SimdClusterSolver
-from kcons.solvers.kernels import groups_of_eight as groups
+from kcons.solvers.distance_clusters import SAVED, SimdClusterSolver, dot, lane_tables, restore_points, worst_row
 from kcons.solvers.kernels.aligned_memory import in_one_array, room
 from kcons.solvers.kernels.array_views import at_first, halves, integers, table_array
 from kcons.solvers.kernels.eight_wide import (
@@ -89,7 +88,7 @@ def _gram(matrix, left, right, coupling, n):
         x, y, z = _point(left, k)
         for j in range(n):
             a, b, c = _point(right, j)
-            poke(matrix, k * n + j, groups.dot(x, y, z, a, b, c) * peek(coupling, k * n + j))
+            poke(matrix, k * n + j, dot(x, y, z, a, b, c) * peek(coupling, k * n + j))
     _factor(matrix, n)
 
 
@@ -128,10 +127,10 @@ def _move_points(points, velocities, inverse_dt, atoms, at, weights, shifts, n_l
         w, i = weights[a], at + a * WIDTH
         dx, dy, dz = _point(shifts, a)
         dx, dy, dz = w * dx, w * dy, w * dz
-        x, y, z = keep_points(points, atoms, i, undo, saved + a * groups.SAVED)
+        x, y, z = keep_points(points, atoms, i, undo, saved + a * SAVED)
         scatter_points(points, atoms, i, x + dx, y + dy, z + dz)
         if move:
-            x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * groups.SAVED)
+            x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * SAVED)
             x, y, z = x + dx * inverse_dt, y + dy * inverse_dt, z + dz * inverse_dt
             scatter_points(velocities, atoms, i, x, y, z)
 
@@ -141,7 +140,7 @@ def _report(multipliers, slots, place, sign, bonds, total, n):
     """Multipliers of unit gradients."""
     for k in range(n):
         x, y, z = _point(bonds, k)
-        f = peek(total, k) * square_root(groups.dot(x, y, z, x, y, z))
+        f = peek(total, k) * square_root(dot(x, y, z, x, y, z))
         scatter(multipliers, slots, place, k, sign * f)
 
 
@@ -169,9 +168,9 @@ def _begin(
             length = gather(goal, slots, place, k)
             poke(squares, k, length * length)
         else:
-            square = groups.dot(x, y, z, x, y, z)
+            square = dot(x, y, z, x, y, z)
             poke(squares, k, square)
-            size = size + groups.dot(a, b, c, a, b, c)
+            size = size + dot(a, b, c, a, b, c)
             rate = splat(0.0)
             if driven:
                 rate = gather(goal, slots, place, k)
@@ -191,7 +190,7 @@ def _judge(error, step, squares, bonds, references, tangent, limit, n):
             # A bond that turned round has found the wrong root.
             x, y, z = _point(bonds, k)
             a, b, c = _point(references, k)
-            e, inner = absolute(e), groups.dot(x, y, z, a, b, c)
+            e, inner = absolute(e), dot(x, y, z, a, b, c)
         else:
             e = e * e
         poke(error, k, e)
@@ -249,12 +248,12 @@ def _kernel(n_rows: int) -> Any:
                 for k in range(n):
                     x, y, z = _point(r, k)
                     if tangent is None:
-                        e = peek(squares, k) - groups.dot(x, y, z, x, y, z)
+                        e = peek(squares, k) - dot(x, y, z, x, y, z)
                         limit = peek(squares, k) * (2.0 * NEWTON_TOLERANCE)
                         ok = ok and all_within(absolute(e), limit)
                     else:
                         a, b, c = _point(s, k)
-                        e = peek(wanted, k) - groups.dot(x, y, z, a, b, c)
+                        e = peek(wanted, k) - dot(x, y, z, a, b, c)
                         ok = ok and all_within(e * e, size * peek(squares, k))
                     poke(error, k, e)
                 if ok or iteration == MAX_ITERATIONS:
@@ -278,15 +277,15 @@ def _kernel(n_rows: int) -> Any:
                     if ok and not kept:
                         store(errors, k * WIDTH, not_positive(peek(step, k)))
                         store(sizes, k * WIDTH, splat(1.0))
-                worst, worst_at = groups.worst_row(errors, sizes, n)
+                worst, worst_at = worst_row(errors, sizes, n)
                 worst_at += group * n * WIDTH
                 if not (ok and kept):
-                    groups.restore_points(points, atoms, undo, group, n_local, kept_points, 0)
+                    restore_points(points, atoms, undo, group, n_local, kept_points, 0)
                     if move:
-                        groups.restore_points(velocities, atoms, undo, group, n_local, kept_points, n_local)
+                        restore_points(velocities, atoms, undo, group, n_local, kept_points, n_local)
                     return False, worst if tangent is None else np.sqrt(worst), most, worst_at
             _spread(shifts, row_ends, s, total, n, n_local)
-            saved = kept_points * group * groups.SAVED
+            saved = kept_points * group * SAVED
             _move_points(changed, moving, inverse_dt, table, at, heavy, shifts, n_local, move, room, saved)
             if report:
                 _report(at_first(multipliers), firsts, group * WIDTH, sign, s, total, n)
@@ -338,6 +337,6 @@ class SmallClusters(SimdClusterSolver):
         super().__init__(rows, lengths, len(local))
         self._kernel = _kernel(len(local))
         weights = np.array(inv_mass, dtype=np.float64)
-        slots, points = groups.lane_tables(members, len(local))
+        slots, points = lane_tables(members, len(local))
         given = points, slots, local.reshape(-1), weights, _couplings(local, weights)
         self.tables = in_one_array((*given, room(6 * len(points))))

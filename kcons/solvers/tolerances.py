@@ -36,8 +36,6 @@ MAX_ROUNDS = 4
 #: has flattened out on the way, as a dihedral that is to turn over does far away, and the positions are none near the
 #: given ones.
 FLAT = 0.01
-#: Steps towards the least squares after which there must have been a gain.
-STALLED = 10
 
 # -- velocities and forces ------------------------------------------------------------------------------------
 

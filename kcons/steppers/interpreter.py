@@ -17,7 +17,6 @@ from numpy import empty, ndarray
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError
-from kcons.motion.certificate import checked_every
 from kcons.steppers.program import Program, Row
 from kcons.steppers.stages.compiled_operations import (
     ENGINE,
@@ -110,32 +109,17 @@ class Interpreted(Listed):
         return self._made_from(system, state, dt, 1)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def march(self, system: System, state: State, dt: float, steps: int, *, check_every: int | None = None) -> State:
-        """The state after so many steps, the same to the last bit as by `step`.
+    def march(self, system: System, state: State, dt: float, steps: int) -> State:
+        """The state after so many steps, the same to the last bit as by `step`; errors as of `step`.
 
         Nobody looks at the states between: where all is compiled, the end of a step and the beginning of the next are
-        one call. `check_every` is as for `run`.
-
-        Raises
-        ------
-        KconsError
-            As `step`; `error.step` says which one.
-        CertificateError
-            As `run`.
+        one call.
         """
         self.check(system)
-        check_every, spare = checked_every(check_every if dt != 0 else 0)
         alone = type(self).step is not Interpreted.step
         while steps > 0:
-            n = left = system.schedule.within(steps, check_every)
-            while left > 0:
-                if alone:
-                    state, made = self.step(system, state, dt), 1
-                else:
-                    state, made = self._made_from(system, state, dt, left)
-                left -= made
-            system.schedule.made(n, check_every, state, dt, spare=spare)
-            steps -= n
+            state, made = (self.step(system, state, dt), 1) if alone else self._made_from(system, state, dt, steps)
+            steps -= made
         return state
 
 

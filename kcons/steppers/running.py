@@ -164,7 +164,7 @@ def run(
             n = min([steps - done, *(rhythm - done % rhythm for _, rhythm in rhythms)])
             n = schedule.within(n, check_every)
             if march is not None:
-                state = march(system, state, dt, n, check_every=0)
+                state = march(system, state, dt, n)
             else:
                 for _ in range(n):
                     state = stepper.step(system, state, dt)

@@ -27,7 +27,6 @@ from ase_systems import FS, Field, Free, loose_waters, off, rigid, slip, state, 
 from kcons.ase import (
     ConstrainedDynamics,
     Constraints,
-    IsokineticDynamics,
     MultipleTimeSteps,
     attach,
     constrain,
@@ -95,21 +94,6 @@ def test_new_masses_are_noticed():
     assert slip(atoms, held) <= 1e-14
     atoms.numbers[1] = 8
     assert np.array_equal(held.engine(atoms).masses, atoms.get_masses())
-
-
-def test_new_cell_is_noticed_and_targets_stay():
-    atoms = molecule("H2O")
-    atoms.set_cell([6, 6, 6])
-    atoms.pbc = True
-    held = constrain(atoms, rigid_water(atoms))
-    lengths = held.engine(atoms).constraint_set.target()
-    atoms.set_cell([5, 5, 5])
-    atoms.positions[1] += [5, 0, 0]
-    assert held.engine(atoms).constraint_set.half_width == pytest.approx(2.5)
-    assert np.array_equal(held.engine(atoms).constraint_set.target(), lengths)
-    assert off(atoms, held) <= 1e-14
-    atoms.pbc = False
-    assert off(atoms, held) > 1
 
 
 def test_a_new_cell_does_not_rebuild_the_engine():
@@ -203,14 +187,6 @@ def test_a_step_too_large_changes_nothing():
     atoms.set_positions(before + 0.01)  # and the object still works
 
 
-def test_a_second_object_of_kcons_says_how_to_make_one():
-    atoms = molecule("CH3OH")
-    first = constrain(atoms, Distance([[0, 1]]))
-    with pytest.raises(UnsupportedError, match=r"Constraints acts on atom 0.*\[\*held, \*new\]"):
-        constrain(atoms, Distance([[0, 2]]))
-    assert atoms.constraints == [first]
-
-
 # -- forces that are known --------------------------------------------------------------------------
 
 
@@ -274,21 +250,6 @@ def test_what_was_given_by_numbers_of_atoms_is_no_longer_of_these():
     del line[0]
     dyn.run(1)
     assert dyn.degrees_of_freedom == 12
-
-
-def test_other_questions_to_the_calculator_change_nothing():
-    """Results in another place whose forces are the same: the variables of a thermostat go on."""
-    runs = []
-    for asked in (False, True):
-        atoms, _ = water(Settings(stiffness=0.05))
-        dyn = IsokineticDynamics(atoms, FS, 300, momentum="free")
-        if asked:
-            dyn.attach(lambda atoms=atoms: (atoms.calc.reset(), atoms.get_potential_energy()))
-        dyn.run(20)
-        runs.append((*state(atoms), dyn.state.thermostat))
-    for one, two in zip(*runs, strict=True):
-        np.testing.assert_array_equal(one, two)
-    assert runs[0][2][1] != 0
 
 
 @pytest.mark.parametrize("changed", ["fast", "slow"])
@@ -374,18 +335,6 @@ def test_frames_that_differ_have_engines_of_their_own(tmp_path):
     assert len({id(each) for each in engines[:6]}) == 6
     assert np.array_equal(engines[1].masses, [16, 2, 2] * 2)
     assert engines[2].cell()[0][0, 0] == 31 and engine.cell()[0][0, 0] == 30
-
-
-def test_a_frame_that_changes_its_cell_leaves_the_engine_to_the_others(tmp_path):
-    atoms, _ = rigid(2)
-    atoms.set_cell([30, 30, 30])
-    atoms.pbc = True
-    frames = frames_of(atoms, tmp_path)
-    engines = [engine_of(frame) for frame in frames]
-    frames[1].set_cell([28, 28, 28])
-    assert engine_of(frames[1]) is not engines[0] and engine_of(frames[1]).cell()[0][0, 0] == 28
-    frames[0].set_cell([32, 32, 32])
-    assert engine_of(frames[2]).cell()[0][0, 0] == 30 and engine_of(frames[0]).cell()[0][0, 0] == 32
 
 
 def test_targets_that_are_open_are_those_of_each_frame():

@@ -7,18 +7,15 @@ from itertools import combinations
 import numpy as np
 import pytest
 from ase import Atoms, units
-from ase.build import fcc111, molecule
+from ase.build import molecule
 from ase.calculators.emt import EMT
-from ase.calculators.tip3p import TIP3P
-from ase.constraints import FixBondLengths
-from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
-from ase_systems import FS, Free, loose_waters, off, random, rigid, slip
+from ase_systems import FS, Free, off, rigid, slip
 
-from kcons.ase import Constraints, constrain, rigid_water
+from kcons.ase import Constraints, constrain
 from kcons.ase.topology import bonds_of
 from kcons.constraints import CenterDistance, Dihedral, Distance
-from kcons.errors import ContradictionError, InfeasibleError, InputError
+from kcons.errors import InfeasibleError, InputError
 
 # -- dynamics and optimization ----------------------------------------------------------------------
 
@@ -36,38 +33,6 @@ def test_velocity_verlet_goes_back_and_does_not_stand_still():
     with np.errstate(all="ignore"), pytest.raises(InputError, match="not finite"):
         dyn.run(1)
     assert off(atoms, held) <= 1e-13
-
-
-def test_agrees_with_fix_bond_lengths():
-    atoms, _ = rigid(2)
-    peer = atoms.copy()
-    peer.set_constraint(FixBondLengths(rigid_water(peer).atoms))
-    peer.calc = TIP3P(rc=6.0)
-    for a in (atoms, peer):
-        VelocityVerlet(a, 1 * units.fs).run(50)
-    assert np.abs(atoms.positions - peer.positions).max() <= 1e-9
-    assert np.abs(atoms.get_velocities() - peer.get_velocities()).max() <= 1e-9
-
-
-def test_periodic_wrap_changes_nothing():
-    cell = np.array([[7.0, 0, 0], [2.0, 6.5, 0], [-1.0, 1.5, 6.0]])
-    whole = molecule("H2O")
-    whole.set_cell(cell)
-    whole.pbc = True
-    whole.positions += cell.sum(axis=0) - whole.positions[0]  # the oxygen sits on the corner
-    whole.calc = Free()
-    thermalize_momenta(whole, 800, rng=random(3))
-    wrapped = whole.copy()
-    wrapped.calc = Free()
-    for a in (whole, wrapped):
-        constrain(a, rigid_water(a))
-    dyn = VelocityVerlet(wrapped, 2 * units.fs)
-    dyn.attach(wrapped.wrap)
-    dyn.run(300)
-    VelocityVerlet(whole, 2 * units.fs).run(300)
-    cells = (wrapped.positions - whole.positions) @ np.linalg.inv(cell)
-    assert np.abs(cells - np.round(cells)).max() <= 1e-11
-    assert np.ptp(np.round(cells), axis=0).max() > 0  # the molecule was really cut
 
 
 def test_float32_forces():
@@ -102,30 +67,6 @@ def test_arrays_that_are_not_contiguous():
 # -- degrees of freedom, momenta --------------------------------------------------------------------
 
 
-def test_dof_counts_the_rank():
-    atoms = loose_waters(2)
-    rows = rigid_water(atoms)
-    atoms.set_constraint(Constraints([rows, rows, Distance([0, 1])]))
-    assert atoms.get_number_of_degrees_of_freedom() == 12
-    atoms.set_constraint(Constraints([rows]))
-    assert atoms.get_number_of_degrees_of_freedom() == 12
-
-
-def test_momenta_are_projected_once():
-    atoms, held = rigid(2, temperature=None)
-    rng = np.random.default_rng(2)
-    raw = rng.normal(size=(6, 3))
-    masses = atoms.get_masses()[:, None]
-    kinetic = 0.5 * (raw**2 / masses).sum()
-    atoms.set_momenta(raw)
-    assert slip(atoms, held) <= 1e-14
-    assert atoms.get_kinetic_energy() < kinetic
-    assert atoms.get_momenta().sum(axis=0) == pytest.approx(raw.sum(axis=0), abs=1e-13)
-    once = atoms.get_momenta()
-    atoms.set_momenta(once)
-    assert np.abs(atoms.get_momenta() - once).max() <= 1e-14
-
-
 @pytest.mark.parametrize("rows", [Distance([0, 1]), Distance([[0, 1], [0, 2]])])
 def test_integers_are_not_cut(rows):
     """ASE hands on the array that it was given, and would keep 0.6 as 0."""
@@ -151,11 +92,6 @@ def test_integers_are_not_cut(rows):
     assert not atoms.get_momenta().any()
 
 
-def test_no_hook_that_would_act_twice():
-    # Its presence would make ASE apply adjust_forces to the forces of dynamics.
-    assert not hasattr(Constraints, "adjust_potential_energy")
-
-
 def test_forces_off_the_surface_use_the_rows_there():
     atoms, held = rigid(1, temperature=None)
     atoms.positions[1] += [0.05, 0.02, 0.0]
@@ -176,33 +112,6 @@ def test_momenta_of_which_nothing_is_left(degrees):
     assert np.abs(atoms.get_momenta()).max() <= 1e-15
 
 
-def test_a_molecule_at_rest_stays_certified():
-    """Forces along a bond alone, so that momenta are rounding whenever they are certified."""
-    atoms = molecule("CO")
-    atoms.rotate(40, [1, 2, 3])
-    atoms.calc = EMT()
-    held = constrain(atoms, Distance([0, 1], 1.3), project=True)
-    dynamics = VelocityVerlet(atoms, FS)
-    for _ in dynamics.irun(100):
-        held._momenta_due = 0
-    assert np.abs(atoms.get_velocities()).max() <= 1e-12
-
-
-def test_momenta_of_water_from_a_file():
-    """With seven decimals the geometry is that of the model to what `constrain` takes, and not to a certificate."""
-    exact = molecule("H2O")
-    constrain(exact, rigid_water(exact, "tip3p"), project=True)
-    atoms = molecule("H2O")
-    atoms.positions = np.round(exact.positions, 7)
-    held = constrain(atoms, rigid_water(atoms, "tip3p"))
-    assert off(atoms, held) > 1e-8
-    thermalize_momenta(atoms, 300, rng=np.random.default_rng(1))
-    assert held.report(atoms).velocity_residual <= 1e-15
-    atoms.calc = Free()
-    VelocityVerlet(atoms, FS).run(1)
-    assert off(atoms, held) <= 1e-14
-
-
 # -- targets ----------------------------------------------------------------------------------------
 
 
@@ -218,25 +127,6 @@ def test_explicit_target_off_is_refused_with_its_size():
     with pytest.raises(InputError, match="restore"):
         atoms.set_positions(before + 0.01)
     assert np.array_equal(atoms.positions, before)
-
-
-def test_project_moves_to_the_nearest_point():
-    atoms = molecule("H2O")
-    center = atoms.get_center_of_mass()
-    held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
-    assert off(atoms, held) <= 1e-15
-    assert atoms.get_center_of_mass() == pytest.approx(center, abs=1e-14)
-    assert atoms.get_distance(0, 1) == pytest.approx(0.9572, abs=1e-14)
-    assert atoms.get_angle(1, 0, 2) == pytest.approx(104.52, abs=1e-11)
-
-
-def test_impossible_restore_changes_nothing():
-    atoms = Atoms("H3", positions=[[0, 0, 0], [1, 0, 0], [0.4, 0.9, 0]])
-    before = atoms.positions.copy()
-    with pytest.raises((InfeasibleError, ContradictionError)):
-        constrain(atoms, Distance([[0, 1], [1, 2], [0, 2]], [1.0, 1.0, 3.0]), project=True)
-    assert np.array_equal(atoms.positions, before)
-    assert atoms.constraints == []
 
 
 @pytest.mark.parametrize("error", [InputError, KeyboardInterrupt])
@@ -258,15 +148,6 @@ def test_projection_that_fails_late_changes_nothing(error, monkeypatch):
 
 
 # -- changes of the atoms ---------------------------------------------------------------------------
-
-
-def test_appended_atoms_are_free():
-    atoms, held = rigid(1)
-    atoms.extend(Atoms("Ar", positions=[[5, 5, 5]]))
-    atoms.calc = Free()
-    VelocityVerlet(atoms, 1 * units.fs).run(5)
-    assert atoms.get_number_of_degrees_of_freedom() == 12 - 3
-    assert off(atoms, held) <= 1e-14
 
 
 def test_what_is_known_of_one_image_says_nothing_of_another():
@@ -303,22 +184,6 @@ def test_a_torsion_at_any_target(degrees: int) -> None:
     assert abs((atoms.get_dihedral(3, 2, 1, 0) - degrees + 180) % 360 - 180) < 1e-9
     np.testing.assert_allclose(lengths(atoms), before, rtol=0, atol=0.01)
     assert held.report(atoms).residual < 1e-14 * 4
-
-
-def test_an_adsorbate_turns_and_the_metal_stays() -> None:
-    """Metals have no bonds that could be changed, nor are they moved along."""
-    slab = fcc111("Cu", (3, 3, 2), vacuum=12.0)
-    ethanol = molecule("CH3CH2OH")
-    ethanol.positions += slab.positions.mean(axis=0) - ethanol.positions.mean(axis=0)
-    ethanol.positions[:, 2] += 8.0
-    both = slab + ethanol
-    both.wrap()
-    first = len(slab)
-    before = lengths(both)
-    metal = both.positions[:first].copy()
-    constrain(both, Dihedral([[first + 3, first + 2, first + 1, first]], 0.5), project=True)
-    np.testing.assert_allclose(lengths(both), before, rtol=0, atol=0.01)
-    np.testing.assert_array_equal(both.positions[:first], metal)
 
 
 def test_bonds_that_are_given_are_taken() -> None:

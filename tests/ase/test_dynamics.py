@@ -23,29 +23,16 @@ from kcons.ase import (
     ConstrainedLangevin,
     ConstrainedMonteCarlo,
     ConstrainedNoseHoover,
-    Constraints,
     IsokineticDynamics,
     attach,
     constrain,
     draw_velocities,
 )
-from kcons.comparison.projected_equation import ProjectedEquation
-from kcons.constraints import Distance, KnifeEdge
+from kcons.constraints import Distance
 from kcons.errors import InputError, KconsError
-from kcons.steppers import Geodesic, Rattle, Suzuki4
+from kcons.steppers import Rattle
 
 # -- right ------------------------------------------------------------------------------------------
-
-
-def test_the_listing_is_that_of_the_stepper():
-    atoms, _ = rigid()
-    for stepper in (Rattle(), Suzuki4(), Geodesic()):
-        dynamics = ConstrainedDynamics(atoms, FS, stepper=stepper)
-        assert dynamics.listing() == stepper.listing()
-    assert (
-        IsokineticDynamics(atoms, FS, temperature_K=300, momentum="free").listing().splitlines()[1].split()[0] == "turn"
-    )
-    assert ConstrainedDynamics(atoms, FS, stepper=ProjectedEquation()).listing() == "ProjectedEquation(2)"
 
 
 @pytest.mark.parametrize("case", ["rigid", "with a spring", "free"])
@@ -66,22 +53,6 @@ def test_follows_velocity_verlet(case):
     assert case == "free" or off(ours, held) <= 1e-13
 
 
-def test_rows_that_ase_has_no_place_for():
-    """A target that moves, whose rate comes into the velocities at the start, and a row that holds velocities."""
-    rate = 0.01 / FS
-    row = Distance([0, 1], lambda t: 1.1 + rate * t)
-    for start in (0.0, 10 * FS):
-        atoms = Atoms("CO", positions=[[0, 0, 0], [1.1 + rate * start, 0, 0]], calculator=Field(0.0))
-        dyn = ConstrainedDynamics(atoms, FS, constraints=[row, KnifeEdge(0, 1, [0, 0, 1])], time=start)
-        assert atoms.get_velocities()[1, 0] - atoms.get_velocities()[0, 0] == pytest.approx(rate, rel=1e-10)
-        dyn.run(20)
-        assert dyn.get_time() == pytest.approx(start + 20 * FS)
-        assert atoms.get_distance(0, 1) == pytest.approx(1.3 + rate * start, abs=1e-13)
-        assert dyn.degrees_of_freedom == 4
-    with pytest.raises(InputError, match="off row"):
-        ConstrainedDynamics(atoms, FS, constraints=[row], time=0.0)
-
-
 @pytest.mark.parametrize("beside_ours", [False, True])
 def test_ase_constraints_are_absorbed(beside_ours):
     atoms = molecule("CH3CH2OH")
@@ -98,27 +69,6 @@ def test_ase_constraints_are_absorbed(beside_ours):
     assert held is None or off(atoms, held) <= 1e-14
     assert dyn.degrees_of_freedom == 27 - 3 - 2 - beside_ours
     assert dyn.get_temperature() == pytest.approx(atoms.get_temperature())
-
-
-def boxed() -> tuple[Atoms, Constraints]:
-    atoms, held = water(Field(0.0))
-    atoms.set_cell([6.0, 6.5, 7.0])
-    atoms.pbc = True
-    return atoms, held
-
-
-def test_periodic_box_that_changes():
-    atoms, _ = boxed()
-    other, _ = boxed()
-    dyn = ConstrainedDynamics(atoms, FS)
-    dyn.run(30)
-    engine = dyn._systems().motion
-    atoms.set_cell([6.5, 6.5, 7.0])  # no molecule is cut by the boundary
-    dyn.run(30)
-    assert dyn._systems().motion is engine
-    assert engine.constraint_set.half_width == pytest.approx(3.25)
-    ConstrainedDynamics(other, FS).run(60)
-    assert np.abs(atoms.positions - other.positions).max() <= 1e-13
 
 
 # -- ASE's conventions ------------------------------------------------------------------------------
@@ -162,14 +112,6 @@ def test_a_refused_start_leaves_the_files_of_an_older_run(tmp_path, thermostat):
         with pytest.raises(InputError, match="atoms are off row"):
             ConstrainedDynamics(atoms, FS, **files)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_one_force_evaluation_a_step():
-    atoms, _ = water()
-    dyn = ConstrainedDynamics(atoms, FS)
-    dyn.attach(atoms.get_potential_energy)
-    dyn.run(10)
-    assert atoms.calc.calls == 11
 
 
 def test_forces_are_not_computed_for_nobody():

@@ -148,16 +148,6 @@ def test_atoms_scaled_with_the_cell_are_put_right(name, factor):
     assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=0.1)
 
 
-def test_a_cell_that_is_changed_alone_is_no_edit():
-    atoms, held = gas()
-    run = VelocityVerlet(atoms, FS)
-    run.run(2)
-    kinetic = atoms.get_kinetic_energy()
-    atoms.set_cell(atoms.cell * 1.1)
-    run.run(2)
-    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-3) and off(atoms, held) <= 1e-12
-
-
 def test_an_edit_in_a_new_cell_is_an_edit():
     atoms, _ = gas()
     run = VelocityVerlet(atoms, FS)
@@ -208,15 +198,6 @@ def test_frames_on_the_constraints_are_taken(name, digits):
         atoms.set_positions(frame.positions)
         assert np.abs(atoms.positions - frame.positions).max() <= (1e-14 if digits is None else 2 * 10.0**-digits)
         assert off(atoms, held) <= 1e-12
-
-
-def test_a_frame_is_taken_by_edited_atoms():
-    """It is on the constraints itself, wherever the atoms were."""
-    atoms, held = held_ethanol()
-    frame = atoms.get_positions()
-    EDITS["rotate_dihedral"](atoms)
-    atoms.set_positions(frame)
-    assert np.array_equal(atoms.positions, frame) and off(atoms, held) <= 1e-12
 
 
 def test_positions_that_no_digits_explain_are_refused_as_before():

@@ -23,7 +23,6 @@ from kcons.ase import (
     ConstraintLogger,
     Constraints,
     IsokineticDynamics,
-    MultipleTimeSteps,
     PressureReporter,
     constrain,
     draw_velocities,
@@ -45,19 +44,6 @@ def moving() -> Atoms:
 
 def columns(log: io.StringIO) -> np.ndarray:
     return np.array([line.split() for line in log.getvalue().splitlines()[1:]], dtype=float)
-
-
-def test_rows_that_only_the_dynamics_holds_count():
-    """ASE's own logger has 27 degrees of freedom for these atoms, of which 3 are held."""
-    atoms, ours, theirs = moving(), io.StringIO(), io.StringIO()
-    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=ROWS, logfile=ours)
-    dynamics.attach(MDLogger(dynamics, atoms, theirs))
-    dynamics.run(3)
-    expected = 2 * atoms.get_kinetic_energy() / (24 * units.kB)
-    assert columns(ours)[-1, 4] == pytest.approx(expected, abs=0.06)
-    assert columns(theirs)[-1, 4] == pytest.approx(expected * 24 / 27, abs=0.06)
-    assert np.array_equal(columns(ours)[:, :4], columns(theirs)[:, :4])
-    assert ours.getvalue().splitlines()[0] == theirs.getvalue().splitlines()[0]
 
 
 class Wells(Calculator):
@@ -102,22 +88,6 @@ def test_with_noise_the_log_is_of_the_middle_of_the_step():
     assert total == pytest.approx(potential + kinetic, abs=2e-3)
     draw_velocities(atoms, 300, rng=3)  # these are nobody's middle of a step
     assert dynamics.get_kinetic_energy() == pytest.approx(atoms.get_kinetic_energy(), rel=1e-14)
-
-
-def test_several_time_steps_and_noise():
-    step = 10 * units.fs
-    atoms = oscillators(step)
-    draw_velocities(atoms, 300, rng=1)
-    places, stiffness = atoms.calc.places, atoms.calc.stiffness
-    parts = {"fast": Wells(0.99 * stiffness, places), "slow": Wells(0.01 * stiffness, places)}
-    dynamics = MultipleTimeSteps(atoms, 2 * step, **parts, temperature_K=300, friction=0.5 / step, fast_steps=2, rng=3)
-    dynamics.run(50)
-    found = []
-    dynamics.attach(lambda: found.append((dynamics.get_temperature(), atoms.get_temperature())))
-    dynamics.run(1000)
-    middle, end = np.mean(found, axis=0)
-    assert middle == pytest.approx(300, abs=8)
-    assert end == pytest.approx(225, abs=8)
 
 
 @pytest.mark.parametrize("friction", [0.0, None])
@@ -209,19 +179,6 @@ def test_stress_is_that_of_all_rows(held_by):
     tensor = -reporter.values[0] / units.GPa
     assert columns(log)[0, 5:11] == pytest.approx(tensor[(0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1)], abs=6e-4)
     assert abs(tensor[2, 2]) > 0.05
-
-
-def test_stress_of_a_target_that_moves():
-    """Its rows are looked at as they are by now."""
-    atoms, log = Atoms("Ar2", [[0, 0, 0], [3.5, 0, 0]], cell=[20.0] * 3, pbc=True), io.StringIO()
-    atoms.calc = LennardJones(epsilon=0.01, sigma=3.4, rc=9.0)
-    rod = Distance([0, 1], lambda t: 3.5 + 0.01 * t / units.fs)
-    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=rod)
-    dynamics.run(5)
-    reporter = PressureReporter(dynamics, virial="atomic")
-    ConstraintLogger(dynamics, atoms, log, stress=True)()
-    reporter()
-    assert columns(log)[0, 5] == pytest.approx(-reporter.values[0][0, 0] / units.GPa, abs=6e-4)
 
 
 @pytest.mark.parametrize("row", [FixedAtoms([0, 1]), FixAtoms([0, 1])])

@@ -25,12 +25,6 @@ def test_names_and_settings():
     assert named_calculator("gfn1", {"charge": 1}).parameters.method == "GFN1-xTB"
 
 
-def test_a_name_that_is_known_is_not_proposed_again():
-    with pytest.raises(InputError, match="no calculator 'lj' with these settings") as caught:
-        named_calculator("lj", {"sigma": "wide"})
-    assert "did you mean" not in str(caught.value)
-
-
 @pytest.mark.parametrize(("name", "settings"), [("no", {}), ("no.module:thing", {}), ("lj", {"nothing of mine": 1})])
 def test_what_there_is_not_is_said(name, settings):
     if name == "lj":

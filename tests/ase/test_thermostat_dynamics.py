@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.calculator import Calculator, all_changes
-from ase.constraints import ExternalForce, FixAtoms, Hookean
+from ase.constraints import ExternalForce, FixAtoms
 from ase.io import read
-from ase.md.logger import MDLogger
 from ase_systems import equal, state
 
 from kcons.ase import (
-    ConstrainedDynamics,
     ConstrainedLangevin,
     ConstrainedMonteCarlo,
     ConstrainedNoseHoover,
@@ -27,8 +24,8 @@ from kcons.ase import (
     draw_velocities,
     rigid_water,
 )
-from kcons.constraints import Distance, FixedAtoms, Plane
-from kcons.errors import InputError, KconsError, NonFiniteError, OverdeterminedError, UnsupportedError
+from kcons.constraints import Distance, FixedAtoms
+from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
 from kcons.steppers import BlanesMoan4, State, System, run
 from kcons.thermostats import ForceGroups, HamiltonianMonteCarlo, IsokineticSpheres, LangevinRespa
@@ -197,21 +194,6 @@ def test_where_nothing_is_conserved(kind, why):
         made(kind, waters()).get_conserved_energy()
 
 
-def test_springs_of_ase_have_an_energy():
-    atoms, spring = waters(2), Hookean(0, 3, 5.0, rt=0.5)
-    atoms.set_constraint([*atoms.constraints, spring])
-    dyn = ConstrainedLangevin(atoms, 0.5 * FS, 300, 0.0, rng=1)
-    before = dyn.get_conserved_energy()
-    dyn.run(20)
-    assert dyn.get_conserved_energy() == pytest.approx(before, abs=0.02) and before > 10
-    atoms = wells()
-    atoms.set_constraint([*atoms.constraints, spring])
-    dyn = sampler(atoms, keep=0.0, steps=8, timestep=0.5 * FS)
-    dyn.run(2)
-    assert spring.adjust_potential_energy(atoms) > 0.1
-    assert dyn.counts.mean_square < 1e-3
-
-
 def test_the_chain_has_the_constants_of_ase():
     moving = made("nose-hoover", waters(), tchain=4)
     np.testing.assert_allclose(moving.stepper._masses(18)[:2], [18 * KT * (50 * FS) ** 2, KT * (50 * FS) ** 2])
@@ -276,23 +258,6 @@ def test_a_restart_asks_the_calculator_for_forces(kind, tmp_path):
     assert equal(ends[0], ends[2]) and equal(ends[1], ends[2])
 
 
-def test_a_run_goes_on_from_a_state_of_another_dynamics():
-    """Velocities of the state, scaled to K; the number of the step and the time go on."""
-    moving = ConstrainedDynamics(waters(), FS)
-    moving.run(10)
-    given = moving.state
-    again = waters(momenta=False)
-    resumed = made("isokinetic", again, state=given)
-    assert resumed.nsteps == 10 and resumed.get_time() == 10 * FS
-    scale = again.get_velocities() / given.velocities
-    np.testing.assert_allclose(scale, scale[0, 0], rtol=1e-12)
-    for _ in range(2):
-        assert 2 * again.get_kinetic_energy() == pytest.approx(17 * KT, rel=1e-12)
-        resumed.run(5)
-    with pytest.raises(InputError, match="not both"):
-        made("isokinetic", again, state=given, restart="a.npz")
-
-
 def test_isokinetic_goes_on_from_a_trajectory(tmp_path):
     atoms = waters()
     moving = made("isokinetic", atoms, trajectory=str(tmp_path / "md.traj"))
@@ -322,23 +287,6 @@ def test_files_that_hold_no_restart(tmp_path):
     with pytest.raises(InputError, match="variables of another thermostat"):
         made("isokinetic", atoms, restart=tmp_path / "chain.npz")
     assert equal(before, state(atoms))
-
-
-def test_noise_is_reproducible():
-    runs = []
-    for rng in (5, 5, 6, np.random.default_rng(5), np.random.default_rng(5), None, None):
-        atoms = waters()
-        moving = made("langevin", atoms, rng=rng)
-        moving.run(10)
-        runs.append((moving.seed, atoms.get_positions()))
-    a, b, c, d, e, f, g = (x for _, x in runs)
-    assert np.array_equal(a, b) and np.array_equal(d, e)
-    assert not np.array_equal(a, c) and not np.array_equal(f, g)
-    atoms = waters()
-    moving = made("langevin", atoms, rng=runs[5][0])
-    moving.run(10)
-    assert np.array_equal(atoms.positions, f)
-    assert f"rng={runs[5][0]}" in moving.todict()["stepper"] and moving.todict()["md-type"] == "ConstrainedLangevin"
 
 
 # -- changes by others ------------------------------------------------------------------------------
@@ -373,20 +321,6 @@ def test_momenta_set_in_between_are_used(kind):
     else:
         assert 2 * atoms.get_kinetic_energy() / 18 > 1.5 * KT
         assert np.abs(moving.state.thermostat - chain).max() <= 0.5  # the chain and the heat go on
-
-
-def test_who_moves_the_atoms_moves_the_energy():
-    atoms = wells()
-    dyn = sampler(atoms)
-    dyn.run(3)
-    atoms.translate([0.5, 0, 0])
-    moved = atoms.positions.copy()
-    dyn.run(1)
-    fresh = wells()
-    fresh.set_positions(moved, apply_constraint=False)
-    assert dyn.counts.proposals == 4
-    expected = (fresh if np.array_equal(atoms.positions, moved) else atoms).get_potential_energy()
-    assert dyn.state.thermostat[0] == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["langevin", "nose-hoover", "monte carlo", "two steps", "spheres"])
@@ -434,33 +368,6 @@ def test_bad_input_changes_nothing(kind, options, words):
     assert equal(before, state(atoms)) and (atoms.calc is calculator or "step" in options)
 
 
-def test_isokinetic_without_motion():
-    atoms = waters(momenta=False)
-    with pytest.raises(InputError, match="needs non-zero kinetic energy"):
-        IsokineticDynamics(atoms, FS, 300)
-    assert (atoms.get_momenta() == 0).all()
-    atoms = Atoms("OH", [[0, 0, 0], [0, 0, 1.0]], calculator=Waves())
-    atoms.set_constraint(Constraints([FixedAtoms([0]), Distance([[0, 1]]), Plane([1], [1.0, 0, 0])]))
-    draw_velocities(atoms, 300, 1)
-    with pytest.raises(OverdeterminedError, match="g - 1 = 0"):
-        IsokineticDynamics(atoms, FS, 300)
-
-
-@pytest.mark.parametrize("kind", ["isokinetic", "nose-hoover"])
-def test_total_momentum_is_said(kind):
-    atoms = waters(calc=Pairs())
-    with pytest.warns(UserWarning, match="total momentum is not zero"):
-        made(kind, atoms)
-    draw_velocities(atoms, 300, 1, zero_momentum=True)
-    moving = made(kind, atoms)
-    moving.run(3)
-    draw_velocities(atoms, 300, 2)
-    with pytest.warns(UserWarning, match="total momentum is not zero"):
-        moving.run(1)
-    draw_velocities(atoms, 300, 1, zero_momentum=True)
-    moving.run(3)
-
-
 @pytest.mark.parametrize("kind", ["isokinetic", "langevin", "nose-hoover", "two steps", "spheres"])
 @pytest.mark.parametrize("bad", [0, 1, 6])
 def test_forces_that_are_not_numbers(kind, bad):
@@ -496,21 +403,6 @@ def test_an_error_of_the_calculator_leaves_the_last_good_atoms():
         dyn.run(1)
 
 
-@THREE
-@pytest.mark.filterwarnings("ignore:the atoms move in steps")
-def test_a_time_step_that_is_too_large_leaves_the_atoms_alone(kind):
-    atoms = waters()
-    moving = made(kind, atoms)
-    moving.run(3)
-    before = state(atoms)
-    moving.set_timestep(60 * FS if kind != "nose-hoover" else 1e3 * FS)
-    with pytest.raises(KconsError, match="time step"):
-        moving.run(50)
-    assert moving.nsteps > 3 or equal(before, state(atoms))
-    moving.set_timestep(FS)
-    moving.run(2)
-
-
 # -- Monte Carlo ------------------------------------------------------------------------------------
 
 
@@ -537,19 +429,6 @@ def test_monte_carlo_is_what_arrays_give(stepper, step):
     np.testing.assert_allclose(atoms.get_velocities(), there.velocities, atol=1e-9)
     assert 0 < dyn.counts.accepted <= 12 == dyn.counts.proposals
     assert dyn.get_time() == pytest.approx(there.time)
-
-
-def test_logs_and_trajectories_of_proposals(tmp_path):
-    atoms, energies = wells(), []
-    dyn = sampler(atoms, timestep=7 * FS, trajectory=str(tmp_path / "run.traj"))
-    dyn.attach(MDLogger(dyn, atoms, str(tmp_path / "log")))
-    dyn.attach(lambda: energies.append(atoms.get_potential_energy()))
-    dyn.run(10)
-    frames = read(tmp_path / "run.traj", ":")
-    assert [f.get_potential_energy() for f in frames] == pytest.approx(energies, abs=1e-12)
-    assert len((tmp_path / "log").read_text().splitlines()) == 12
-    kept = sum(a == b for a, b in pairwise(energies))
-    assert kept == dyn.counts.proposals - dyn.counts.accepted > 0
 
 
 def test_a_step_is_found():
@@ -615,15 +494,6 @@ def test_forces_that_ase_objects_add():
     made("two steps", one, fast_steps=2, friction=0.0).run(3)
     made("langevin", two, FS / 8, friction=0.0).run(24)
     np.testing.assert_allclose(one.positions, two.positions, rtol=0, atol=2e-5)
-
-
-def test_the_temperature_on_spheres():
-    atoms = waters()
-    moving = made("spheres", atoms)
-    moving.run(1)
-    g, whole = np.array([3, 3] * 3), np.array([4, 4] * 3)
-    expected = 0.5 * KT * (g * (whole - 1) / whole).sum()
-    assert moving.get_temperature() == pytest.approx(300 * atoms.get_kinetic_energy() / expected, rel=1e-12)
 
 
 # -- velocities -------------------------------------------------------------------------------------

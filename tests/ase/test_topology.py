@@ -49,14 +49,6 @@ def test_a_molecule_that_ase_wrote_to_a_pdb_file_keeps_its_bonds(tmp_path):
             assert constraints_of(back, held)[0].n_rows == rows[0].n_rows
 
 
-def test_atoms_without_a_place_have_no_bonds():
-    atoms = molecule("CH3OH") + molecule("H2O")
-    atoms.positions[-3:] += 20.0
-    atoms.positions[-1] = np.nan
-    expected = len(bonds_of(molecule("CH3OH"))) + 1
-    assert len(bonds_of(atoms)) == expected and bonds_of(atoms).max() == len(atoms) - 2
-
-
 @pytest.mark.parametrize("pair", [[0, 3], [-1, 0]])
 def test_bonds_that_name_no_atoms_are_refused(pair):
     atoms = molecule("H2O")
@@ -119,14 +111,6 @@ def test_there_and_back():
         (back.info["bonds"], atoms.info["bonds"]),
     ):
         np.testing.assert_allclose(found, given, rtol=1e-14)
-
-
-def test_sites_without_a_number_have_no_mass():
-    atoms = Atoms("OH2X", positions=[[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0], [0.1, 0.1, 0]])
-    topology = snapshot_of(atoms).topology
-    assert topology.masses[3] == 0.0 and topology.elements[3] == ""
-    atoms.set_masses([16.0, 1.0, 1.0, 2.0])
-    assert snapshot_of(atoms).topology.masses[3] == 2.0
 
 
 def test_velocities_of_atoms_without_mass():
@@ -196,15 +180,6 @@ def test_bonds_that_are_far_too_long_are_not_held():
     atoms.info["bonds"] = [[0, 1], [1, 5]]
     with pytest.raises(InputError, match="another order of atoms"):
         constraints_of(atoms, "hbonds")
-
-
-@pytest.mark.parametrize("bonds", [[[0, 1, 1], [0, 2, 1]], [[0, 1.7]], "ab", {1: 2}, np.arange(9), 3])
-def test_bonds_that_are_no_pairs_are_refused(bonds):
-    atoms = molecule("CH3OH")
-    atoms.info["bonds"] = bonds
-    for asked in (bonds_of, snapshot_of, constraints_of):
-        with pytest.raises(InputError, match=r"atoms\.info\['bonds'\] must be pairs"):
-            asked(atoms)
 
 
 # -- heavy hydrogens ---------------------------------------------------------------------------------------

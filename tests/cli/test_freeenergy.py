@@ -131,17 +131,6 @@ def test_a_run_that_is_stopped_says_how_it_goes_on(tmp_path):
     assert [path.name for path in (tmp_path / "input").iterdir()] == ["settings.json"]
 
 
-def test_a_scheduler_is_named_by_who_runs_the_plan(tmp_path, capsys, monkeypatch):
-    """Its answers are pickles."""
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "input.toml").write_text(INPUT + '[workers]\nscheduler = "tcp://127.0.0.1:9"\n')
-    assert main(["freeenergy", "input.toml"]) == 2
-    assert "if you trust it, say so: --scheduler tcp://127.0.0.1:9" in capsys.readouterr().err
-    assert not (tmp_path / "input").exists()
-    assert main(["freeenergy", "input.toml", "--list"]) == 0
-
-
 def test_two_runs_into_one_folder_and_results_of_others(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))

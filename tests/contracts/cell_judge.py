@@ -10,11 +10,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from ase import Atoms
+from ase.calculators.calculator import Calculator, all_changes
+from ase.md.verlet import VelocityVerlet
 from cell_molecules import half_width
 from cell_oracle import EPS, Array, NoSolution, advance, stepper_of
 from cell_worlds import World, world, wrapping
 
 from kcons import ConstraintSet, Motion, State, System, run
+from kcons.ase import ConstrainedDynamics, constrain
 from kcons.errors import KconsError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, KahanLi6, Rattle, Suzuki4
 
@@ -250,6 +254,9 @@ class Judge:
             self.wild()
         if self.periodic and not self._far() and not w.elsewhere and rng.random() < 0.3:
             self.new_cell()
+        still = all(i.how != "moving" for i in w.items)
+        if still and rng.random() < 0.2:
+            self.ase()
         return self.verdicts
 
     def elsewhere(self, chance: float) -> Array:
@@ -574,6 +581,53 @@ class Judge:
         self.rows.set_cell(old)
         w.cell = old
 
+    def ase(self) -> None:
+        """`constrain` and VelocityVerlet, with the atoms wrapped between two steps."""
+        w, rng = self.w, self.rng
+        images = w.images
+        calculator = Springs(w.springs, w.stored(w.anchors))
+        atoms = Atoms("H" * len(w.x), positions=self.x, calculator=calculator)
+        atoms.set_cell(w.cell)
+        atoms.pbc = w.pbc & self.periodic
+        atoms.set_masses(w.masses)
+        atoms.set_velocities(w.v)
+        steps = 1 if w.placed.any() else int(rng.integers(1, 3))
+        link, pair = w.nearness(w.x), Pair(self)
+        dynamics = (VelocityVerlet if rng.random() < 0.6 else ConstrainedDynamics)(atoms, w.dt)
+        name = f"ASE {type(dynamics).__name__}"
+
+        def go(number: int) -> bool:
+            if number == 0:
+                constrain(atoms, w.constraints())
+            dynamics.run(1)
+            return True
+
+        for number in range(steps):
+            solvable = True
+            try:
+                pair.first("Rattle", 0.0)
+                pair.second("Rattle", 0.0)
+                link = max(link, w.nearness(pair.x, every=True))
+            except NoSolution:
+                solvable = False
+            if number and self.periodic:
+                # Near a face rounding decides, so that ASE's own choice is taken.
+                whole = atoms.positions - images @ w.cell
+                atoms.wrap()
+                images = np.round(np.linalg.solve(w.cell.T, (atoms.positions - whole).T).T).astype(int)
+                calculator.anchors = w.anchors + images @ w.cell
+            if not self.attempt(name, lambda n=number: go(n), [], link, solvable) or not solvable:
+                return
+            largest = _top(atoms.positions, self.x)
+            (x, v), (off_x, off_v) = (pair.x, pair.v), pair.apart()
+            rounding = 64 * EPS * self.dependent[2] * largest
+            room = ROOM * (number + 1)
+            if not self.compare(name, atoms.positions - images @ w.cell, x, room * off_x + rounding):
+                return
+            # ASE takes velocities from differences of positions.
+            if not self.compare(name, atoms.get_velocities(), v, room * off_v + rounding / w.dt):
+                return
+
 
 class Pair:
     """The oracle's motion, and a twin whose start and targets are rounded otherwise."""
@@ -595,6 +649,21 @@ class Pair:
     def apart(self) -> tuple[float, float]:
         one, other = (self.x, self.v), self.twin
         return float(np.abs(one[0] - other[0]).max()), float(np.abs(one[1] - other[1]).max())
+
+
+class Springs(Calculator):
+    """Each atom on a spring of its own."""
+
+    implemented_properties = ["energy", "forces"]
+
+    def __init__(self, springs: Array, anchors: Array) -> None:
+        super().__init__()
+        self.springs, self.anchors = springs, anchors
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes) -> None:
+        super().calculate(atoms, properties, system_changes)
+        d = atoms.positions - self.anchors
+        self.results = {"energy": 0.5 * float((self.springs * d * d).sum()), "forces": -self.springs * d}
 
 
 def _top(*arrays: Array) -> float:

@@ -9,12 +9,14 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
+from openmm import unit
 from openmm_ensembles import ENSEMBLES
 from openmm_systems import GPUS, PLATFORMS, context_of, masses_of, rows_of, started, state_of, total_energy
 
-from kcons.openmm import ProjectedIntegrator
+from kcons.openmm import Langevin, ProjectedIntegrator
 from kcons.openmm.integrator.schemes import SCHEMES
 
+GAS = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 T = 300.0
 #: 1/ps. <K> of 12 ps then has a standard deviation of 1.8 % over seeds.
 RATE = 20.0
@@ -91,6 +93,31 @@ def every_shape(coupled=True):
     return system, x
 
 
+@pytest.mark.parametrize(("name", "platform"), here(AT_CONSTANT_ENERGY))
+def test_single_bond(name, platform):
+    """A harmonic oscillator; positions and velocities against the closed form, and the energy."""
+    system, bond = openmm.System(), openmm.HarmonicBondForce()
+    system.addParticle(2.0)
+    system.addParticle(2.0)
+    bond.addBond(0, 1, 1.5, 1.0)
+    system.addForce(bond)
+    dt = 0.01
+    integrator = MADE[name](dt)
+    context = context_of(system, integrator, platform)
+    context.setPositions([[-1, 0, 0], [1, 0, 0]])
+    first = total_energy(context)
+    for step in range(STEPS.get(name, 200)):
+        time = dt * step
+        x, v = state_of(context)
+        distance, rate = 1.5 + 0.5 * np.cos(time), -0.5 * np.sin(time)
+        np.testing.assert_allclose(x, [[-distance / 2, 0, 0], [distance / 2, 0, 0]], atol=1e-4)
+        np.testing.assert_allclose(v, [[-rate / 2, 0, 0], [rate / 2, 0, 0]], atol=1e-4)
+        assert total_energy(context) == pytest.approx(first, rel=1e-4)
+        assert total_energy(context) == pytest.approx(0.125, rel=1e-4)
+        integrator.step(1)
+    assert context.getState().getTime()._value == pytest.approx(dt * STEPS.get(name, 200), rel=1e-12)
+
+
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")
 @pytest.mark.parametrize("name, platform", HERE_AND_THERE)
 def test_constraints_of_every_shape(name, platform):
@@ -118,6 +145,76 @@ def test_constraints_of_every_shape(name, platform):
     assert context.getState().getTime()._value == pytest.approx(0.002 * steps, rel=1e-9)
 
 
+@pytest.mark.parametrize(("name", "platform"), here(ENSEMBLE_MADE))
+def test_temperature(name, platform):
+    """<K> = g kT/2 of a constrained chain in a field, to 6/sqrt(n); constant where it is to be."""
+    system = openmm.System()
+    field = openmm.CustomExternalForce("50*(x^2+1.3*y^2+0.7*z^2)+20*x^4")
+    rng = np.random.default_rng(0)
+    x = np.cumsum(rng.normal(size=(8, 3)) * 0.1, axis=0)
+    for i in range(8):
+        field.addParticle(system.addParticle(2.0 + i), [])
+        if i % 3:
+            system.addConstraint(i - 1, i, float(np.linalg.norm(x[i] - x[i - 1])))
+    system.addForce(field)
+    integrator = MADE[name](0.004, tolerance=1e-7)
+    integrator.setRandomNumberSeed(1)  # before the Context, which reads it
+    context = started(system, integrator, x, None, platform)
+    integrator.setVelocitiesToTemperature(context, T, 3)
+    integrator.step(1000)
+    n = 3000
+    kinetic = []
+    for _ in range(n // 2):
+        integrator.step(2)
+        kinetic.append(integrator.kinetic_energy()._value)
+    freedom = integrator.degrees_of_freedom()
+    assert freedom == 24 - 5
+    wanted = 0.5 * (freedom - (name == "Isokinetic")) * GAS * T
+    assert np.mean(kinetic) == pytest.approx(wanted, rel=6 / np.sqrt(n))
+    if name == "Isokinetic":
+        np.testing.assert_allclose(kinetic, wanted, rtol=1e-6)
+    else:
+        assert np.std(kinetic) > 0.1 * wanted
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_random_seed(platform):
+    """The same seed, the same run; another, another."""
+    system, x = every_shape()
+    ends = []
+    for seed in (5, 5, 10, 10):
+        integrator = MADE["Langevin"](0.002)
+        integrator.setRandomNumberSeed(seed)
+        context = started(system, integrator, x, 0 * x, platform)
+        integrator.step(10)
+        ends.append(state_of(context)[0])
+    np.testing.assert_array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[2], ends[3])
+    assert np.abs(ends[0] - ends[2]).max() > 1e-4
+
+
+@pytest.mark.parametrize(("name", "platform"), here(("rattle", *ENSEMBLE_MADE)))
+def test_initial_temperature(name, platform):
+    """Velocities that are drawn have the temperature on average, to 2 %; no particle alone."""
+    system = openmm.System()
+    n = 3000
+    for k in range(n):
+        system.addParticle(10.0)
+        if k % 2:
+            system.addConstraint(k - 1, k, 1.0)
+    x = np.random.default_rng(0).random((n, 3)) * 10
+    x[1::2] = x[::2]
+    x[1::2, 0] += 1.0
+    integrator = MADE[name](0.001)
+    context = started(system, integrator, x, None, platform)
+    kinetic = []
+    for seed in range(1, 11):
+        integrator.setVelocitiesToTemperature(context, T, seed)
+        kinetic.append(integrator.kinetic_energy()._value)
+    assert np.mean(kinetic) == pytest.approx(0.5 * (3 * n - n // 2) * GAS * T, rel=0.02)  # four standard errors
+    assert integrator.degrees_of_freedom() == 3 * n - n // 2
+
+
 @pytest.mark.filterwarnings("ignore:total momentum", "ignore:the forces exert no torque")
 @made
 def test_massless_particles(name, platform):
@@ -140,6 +237,27 @@ def test_massless_particles(name, platform):
     system.addConstraint(0, 1, 1.0)
     with pytest.raises(openmm.OpenMMException, match="massless"):
         context_of(system, MADE[name](0.001), platform)
+
+
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
+@pytest.mark.filterwarnings("ignore:total momentum")
+@made
+def test_force_groups(name, platform):
+    system = openmm.System()
+    system.addParticle(1.0)
+    system.addParticle(1.0)
+    for group, energy in ((1, "100*x"), (2, "100*y")):
+        force = openmm.CustomExternalForce(energy)
+        force.addParticle(0)
+        force.setForceGroup(group)
+        system.addForce(force)
+    integrator = ProjectedIntegrator(0.01, ensemble=Langevin(0, 0)) if name == "Langevin" else MADE[name](0.01)
+    integrator.setIntegrationForceGroups({1})
+    context = started(system, integrator, np.zeros((2, 3)), [[0, 0, 0.0], [1.0, 0, 0]], platform)
+    integrator.step(5)
+    x = state_of(context)[0]
+    assert x[0, 0] < -1e-3
+    assert x[0, 1] == x[0, 2] == 0
 
 
 @at_constant_energy

@@ -6,9 +6,9 @@ import numpy as np
 
 from hard_cases import truths
 from hard_cases.case import Outcome, case, outcome
-from hard_cases.contract import Frame, Program, together
 from hard_cases.motions import OMEGA, Seen, energy_off, every, flat_body, move, tumble
 from hard_cases.problem import Array, Problem
+from hard_cases.programs import Frame, Program, together
 
 TRIANGLE = [(0, 1), (0, 2), (1, 2)]
 WATER = np.array([[0.0, 0.0, 0.0], [0.9572, 0.0, 0.0], [-0.23999, 0.92663, 0.0]])

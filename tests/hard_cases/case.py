@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from hard_cases.contract import CannotExpressError, Program
+from hard_cases.programs import PROGRAMS, CannotExpressError, Program, quiet
 from kcons.errors import KconsError
 
 #: 'bound': the checks must hold; 'raise': a refusal is asked for; 'warn-or-raise': either will do.
@@ -154,8 +154,6 @@ def judge(case: Case, found: Outcome | BaseException, warned: str = "", program:
 
 def run_cell(case: Case, program: str, quick: bool) -> Cell:
     """The verdict on one program in one case."""
-    from hard_cases.programs import PROGRAMS, quiet  # they need cases
-
     if program in case.cannot:
         return Cell("cannot express", False, case.cannot[program])
     warned = ""

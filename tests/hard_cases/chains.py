@@ -9,10 +9,9 @@ import numpy as np
 
 from hard_cases import truths
 from hard_cases.case import Outcome, case, outcome
-from hard_cases.contract import Program, together
 from hard_cases.motions import Seen, energy_off, move
 from hard_cases.problem import Array, Problem
-from hard_cases.programs import Core
+from hard_cases.programs import Core, Program, together
 
 
 def zigzag(n: int, degrees: float = 110.0, length: float = 1.0) -> Array:

@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from hard_cases.case import Outcome, case, outcome
-from hard_cases.contract import Program
 from hard_cases.problem import Array
+from hard_cases.programs import Program
 from hard_cases.steps import each_refused
 
 NONE = "no growth models and no linear flows"

@@ -10,8 +10,8 @@ from hard_cases import truths
 from hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from hard_cases.case import Outcome, case, outcome
 from hard_cases.chains import bonds, zigzag
-from hard_cases.contract import Program
 from hard_cases.problem import Problem
+from hard_cases.programs import Program
 from hard_cases.steps import each_refused
 from kcons.constraints import LinearCombination, Plane
 

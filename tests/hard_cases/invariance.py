@@ -13,10 +13,9 @@ from hard_cases import truths
 from hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from hard_cases.case import Outcome, case, outcome
 from hard_cases.chains import bonds, zigzag
-from hard_cases.contract import CannotExpressError, Program
 from hard_cases.long_runs import pendulum
 from hard_cases.problem import Array, Numbers, Problem
-from hard_cases.programs import Core, PlainAse, PlainOpenMM
+from hard_cases.programs import CannotExpressError, Core, PlainAse, PlainOpenMM, Program
 from hard_cases.steps import each_refused
 
 

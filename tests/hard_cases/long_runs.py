@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from hard_cases.case import Outcome, case, outcome
-from hard_cases.contract import Program
 from hard_cases.motions import Seen
 from hard_cases.problem import Array, Problem
-from hard_cases.programs import Core
+from hard_cases.programs import Core, Program
 from kcons.errors import KconsError
 
 #: Steps of the pendulum for each program: quick and full.

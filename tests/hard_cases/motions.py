@@ -9,8 +9,8 @@ import numpy as np
 
 from hard_cases import truths
 from hard_cases.case import Outcome, outcome
-from hard_cases.contract import Frame, Program, together
 from hard_cases.problem import Array, Pairs, Problem
+from hard_cases.programs import Frame, Program, together
 
 OMEGA = np.array([0.9, -0.5, 0.7])
 

@@ -1,30 +1,142 @@
 """The programs side by side: the core of kcons, its parts for ASE and OpenMM, and ASE and OpenMM by themselves.
 
-All take the same `Problem` and are watched in the same way. Peers run at the settings that are best for them:
-ASE's FixBondLengths at its tolerance of 1e-13, OpenMM on the Reference platform (double precision) at 1e-12.
+All take the same `Problem`, run it, and show every frame to a watcher. Peers run at the settings that are best for
+them: ASE's FixBondLengths at its tolerance of 1e-13, OpenMM on the Reference platform (double precision) at 1e-12.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from hard_cases.contract import (
-    CannotExpressError,
-    Course,
-    Frame,
-    NotIntactError,
-    Program,
-)
 from hard_cases.problem import Array, Problem
 from kcons.comparison.runs import InAse, InOpenMM, OnArrays, Run
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion
-from kcons.steppers import Rattle, System
+from kcons.steppers import Rattle, Stepper, System
+
+
+class CannotExpressError(Exception):
+    """The program has no means to state the problem; the message says which are missing."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is seen of a run: positions, velocities, energies; NaN where a program does not tell."""
+
+    x: Array
+    v: Array
+    kinetic: float
+    potential: float
+
+    @property
+    def energy(self) -> float:
+        return self.kinetic + self.potential
+
+
+Watch = Callable[[Frame], Any]
+
+
+def together(*watches: Watch) -> Watch:
+    """A watcher that tells several."""
+
+    def watch(frame: Frame) -> None:
+        for one in watches:
+            one(frame)
+
+    return watch
+
+
+class NotIntactError(AssertionError):
+    """A call that failed has changed its input."""
+
+
+class Program:
+    """Something that can run a problem; its name is one of `SYSTEMS`."""
+
+    name = ""
+    #: How long runs may be, as a part of what a case asks for.
+    pace = 1.0
+
+    def length(self, quick: bool, short: int, full: int) -> int:
+        """Steps to run: `short` for a quick look, else `full`; fewer for slow programs."""
+        return max(10, round(self.pace * (short if quick else full)))
+
+    def run(
+        self,
+        problem: Problem,
+        dt: float,
+        steps: int,
+        watch: Watch | None = None,
+        *,
+        every: int = 1,
+        project: bool = False,
+        wrap: bool = False,
+        stepper: Stepper | None = None,
+    ) -> Frame:
+        """Run and return the last frame; `watch` sees the start and every `every` steps.
+
+        `project` brings the start onto the constraints by the means the program offers for it, `wrap` puts atoms back
+        into the cell after each step, `stepper` is for the core only.
+        """
+        run = self.begin(problem, dt, project, stepper)
+
+        def frame() -> Frame:
+            x, v = run.observe()
+            return Frame(x, v, self.kinetic(problem, run, v), problem.potential(x))
+
+        if watch:
+            watch(frame())
+        done = 0
+        while done < steps:
+            block = 1 if wrap else min(every, steps - done)
+            run.advance(block)
+            done += block
+            if wrap:
+                put(run, wrapped(run.observe()[0], problem.cell))
+            if watch and done % every == 0:
+                watch(seen := frame())
+                if not np.all(np.isfinite(seen.x)):
+                    return seen
+        return frame()
+
+    def begin(self, problem: Problem, dt: float, project: bool, stepper: Stepper | None) -> Run:
+        """The engine, at the start."""
+        raise NotImplementedError
+
+    def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
+        """Kinetic energy of a run, at velocities v."""
+        return problem.kinetic(v)
+
+    def degrees_of_freedom(self, problem: Problem) -> int:
+        """As the program counts them."""
+        raise NotImplementedError
+
+
+def wrapped(x: Array, cell: Any) -> Array:
+    """Atoms put into the cell one by one; those inside are not touched."""
+    lattice = np.asarray(cell, dtype=float)
+    return np.asarray(x - np.floor(x @ np.linalg.inv(lattice)) @ lattice)
+
+
+def put(run: Run, x: Array) -> None:
+    """Other positions, such as those wrapped into a cell, and the velocities as they are."""
+    if isinstance(run, OnArrays):
+        run.state = replace(run.state, positions=x)
+    elif isinstance(run, InAse):  # as atoms.wrap() does it: not through the constraints
+        run.atoms.arrays["positions"][:] = x
+    elif isinstance(run, InOpenMM):
+        run.context.setPositions(x * run.length)
+    else:
+        raise TypeError(type(run).__name__)
+
+
+# -- kcons on arrays -------------------------------------------------------------------------------------
 
 
 class Core(Program):
@@ -50,12 +162,11 @@ class Core(Program):
             if [a.tobytes() for a in given] != before:
                 raise NotIntactError("input arrays were changed")
 
-    def begin(self, problem: Problem, course: Course) -> Run:
+    def begin(self, problem: Problem, dt: float, project: bool, stepper: Stepper | None) -> Run:
         system = self.system(problem)
-        stepper = Rattle() if course.stepper is None else course.stepper
+        stepper = Rattle() if stepper is None else stepper
         stepper.check(system)
-        start = system.initial_state(problem.x, problem.v, project=course.project)
-        return _Intact(system, start, stepper, course.dt)
+        return _Intact(system, system.initial_state(problem.x, problem.v, project=project), stepper, dt)
 
     def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
         return run.system.kinetic_energy(v)
@@ -137,11 +248,11 @@ class PlainAse(Program):
         atoms.set_positions(atoms.get_positions())
         atoms.set_momenta(atoms.get_momenta())
 
-    def begin(self, problem: Problem, course: Course) -> Run:
-        if course.stepper is not None:
+    def begin(self, problem: Problem, dt: float, project: bool, stepper: Stepper | None) -> Run:
+        if stepper is not None:
             raise CannotExpressError("one scheme only")
-        atoms = self.atoms(problem, project=course.project)
-        return _AsRun(atoms, self.dynamics(atoms, course.dt), course.dt)
+        atoms = self.atoms(problem, project=project)
+        return _AsRun(atoms, self.dynamics(atoms, dt), dt)
 
     def degrees_of_freedom(self, problem: Problem) -> int:
         return int(self.atoms(problem).get_number_of_degrees_of_freedom())
@@ -278,15 +389,15 @@ class PlainOpenMM(Program):
                 back = np.zeros_like(v)
             context.setVelocities(v - back)
 
-    def begin(self, problem: Problem, course: Course) -> Run:
-        if course.stepper is not None:
+    def begin(self, problem: Problem, dt: float, project: bool, stepper: Stepper | None) -> Run:
+        if stepper is not None:
             raise CannotExpressError("one scheme only")
-        if course.dt <= 0:
+        if dt <= 0:
             raise CannotExpressError("OpenMM takes no steps back and none of zero length")
-        system, integrator, part = self.build(problem, course.dt)
+        system, integrator, part = self.build(problem, dt)
         context = self.context(system, integrator)
-        self.start(problem, context, part, course.dt, course.project)
-        return InOpenMM(context, integrator, course.dt)
+        self.start(problem, context, part, dt, project)
+        return InOpenMM(context, integrator, dt)
 
     def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
         return float(run.context.getState(energy=True).getKineticEnergy()._value)

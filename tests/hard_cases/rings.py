@@ -6,9 +6,9 @@ import numpy as np
 
 from hard_cases import truths
 from hard_cases.case import Outcome, case, outcome
-from hard_cases.contract import Program, together
 from hard_cases.motions import OMEGA, Seen, energy_off, every, flat_body, move
 from hard_cases.problem import Array, Pairs, Problem
+from hard_cases.programs import Program, together
 
 SINGULAR = "right to 10 x the error of RATTLE and flat to 1e-8, or refused with the count of degrees of freedom"
 

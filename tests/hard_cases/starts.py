@@ -8,10 +8,9 @@ from hard_cases import truths
 from hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from hard_cases.case import Outcome, case, outcome
 from hard_cases.chains import bonds, zigzag
-from hard_cases.contract import Frame, Program, together, wrapped
 from hard_cases.motions import Seen, energy_off
 from hard_cases.problem import Array, Problem
-from hard_cases.programs import Core, KconsInAse
+from hard_cases.programs import Core, Frame, KconsInAse, Program, together, wrapped
 
 
 def _first(program: Program, problem: Problem, steps: int = 0) -> tuple[Frame, Frame]:

@@ -12,10 +12,9 @@ from hard_cases import truths
 from hard_cases.bodies import TRIANGLE
 from hard_cases.case import Check, Outcome, case, outcome
 from hard_cases.chains import bonds, zigzag
-from hard_cases.contract import CannotExpressError, Frame, Program
 from hard_cases.motions import Seen, energy_off
 from hard_cases.problem import Problem
-from hard_cases.programs import Core, PlainAse
+from hard_cases.programs import CannotExpressError, Core, Frame, PlainAse, Program
 from hard_cases.starts import rotor
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, KahanLi6, Rattle, Stepper, Suzuki4
 

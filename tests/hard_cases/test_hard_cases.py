@@ -9,8 +9,7 @@ import pytest
 
 from hard_cases import thermostats
 from hard_cases.case import OURS, Case, all_cases, judge, outcome, run_cell
-from hard_cases.contract import CannotExpressError
-from hard_cases.programs import Core
+from hard_cases.programs import CannotExpressError, Core
 from hard_cases.steps import each_refused
 from kcons.errors import InputError
 

@@ -7,9 +7,8 @@ from itertools import combinations
 import numpy as np
 
 from hard_cases.case import Outcome, case, outcome
-from hard_cases.contract import CannotExpressError, Program
 from hard_cases.problem import Array, Problem
-from hard_cases.programs import Core, KconsInAse, KconsInOpenMM
+from hard_cases.programs import CannotExpressError, Core, KconsInAse, KconsInOpenMM, Program
 from hard_cases.steps import each_refused
 from kcons.constraints import Plane, Sphere
 from kcons.steppers import State

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import ellipj, ellipk
 
-from kcons import ConstraintSet, Motion, State, System
-from kcons.constraints import Distance, FixedAtoms, projection
+from kcons.constraints import projection
 from kcons.errors import (
     ConstraintError,
     ConvergenceError,
@@ -20,7 +19,6 @@ from kcons.errors import (
     SingularGeometryError,
 )
 from kcons.models import Multibody
-from kcons.steppers import BlanesMoan6, run
 
 #: Steps of one size: no error is too large for it.
 FIXED = {"rtol": 1.0, "atol": 1e9}
@@ -143,40 +141,6 @@ def test_no_time_and_no_times():
 
 
 # -- the same motion in other coordinates ------------------------------------------------------------
-
-
-def cartesian_end(constraints, x, v, masses, until):
-    motion = Motion(ConstraintSet(constraints, x, masses), x)
-    gravity = np.array([0.0, -GRAVITY, 0.0]) * np.array(masses)[:, None]
-    system = System(motion, lambda x, t: gravity)
-    return run(system, State(x, v), until / 1000, 1000, stepper=BlanesMoan6()).positions
-
-
-def test_double_pendulum_in_angles():
-    """A full matrix that changes with the angles, against two rods."""
-    m, M, l, L = 1.0, 2.0, 0.7, 1.1
-
-    def mass(q):
-        c = m * l * L * np.cos(q[0] - q[1])
-        return np.array([[(m + M) * L**2, c], [c, m * l**2]])
-
-    def force(q, v, t):
-        s = m * l * L * np.sin(q[0] - q[1])
-        weight = GRAVITY * np.array([(m + M) * L * np.sin(q[0]), m * l * np.sin(q[1])])
-        return np.array([-s * v[1] ** 2, s * v[0] ** 2]) - weight
-
-    q = np.array([1.2, -0.4])
-    found = Multibody(mass, force).solve(q, np.zeros(2), (0, 0.5), rtol=1e-12, atol=1e-12)
-
-    def place(q):
-        x = np.zeros((3, 3))
-        x[1] = L * np.sin(q[0]), -L * np.cos(q[0]), 0.0
-        x[2] = x[1] + [l * np.sin(q[1]), -l * np.cos(q[1]), 0.0]
-        return x
-
-    rods = [FixedAtoms([0]), Distance([[0, 1], [1, 2]])]
-    end = cartesian_end(rods, place(q), np.zeros((3, 3)), [0.0, M, m], 0.5)
-    np.testing.assert_allclose(place(found.q[-1]), end, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("method", ["DOP853", "Radau"])

@@ -12,7 +12,7 @@ from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain
 from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.constraints import Angle, Distance, Sphere
-from kcons.errors import CertificateError, InputError
+from kcons.errors import CertificateError
 from kcons.solvers.cluster_solver import Outcome
 from kcons.steppers import Suzuki4
 
@@ -75,15 +75,6 @@ def test_a_later_error_comes_with_the_last_certified_state():
     assert np.array_equal(good.positions, expected.positions)
 
 
-def test_only_what_is_asked_for_is_certified():
-    careless, start = system()
-    careless.motion.plan.solvers[0] = Careless(careless.motion.plan.solvers[0], "positions")
-    end = run(careless, start, 0.01, 20, check_every=0)
-    assert np.abs(careless.motion.constraint_set.value(end.positions)).max() > 1e-6
-    with pytest.raises(InputError, match="check_every"):
-        run(careless, start, 0.01, 20, check_every=-1)
-
-
 def test_the_count_goes_on_from_run_to_run():
     held, start = system()
     seen = []
@@ -93,17 +84,6 @@ def test_the_count_goes_on_from_run_to_run():
     for _ in range(45):
         state = run(held, state, 0.01, 1, check_every=20)
     assert np.allclose(seen, [0.01, 0.21, 0.41])
-
-
-def test_certificates_change_no_trajectory_and_observers_see_what_they_are_due():
-    held, start = system(angle=False)
-    plain = run(held, start, 0.01, 100, check_every=0)
-    other, _ = system(angle=False)
-    seen = []
-    end = run(other, start, 0.01, 100, check_every=7, observers=[lambda s: seen.append(s.step)], every=25)
-    assert np.array_equal(plain.positions, end.positions)
-    assert np.array_equal(plain.velocities, end.velocities)
-    assert seen == [0, 25, 50, 75, 100]
 
 
 def test_steppers_that_let_constraints_drift_are_not_certified():

@@ -62,17 +62,6 @@ def test_few_atoms_among_many_get_what_they_get_alone(moving: bool) -> None:
         np.testing.assert_array_equal(found[free], off[free])
 
 
-def test_free_atoms_may_hold_anything() -> None:
-    many, x, numbers = system(400)
-    motion = Motion(many, x)
-    free = np.setdiff1d(np.arange(len(x)), numbers)
-    step, v = x + steps(len(x), 1)[0], np.zeros_like(x)
-    step[free], v[free] = np.nan, np.inf
-    assert np.isfinite(motion.project_positions(step, x, velocities=v, dt=1.0)[numbers]).all()
-    assert np.isfinite(motion.project_velocities(x, v)[numbers]).all()
-    assert np.isfinite(motion.project_forces(x, v)[numbers]).all()
-
-
 def test_memory_of_one_bond_does_not_depend_on_the_number_of_atoms() -> None:
     """After set-up: neither a step's peak nor what is kept between steps."""
 

@@ -105,40 +105,6 @@ def test_failure_changes_nothing(sample) -> None:
         assert (lam == 5).all() and (out == 3).all()
 
 
-@pytest.mark.parametrize("layout", ["float32", "list", "Fortran", "strided", "big-endian", "integers"])
-def test_arrays_of_any_kind_are_read(sample, layout: str) -> None:
-    motion, x = sample
-    move, v = steps(len(x), 4)
-    new = x + move
-
-    def made(y: np.ndarray):
-        wide = np.zeros((2 * len(y), 6))
-        wide[::2, ::2] = y
-        table = {
-            "float32": y.astype(np.float32),
-            "list": y.tolist(),
-            "Fortran": np.asfortranarray(y),
-            "strided": wide[::2, ::2],
-            "big-endian": y.astype(">f8"),
-            "integers": np.rint(y).astype(int),
-        }
-        return table[layout]
-
-    if layout == "integers":
-        u = made(10 * v)
-        np.testing.assert_array_equal(motion.project_velocities(x, u), motion.project_velocities(x, u.astype(float)))
-        return
-    exact = np.asarray(made(new), dtype=np.float64)
-    reference = np.asarray(made(x), dtype=np.float64)
-    result = motion.project_positions(made(new), made(x))
-    np.testing.assert_array_equal(result, motion.project_positions(exact, reference))
-    assert result.dtype == np.float64
-    speeds = np.asarray(made(v), dtype=np.float64)
-    np.testing.assert_array_equal(
-        motion.acceleration(made(x), made(v), made(v)), motion.acceleration(reference, speeds, speeds)
-    )
-
-
 def test_arrays_that_cannot_take_a_result_are_refused(sample) -> None:
     motion, x = sample
     n = motion.constraint_set.n_rows

@@ -9,7 +9,7 @@ import pytest
 
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import ContradictionError, UnsupportedError
+from kcons.errors import ContradictionError
 from kcons.motion import Motion
 from kcons.plan import make_plan
 
@@ -153,13 +153,6 @@ def test_velocity_row_between_fixed_atoms_that_agrees() -> None:
     assert plan.rank == 3
     with pytest.raises(ContradictionError):
         planned([moving, held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.1)], WATER)
-
-
-def test_too_large_for_the_dense_rescue() -> None:
-    plan = planned(held.Distance([(k, k + 1) for k in range(19)]), ZIGZAG)
-    with pytest.raises(UnsupportedError, match="cluster of 19 rows around #0 Distance"):
-        plan.general_for_all(18)
-    assert len(plan.general_for_all(19).rows) == 19
 
 
 # -- rows that are named twice ----------------------------------------------------------------------

@@ -173,16 +173,6 @@ def _sphere(spec: Spec) -> list[held.Constraint]:
     return [held.Sphere(spec["atom"], spec["point"], spec["target"])]
 
 
-def _moving_sphere(spec: Spec) -> list[held.Constraint]:
-    l0, a, omega = spec["l0"], spec["a"], spec["omega"]
-    target = held.MovingTarget(
-        value=lambda t: l0 + a * np.sin(omega * t),
-        rate=lambda t: a * omega * np.cos(omega * t),
-        acceleration=lambda t: -a * omega**2 * np.sin(omega * t),
-    )
-    return [held.Sphere(spec["atom"], spec["point"], target)]
-
-
 def _ellipse_xz(spec: Spec) -> list[held.Constraint]:
     weights = np.array([1 / spec["a"] ** 2, 0.0, 1 / spec["b"] ** 2])
     return [
@@ -211,11 +201,9 @@ CONSTRAINTS: dict[str, Callable[[Spec], list[held.Constraint]]] = {
     "angle_cos": lambda spec: [held.Angle(spec["atoms"], spec["angle_rad"])],
     "plane": lambda spec: [held.Plane(spec["atom"], spec["normal"], spec["target"])],
     "ellipse_xz": _ellipse_xz,
-    "ellipsoid": lambda spec: [held.Ellipsoid(spec["atom"], np.zeros(3), [spec["a"], spec["b"], spec["c"]])],
     "torus": lambda spec: [held.Torus(spec["atom"], np.zeros(3), [0.0, 0.0, 1.0], spec["R"], spec["r"])],
     "rotating_plane": _rotating_plane,
     "rotating_ellipse": _rotating_ellipse,
-    "moving_distance_to_point": _moving_sphere,
     "linear_vector": lambda spec: [held.LinearRelation(spec["atoms"][0], spec["atoms"][1:], spec["weights"])],
 }
 
@@ -271,12 +259,6 @@ def _lj(spec: Spec, masses: Array) -> tuple[Force, Potential]:
         lambda r: 24 * epsilon / r * (2 * (sigma / r) ** 12 - (sigma / r) ** 6),
         lambda r: 4 * epsilon * ((sigma / r) ** 12 - (sigma / r) ** 6),
     )
-
-
-def _coulomb(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    q = np.array(spec["charges"])
-    product = np.array([q[i] * q[j] for i, j in spec["pairs"]])
-    return _between(spec["pairs"], lambda r: product / r**2, lambda r: product / r)
 
 
 def _torsion_cos3(spec: Spec, masses: Array) -> tuple[Force, Potential]:
@@ -341,7 +323,6 @@ FORCES: dict[str, Callable[[Spec, Array], tuple[Force, Potential]]] = {
     "quartic_site": _quartic_site,
     "harmonic_bond": _harmonic_bond,
     "lj": _lj,
-    "coulomb": _coulomb,
     "torsion_cos3": _torsion_cos3,
     "friction": _friction,
 }

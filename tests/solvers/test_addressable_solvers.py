@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
-
 import numba
 import numpy as np
 import pytest
@@ -88,15 +85,6 @@ def test_python_functions_can_be_called_and_what_they_raise_is_kept() -> None:
     np.testing.assert_array_equal(new, kept)
     with pytest.raises(ZeroDivisionError, match="of its own"):
         solver.positions(Request(new, X))
-
-
-def test_copies_have_tables_of_their_own() -> None:
-    for solver in solvers():
-        for other in (copy.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
-            assert not np.shares_memory(solver.tables, other.tables)
-            new, same = X + 0.01, X + 0.01
-            assert solver.positions(Request(new, X)) == other.positions(Request(same, X))
-            np.testing.assert_array_equal(new, same)
 
 
 def test_kernels_are_compiled_for_their_own_solver_only() -> None:

@@ -179,32 +179,6 @@ def test_no_more_is_left_than_rounding(offset: float, apart: float, converged: b
         assert np.all(np.abs(whole.value(moved, 1.0)) <= max(1.0, 0.6e14 * apart) * whole.tolerance(moved, 1.0))
     else:
         np.testing.assert_array_equal(moved, before)
-        assert solver.restore(moved, time=1.0).converged is False
-
-
-def test_velocity_rows_move_no_positions() -> None:
-    rows = [held.RadiusOfGyration([[0, 1, 2]]), held.LinearVelocity([[0, 1]], np.ones((2, 3)), 0.7)]
-    solver, whole = solver_of(rows, WATER)
-    new, lam = WATER + 0.05, np.empty(2)
-    new[1] += 0.1
-    alone, _ = solver_of(rows[:1], WATER)
-    y, z = new.copy(), new.copy()
-    assert positions(solver, y, WATER, multipliers=lam).converged
-    assert positions(alone, z, WATER).converged
-    np.testing.assert_allclose(y, z, rtol=0, atol=1e-14)
-    assert lam[1] == 0.0
-    v = np.random.default_rng(0).normal(size=(3, 3))
-    rates = whole.velocity_target(WATER)
-    assert solver.tangents(Request(v, WATER, rates)).converged
-    np.testing.assert_allclose(whole.jacobian(WATER) @ v.ravel(), rates, rtol=0, atol=1e-14)
-
-
-def test_only_velocity_rows() -> None:
-    solver, _ = solver_of([held.LinearVelocity([[0, 1]], np.ones((2, 3)), 0.7)], WATER)
-    y, lam = WATER + 0.5, np.empty(1)
-    assert positions(solver, y, WATER, multipliers=lam).converged
-    np.testing.assert_array_equal(y, WATER + 0.5)
-    assert lam[0] == 0.0
 
 
 def test_a_step_too_far_is_refused_and_changes_nothing() -> None:
@@ -267,30 +241,3 @@ def test_a_gradient_that_vanishes() -> None:
     assert not outcome.converged and outcome.worst_row == 0
     outcome = solver.tangents(Request(x.copy(), x))
     assert not outcome.converged and outcome.worst_row == 0
-
-
-def test_outcome_counts_iterations_even_without_residual() -> None:
-    x = np.array([[1.0, 0, 0]])
-    solver, _ = solver_of([held.Plane([0], [1.0, 0, 0])], x)
-    outcome = positions(solver, x + np.array([[0.5, 0, 0]]), x)
-    assert outcome == (True, 0.0, outcome.iterations, 0)
-    assert outcome.iterations > 0
-
-
-def test_no_rows() -> None:
-    solver, _ = solver_of([], WATER)
-    y = WATER.copy()
-    assert positions(solver, y, WATER).converged
-    assert solver.tangents(Request(y, WATER)).converged
-    assert solver.restore(y, time=0.0).converged
-    assert solver.rank(WATER, 0.0) == 0
-    np.testing.assert_array_equal(y, WATER)
-
-
-def test_restore_stops_at_the_least_squares_optimum() -> None:
-    """Levenberg-Marquardt on rows that contradict: 4/3 is the smallest sum of squares."""
-    x = np.array([[0.2, 0.1, 0], [1.2, 0.0, 0.1]])
-    solver, whole = solver_of([held.Distance([0, 1], 1.0), held.Plane([0, 1], [1.0, 0, 0], [0.0, 3.0])], x)
-    outcome = solver.restore(x, time=0.0)
-    assert not outcome.converged
-    np.testing.assert_allclose(np.sum(whole.value(x) ** 2), 4 / 3, rtol=1e-6)

@@ -10,9 +10,8 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError
 from kcons.motion import Motion
 from kcons.solvers.addressable_solvers import packed_positions, packed_tangents, set_lattice
-from kcons.steppers.stages.packed_system import MOST_ROWS, packed_rows
+from kcons.steppers.stages.packed_system import packed_rows
 
-FAR_AWAY = np.array([5.0, -7.0, 3.0])
 TRIANGLE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])
 
 
@@ -129,10 +128,3 @@ def test_nothing_changes_where_a_chain_has_no_solution(options) -> None:
     speed = v.copy()
     assert not packed_tangents(x, speed, found)
     assert np.array_equal(speed, v, equal_nan=True)
-
-
-def test_rows_of_chains_are_not_counted() -> None:
-    """Only others are: how many there may be is that of the kernel for all shapes."""
-    assert engine([20000], stars=MOST_ROWS // 3)[-1]
-    with pytest.raises(AssertionError, match="too many rows"):
-        engine([100], stars=MOST_ROWS // 3 + 1)

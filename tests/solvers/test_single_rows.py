@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 from constraint_cases import CASES, MASSES, TIME, scattered
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import CenterDistance, Custom, Dihedral, Ellipsoid, FixedAtoms, RowKind, Sphere, Torus
+from kcons.constraints import Custom, Dihedral, RowKind, Sphere
 from kcons.errors import ConvergenceError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -94,25 +92,3 @@ def test_a_dihedral_that_turns_over_has_no_solution_far_away(seed):
     kept = new.copy()
     assert not SingleRows(whole, np.arange(1), inverse_masses).positions(Request(new, x)).converged
     assert np.array_equal(new, kept)
-
-
-def test_what_cannot_move_is_not_counted_or_moved():
-    x = np.array([[2.0, 0, 0], [0, 0, 0.0], [0, 3.0, 0], [5.0, 5.0, 5.0]])
-    rows = [FixedAtoms([0]), CenterDistance([0], [1]), Torus(2, [0, 0, 0], [0, 0, 1.0], 2.0)]
-    motion = Motion(ConstraintSet(rows, x, [1.0, 2.0, 3.0, 4.0]), x)
-    assert [line.solver for line in motion.plan.kinds] == ["SingleRows"] and motion.rank == 5
-    y = motion.project_positions(x + 0.1, x)
-    assert np.array_equal(y[0], x[0])
-    assert np.linalg.norm(y[1] - y[0]) == pytest.approx(2.0, abs=1e-15)
-    solver = motion.plan.solvers[0]
-    assert solver.rank(x, None, 0.0) == 2
-
-
-def test_copies_have_addresses_of_their_own():
-    solver, _, whole = both(Ellipsoid([0, 3], [0, 0, 0], [1, 2, 3.0], target=None), scattered(0))
-    other = copy.deepcopy(solver)
-    del solver
-    x = scattered(0)
-    y = x + 0.01
-    assert other.positions(Request(y, x)).converged
-    assert np.all(np.abs(whole.value(y)) <= whole.tolerance(y))

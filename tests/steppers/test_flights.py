@@ -144,20 +144,6 @@ def test_great_circles_end_on_the_sphere_wherever_they_start() -> None:
             assert abs(np.linalg.norm(at[0] - center) - 2.0) <= 4 * np.spacing(2.0)
 
 
-def test_great_circles_absorb_velocities_along_the_radius() -> None:
-    x = np.array([[1.0, 0.0, 0.0]])
-    system = system_of([Sphere(0, [0, 0, 0], 1.0)], x, [2.0])
-    state = system.initial_state(x, [[0.0, 3.0, 0.0]])
-    pushed = type(state)(x, state.velocities + np.array([[0.8, 0.0, 0.0]]))
-    for start in (state, pushed):
-        at, v = flown(system, start, 1.5, exact=True)
-        np.testing.assert_allclose(at[0], [np.cos(4.5), np.sin(4.5), 0.0], rtol=0, atol=1e-15)
-        # The part along the radius stays where it was: the projection at the end of the step removes the rest.
-        tangent = np.array([-np.sin(4.5), np.cos(4.5), 0.0])
-        assert v[0] @ tangent == pytest.approx(3.0, abs=1e-14)
-        assert abs(v[0] @ at[0]) <= 1e-14
-
-
 # -- times ------------------------------------------------------------------------------------------
 
 

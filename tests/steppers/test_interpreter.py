@@ -12,7 +12,7 @@ from stepper_systems import system_of
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Angle, Custom, Distance, FixedAtoms, ImplicitSurface, MovingTarget, Plane, Sphere
-from kcons.errors import ConvergenceError, ImageError, InputError, KconsError, NonFiniteError
+from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.solvers.tolerances import MANY_ITERATIONS
 from kcons.steppers import (
     BlanesMoan4,
@@ -167,27 +167,6 @@ def pair_and_atom(at: float) -> tuple[System, State]:
 
 
 @PIECEWISE
-@pytest.mark.parametrize("at", [0.0, 1e7])
-def test_a_step_of_no_operations_ends_where_it_began(at, piecewise) -> None:
-    system, state = pair_and_atom(at)
-    if piecewise:
-        system.packed = None
-    assert (state.remainder is not None) == (at > 0)
-    steps = Interpreter(system, state, 0.1, Program([]))
-    if state.remainder is not None:
-        # Relative to the anchor, with all digits.
-        assert np.array_equal(steps.x[system.anchor], state.remainder[system.anchor])
-        assert abs(np.linalg.norm(steps.x[1] - steps.x[2]) - system.motion.constraint_set.target(0.0)[0]) <= 1e-15
-    assert np.array_equal(steps.whole(steps.x), state.positions)
-    end = steps.through()
-    assert np.array_equal(end.positions, state.positions)
-    assert (end.remainder is None) == (state.remainder is None)
-    if state.remainder is not None:
-        np.testing.assert_allclose(end.remainder, state.remainder, rtol=0, atol=1e-16)
-    assert system.last is end and end.step == 1 and end.time == 0.1 and steps.made == 1
-
-
-@PIECEWISE
 def test_times_within_a_step_are_exact(piecewise) -> None:
     system, state = pair_and_atom(0.0)
     if piecewise:
@@ -224,25 +203,6 @@ def test_kicks_in_succession_and_before_other_operations(piecewise) -> None:
     last = Interpreter(system, start, 0.02, Program([Project(), Kick(0.5)])).through()
     push = 0.01 * start.forces * system.inverse_masses
     np.testing.assert_allclose(last.velocities, state.velocities + push, rtol=0, atol=1e-15)
-
-
-def test_methods_of_verbs_and_errors_get_the_number_of_the_step() -> None:
-    done: list[tuple[str, float]] = []
-
-    class Noted(Interpreter):
-        def damp(self, row, begun):
-            done.append((row.name, row.length))
-            if self.number == 3:
-                raise ImageError("half the cell apart")
-
-    system, state = molecules(*GROUPS)
-    program = Program([Kick(0.25), Evaluate()])
-    program.rows.insert(0, program.rows[0]._replace(name="damp", verb=0, length=0.7, kick=0.0))
-    for table, value in ((program.ends, 0.0), (program.shown, False), (program.flies, False)):
-        table.insert(0, value)
-    with pytest.raises(ImageError) as caught:
-        Noted(system, state, 0.1, program, 5).through()
-    assert caught.value.step == 3 and done == [("damp", 0.7)] * 3
 
 
 def test_programs_are_of_use_in_other_processes() -> None:
@@ -314,14 +274,14 @@ def test_the_engine_is_asked_for_nothing_and_forces_are_not_copied() -> None:
         setattr(system.motion, call, made.append)
     step = type(system).accepted
     system.accepted = lambda raw, number, copy: made.append((number, copy)) or step(system, raw, number, copy)
-    after = Rattle().march(system, state, 0.02, 8, check_every=0)
+    after = Rattle().march(system, state, 0.02, 8)
     assert not made
     # Forces of other kinds are taken as they come.
     kinds = (np.ndarray.tolist, np.asfortranarray, lambda f: np.repeat(f, 2, axis=1)[:, ::2], np.float32, np.longdouble)
     for kind in kinds:
         made.clear()
         system.force = lambda x, time, kind=kind: kind(force(x, time))
-        found = Rattle().march(system, state, 0.02, 8, check_every=0)
+        found = Rattle().march(system, state, 0.02, 8)
         assert made == [(number, False) for number in range(1, 9)]
         if kind is not np.float32:
             assert_same(found, after)
@@ -442,7 +402,7 @@ def test_a_cell_that_the_force_function_changes(stepper) -> None:
 
         system.force = press
         if together:
-            ends.append(stepper.march(system, state, 0.02, 6, check_every=0))
+            ends.append(stepper.march(system, state, 0.02, 6))
         else:
             ends.append(one_by_one(stepper, system, state, 0.02, 6))
     assert_same(*ends[:2])

@@ -21,18 +21,16 @@ from stepper_systems import (
 )
 
 from kcons.comparison.projected_equation import ProjectedEquation
-from kcons.constraints import Distance, FixedAtoms, LinearVelocity, MovingTarget, Sphere
+from kcons.constraints import Distance, FixedAtoms, MovingTarget, Sphere
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6,
     Composition,
     Geodesic,
-    KahanLi6,
     Rattle,
     Splitting,
     State,
-    Suzuki4,
     run,
 )
 from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
@@ -191,18 +189,6 @@ def test_rows_and_forces_are_asked_for_the_times_of_the_stages(stepper) -> None:
     assert end.positions[0] @ end.velocities[0] == pytest.approx(1.05 * 0.1, abs=1e-15)
 
 
-@COMPOSITIONS
-def test_velocity_rows_and_friction_together(stepper) -> None:
-    """An atom driven by cos t in x, slowed down in y: x = sin t, y = (1 - exp(-t/2))/0.5."""
-    rows = [LinearVelocity(0, [[1, 0, 0]], target=np.cos)]
-    system = system_of(rows, np.zeros((1, 3)), [2.0], lambda x, v, t: -1.0 * v, velocity_dependent=True)
-    start = system.initial_state(np.zeros((1, 3)), [[1.0, 1.0, 0.0]])
-    exact = np.array([np.sin(2.0), 2 * (1 - np.exp(-1.0)), 0.0])
-    steps = [4, 6, 8] if stepper.order == 6 else [8, 16, 32]
-    errors = [np.abs(run(system, start, 2.0 / n, n, stepper=stepper).positions[0] - exact).max() for n in steps]
-    assert slope(1 / np.array(steps), errors) == pytest.approx(stepper.order, abs=0.15)
-
-
 @pytest.mark.parametrize(
     ("fractions", "order", "match"),
     [
@@ -282,14 +268,6 @@ def test_great_circles_of_an_atom_at_rest() -> None:
     assert np.isfinite(end.velocities).all()
 
 
-def test_great_circles_agree_with_substeps() -> None:
-    system, state, _ = sphere()
-    exact = run(system, state, 0.1, 10, stepper=Geodesic()).positions
-    steppers = [flights(n) for n in (8, 16, 32)]
-    errors = [np.abs(run(system, state, 0.1, 10, stepper=each).positions - exact).max() for each in steppers]
-    np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 2.0, atol=0.1)
-
-
 def test_error_is_that_of_the_splitting_alone() -> None:
     """A fast rotor in a weak field: the drift is exact, what is left goes with the field."""
     field = 1e-3 * np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
@@ -300,19 +278,6 @@ def test_error_is_that_of_the_splitting_alone() -> None:
 
 
 # -- Runge-Kutta-Nystrom ----------------------------------------------------------------------------
-
-
-def test_fewest_evaluations_of_their_order() -> None:
-    """At the same cost in forces the error is below that of the compositions."""
-    system, state = rotor(omega=1.0, force=lambda x, t: -x + 0.1 * x**3)
-    exact = run(system, state, 0.01, 200, stepper=BlanesMoan6())
-
-    def error(stepper, evaluations: int) -> float:
-        n = evaluations // stepper.force_evaluations
-        return float(np.abs(run(system, state, 2 / n, n, stepper=stepper).positions - exact.positions).max())
-
-    assert 2 * error(BlanesMoan4(), 240) < error(Suzuki4(), 240)
-    assert 10 * error(BlanesMoan6(), 198) < error(KahanLi6(), 198)
 
 
 @SPLITTINGS

@@ -206,16 +206,6 @@ def test_reprs_build_the_stepper_again() -> None:
 # -- the check of reversibility --------------------------------------------------------------------------
 
 
-@REVERSIBLE
-def test_check_passes_good_steps_and_changes_nothing(stepper) -> None:
-    system, start = molecule()
-    checked = ReversibilityCheck(stepper)
-    a, b = run(system, start, 0.02, 50, stepper=checked), run(system, start, 0.02, 50, stepper=stepper)
-    assert np.array_equal(a.positions, b.positions)
-    assert (checked.order, checked.symplectic) == (stepper.order, stepper.symplectic)
-    assert checked.force_evaluations == 2 * stepper.force_evaluations
-
-
 class Drifting(Rattle):
     """Claims to be reversible and loses a little speed."""
 

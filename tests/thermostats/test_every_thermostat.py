@@ -114,20 +114,3 @@ def test_steps_and_systems_that_cannot_be(name):
     after = stepper.step(held, state, 0.1)
     still = stepper.step(held, after, 0.0)
     assert np.array_equal(still.positions, after.positions) and np.array_equal(still.velocities, after.velocities)
-
-
-@pytest.mark.parametrize(
-    ("stepper", "words"),
-    [
-        (LangevinRespa(0.5, 1.0, 3), "LangevinRespa(0.5, 1.0, rng=3)"),
-        (LangevinRespa(0.5, 1.0, 3, steps=TWO, slow_kicks="middle"), "slow_kicks='middle')"),
-        (
-            IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres="axes"),
-            "IsokineticSpheres(0.5, 1.0, rng=3, steps={'slow': 1, 'fast': 4}, spheres='axes', auxiliary=1)",
-        ),
-        (HamiltonianMonteCarlo(0.5, (2, 4), 7), "HamiltonianMonteCarlo(0.5, (2, 4), rng=7, stepper=Rattle())"),
-        (Isokinetic(0.5, order=4, convention="notes"), "Isokinetic(0.5, order=4, convention='notes')"),
-    ],
-)
-def test_words(stepper, words):
-    assert repr(stepper).endswith(words)

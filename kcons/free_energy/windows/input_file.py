@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 import sys
 import tomllib
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from functools import partial
 from itertools import product
@@ -191,7 +191,6 @@ class Pulls:
 @dataclass(kw_only=True)
 class Workers:
     processes: Count | None = None
-    scheduler: Text | None = None
 
 
 #: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
@@ -229,8 +228,6 @@ class InputFile:
     pull_steps : int
         Steps of each of these.
     processes : int or None
-    scheduler : str or None
-        Address of a scheduler of Dask.
     """
 
     sampler: Sampler
@@ -241,37 +238,34 @@ class InputFile:
     pulls: dict[str, Any] | None
     pull_steps: int
     processes: int | None
-    scheduler: str | None
 
-    def executor(self) -> AbstractContextManager[Executor | None]:
-        """Where the windows run; None for processes of this machine.
 
-        Raises
-        ------
-        InputError
-            No scheduler answers.
-        UnsupportedError
-            Dask is not installed.
-        """
-        if self.scheduler is None:
-            return nullcontext()
-        try:
-            from distributed import Client
-        except ModuleNotFoundError:
-            raise UnsupportedError(
-                "a scheduler is one of Dask, which is not installed: python -m pip install 'dask[distributed]'"
-            ) from None
-        try:
-            client = Client(self.scheduler, timeout="10s")
-        except (OSError, ValueError) as error:
-            raise InputError(f"no scheduler of Dask answers at {self.scheduler}: {error}", item="scheduler") from error
+@contextmanager
+def executor_at(scheduler: str | None) -> Iterator[Executor | None]:
+    """Where the windows run, by the address of a scheduler of Dask; None for processes of this machine.
 
-        @contextmanager
-        def cluster() -> Any:
-            with closing(client):
-                yield client.get_executor(pure=False)
+    Raises
+    ------
+    InputError
+        No scheduler answers.
+    UnsupportedError
+        Dask is not installed.
+    """
+    if scheduler is None:
+        yield None
+        return
+    try:
+        from distributed import Client
 
-        return cluster()
+        client = Client(scheduler, timeout="10s")
+    except ModuleNotFoundError:
+        raise UnsupportedError(
+            "a scheduler is one of Dask, which is not installed: python -m pip install 'dask[distributed]'"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"no scheduler of Dask answers at {scheduler}: {error}", item="scheduler") from error
+    with closing(client):
+        yield client.get_executor(pure=False)
 
 
 def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -> InputFile:
@@ -316,7 +310,7 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
-    pulls, workers = tables.get("pulls"), tables["workers"]
+    pulls = tables.get("pulls")
     if "improve" in data and (len(coordinates) > 1 or len(targets) < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
@@ -331,8 +325,7 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         data.get("improve"),
         None if pulls is None else _pulls(pulls, coordinates, targets),
         Pulls.steps if pulls is None else pulls.steps,
-        workers.processes,
-        workers.scheduler,
+        tables["workers"].processes,
     )
 
 

@@ -480,7 +480,7 @@ def find_equilibria(
                     jac=lambda X: flow.jacobian(time, X),
                     options={"xtol": 1e-13},
                 )
-                X = _polished(flow, time, np.asarray(result.x))
+                X = np.asarray(result.x)
                 place, left = (X - low) / width, float(np.linalg.norm(flow.velocity(time, X)))
             except InputError:  # the search has left all numbers
                 continue
@@ -504,14 +504,3 @@ def equilibrium_at(flow: Flow, position: ArrayLike, time: float = 0.0) -> Equili
     there = X - np.linalg.lstsq(A, V, rcond=1e-10)[0]
     moved = 4.0 * np.abs(flow.jacobian(time, there) - A) if np.all(np.isfinite(there)) else np.zeros_like(A)
     return Equilibrium(X, A, classify(A, moved + flow.jacobian_error(time, X)), float(np.linalg.norm(V)))
-
-
-def _polished(flow: Flow, time: float, X: FloatArray) -> FloatArray:
-    """Two Newton steps of least norm, kept where they help."""
-    for _ in range(2):
-        V = flow.velocity(time, X)
-        trial = X - np.linalg.lstsq(flow.jacobian(time, X), V, rcond=1e-10)[0]
-        if not np.all(np.isfinite(trial)) or np.linalg.norm(flow.velocity(time, trial)) >= np.linalg.norm(V):
-            return X
-        X = trial
-    return X

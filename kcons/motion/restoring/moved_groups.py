@@ -14,9 +14,8 @@ What has fixed atoms stays where it is. A dihedral or an angle turns the lighter
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,10 +24,10 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
-from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
 from kcons.motion.certificate import off_row
 from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
+from kcons.motion.restoring.nearest_point import least_squares
 from kcons.motion.restoring.rigid_pieces import Move, bend, stretch, torsion
 from kcons.plan.plan import Plan
 from kcons.solvers import tolerances
@@ -128,8 +127,8 @@ def moved(geometry: Geometry) -> FloatArray | None:
 def eased(geometry: Geometry) -> FloatArray | None:
     """The start with all atoms of its molecules moved, bonds and angles as near to theirs as the rows allow, or None.
 
-    Gauss-Newton steps on the rows, weighed heavily, and on changes of bonds and of the ends of angles, in units of
-    what may change.
+    Least squares of the rows, weighed heavily, and of changes of bonds and of the ends of angles, in units of what may
+    change.
     """
     held, time, start = geometry.held, geometry.time, geometry.start
     if not geometry.checked or not geometry.usable or held.n_rows > MOST_ROWS:
@@ -139,48 +138,23 @@ def eased(geometry: Geometry) -> FloatArray | None:
     if not np.any(weights > 0) or len(atoms) > MOST_EASED or not np.isfinite(start[atoms]).all():
         return None
     atoms = atoms[~geometry.pinned[atoms]]
-    columns = (3 * atoms[:, None] + np.arange(3)).ravel()
-    # Free motions cost nothing: they stay out by a weight far below that of any tie.
-    least = 1e-3 * float(weights[weights > 0].min()) ** 2
     heavy = np.where(held.holonomic, HEAVY / held.scale, 0.0)
     x = geometry.placed()
     reach = 0.3 * float(ties.scale.min())
     with np.errstate(all="ignore"):
-        for _ in range(EASING):
-            off = np.concatenate([heavy * held.value(x, time), weights * ties.value(x)])
-            rows = [sp.diags_array(heavy) @ held.jacobian(x, time), sp.diags_array(weights) @ ties.jacobian(x)]
-            table = sp.csr_array(sp.vstack(rows))[:, columns]
-            if not (np.isfinite(off).all() and np.isfinite(table.data).all()):
-                return None
-            normal = sp.csc_array(table.T @ table + least * sp.eye_array(len(columns)))
-            try:
-                step = -_solve(normal, table.T @ off)
-            except RuntimeError:  # exactly singular: sizes that differ by more than double precision
-                return None
-            longest = float(np.abs(step).max())
-            x.reshape(-1)[columns] += step * min(1.0, reach / longest) if longest > 0 else 0.0
-            if not longest > 1e-9 * reach:
-                break
+        least_squares(
+            x,
+            atoms,
+            lambda y: np.concatenate([heavy * held.value(y, time), weights * ties.value(y)]),
+            lambda y: sp.vstack(
+                [sp.diags_array(heavy) @ held.jacobian(y, time), sp.diags_array(weights) @ ties.jacobian(y)]
+            ),
+            steps=EASING,
+            still=1e-9 * reach,
+            longest=reach,
+        )
         left = np.abs(held.value(x, time)) / held.scale
     return x if np.all(left[held.holonomic] <= NEAR) else None
-
-
-def _solve(normal: sp.csc_array, right: FloatArray) -> FloatArray:
-    from scipy.sparse.linalg import splu  # slow to import, rarely needed
-
-    return np.asarray(splu(normal).solve(right))
-
-
-@dataclass(frozen=True)
-class _Own:
-    """A row with a motion of its own."""
-
-    row: int
-    part: ConstraintSet
-    atoms: IntArray
-    move: Move
-    #: (i, j, k) of a distance that is changed by the angle at j.
-    across: tuple[int, int, int] | None = None
 
 
 class _Motions:
@@ -205,6 +179,8 @@ class _Motions:
 
     def _follow_fixed(self, y: FloatArray) -> None:
         """Molecules with fixed atoms that are placed elsewhere go along, in place."""
+        from scipy.spatial.transform import Rotation  # slow to import, rarely needed
+
         places = {
             int(a): item.target_at(self.time)[3 * n : 3 * n + 3]
             for item in self.held.constraints
@@ -212,120 +188,69 @@ class _Motions:
             for n, a in enumerate(item.atoms[::3, 0])
         }
         for molecule in self.pieces.molecules:
-            fixed = molecule[self.pinned[molecule]]
-            if not len(fixed):
-                continue
-            target = np.array([places[int(a)] for a in fixed]) + self._images[fixed]
+            fixed = molecule[[a in places for a in molecule.tolist()]]
+            target = np.array([places[a] for a in fixed.tolist()]).reshape(-1, 3) + self._images[fixed]
             if np.array_equal(y[fixed], target):
                 continue
             here, there = y[fixed].mean(axis=0), target.mean(axis=0)
-            u, _, vt = np.linalg.svd((y[fixed] - here).T @ (target - there))
-            turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-            if len(fixed) < 3:
-                turn = _turn_of_line(y[fixed] - here, target - there)
-            y[molecule] = (y[molecule] - here) @ turn + there
+            if len(fixed) > 1:
+                arms = np.stack([target - there, y[fixed] - here])[:, : None if len(fixed) > 2 else 1]
+                with warnings.catch_warnings(action="ignore"):  # of atoms on one line, of which any turn does
+                    turn, _ = Rotation.align_vectors(*arms)
+                y[molecule] = here + turn.apply(y[molecule] - here)
+            y[molecule] += there - here
             y[fixed] = target
 
-    def _side(self, j: int, k: int, moves: IntArray, stays: IntArray) -> IntArray | None:
-        """What lies beyond the bond j-k, if that contains all of one group, none of another, and no fixed atom."""
-        side = self.pieces.beyond(j, k)
-        return self._piece(side, moves, stays) if side is not None else None
-
-    def _apart(self, moves: IntArray, stays: IntArray) -> IntArray | None:
-        """The molecules of some atoms, if they have none of some others and no fixed atom."""
-        return self._piece(self._molecules(moves), moves, stays)
-
-    def _piece(self, atoms: IntArray, moves: IntArray, stays: IntArray) -> IntArray | None:
-        inside = np.isin(np.concatenate([moves, stays]), atoms)
-        wanted = np.arange(len(inside)) < len(moves)
-        return atoms if np.array_equal(inside, wanted) and not self.pinned[atoms].any() else None
-
-    def _lightest(self, found: list[tuple[IntArray | None, Move | None]]) -> Move | None:
-        """Of the motions that are possible, that of the least mass."""
-        able = [(float(self.held.masses[atoms].sum()), move) for atoms, move in found if atoms is not None and move]
+    def _own(self, family: str, atoms: IntArray) -> Move | None:
+        """The motion that changes one row and, if possible, no other bond or angle: that of the lighter piece."""
+        if family == "Distance":
+            return self._shifted(*atoms.tolist())
+        able: list[tuple[float, Move]] = []
+        for order in (atoms, atoms[::-1]):
+            i, j, k = order[:3].tolist()
+            pieces = [self._piece(self.pieces.beyond(j, k), order, 2)]
+            for last in range(1, len(order) - 1):
+                molecules = np.unique(np.concatenate([self.pieces.molecule(a) for a in order[-last:].tolist()]))
+                pieces.append(self._piece(molecules, order, len(order) - last))
+            for piece in pieces:
+                if piece is not None:
+                    move = torsion(piece, j, k) if family == "Dihedral" else bend(piece, i, j, k)
+                    able.append((float(self.held.masses[piece].sum()), move))
+                    break
         return min(able, key=lambda entry: entry[0])[1] if able else None
 
-    def _own(self, family: str, atoms: IntArray) -> tuple[Move | None, tuple[int, int, int] | None]:
-        """The motion that changes one row and, if possible, no other bond or angle."""
-        image = partial(minimum_image, lattice=self.held.lattice)
-        found: list[tuple[IntArray | None, Move | None]] = []
-        if family == "Distance":
-            i, k = atoms.tolist()
+    def _piece(self, piece: IntArray | None, order: IntArray, first: int) -> IntArray | None:
+        """A piece with the atoms of a row from `first` on, with none of those before, and no fixed atom; else None."""
+        if piece is None or self.pinned[piece].any():
+            return None
+        return piece if np.array_equal(np.isin(order, piece), np.arange(len(order)) >= first) else None
 
-            def axis(x: FloatArray) -> FloatArray:
-                return image(x[k] - x[i])
-
-            move = self._shifted(np.array([k]), np.array([i]), axis)
-            if move is not None:
-                return move, None
-            for j in self.geometry.between(i, k):
-                move, _ = self._own("Angle", np.array([i, j, k]))
-                if move is not None:
-                    return move, (i, j, k)
-            return None, None
-        if family == "Angle":
-            for i, j, k in (atoms.tolist(), atoms[::-1].tolist()):
-                moves, stays = np.array([k]), np.array([i, j])
-                piece = self._side(j, k, moves, stays) if self.pieces.bonded(j, k) else None
-                if piece is None:
-                    piece = self._apart(moves, stays)
-                found.append((piece, None if piece is None else bend(piece, i, j, k)))
-        elif family == "Dihedral":
-            for i, j, k, l in (atoms.tolist(), atoms[::-1].tolist()):
-                piece = None
-                if self.pieces.bonded(j, k):
-                    piece = self._side(j, k, np.array([k, l]), np.array([i, j]))
-                if piece is None:
-                    piece = self._apart(np.array([l]), np.array([i, j, k]))
-                if piece is None:
-                    piece = self._apart(np.array([k, l]), np.array([i, j]))
-                found.append((piece, None if piece is None else torsion(piece, j, k)))
-        return self._lightest(found), None
-
-    def _owns(self) -> list[_Own]:
-        """Motions of the rows that are off."""
-        held = self.held
-        off = self.geometry.misfit > OFF * 1e-3
-        found: list[_Own] = []
-        for item, first in zip(held.constraints, held.starts, strict=False):
-            if item.family not in ("Distance", "Angle", "Dihedral", "CenterDistance"):
-                continue
-            for n in np.flatnonzero(off[first : first + item.n_rows]).tolist():
-                row = int(first) + n
-                part, atoms = held.subset(np.array([row]))
-                if item.family == "CenterDistance":
-                    move, across = self._centers(item.atoms[n], getattr(item, "split"), part, atoms), None  # noqa: B009
-                else:
-                    move, across = self._own(item.family, item.atoms[n])
-                if move is not None:
-                    found.append(_Own(row, part, atoms, move, across))
-        return found
-
-    def _shifted(self, a: IntArray, b: IntArray, axis: Callable[[FloatArray], FloatArray]) -> Move | None:
-        """Shift what belongs to two groups along the way from b to a: the two sides of a bond, or molecules."""
-        sides = None
-        if len(a) == len(b) == 1 and self.pieces.bonded(int(a[0]), int(b[0])):
-            sides = self.pieces.beyond(int(b[0]), int(a[0])), self.pieces.beyond(int(a[0]), int(b[0]))
-        if sides is None or sides[0] is None or sides[1] is None:
-            sides = self._molecules(a), self._molecules(b)
-            if len(np.intersect1d(*sides)):
+    def _shifted(self, i: int, k: int) -> Move | None:
+        """Shift the two sides of a bond, or two molecules, along the way between two atoms."""
+        sides = [self.pieces.beyond(i, k), self.pieces.beyond(k, i)]
+        if sides[0] is None or sides[1] is None:
+            sides = [self.pieces.molecule(k), self.pieces.molecule(i)]
+            if np.isin(i, sides[0]):
                 return None
-        able = [side if not self.pinned[side].any() else side[:0] for side in sides if side is not None]
-        return stretch(able[0], able[1], self.held.masses, axis) if len(able[0]) or len(able[1]) else None
-
-    def _molecules(self, atoms: IntArray) -> IntArray:
-        """All atoms of the molecules of some atoms."""
-        return np.unique(np.concatenate([self.pieces.molecule(a) for a in atoms.tolist()]))
-
-    def _centers(self, atoms: IntArray, split: int, part: ConstraintSet, own: IntArray) -> Move | None:
-        """Shift the molecules of two groups along the line of their centers."""
-        mine = np.isin(own, atoms[:split])
+        able = [side[:0] if self.pinned[side].any() else side for side in sides if side is not None]
 
         def axis(x: FloatArray) -> FloatArray:
-            gradient = part.jacobian(x[own], self.time).toarray().reshape(-1, 3)
-            return np.asarray(gradient[mine].sum(axis=0))
+            return minimum_image(x[k] - x[i], self.held.lattice)
 
-        return self._shifted(atoms[:split], atoms[split:], axis)
+        return stretch(able[0], able[1], self.held.masses, axis) if len(able[0]) or len(able[1]) else None
+
+    def _owns(self) -> list[tuple[int, ConstraintSet, IntArray, Move]]:
+        """Rows that are off and have a motion of their own, each as a set of its own with its atoms, and the motion."""
+        held = self.held
+        off = self.geometry.misfit > OFF * 1e-3
+        found = []
+        for item, first in zip(held.constraints, held.starts, strict=False):
+            if item.family in ("Distance", "Angle", "Dihedral"):
+                for n in np.flatnonzero(off[first : first + item.n_rows]).tolist():
+                    move = self._own(item.family, item.atoms[n])
+                    if move is not None:
+                        found.append((int(first) + n, *held.subset(np.array([int(first) + n])), move))
+        return found
 
     def _sweep(self, y: FloatArray) -> None:
         """Let every row that is off make its motion, over and over, in place."""
@@ -334,42 +259,15 @@ class _Motions:
         last, made = np.inf, 0
         for _ in range(SWEEPS):
             largest = 0.0
-            for own in owns:
-                sigma = float(own.part.value(y[own.atoms], time)[0])
-                size = abs(sigma) / float(held.scale[own.row])
+            for row, part, atoms, move in owns:
+                sigma = float(part.value(y[atoms], time)[0])
+                size = abs(sigma) / float(held.scale[row])
                 if not size > 1e-13:
                     continue
                 largest = max(largest, size)
-                amount = -sigma if own.across is None else self._opening(y, own.across, -sigma)
                 made += 1
-                if made > MOST_MOVES or not own.move.make(y, amount):
+                if made > MOST_MOVES or not move.make(y, -sigma):
                     return
             if largest < 1e-12 or (largest > 0.9 * last and largest < 1e-9):
                 break
             last = min(last, largest)
-
-    def _opening(self, y: FloatArray, across: tuple[int, int, int], change: float) -> float:
-        """By how much the angle i-j-k must grow for the distance i-k to grow by `change`."""
-        i, j, k = across
-        u, w = y[i] - y[j], y[k] - y[j]
-        a, b = float(np.linalg.norm(u)), float(np.linalg.norm(w))
-        now = float(np.arctan2(np.linalg.norm(cross(u, w)), u @ w))
-        goal = float(np.linalg.norm(y[k] - y[i])) + change
-        cosine = (a * a + b * b - goal * goal) / (2 * a * b)
-        return float(np.arccos(np.clip(cosine, -1.0, 1.0))) - now
-
-
-def _turn_of_line(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The least turn, as a matrix for rows from the left, that takes the line of one or two points to another."""
-    u, w = a[0], b[0]
-    lu, lw = float(np.linalg.norm(u)), float(np.linalg.norm(w))
-    if lu == 0 or lw == 0:
-        return np.eye(3)
-    u, w = u / lu, w / lw
-    axis, cosine = cross(u, w), float(u @ w)
-    if cosine < -1 + 1e-12:
-        axis = cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
-        axis /= np.linalg.norm(axis)
-        return 2 * np.outer(axis, axis) - np.eye(3)
-    matrix = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return (np.eye(3) + matrix + matrix @ matrix / (1 + cosine)).T

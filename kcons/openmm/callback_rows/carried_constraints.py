@@ -142,6 +142,21 @@ class Passage:
 
 
 class Engine:
+    """The engine of rows in a System, the cell that it knows, and the precision of the Context."""
+
+    def __init__(self, motion: Motion, masses: FloatArray, cell: FloatArray | None) -> None:
+        self.motion, self.masses, self.cell = motion, masses, cell
+        self.atoms: IntArray = motion.sources[0].touched
+        self.precision = Precision("", "double")
+
+    def follow_cell(self, state: openmm.State) -> None:
+        cell = cell_of(state.getPeriodicBoxVectors())
+        if self.cell is None or not np.array_equal(cell, self.cell):
+            self.motion.set_cell(cell)
+            self.cell = cell
+
+
+class CallbackEngine(Engine):
     """What the callbacks share: the engine, where the particles are, and how far the step is."""
 
     def __init__(
@@ -154,9 +169,7 @@ class Engine:
     ) -> None:
         time = number(time, unit.picosecond, "time")
         held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
-        self.motion = Motion(held, positions, time=time)
-        self.masses, self.cell = masses, cell
-        self.atoms: IntArray = held.touched
+        super().__init__(Motion(held, positions, time=time), masses, cell)
         #: Where the carried particles are in arrays of all.
         self._held: slice | IntArray = slice(None) if len(self.atoms) == len(masses) else self.atoms
         n, local = masses.shape[0], (len(self.atoms), 3)
@@ -167,7 +180,6 @@ class Engine:
         self._x, self._read = np.zeros(local), np.zeros(local)
         #: To and from OpenMM.
         self.passage = Passage(self.atoms, n)
-        self.precision = self.passage.precision
         #: Whether the times of a drift matter, or its length.
         self.timed = self.motion.constraint_set.moving or not self.motion.constraint_set.holonomic.all()
         resting = [c.atoms.ravel() for c in held.constraints if c.fixes_atoms]
@@ -336,12 +348,6 @@ class Engine:
         stage = min(max(stage, 0), len(self._fractions) - 1)
         return start + self._nodes[stage] * dt, start + self._nodes[stage + 1] * dt, self._fractions[stage] * dt
 
-    def follow_cell(self, state: openmm.State) -> None:
-        cell = cell_of(state.getPeriodicBoxVectors())
-        if self.cell is None or not np.array_equal(cell, self.cell):
-            self.motion.set_cell(cell)
-            self.cell = cell
-
     def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
         """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
         change = None
@@ -383,7 +389,7 @@ class Engine:
 class Callback:
     """The function of one PythonForce."""
 
-    def __init__(self, engine: Engine, phase: str) -> None:
+    def __init__(self, engine: CallbackEngine, phase: str) -> None:
         self.engine, self.phase = engine, phase
 
     def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
@@ -469,7 +475,7 @@ class CarriedConstraints(Part):
         x = nanometers(positions, len(masses))
         wraps = system.usesPeriodicBoundaryConditions() if periodic is None else periodic
         cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
-        self._engine = Engine(with_massless_atoms(given, masses), x, masses, cell, time)
+        self._engine = CallbackEngine(with_massless_atoms(given, masses), x, masses, cell, time)
         refuse_virtual_sites(system, self.atoms, masses)
         #: The constraints as they were given, with targets that were found.
         self.given: Sequence[Constraint] = self.motion.sources[0].constraints

@@ -13,8 +13,7 @@ import openmm
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.motion.motion import Motion
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, cell_of, refuse_virtual_sites
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Engine, cell_of, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
 from kcons.openmm.device.rows import DeviceRows, rows_of
 from kcons.openmm.integrator.part import Part, Solver
@@ -23,21 +22,6 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import SystemRows, settled_rows
 from kcons.openmm.quantities import accepted, masses_of
 from kcons.openmm.states import positions_of
-
-
-class _Engine:
-    """The engine of rows in a Context, as the host asks it."""
-
-    def __init__(self, motion: Motion, masses: FloatArray, cell: FloatArray | None) -> None:
-        self.motion, self.masses, self.cell = motion, masses, cell
-        self.atoms: IntArray = motion.sources[0].touched
-        self.precision = Precision("", "double")
-
-    def follow_cell(self, state: openmm.State) -> None:
-        cell = cell_of(state.getPeriodicBoxVectors())
-        if self.cell is None or not np.array_equal(cell, self.cell):
-            self.motion.set_cell(cell)
-            self.cell = cell
 
 
 class KernelRows(CarriedConstraints):
@@ -66,7 +50,7 @@ class KernelRows(CarriedConstraints):
         self._carried = carried[0]._engine if len(carried) == len(parts) == 1 else None
         #: Whether rows take periodic images: as `hold` was told, else as the System.
         self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
-        self._bound: tuple[DeviceRows, _Engine] | None = None
+        self._bound: tuple[DeviceRows, Engine] | None = None
         self._of: tuple[Any, ...] = ()
         self._context: Callable[[], openmm.Context | None] = lambda: None
         self.code = 0
@@ -100,7 +84,7 @@ class KernelRows(CarriedConstraints):
         if self._bound is None or self._of != made_of:
             cell = None if self._wraps is False else cell
             rows = rows_of(masses, system_rows, self.given, positions, cell, time)
-            self._bound, self._of = (rows, _Engine(rows.motion, masses, cell)), made_of
+            self._bound, self._of = (rows, Engine(rows.motion, masses, cell)), made_of
             self._slopes = None
         return self._bound[0]
 

@@ -12,6 +12,7 @@ for the next Newton step in the opposite direction: a Newton step reads the chai
 import numpy as np
 
 from kcons.constraints.compilation import njit
+from kcons.solvers.distance_clusters import dot
 from kcons.solvers.kernels.array_views import at_first, halves, integers, octets, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
@@ -33,7 +34,6 @@ from kcons.solvers.kernels.eight_wide import (
     where_greater,
     where_zero,
 )
-from kcons.solvers.kernels.groups_of_eight import dot
 from kcons.solvers.kernels.lattices import OPEN, lattice_numbers, minimum_image
 from kcons.solvers.tolerances import CHAIN_SPEED_TOLERANCE, MAX_ITERATIONS, NEWTON_TOLERANCE, TINY
 

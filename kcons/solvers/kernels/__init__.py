@@ -6,5 +6,4 @@
 - `any_width`: numbers some doubles wide
 - `eight_wide`: a number eight doubles wide
 - `two_and_four_wide`: numbers two and four doubles wide
-- `groups_of_eight`: clusters eight at a time
 """

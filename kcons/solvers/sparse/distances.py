@@ -35,8 +35,16 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
 )
 from kcons.solvers.sparse.elimination import FAST, make_pattern, number_atoms
-from kcons.solvers.sparse.step_control import factor_serves, hopeless, refines
-from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
+from kcons.solvers.sparse.substitution import (
+    RIGHT,
+    backward,
+    factor,
+    factor_serves,
+    factor_symmetric,
+    forward,
+    hopeless,
+    refines,
+)
 from kcons.solvers.tolerances import (
     EPS,
     NEAR,

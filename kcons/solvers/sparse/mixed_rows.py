@@ -42,8 +42,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
 from kcons.solvers.sparse.elimination import FAST, make_pattern, make_triples, number_atoms
 from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, first_flat, miss
-from kcons.solvers.sparse.step_control import factor_serves, hopeless, refines, stalled
-from kcons.solvers.sparse.substitution import update
+from kcons.solvers.sparse.substitution import factor_serves, hopeless, refines, stalled, update
 from kcons.solvers.tolerances import (
     EPS,
     MANY_ITERATIONS,

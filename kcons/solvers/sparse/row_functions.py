@@ -8,6 +8,10 @@ A row that is linear in the velocities, a(r, t) . v, is a function of where a fl
 way d, which stands behind r. Its gradient by the end is a + (da/dr)^T d/2, of which only a has to be exact, and where d
 is 0 it is a. Steps without the second part take more iterations.
 
+Of many rows of one atom each, a block is taken by one function with a loop over the rows, of which the compiler makes
+vector code where the family's function allows it. Positions stand as all x, all y and all z; what is put out stands row
+by row. Rows may share their parameters, or have them one after another.
+
 All parameters lie in one array. It begins with two times, now and at the reference, with whether rows of velocities
 count (1) or not (0), and with room for what functions get and give, from `ROOM` on; then come those of each row, and
 for a function before them its address and its period.
@@ -25,7 +29,7 @@ import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, is_jitted
+from numba.extending import intrinsic, is_jitted, register_jitable
 
 from kcons.constraints.compilation import cfunc, has_a_file, njit
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
@@ -34,17 +38,21 @@ from kcons.constraints.functions.custom import PythonRows
 from kcons.constraints.target import FloatArray
 from kcons.solvers.kernels.any_width import pointer
 from kcons.solvers.sparse.elimination import FAST
-from kcons.solvers.sparse.rows_at_once import FEWEST, rows_at_once
 
 FUNCTION = int(RowKind.FUNCTION)
 #: A function of positions relative to the first atom.
 RELATIVE_FUNCTION = FUNCTION + 1
 #: From here on rows of velocities, of absolute positions and of differences.
 VELOCITY = int(RowKind.VELOCITY)
+#: The most rows that are taken at once.
+BLOCK = 32
+#: And the fewest for which this is worth the call.
+FEWEST = 8
 #: Where it stands whether rows of velocities count, and the first of the numbers that a function gets and gives.
 COUNT, ROOM = 2, 3
 _NUMBERS = types.CPointer(types.float64)
 ROW = types.void(_NUMBERS, _NUMBERS, types.float64, _NUMBERS)
+_ROWS = types.void(types.int64, _NUMBERS, _NUMBERS, types.int64, types.float64, _NUMBERS)
 _C_ROW = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_double, ctypes.c_void_p)
 
 
@@ -130,6 +138,52 @@ def _of_jitted_coefficients(coefficients: Any, width: int, timed: bool, step: fl
                 out[1 + k] += 0.5 * change / step
 
     return row
+
+
+@intrinsic
+def _from(typingctx, numbers, start):  # type: ignore[no-untyped-def]
+    """The numbers behind the first `start`."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.gep(args[0], [args[1]], inbounds=True)
+
+    return _NUMBERS(_NUMBERS, types.int64), codegen
+
+
+@intrinsic
+def call_rows(typingctx, numbers, address, n, r, p, stride, time, out):  # type: ignore[no-untyped-def]
+    """Call the function at `address` for n rows; r, p and out are places among the numbers."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        r, p, out = (builder.gep(data, [args[k]], inbounds=True) for k in (3, 4, 7))
+        integer, double = ir.IntType(64), ir.DoubleType()
+        pointer = ir.PointerType(double)
+        kind = ir.FunctionType(ir.VoidType(), [integer, pointer, pointer, integer, double, pointer])
+        function = builder.inttoptr(args[1], ir.PointerType(kind))
+        builder.call(function, [args[2], r, p, args[5], args[6], out])
+        return context.get_dummy_value()
+
+    place = types.int64
+    return types.void(numbers, place, place, place, place, place, types.float64, place), codegen
+
+
+@functools.cache
+def rows_at_once(function: Callable[..., None]) -> Any:
+    """Of ``row(r, p, t, out)`` for one atom, compiled; has an `address`."""
+    # Not compiled apart: what Numba keeps is found again by the function's name, and by no name that it gives itself.
+    row = register_jitable(fastmath=FAST, error_model="numpy")(function)
+
+    def rows(n, r, p, stride, t, out):  # type: ignore[no-untyped-def]
+        if stride == 0:
+            for i in range(n):
+                row((r[i], r[BLOCK + i], r[2 * BLOCK + i]), p, t, _from(out, 4 * i))
+        else:
+            for i in range(n):
+                row((r[i], r[BLOCK + i], r[2 * BLOCK + i]), _from(p, stride * i), t, _from(out, 4 * i))
+
+    rows.__qualname__ = f"rows_at_once.{function.__qualname__}"  # each family has a file of its own
+    return cfunc(_ROWS, cache=has_a_file(function), fastmath=FAST, error_model="numpy")(rows)
 
 
 class CalledRows:

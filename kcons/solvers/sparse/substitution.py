@@ -1,4 +1,4 @@
-"""Elimination and substitution for distance rows: the sweeps over one cluster.
+"""Elimination and substitution for distance rows: the sweeps over one cluster, and the steps of Newton's method.
 
 A row's line of eight doubles holds its vectors r and s, the accumulated change of its pivot, and its
 right-hand side: r0 s0 r1 s1 r2 s2 change right. An entry's line of four doubles holds A_lk / pivot and A_kl
@@ -25,7 +25,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
     swapped,
 )
 from kcons.solvers.sparse.elimination import FAST
-from kcons.solvers.tolerances import PIVOT_TOLERANCE
+from kcons.solvers.tolerances import MAX_ITERATIONS, NEWTON_TOLERANCE, PIVOT_TOLERANCE, ROUNDINGS
 
 #: Places of the two last numbers in a row's line.
 CHANGE, RIGHT = 6, 7
@@ -189,3 +189,33 @@ def backward(first, last, links, columns, state, entries, pivots, moves, solutio
         i, j = 4 * load_index(links, 4 * k + 2), 4 * load_index(links, 4 * k + 3)
         store_quad(moves, i, load_quad(moves, i) + (step * load_double(moves, i + 3)) * s)
         store_quad(moves, j, load_quad(moves, j) - (step * load_double(moves, j + 3)) * s)
+
+
+# -- control of the steps, whatever the rows are; a step may reuse the factor of the one before ---------------
+
+# Spliced into the loops: what is called there from them, with arrays, costs small clusters a sixth of their time.
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def hopeless(iteration, error, previous):  # type: ignore[no-untyped-def]
+    """Whether Newton runs away, or has had its time."""
+    return iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def stalled(iteration, error, previous, excess, n_rows):  # type: ignore[no-untyped-def]
+    """Whether nothing is to be gained, where the largest residual is `excess` roundings."""
+    return iteration > 4 and error > 0.1 * previous and excess * excess <= ROUNDINGS * ROUNDINGS * n_rows
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def factor_serves(factored, error, previous):  # type: ignore[no-untyped-def]
+    """Whether a step with the factor there is gains enough for its lower price."""
+    ratio = error / previous
+    return factored and (error * ratio <= NEWTON_TOLERANCE or ratio < 1e-4)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def refines(iteration, error, previous, allowed):  # type: ignore[no-untyped-def]
+    """Whether one refinement of tangents more is worth it: as long as it helps; the least error is accepted."""
+    return not (error <= allowed or iteration > 8 or not (error < 0.5 * previous))

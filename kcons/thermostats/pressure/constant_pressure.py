@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.motion.certificate import checked_every
 from kcons.steppers import State, Stepper, System
 from kcons.steppers.operations import Operation
 from kcons.steppers.stepper import Listed, require_stepper
@@ -97,13 +96,11 @@ class ConstantPressure(Listed):
         """
         return self._advanced(system, state, dt, 1)
 
-    def march(self, system: System, state: State, dt: float, steps: int, *, check_every: int | None = None) -> State:
+    def march(self, system: System, state: State, dt: float, steps: int) -> State:
         """The state after so many steps, the same to the last bit as by `step`."""
-        check_every, spare = checked_every(check_every if dt != 0 else 0)
         while steps > 0:
-            n = system.schedule.within(min(steps, self.barostat.every - state.step % self.barostat.every), check_every)
+            n = min(steps, self.barostat.every - state.step % self.barostat.every)
             state = self._advanced(system, state, dt, n)
-            system.schedule.made(n, check_every, state, dt, spare=spare)
             steps -= n
         return state
 
@@ -116,7 +113,7 @@ class ConstantPressure(Listed):
         assert isinstance(system, CellSystem)
         march = getattr(self.stepper, "march", None)
         if steps > 1 and march is not None:
-            after = march(system, state, dt, steps, check_every=0)
+            after = march(system, state, dt, steps)
         else:
             after = state
             for _ in range(steps):

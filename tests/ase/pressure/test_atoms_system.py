@@ -155,16 +155,6 @@ def test_trials_are_judged_by_the_energy_that_forces_belong_to():
     assert 0 < np.abs(volumes / SIDE**3 - 1).max() < 0.06
 
 
-def test_forces_after_a_trial_are_those_in_the_new_cell():
-    atoms = crystal()
-    dyn = ConstrainedLangevin(atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=CellRescaling(0.0, 100 * FS, 1.0, every=1))
-    dyn.run(3)
-    fresh = atoms.copy()
-    fresh.set_constraint()
-    fresh.calc = EMT()
-    assert dyn.state.forces == pytest.approx(fresh.get_forces(), abs=1e-12)
-
-
 def test_fixed_atoms_stay_as_a_wall_where_asked():
     atoms, _ = gas()
     atoms.set_constraint()
@@ -255,18 +245,6 @@ def test_forces_of_ase_constraints_count_in_the_energy():
     dyn = ConstrainedLangevin(atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=CellRescaling(0.0, 100 * FS, 1.0))
     with pytest.raises(UnsupportedError, match="no stress"):
         dyn.run(1)
-
-
-def test_a_user_may_change_the_cell_between_steps():
-    atoms, _ = gas()
-    dyn = MADE["langevin"](atoms, barostat=barostats()["monte carlo"])
-    dyn.run(5)
-    tried = dyn.state.barostat[11]
-    atoms.set_cell(1.05 * atoms.cell.array, scale_atoms=False)
-    volume = atoms.get_volume()
-    dyn.run(1)
-    assert abs(atoms.get_volume() / volume - 1) < 0.3
-    assert dyn.state.barostat[11] == tried + 1
 
 
 def test_a_step_that_fails_after_a_trial_leaves_the_cell(monkeypatch):

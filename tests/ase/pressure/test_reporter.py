@@ -81,15 +81,6 @@ def test_forces_of_ase_constraints_have_no_stress():
     assert np.isfinite(reporter.mean)
 
 
-def test_beside_fixed_atoms_the_pressure_is_the_atomic_one():
-    atoms = copper()
-    atoms.set_constraint(FixAtoms([0]))
-    dynamics = ConstrainedLangevin(atoms, FS, 300, 0.01 / FS, rng=1)
-    with pytest.raises(UnsupportedError, match=r"holds atom 0 in space.*only a pressure is asked for, virial='atomic'"):
-        PressureReporter(dynamics)()
-    PressureReporter(dynamics, virial="atomic")()
-
-
 @pytest.mark.parametrize("virial", ["molecular", "difference"])
 def test_beside_a_wall_of_fixed_atoms_the_mean_is_that_of_the_rest(virial):
     """Along the axis that the barostat changes: along the others the wall stays, and its share was the largest."""

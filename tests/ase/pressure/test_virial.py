@@ -9,13 +9,10 @@ import pytest
 from ase import Atoms, units
 from ase.build import bulk
 from ase.calculators.emt import EMT
-from ase.calculators.lj import LennardJones
 from ase.filters import ExpCellFilter, FrechetCellFilter, StrainFilter, UnitCellFilter
-from ase.md.langevin import Langevin
-from ase.md.nptberendsen import Inhomogeneous_NPTBerendsen, NPTBerendsen
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.optimize import BFGS
-from ase_systems import FS, TEMPERATURE, Free, dumbbells, follow, mean_and_error, off, pressure, random, water_gas
+from ase_systems import TEMPERATURE, pressure, random, water_gas
 
 from kcons.ase import ConstrainedCalculator, constrain, rigid_water
 from kcons.constraints import Distance, Plane
@@ -43,92 +40,7 @@ def test_ideal_gas_of_rigid_water():
     assert error < 0.02 * expected
 
 
-def test_stress_across_the_boundary_and_with_dependent_rows():
-    atoms = water_gas(2)
-    rows = rigid_water(atoms)
-    constrain(atoms, rows)
-    thermalize_momenta(atoms, TEMPERATURE, rng=random())
-    stress = atoms.get_stress(include_ideal_gas=True)
-    other = atoms.copy()
-    other.calc = Free()
-    other.set_constraint()
-    other.positions += [0.3, -0.2, 0.4]
-    other.wrap()
-    constrain(other, [rows, rows])
-    other.set_momenta(atoms.get_momenta())
-    assert other.get_stress(include_ideal_gas=True) == pytest.approx(stress, rel=1e-10, abs=1e-16)
-
-
-@pytest.mark.parametrize(
-    "cls",
-    [NPTBerendsen, pytest.param(Inhomogeneous_NPTBerendsen, marks=pytest.mark.validation)],
-    ids=lambda c: c.__name__,
-)
-def test_berendsen_barostat_reaches_its_pressure(cls, monkeypatch):
-    atoms, held = dumbbells(60, side=40.0)
-    target = 1.2 * 60 * units.kB * TEMPERATURE / atoms.get_volume()
-    engine = held.engine(atoms)
-    dyn = cls(
-        atoms,
-        2 * FS,
-        temperature_K=TEMPERATURE,
-        pressure_au=target,
-        taut=20 * FS,
-        taup=100 * FS,
-        compressibility_au=1 / target,
-        fixcm=False,
-    )
-    seen = follow(dyn, lambda: pressure(atoms), 1200)
-    mean, error = mean_and_error(seen[400:])
-    assert held.engine(atoms) is engine  # the cell changes at every step; the engine stays
-    assert abs(mean - target) <= 3 * error + 0.01 * target
-    # and it is that of the molecules as points
-    momenta = atoms.get_momenta().reshape(60, 2, 3).sum(axis=1)
-    point = (momenta**2).sum() / (3 * atoms.get_masses()[:2].sum() * atoms.get_volume())
-    assert pressure(atoms) == pytest.approx(point, rel=1e-10)
-    assert off(atoms, held) <= 1e-12
-
-
-def test_stress_is_the_derivative_under_a_constrained_strain():
-    atoms = bulk("Cu", cubic=True) * 2
-    atoms.rattle(0.05, rng=random())
-    atoms.calc = EMT()
-    held = constrain(atoms, Distance([[0, 1], [2, 3]]))
-    stress = atoms.get_stress(voigt=False)
-    cell, x = atoms.cell.array.copy(), atoms.get_positions()
-    for i, j in ((0, 0), (2, 2), (0, 1), (1, 2)):
-        energies = []
-        for h in (1e-5, -1e-5):
-            strain = np.eye(3)
-            strain[i, j] += h / 2
-            strain[j, i] += h / 2
-            strained = Atoms(atoms.symbols, positions=x @ strain, cell=cell @ strain, pbc=True, calculator=EMT())
-            strained.set_constraint(held.copy())
-            moved = strained.constraints[0].engine(strained).project_positions(strained.positions, strained.positions)
-            strained.positions = moved
-            energies.append(strained.get_potential_energy())
-        derivative = (energies[0] - energies[1]) / 2e-5 / atoms.get_volume()
-        assert stress[i, j] == pytest.approx(derivative, abs=2e-7)
-
-
 # -- long statistics --------------------------------------------------------------------------------
-
-
-@pytest.mark.validation
-def test_gas_of_rigid_water_under_langevin():
-    atoms = water_gas()
-    held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
-    thermalize_momenta(atoms, TEMPERATURE, rng=random())
-    dyn = Langevin(atoms, FS, temperature_K=TEMPERATURE, friction=0.02 / FS, fixcm=False, rng=random(5))
-    seen = []
-    dyn.attach(lambda: seen.append((pressure(atoms), atoms.get_temperature())), 5)
-    dyn.run(60_000)
-    expected = 27 * units.kB * TEMPERATURE / atoms.get_volume()
-    for values, target in zip(np.array(seen)[100:].T, (expected, TEMPERATURE), strict=True):
-        mean, error = mean_and_error(values, blocks=20)
-        assert error < 0.01 * target
-        assert abs(mean - target) <= 3 * error
-    assert off(atoms, held) <= 1e-12
 
 
 # -- cells are relaxed with molecules that stay rigid; what would break them is refused ------------
@@ -173,17 +85,6 @@ def test_forces_of_a_filter_are_the_derivative_of_its_energy(name):
         assert -(forces * d).sum() == pytest.approx((energies[0] - energies[1]) / 2e-5, rel=1e-4, abs=1e-5)
 
 
-@pytest.mark.parametrize("name", FILTERS)
-def test_a_molecular_crystal_relaxes(name):
-    atoms = crystal()
-    lengths = [atoms.get_distance(2 * k, 2 * k + 1, mic=True) for k in range(4)]
-    begun = atoms.get_potential_energy()
-    BFGS(filtered(FILTERS[name], atoms), logfile=None).run(fmax=0.05, steps=10)
-    assert atoms.get_potential_energy() < begun - 0.1
-    found = [atoms.get_distance(2 * k, 2 * k + 1, mic=True) for k in range(4)]
-    assert found == pytest.approx(lengths, abs=1e-9)
-
-
 def test_what_scales_atoms_past_their_constraints_is_refused():
     atoms = crystal()
     optimizer = BFGS(StrainFilter(atoms), logfile=None)
@@ -219,9 +120,3 @@ def test_filters_beside_atoms_that_stay_are_refused(name, calculator):
         flat.set_positions(y)
         energies.append(flat.get_potential_energy())
     assert -forces[n, 0] == pytest.approx((energies[0] - energies[1]) / 2e-5, rel=1e-4, abs=1e-5)
-
-
-def test_free_atoms_and_the_strain_filter_go_together():
-    atoms = bulk("Ar", "fcc", a=5.6, cubic=True)
-    atoms.calc = LennardJones(sigma=3.4, epsilon=0.01, rc=2.7)
-    BFGS(StrainFilter(atoms), logfile=None).run(fmax=0.01, steps=3)

@@ -57,26 +57,6 @@ def test_differenced_time_terms():
         assert found == pytest.approx(expected, abs=2e-11)
 
 
-def test_custom_distance_is_the_distance():
-    x = scattered(3)
-    v = scattered(4)
-    ours = ConstraintSet([Custom([[0, 1], [4, 2]], gap, gap_gradient, translation_invariant=True)], x, MASSES)
-    theirs = ConstraintSet([Distance([[0, 1], [4, 2]])], x, MASSES)
-    assert ours.target() == pytest.approx(theirs.target(), rel=1e-15)
-    assert ours.acceleration_target(x, v) == pytest.approx(theirs.acceleration_target(x, v), rel=1e-10)
-
-
-def test_custom_coordinate_with_a_period():
-    item = Custom([0], lambda r: np.arctan2(r[0, 1], r[0, 0]), _polar_gradient, target=3.1, period=2 * np.pi)
-    x = np.array([[np.cos(-3.1), np.sin(-3.1), 0.0]])
-    assert ConstraintSet([item], x, np.ones(1)).value(x)[0] == pytest.approx(2 * np.pi - 6.2, rel=1e-12)
-
-
-def _polar_gradient(r):
-    x, y, _ = r[0]
-    return np.array([[-y, x, 0.0]]) / (x * x + y * y)
-
-
 def test_a_wrong_gradient_is_found_before_it_moves_anything():
     with pytest.raises(InputError, match=r"row 1, Custom\(0, 1\): gradient gives .* but differences .* give"):
         ConstraintSet([Distance([2, 3]), Custom([0, 1], gap, lambda r: 2 * gap_gradient(r))], scattered(0), MASSES)

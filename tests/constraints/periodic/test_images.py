@@ -10,7 +10,6 @@ from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import (
     Angle,
     CenterDistance,
-    CenterOfMass,
     Dihedral,
     Distance,
     FixedAtoms,
@@ -146,18 +145,6 @@ def test_atoms_that_nothing_ties_raise_before_their_image_flips(wrapped):
     assert set(caught.value.atoms) <= {0, 1, 2, 3}
     assert "time step" not in str(caught.value)
     assert np.array_equal(state.positions % 10.0 if wrapped else state.positions, before)
-
-
-def test_a_molecule_across_the_boundary_held_by_its_center():
-    x = np.array([[9.5, 5.0, 5.0], [10.5, 5.0, 5.0], [10.0, 5.8, 5.0]])
-    rows = [Distance([[0, 1], [1, 2]]), LinearCombination([0, 2], [[0, 1.0, 0], [0, -1.0, 0]]), CenterOfMass([0, 1, 2])]
-    masses = np.array([1.0, 2.0, 3.0])
-    free, there = Motion(ConstraintSet(rows, x, masses), x), x % 10.0
-    motion = Motion(ConstraintSet(rows, there, masses, cell=[10.0] * 3), there)
-    step = 1e-2 * np.random.default_rng(0).normal(size=x.shape)
-    right = free.project_positions(x + step, x)
-    out = motion.project_positions(there + step, there)
-    assert np.abs(out - there - (right - x)).max() < 1e-13
 
 
 def test_rows_between_fixed_atoms_that_begin_to_move():

@@ -11,19 +11,11 @@ from kcons.constraints.periodic.one_piece import (
     lined_up,
     make_whole,
     minimum_image,
-    neighbor_lists,
     spanning_tree,
 )
 from kcons.errors import InputError
 
 CELL = np.array([[7.0, 0, 0], [2.0, 8.0, 0], [-1.0, 3.0, 9.0]])
-
-
-def test_a_lattice_and_its_inverse():
-    full, inverse = lattice_of(CELL, True)
-    np.testing.assert_array_equal(full, CELL)
-    np.testing.assert_allclose(full @ inverse, np.eye(3), atol=1e-15)
-    assert lattice_of(None, True) is None and lattice_of(CELL, False) is None
 
 
 @pytest.mark.parametrize("pbc", [(True, False, False), (True, True, False), (False, True, True)])
@@ -62,12 +54,6 @@ def test_lists_follow_their_first_atom():
     found = lined_up(wrapped.copy(), lattice)
     np.testing.assert_allclose(found - found[:, :1], r - r[:, :1], atol=1e-12)
     np.testing.assert_array_equal(found[:, 0], wrapped[:, 0])
-
-
-def test_neighbors_ascend():
-    start, neighbors = neighbor_lists(np.array([[4, 1], [0, 3], [1, 0], [2, 1]]), 6)
-    lists = [neighbors[start[a] : start[a + 1]].tolist() for a in range(6)]
-    assert lists == [[1, 3], [0, 2, 4], [1], [0], [1], []]
 
 
 def test_a_tree_is_walked_breadth_first_from_its_roots():

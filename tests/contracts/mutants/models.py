@@ -76,10 +76,8 @@ MUTANTS = {
         ("        «told.clear()→pass»\n", "test_multibody.py::test_what_ends_a_run_is_told_not_what_was_got_over"),
         ("«self.D[0] += y - self.y→pass»", "test_integration.py::test_the_next_step_starts_from_the_projection"),
     ],
-    "solvers/sparse/rows_at_once.py": [
-        ("_from(p, «stride→0» * i)", "test_rows_at_once.py::test_values_and_gradients_are_those_of_one_row"),
-    ],
     "solvers/sparse/row_functions.py": [
+        ("_from(p, «stride→0» * i)", "test_rows_at_once.py::test_values_and_gradients_are_those_of_one_row"),
         ("alike[«first + size - 1→:»] = True", "test_rows_at_once.py::test_who_is_called_one_by_one"),
         (
             "and before[1] == time« and before[2] == value→»:",

@@ -76,7 +76,7 @@ MUTANTS = {
     ],
     "openmm/integrator/program.py": [
         (
-            "for name, value in («*self.settings.items(), →»*self.idle.items()):",
+            "in (*self.«settings→idle».items(), *self.idle.items()):",
             "test_settings.py::test_a_setting_has_a_method_of_its_own",
         ),
     ],
@@ -228,7 +228,7 @@ MUTANTS = {
             "test_surface_integrator.py::test_great_circles_at_any_time_step",
         ),
         (
-            '«d *= radius / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None]→pass»',
+            '"ij,ij->i", d, way)[:, None] / radius«**2→»)',
             "test_surface_integrator.py::test_the_steps_are_those_of_the_core",
         ),
         (

@@ -126,7 +126,7 @@ MUTANTS = {
     ],
     "motion/restoring/nearest_point.py": [
         (
-            "here = «mixed.after(here, ahead)→ahead»",
+            "            «self._descend(start, here)→pass»\n",
             "test_nearest_point.py::test_the_nearest_point_is_found_where_the_surface_is_much_bent",
         ),
     ],

@@ -109,12 +109,3 @@ def test_an_average_over_processes_has_the_moments_of_a_mixture():
     assert np.abs((np.cov(samples.T) - covariance) / np.outer(spread, spread)).max() < 0.02
     assert mixed.mean(x, [-1])[0] == pytest.approx(mean[:3], rel=1e-12)
     assert mixed.closed().weights is mixed.weights
-
-
-def test_what_is_learned_is_surer_than_nothing_and_less_sure_than_the_most_likely():
-    x = np.linspace(0.0, 3.0, 6)[:, None]
-    found = learn(x, np.sin(2 * x), np.full((6, 1, 1), 1e-3), [Axis(0.0, 3.0, False)], [True])
-    at = (np.array([[0.3], [2.6]]), [0])
-    assert found.weights.sum() == pytest.approx(1.0) and (found.weights > 0).all()
-    sure, careful = (np.diag(each.posterior(at)[1]) for each in (found.best, found))
-    assert (careful > sure).all() and (careful < 4 * sure + 0.2).all()

@@ -59,14 +59,6 @@ def fitted(name, n, error, seed):
 
 
 @pytest.mark.parametrize("name", SURFACES)
-def test_gradients_of_the_tests_are_gradients(name):
-    value, gradient, low, high, _ = SURFACES[name]
-    x, h = np.random.default_rng(0).uniform(low, high, (5, 2)), 1e-6
-    for j, step in enumerate(h * np.eye(2)):
-        assert gradient(x)[:, j] == pytest.approx((value(x + step) - value(x - step)) / (2 * h), abs=1e-6)
-
-
-@pytest.mark.parametrize("name", SURFACES)
 def test_scattered_windows_give_the_surface_within_its_errors(name):
     value = SURFACES[name][0]
     away, sizes = [], []

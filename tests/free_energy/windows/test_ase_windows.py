@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from ase import Atoms
 from ase.build import molecule
-from ase.calculators.calculator import Calculator
 from ase.calculators.lj import LennardJones
 from ase.constraints import FixAtoms
 
@@ -51,20 +50,6 @@ def test_a_window_without_a_pull(tmp_path):
     found = Windows(sampler(), tmp_path, settings, both_sides=False, executor=ThreadPoolExecutor(1))
     result = found.run([np.pi / 3])
     assert result.failed == {} and len(result.windows) == 1
-
-
-def test_a_calculator_that_fails_is_named(tmp_path):
-    windows = AseWindows(molecule("CH3OH"), Broken, {"turn": TURN}, [PIECES])
-    with pytest.raises(RuntimeError, match="no convergence"):
-        windows.sample(Window(0, "up", (1.0,), (1.1,), 5), SHORT, tmp_path / "one")
-    assert not (tmp_path / "one").exists()
-
-
-class Broken(Calculator):
-    implemented_properties = ["energy", "forces"]
-
-    def calculate(self, *_):
-        raise RuntimeError("no convergence")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from openmm_systems import DATA
 from kcons.constraints import Angle, Dihedral, Distance, MovingTarget
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy import HeldCoordinatesReporter, local_mean_force
-from kcons.openmm import CollectiveRows, Langevin, ProjectedIntegrator, Row, hold
+from kcons.openmm import CollectiveRows, Langevin, ProjectedIntegrator, hold
 
 PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
 FIELD = app.ForceField("amber14-all.xml", "implicit/gbn2.xml")
@@ -100,21 +100,6 @@ def test_the_same_coordinate_held_in_three_ways(tmp_path):
     for way in ("collective", "hold"):
         for one, other in zip(found["System"], found[way], strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-6)
-
-
-def test_work_of_a_pulled_torsion():
-    """What moving the target adds to the energy: the sum of `CollectiveRows.work`, to second order."""
-    system = peptide()
-    rows = CollectiveRows(system, [Row(torsion(), rate=2.0)], positions=PDB.positions)
-    integrator = ProjectedIntegrator(0.0005, parts=[rows])
-    simulation = simulation_of(system, integrator)
-    reporter = HeldCoordinatesReporter(io.StringIO(), 1, {"phi": Dihedral([PHI], MovingTarget(lambda t: 2.0 * t))})
-    simulation.reporters.append(reporter)
-    simulation.step(1)
-    start = rows.work(integrator)[0]
-    simulation.step(200)
-    gained = rows.work(integrator)[0] - start
-    assert reporter.series.work[-1] == pytest.approx(gained, rel=2e-3) and abs(gained) > 0.1
 
 
 def test_work_of_a_pull_by_hold_is_the_energy_that_it_adds():

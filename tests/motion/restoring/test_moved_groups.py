@@ -16,10 +16,9 @@ from ase.neighborlist import natural_cutoffs, neighbor_list
 
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import InfeasibleError, InputError, KconsError
+from kcons.errors import InfeasibleError, KconsError
 from kcons.motion import Motion
 from kcons.motion.restoring.kept_geometry import bonds_of
-from kcons.motion.restoring.rigid_pieces import MoleculeGraph
 from kcons.topology.guessed_bonds import bonds_without_elements
 
 #: What may change: angstrom, degrees.
@@ -129,18 +128,6 @@ def test_the_piece_without_fixed_atoms_turns() -> None:
     np.testing.assert_array_equal(start, atoms.positions)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_masses_of_many_orders_do_not_matter(seed: int) -> None:
-    atoms = molecule("trans-butane")
-    rng = np.random.default_rng(seed)
-    masses = 10 ** rng.uniform(np.log10(2e-3), 7, len(atoms))
-    quads = torsions(atoms)
-    motion = engine(atoms, [held.Dihedral(quads, rng.uniform(-np.pi, np.pi, len(quads)))], masses)
-    x = motion.restore_positions(atoms.positions)
-    fulfilled(motion, x)
-    kept(atoms, x)
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_wrapped_into_a_small_cell(seed: int) -> None:
     """Atoms may be stored in any image and stay in theirs."""
@@ -166,15 +153,6 @@ def test_bonds_that_are_held_count() -> None:
     x = motion.restore_positions(atoms.positions)
     fulfilled(motion, x)
     kept(atoms, x)
-
-
-def test_at_a_time() -> None:
-    atoms = molecule("CH3CH2OH")
-    motion = engine(atoms, [held.Dihedral([[3, 2, 1, 0]], lambda t: np.pi + t)])
-    for time in (0.1, 1.0, 2.9):
-        x = motion.restore_positions(atoms.positions, time=time)
-        fulfilled(motion, x, time)
-        kept(atoms, x)
 
 
 # -- angles, bonds, distances between groups --------------------------------------------------------
@@ -253,48 +231,6 @@ def test_without_bonds_the_nearest_point_as_asked() -> None:
     fulfilled(motion, x)
     away = np.linalg.norm(x - ring.positions, axis=1)
     assert set(np.flatnonzero(away > 1e-12).tolist()) == {0, 1}
-
-
-def test_without_bonds_far_starts_go_to_the_nearest_point_too() -> None:
-    """The foot of the perpendicular in the mass metric, where groups would have been moved first."""
-    ring = molecule("C6H6")
-    angle = ring.get_angle(0, 1, 2) * np.pi / 180
-    motion = engine(ring, [held.Angle([[0, 1, 2]], angle + 0.3), held.Distance([[0, 1], [1, 2]])])
-    x = motion.restore_positions(ring.positions, bonds=[])
-    fulfilled(motion, x)
-    way = x - ring.positions
-    assert abs(motion.project_velocities(x, way)).max() < 1e-9 * abs(way).max()
-
-
-def test_what_rounding_leaves_is_no_reason_to_look_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows that depend on each other, and far images: residuals of some roundings, in the point that is nearest."""
-    ring = molecule("C6H6")
-    motion = engine(ring, [held.Distance([[0, 1]])])
-    left = 3 * float(motion.constraint_set.tolerance(ring.positions)[0])
-    seen = []
-    honest = type(motion.constraint_set).value
-
-    def rounded(rows: ConstraintSet, x: np.ndarray, time: float = 0.0) -> np.ndarray:
-        seen.append(x)
-        return honest(rows, x, time) + left
-
-    monkeypatch.setattr(ConstraintSet, "value", rounded)
-    x = motion.restore_positions(ring.positions, bonds=[])
-    assert seen and abs(x - ring.positions).max() < 1e-13
-    left *= 10
-    with pytest.raises(InfeasibleError, match="miss row"):
-        motion.restore_positions(ring.positions, bonds=[])
-
-
-@pytest.mark.parametrize(
-    "bonds",
-    [[[0, 9]], [[0, 0]], [[-1, 2]], [[0.5, 1]], [[0, 1, 2]]],
-    ids=["beyond", "self", "negative", "half", "three"],
-)
-def test_bad_bonds_are_refused(bonds: list[list[float]]) -> None:
-    atoms = molecule("CH3CH2OH")
-    with pytest.raises(InputError, match="bonds"):
-        engine(atoms, [held.Distance([[0, 1]])]).restore_positions(atoms.positions, bonds=bonds)
 
 
 # -- bounds -------------------------------------------------------------------------------------------
@@ -423,15 +359,3 @@ def test_held_distances_that_are_no_bonds() -> None:
     motion = engine(chain, [held.Distance([ends])])
     found = bonds_of(motion.constraint_set, chain.positions, 0.0, None)
     assert [tuple(b) for b in found.tolist()] == sorted(bond_table(chain))
-
-
-def test_pieces_of_a_ring_with_tails() -> None:
-    """0-1-2-3 is a ring, 3-4-5 a tail, 6-7 another molecule, 8 alone and not asked for."""
-    bonds = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (3, 4), (4, 5), (6, 7)])
-    pieces = MoleculeGraph(9, bonds, np.array([0, 6]))
-    for j, k, beyond in [(3, 4, {4, 5}), (4, 3, {0, 1, 2, 3}), (4, 5, {5}), (5, 4, {0, 1, 2, 3, 4}), (7, 6, {6})]:
-        found = pieces.beyond(j, k)
-        assert found is not None and set(found.tolist()) == beyond
-    assert pieces.beyond(0, 1) is None and pieces.beyond(0, 5) is None
-    assert set(pieces.molecule(5).tolist()) == {0, 1, 2, 3, 4, 5}
-    assert set(pieces.atoms.tolist()) == set(range(8))

@@ -95,17 +95,6 @@ def test_the_nearest_point_is_the_same_in_any_unit(unit: float) -> None:
     np.testing.assert_allclose(nearest(unit), nearest(1.0), rtol=0, atol=1e-10)
 
 
-def test_a_search_that_uses_up_its_work_keeps_how_far_it_came() -> None:
-    rng = np.random.default_rng(17)
-    x, masses = rng.normal(size=(4, 3)), rng.uniform(1, 16, 4)
-    start = x + 0.25 * rng.normal(size=x.shape)
-    whole = ConstraintSet(held.Distance([(0, 1), (1, 2), (2, 3)]), x, masses)
-    motion = Motion(whole, x)
-    found = motion.restore_positions(start, bonds=[])
-    fulfilled(whole, found)
-    assert off_the_perpendicular(whole, motion, start, found) < 1e-6
-
-
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("factor", [0.8, 1.2, 0.5, 2.0])
 def test_scaled_starts(name: str, factor: float) -> None:
@@ -113,22 +102,6 @@ def test_scaled_starts(name: str, factor: float) -> None:
     motion, whole, x = engine(name)
     start = x.mean(axis=0) + factor * (x - x.mean(axis=0)) + 0.02 * np.random.default_rng(1).normal(size=x.shape)
     fulfilled(whole, motion.restore_positions(start))
-
-
-def test_points_already_there_do_not_move() -> None:
-    for name in SETS:
-        motion, whole, x = engine(name)
-        once = motion.restore_positions(x)
-        np.testing.assert_allclose(once, x, rtol=0, atol=1e-14)
-        fulfilled(whole, once)
-
-
-def test_restored_at_a_time() -> None:
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0.5, 0]])
-    rows = [held.Distance([0, 1], lambda t: 1.0 + t), held.FixedAtoms([2], lambda t: [2.0, 0.5, t])]
-    motion = Motion(ConstraintSet(rows, x, [1.0, 1.0, 0.0]), x)
-    y = motion.restore_positions(x, time=0.5)
-    np.testing.assert_allclose(y, [[-0.25, 0, 0], [1.25, 0, 0], [2.0, 0.5, 0.5]], rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -11,7 +11,6 @@ import pytest
 from openmm import unit
 from openmm_parts import HeldCoordinates
 from openmm_systems import (
-    PLATFORMS,
     alanine,
     dumbbell,
     holding,
@@ -27,7 +26,6 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Isokinetic, ProjectedIntegrator
 from kcons.openmm.integrator.system_checks import refuse_agents
 
-platforms = pytest.mark.parametrize("platform", PLATFORMS)
 PS = unit.picosecond
 
 

@@ -11,7 +11,6 @@ import pytest
 from openmm import unit
 from openmm_parts import HeldCoordinates
 from openmm_systems import (
-    PLATFORMS,
     alanine,
     context_of,
     dumbbell,
@@ -39,7 +38,6 @@ from kcons.openmm import (
 )
 from kcons.openmm.integrator.ensemble import Ensemble
 
-platforms = pytest.mark.parametrize("platform", PLATFORMS)
 #: The trap of `tied_cluster` is round.
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 PS = unit.picosecond

@@ -65,16 +65,6 @@ def test_pattern_holds_every_coupling_and_closes_under_elimination(pairs):
                 t += 1
 
 
-def test_clusters_are_the_connected_parts():
-    pairs = [(0, 1), (5, 6), (1, 2), (6, 7), (9, 10)]
-    pattern = pattern_of(pairs, 11)
-    parts = [
-        {pairs[row] for row in pattern.order[a:b]}
-        for a, b in zip(pattern.clusters[:-1], pattern.clusters[1:], strict=True)
-    ]
-    assert sorted(map(sorted, parts)) == [[(0, 1), (1, 2)], [(5, 6), (6, 7)], [(9, 10)]]
-
-
 def test_rows_that_are_coupled_too_densely_are_refused_in_words(monkeypatch):
     monkeypatch.setattr(elimination, "MOST_UPDATES", 1e3)
     x = np.random.default_rng(1).normal(size=(31, 3))

@@ -75,24 +75,6 @@ def test_tangents_match_dense_solve(driven):
     assert np.abs(a @ y.ravel() - wanted).max() <= 2e-14
 
 
-def test_periodic_equals_unwrapped():
-    """Internal rows only: spheres and planes stand in space."""
-    rng = np.random.default_rng(3)
-    x_ref = 1.5 * rng.normal(size=(10, 3))
-    cell = np.array([[20.0, 0, 0], [3, 18, 0], [-2, 4, 22]])
-    x_new = x_ref + 0.01 * rng.normal(size=(10, 3))
-    jumps = rng.integers(-2, 3, size=(2, 10, 3)) @ cell
-    results = []
-    for shift, box in ((np.zeros((2, 10, 3)), None), (jumps, cell)):
-        given = ConstraintSet(CONSTRAINTS[:3], x_ref + shift[1], np.ones(10), cell=box)
-        solver = SparseRows(given, np.arange(given.n_rows), np.ones(10))
-        x = x_new + shift[0]
-        lattice = None if box is None else given.lattice
-        assert solver.positions(Request(x, x_ref + shift[1], lattice=lattice)).converged
-        results.append(x - shift[0])
-    np.testing.assert_allclose(results[1], results[0], atol=1e-11)
-
-
 def test_pinned_atoms_stay():
     c = Rows(seed=4)
     c.inv_mass[2] = 0.0

@@ -12,7 +12,7 @@ import pytest
 from constraint_cases import CASES, MASSES, TIME, scattered
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Custom, CustomVelocity, Distance, RowKind, Sphere
+from kcons.constraints import Custom, CustomVelocity, Distance, RowKind
 from kcons.errors import InputError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -158,26 +158,6 @@ def test_coefficients_of_numba_are_called_without_python(function):
     assert iterations[0] <= 4 < iterations[1]
 
 
-def test_coefficients_are_found_once_for_a_place():
-    """A step of a bead asks for the middle of each iteration and for where it ends, which is where the next begins."""
-    places = []
-
-    def coefficients(r):
-        places.append(r.tobytes())
-        return np.array([[-r[0, 1], r[0, 0], 0.0]])
-
-    x = np.array([[1.0, 0.2, 0.0]])
-    motion = Motion(ConstraintSet(CustomVelocity(0, coefficients), x, [1.0]), x)
-    system = System(motion, None)
-    state = State(x, motion.project_velocities(x, [[1.0, 0.0, 0.5]]))
-    state = run(system, state, 0.01, 2)
-    places.clear()
-    run(system, state, 0.01, 10)
-    # The first of these begins where the last call ended, or with one place more.
-    assert len(places) - len(set(places)) <= 1
-    assert len(places) <= 10 * 6
-
-
 @pytest.mark.parametrize("known", [True, False], ids=["gradient", "differences"])
 def test_gradients_are_found_once_for_a_place(known):
     """A step asks where it begins, at each iteration, and twice where it ends: three gradients."""
@@ -309,16 +289,6 @@ def test_copies_have_addresses_of_their_own(duplicate):
     y = x + 0.01
     assert other.positions(Request(y, x)).converged
     assert np.all(np.abs(whole.value(y)) <= whole.tolerance(y))
-
-
-def test_rows_that_are_alike_share_their_numbers():
-    x = scattered(0)
-    centers = np.zeros((3, 3))
-    sizes = []
-    for shift in (0.0, 0.1):
-        centers[2, 0] = shift
-        sizes.append(len(both([Sphere([1, 4, 2], centers)], x)[0]._given.numbers))
-    assert sizes[1] - sizes[0] == 2 * (2 + 3)
 
 
 def test_rows_that_elimination_takes_for_dependent_go_to_the_dense_solver():

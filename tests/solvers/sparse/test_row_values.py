@@ -83,14 +83,6 @@ def test_rows_equal_their_constraints(kind, cell):
     )
 
 
-def test_all_kinds_together():
-    rng = np.random.default_rng(9)
-    x = 2 * rng.normal(size=(9, 3))
-    constraint_set, values, gradient = evaluated([*KINDS.values(), Plane([1], [0, 0.6, 0.8])], x)
-    np.testing.assert_allclose(values, constraint_set.measure(x), rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(gradient, constraint_set.jacobian(x).toarray(), atol=1e-12)
-
-
 def test_rows_with_a_place_take_off_what_positions_were_moved_by():
     """Ties see the atoms where they are, places where they are stored."""
     rng = np.random.default_rng(10)

@@ -12,8 +12,7 @@ from kcons.constraints import Custom, Cylinder, Ellipsoid, Formula, Plane, Spher
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse import row_functions
-from kcons.solvers.sparse.row_functions import GivenRows, row_function
-from kcons.solvers.sparse.rows_at_once import BLOCK, FEWEST, rows_at_once
+from kcons.solvers.sparse.row_functions import BLOCK, FEWEST, GivenRows, row_function, rows_at_once
 
 AXIS, OFF = np.array([0.0, 0.6, 0.8]), np.array([0.1, 0.0, 0.0])
 #: More than one block, of which the last one is not full.

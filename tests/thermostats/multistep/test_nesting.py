@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from itertools import pairwise
 
 import numpy as np
@@ -13,14 +12,6 @@ from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Project, Tu
 from kcons.thermostats.multistep.respa import levels_of, nested
 
 THREE = levels_of({"fast": 12, "slow": 1, "medium": 4})
-
-
-def shares(operations, kind):
-    found = Counter()
-    for operation in operations:
-        if isinstance(operation, kind):
-            found[getattr(operation, "group", "")] += operation.fraction
-    return found
 
 
 @pytest.mark.parametrize("turns", [False, True])
