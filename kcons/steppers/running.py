@@ -143,12 +143,13 @@ def run(
         check_call("observers", observer, ("state",))
     stepper.check(system)
     check_every, spare = checked_every(check_every)
-    if dt == 0 or not getattr(stepper, "holds", True):
+    holds = getattr(stepper, "holds", True)  # or lets constraints drift
+    if dt == 0 or not holds:
         check_every = 0
     schedule = system.schedule
     if hasattr(stepper, "barostat"):
         state = stepper.start(system, state)  # type: ignore[attr-defined]  # the first state shown has a cell
-    if steps and state is not system.last:
+    if steps and holds and state is not system.last:
         x = finite_array(system.kernel_arrays(state)[0], system.n_atoms, "positions")
         system.require_on_rows(x, state.time)
     kept: list[State] = []

@@ -90,6 +90,7 @@ def test_steppers_that_let_constraints_drift_are_not_certified():
     held, start = system()
     end = run(held, start, 0.05, 50, stepper=ProjectedEquation(), check_every=1)
     assert np.abs(held.motion.constraint_set.value(end.positions)).max() > 1e-9
+    run(system()[0], State(end.positions * 1.001, end.velocities), 0.05, 1, stepper=ProjectedEquation())
     run(held, start, 0.05, 50, stepper=ProjectedEquation(project=True), check_every=1)
 
 

@@ -159,7 +159,7 @@ MUTANTS = {
         ),
     ],
     "steppers/running.py": [
-        ("if steps and «state is not system.last→False»:", "test_state.py::test_start_off_the_constraints"),
+        ("if steps and holds and «state is not system.last→False»:", "test_state.py::test_start_off_the_constraints"),
         (
             "    «refuse_clock(state.time, state.step, state.time_remainder)\n    →»if stepper",
             "test_running.py::test_states_made_by_hand_with_impossible_numbers",
