@@ -27,6 +27,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, did_you_mean
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, System
+from kcons.steppers.splitting import SCHEMES as STEPPERS
 
 if TYPE_CHECKING:
     from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
@@ -171,16 +172,6 @@ def _step(dt: float) -> str:
 
 # -- kcons on arrays --------------------------------------------------------------------------------
 
-STEPPERS: dict[str, type[steppers.Stepper]] = {
-    "rattle": steppers.Rattle,
-    "geodesic": steppers.Geodesic,
-    "suzuki4": steppers.Suzuki4,
-    "yoshida4": steppers.Yoshida4,
-    "kahan-li6": steppers.KahanLi6,
-    "blanes-moan4": steppers.BlanesMoan4,
-    "blanes-moan6": steppers.BlanesMoan6,
-    "blanes-moan6a": steppers.BlanesMoan6a,
-}
 #: Those that run unless methods are named: the plain one, and of each order a composition and a splitting.
 USUAL = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 
@@ -245,14 +236,16 @@ def _without_step(stepper: steppers.Stepper, dt: float) -> steppers.Stepper:
     return stepper
 
 
-for _name, _kind in STEPPERS.items():
+for _name, _make in STEPPERS.items():
+    _made = _make()
+    _class = type(_made).__name__
     add_method(
         _name,
-        partial(on_arrays, partial(_without_step, _kind())),
-        title=f"kcons {'RATTLE' if _kind is Rattle else _kind.__name__}",
-        force_evaluations=_kind().force_evaluations,
+        partial(on_arrays, partial(_without_step, _made)),
+        title=f"kcons {'RATTLE' if _name == 'rattle' else _class}",
+        force_evaluations=_made.force_evaluations,
         usual=_name in USUAL,
-        code=partial(_code_of_stepper, _kind.__name__),
+        code=partial(_code_of_stepper, _class),
     )
 for _name, _title, _stepper in (
     ("projected-verlet", "Verlet", ProjectedEquation(2)),
@@ -308,7 +301,7 @@ def _dop853(land: bool, system: TestSystem, rtol: float) -> Run:
         f = last[0] = system.potential.forces(x, t)
         return np.concatenate([y[n:], motion.acceleration(x, v, f, t).ravel()])
 
-    def states() -> Iterator[State]:
+    def states(solver: Any) -> Iterator[State]:
         while True:
             message, t = solver.step(), float(solver.t)
             if solver.status == "failed":
@@ -326,8 +319,8 @@ def _dop853(land: bool, system: TestSystem, rtol: float) -> Run:
     speed = float(np.sqrt(np.mean(system.velocities**2))) or 1.0
     start = np.concatenate([system.positions.ravel(), system.velocities.ravel()])
     atol = rtol * np.repeat([1.0, speed], n)
-    solver = DOP853(rate, 0.0, start, system.horizon, rtol=max(rtol, 1e-13), atol=atol)
-    return OfStates(states(), State(system.positions, system.velocities))
+    begin = partial(DOP853, rate, 0.0, start, system.horizon, rtol=max(rtol, 1e-13), atol=atol)
+    return OfStates(lambda: states(begin()), State(system.positions, system.velocities))
 
 
 add_method("dop853", partial(_dop853, False), title="SciPy DOP853 on eq. 105", adaptive=True)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,11 +85,12 @@ class OnArrays(Run):
 
 
 class OfStates(Run):
-    """States that a scheme with steps of its own size gives one after another."""
+    """States, with their times, that `states` gives one after another; it is called again to begin anew."""
 
-    def __init__(self, states: Iterator[State], start: State) -> None:
+    def __init__(self, states: Callable[[], Iterator[State]], start: State) -> None:
         super().__init__(0.0)
-        self.states, self.state = states, start
+        self._begin, self._start = states, start
+        self.rewind()
 
     @property
     def time(self) -> float:
@@ -97,10 +98,14 @@ class OfStates(Run):
 
     def advance(self, steps: int = 1) -> None:
         for _ in range(steps):
-            self.state = next(self.states)
+            self.state = next(self._states)
+        self.done += steps
 
     def observe(self) -> tuple[FloatArray, FloatArray]:
         return self.state.positions, self.state.velocities
+
+    def rewind(self) -> None:
+        self._states, self.state = self._begin(), self._start
 
 
 class InAse(Run):

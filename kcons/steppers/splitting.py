@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from kcons.constraints.arguments import Count, checked
 from kcons.errors import InputError, UnsupportedError
@@ -96,8 +96,8 @@ class Splitting(Interpreted):
                 item="kicks",
             )
         self.kick_first = len(self.kicks) > len(self.drifts)
-        self._made: dict[tuple[bool, ...], tuple[tuple[Operation, ...], Program]] = {}
-        self._known: tuple[System, bool, tuple[tuple[Operation, ...], Program]] | None = None
+        self._by_form: dict[tuple[bool, bool, bool], Program] = {}
+        self._known: tuple[System, bool, Program] | None = None
 
     @property
     def force_evaluations(self) -> int:
@@ -107,25 +107,26 @@ class Splitting(Interpreted):
         return f"{type(self).__name__}()"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        return self._listed(system)[0]
+        exact, settled, damped = self._form(system)
+        flight = (1.0,) if exact else self.flight
+        return splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled, damped=damped)
 
-    def _listed(self, system: System | None) -> tuple[tuple[Operation, ...], Program]:
-        """The operations, and the program that the interpreter goes through."""
+    def _form(self, system: System | None) -> tuple[bool, bool, bool]:
+        """Whether drifts fly along great circles, kicks are solved for, and friction acts."""
+        if system is None:
+            return False, False, False
+        exact = self.exact_flight and system.great_circles is not None
+        return exact, system.velocity_dependent, system.friction > 0
+
+    def _program(self, system: System) -> Program:
+        """The operations as the interpreter goes through them."""
         known = self._known
-        if known is not None and known[0] is system and known[1] is system.velocity_dependent:
-            return known[2]
-        exact = settled = damped = False
-        if system is not None:
-            exact = self.exact_flight and system.great_circles is not None
-            settled, damped = system.velocity_dependent, system.friction > 0
-        kind = exact, settled, damped
-        if kind not in self._made:
-            flight = (1.0,) if exact else self.flight
-            listed = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled, damped=damped)
-            self._made[kind] = listed, Program(listed)
-        if system is not None:
-            self._known = system, settled, self._made[kind]
-        return self._made[kind]
+        if known is None or known[0] is not system or known[1] is not system.velocity_dependent:
+            form = self._form(system)
+            if form not in self._by_form:
+                self._by_form[form] = Program(self.operations(system))
+            self._known = known = system, system.velocity_dependent, self._by_form[form]
+        return known[2]
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` where the stepper may not be used: here, nowhere."""
@@ -133,7 +134,7 @@ class Splitting(Interpreted):
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         if (state is not system.last or state.forces is None) and (self.kick_first or system.velocity_dependent):
             state = system.with_forces(state)
-        return Interpreter(system, state, dt, self._listed(system)[1], steps)
+        return Interpreter(system, state, dt, self._program(system), steps)
 
 
 class Rattle(Splitting):
@@ -356,3 +357,16 @@ class BlanesMoan6a(RungeKuttaNystrom):
 
     def __init__(self) -> None:
         super().__init__(*SRKN_14A, KAHAN_LI_6, exact_flight=True)
+
+
+#: By the names that `kcons compare` and `ProjectedIntegrator` know them by.
+SCHEMES: dict[str, Callable[[], Splitting]] = {
+    "rattle": Rattle,
+    "geodesic": Geodesic,
+    "suzuki4": Suzuki4,
+    "yoshida4": Yoshida4,
+    "kahan-li6": KahanLi6,
+    "blanes-moan4": BlanesMoan4,
+    "blanes-moan6": BlanesMoan6,
+    "blanes-moan6a": BlanesMoan6a,
+}

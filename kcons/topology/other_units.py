@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import ANGLE, LENGTH, read_only
+from kcons.constraints.arguments import read_only
 from kcons.errors import UnsupportedError
 
 C = TypeVar("C", bound=Constraint)
@@ -24,15 +24,15 @@ def rescaled(constraint: C, factor: float) -> C:
     """
     if factor == 1.0:
         return constraint
-    if constraint.moving or constraint.held not in (LENGTH, ANGLE):
+    powers = dict(constraint.held.exponents or {"unknown": 1})
+    if constraint.moving or not powers.keys() <= {"length", "angle"}:
         what = "a target that moves" if constraint.moving else "own functions or velocities"
         raise UnsupportedError(
             f"{constraint!r} has {what}; it cannot be converted to another unit. Write it in the units of the host"
         )
     copy = constraint.with_target(None)
     if constraint.target is not None:
-        target = np.asarray(constraint.target)
-        copy.target = target.copy() if constraint.held is ANGLE else target * factor
+        copy.target = np.asarray(constraint.target) * factor ** powers.get("length", 0)
     for name, power in constraint.length_powers.items():
         setattr(copy, name, read_only(getattr(constraint, name) * factor**power))
     copy._settle()

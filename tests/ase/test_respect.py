@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from ase.build import molecule
 from ase.md.langevinbaoab import LangevinBAOAB
 from ase.md.melchionna import MelchionnaNPT
 from ase.md.nose_hoover_chain import NoseHooverChainNVT
@@ -15,6 +16,7 @@ from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, TEMPERATURE, dumbbells, off, random
 
 from kcons import ConstraintSet
+from kcons.ase import constrain
 from kcons.ase.respect import require_on_surface
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
@@ -60,6 +62,19 @@ def test_honest_dynamics_raise_no_alarm():
         VelocityVerlet(atoms, 8 * FS).run(20)
         thermalize_momenta(atoms, 900, rng=random())
     assert off(atoms, held) <= 1e-12
+
+
+def test_atoms_at_rest_ask_for_the_same_positions():
+    """A kick along the bond is the same in each step, but for rounding."""
+    atoms = molecule("CO")
+    held = constrain(atoms, Distance([0, 1]))
+    start = atoms.get_positions()
+    apart = np.outer(1 / atoms.get_masses(), start[0] - start[1]) * [[1], [-1]]
+    for pull in (0.1, 0.1, 0.11, 0.11, 0.1, 0.1, 0.1):
+        atoms.set_positions(start + pull * apart)
+        atoms.set_momenta(np.zeros((2, 3)))
+    assert off(atoms, held) <= 1e-14
+    assert atoms.positions == pytest.approx(start, abs=1e-14)
 
 
 def test_positions_that_are_not_finite_are_named():

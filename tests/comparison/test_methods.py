@@ -14,6 +14,7 @@ from openmm import unit
 from kcons import steppers
 from kcons.comparison import compare, observed_orders, test_systems
 from kcons.comparison.methods import METHODS, STEPPERS, add_method, choose, code, on_arrays
+from kcons.comparison.runs import OfStates
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.errors import InputError
 from kcons.steppers import Rattle
@@ -77,6 +78,27 @@ def test_a_method_of_ones_own_is_compared(registry):
     assert 'METHODS["triple"].start' in code(pendulum, "triple", 0.0375, "x")
 
 
+def test_a_method_that_gives_states_is_compared(registry):
+    """As many steps as of the stepper that makes them, the same errors, and timed from the start again."""
+
+    def start(system, dt):
+        run = on_arrays(lambda dt: Rattle(), system, dt)
+
+        def states():
+            state = run.start
+            while True:
+                state = run.stepper.step(run.system, state, dt)
+                yield state
+
+        return OfStates(states, run.start)
+
+    add_method("states", start)
+    pendulum = test_systems.build("double-pendulum").with_time_steps([0.0125])
+    plain, made = compare(pendulum, ["rattle", "states"], rounds=1).to_dict("records")
+    assert made["status"] == "ok" and made["rounds"] >= 1
+    assert (made["steps"], made["error"]) == (plain["steps"], plain["error"])
+
+
 def test_what_is_wrong_with_a_method_is_said(registry):
     with pytest.raises(InputError, match="engine is 'gromacs'; choose 'arrays', 'ASE' or 'OpenMM'"):
         add_method("wrong", lambda system, dt: None, engine="gromacs")
@@ -106,7 +128,7 @@ def test_every_stepper_is_a_method():
         for name, item in vars(steppers).items()
         if isinstance(item, type) and hasattr(item, "force_evaluations") and not name.startswith("_")
     } - {steppers.Stepper, steppers.Splitting, steppers.Composition, steppers.RungeKuttaNystrom}
-    assert concrete == set(STEPPERS.values())
+    assert concrete == {type(make()) for make in STEPPERS.values()}
 
 
 @functools.cache

@@ -227,17 +227,17 @@ class _Motions:
 
     def _shifted(self, i: int, k: int) -> Move | None:
         """Shift the two sides of a bond, or two molecules, along the way between two atoms."""
-        sides = [self.pieces.beyond(i, k), self.pieces.beyond(k, i)]
-        if sides[0] is None or sides[1] is None:
-            sides = [self.pieces.molecule(k), self.pieces.molecule(i)]
-            if np.isin(i, sides[0]):
+        one, other = self.pieces.beyond(i, k), self.pieces.beyond(k, i)
+        if one is None or other is None:
+            one, other = self.pieces.molecule(k), self.pieces.molecule(i)
+            if np.isin(i, one):
                 return None
-        able = [side[:0] if self.pinned[side].any() else side for side in sides if side is not None]
+        one, other = (side[:0] if self.pinned[side].any() else side for side in (one, other))
 
         def axis(x: FloatArray) -> FloatArray:
             return minimum_image(x[k] - x[i], self.held.lattice)
 
-        return stretch(able[0], able[1], self.held.masses, axis) if len(able[0]) or len(able[1]) else None
+        return stretch(one, other, self.held.masses, axis) if len(one) or len(other) else None
 
     def _owns(self) -> list[tuple[int, ConstraintSet, IntArray, Move]]:
         """Rows that are off and have a motion of their own, each as a set of its own with its atoms, and the motion."""

@@ -448,8 +448,8 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     integrator = _ALIVE.get(given.integrator)
     if described["parts"] and integrator is None:
         raise UnsupportedError(
-            "the parts of an integrator are those of its Python object: keep a reference to it, and read text by "
-            "from_xml(xml, parts=...)"
+            "the parts of an integrator are those of its Python object: keep a reference to it, and in place of reading "
+            "its text make it again, with parts="
         )
     part = integrator.parts[0] if integrator is not None and integrator.parts else None
     assert part is None or isinstance(part, KernelRows)

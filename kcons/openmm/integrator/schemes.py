@@ -5,17 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from kcons.errors import InputError
-from kcons.steppers import (
-    BlanesMoan4,
-    BlanesMoan6,
-    BlanesMoan6a,
-    Geodesic,
-    KahanLi6,
-    Rattle,
-    Suzuki4,
-    Yoshida4,
-)
 from kcons.steppers.operations import Fly, Kick, Operation, Turn
+from kcons.steppers.splitting import SCHEMES as STEPPERS
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.isokinetic.isokinetic import SCHEMES as ISOKINETIC
 
@@ -29,14 +20,7 @@ def _any_flows(order: int) -> Splitting:
 
 #: Schemes by name.
 SCHEMES: dict[str, Callable[[], Splitting]] = {
-    "rattle": Rattle,
-    "geodesic": Geodesic,
-    "suzuki4": Suzuki4,
-    "yoshida4": Yoshida4,
-    "kahan-li6": KahanLi6,
-    "blanes-moan4": BlanesMoan4,
-    "blanes-moan6": BlanesMoan6,
-    "blanes-moan6a": BlanesMoan6a,
+    **STEPPERS,
     "isokinetic4": lambda: _any_flows(4),
     "isokinetic6": lambda: _any_flows(6),
 }

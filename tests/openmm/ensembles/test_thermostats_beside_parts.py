@@ -1,14 +1,15 @@
-"""Thermostats that scale velocities, beside rows that parts hold."""
+"""Every ensemble has its temperature; those that scale velocities beside rows that parts hold."""
 
 from __future__ import annotations
 
 import copy
 
 import numpy as np
+import openmm
 import pytest
 from ensemble_runs import on_their_rows, run, twice_kinetic, two_parts, warm
 from openmm_ensembles import ENSEMBLES
-from openmm_systems import loose_alanine, state_of
+from openmm_systems import context_of, loose_alanine, state_of, water_box
 
 from kcons.openmm import ProjectedIntegrator, hold
 from kcons.openmm.quantities import GAS_CONSTANT
@@ -16,6 +17,30 @@ from kcons.openmm.quantities import GAS_CONSTANT
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
 #: Noise differs between programs.
 WITHOUT_NOISE = [name for name, make in ENSEMBLES.items() if not make(300).noisy]
+
+
+@pytest.mark.parametrize("bath", ENSEMBLES)
+def test_a_run_has_the_temperature(bath):
+    """From 200 K to 300 K, within three standard errors: rigid waters in a weak well, none of whose momenta last."""
+    system, x = water_box(8)
+    well = openmm.CustomExternalForce("20*(x^2+y^2+1.5*z^2)")
+    for k in range(0, 24, 3):
+        well.addParticle(k)
+    system.addForce(well)
+    integrator = ProjectedIntegrator(2e-3, ensemble=ENSEMBLES[bath](300.0, 50.0))
+    integrator.setRandomNumberSeed(3)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, 200, 1)
+    integrator.step(1000)
+    values = []
+    for _ in range(400):
+        integrator.step(10)
+        values.append(integrator.computeSystemTemperature()._value)
+    blocks = np.reshape(values, (20, -1)).mean(axis=1)
+    error = blocks.std(ddof=1) / np.sqrt(20)
+    assert error < 6
+    assert abs(blocks.mean() - 300) <= max(3 * error, 1e-6)
 
 
 @pytest.mark.parametrize("bath", WITHOUT_NOISE)
