@@ -20,7 +20,7 @@ from nbformat import v4
 TUTORIALS = Path(__file__).resolve().parent / "tutorials"
 PYTHON = re.compile(r"^```python\n(.*?)\n```$", re.MULTILINE | re.DOTALL)
 #: Tutorials on a program that `all` does not install: they run where it is there.
-NEEDS = {"replica_exchange": "openmmtools", "torsions_at_once": "torch_sim"}
+NEEDS = {"replica_exchange": "openmmtools", "sella": "sella", "torsions_at_once": "torch_sim"}
 LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?:)[^)]*\)")
 
 
