@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Self, TextIO
+from weakref import WeakSet
 
 import MDAnalysis
 import numpy as np
@@ -33,6 +34,8 @@ MOST_COLUMNS = 64
 #: Of XTC: steps from the origin that an integer counts; range of steps from which on some frames are packed wrongly;
 #: atoms up to which there is no packing.
 _MOST, _SAFE, _FLOATS = 2**31 - 3, 2**23, 9
+#: Writers of which some may still be open.
+_ALIVE: WeakSet[TrajectoryWriter] = WeakSet()
 _H5MD_UNITS = {
     "timeunit": "ps",
     "lengthunit": "Angstrom",
@@ -101,8 +104,8 @@ class TrajectoryWriter:
     Raises
     ------
     InputError
-        MDAnalysis does not write this format, or not several frames; beside it lies a file of another trajectory where
-        that of the constraints would go.
+        MDAnalysis does not write this format, or not several frames; another writer has the file open; beside it lies a
+        file of another trajectory where that of the constraints would go.
     UnsupportedError
         Velocities or forces are asked of a format without them; H5MD without h5py.
 
@@ -130,11 +133,14 @@ class TrajectoryWriter:
         self.n_frames, self._expects_forces = 0, False
         self.side_file: Path | None = None
         self._side: TextIO | None = None
+        self._writer: Any = None
         self._format = self.path.suffix[1:].upper()
         n_atoms = whole_number(n_atoms, "n_atoms")
         self._decimals = options.get("precision", 3) if self._format == "XTC" else None
         if not self.path.parent.is_dir():
             raise InputError(f"there is no folder {self.path.parent} to write {self.path.name} into", item="path")
+        if any(other._writer is not None and other.path.resolve() == self.path.resolve() for other in _ALIVE):
+            raise InputError(f"{self.path} is open in another TrajectoryWriter; close that first", item="path")
         able = self._format in ("TRR", "H5MD", "NC", "NCDF", "TRZ")
         for asked, what in ((velocities, "velocities"), (forces, "forces")):
             if asked and not able:
@@ -163,6 +169,7 @@ class TrajectoryWriter:
             ) from None
         except RuntimeError as error:
             raise UnsupportedError(f"{self.path.name}: {error}") from None
+        _ALIVE.add(self)
 
     def _refuse_others(self) -> None:
         """The file beside the trajectory takes the place of its own older self only."""

@@ -245,6 +245,17 @@ def test_openmm_simulations(tmp_path):
     assert residuals.max() < 1e-8 and len(residuals) == 4
 
 
+@pytest.mark.parametrize("ending", ["xtc", "h5md"])
+def test_a_file_has_one_writer(tmp_path, ending):
+    path = tmp_path / f"run.{ending}"
+    with TrajectoryWriter(path, 3) as writer:
+        with pytest.raises(InputError, match="open in another TrajectoryWriter"):
+            TrajectoryWriter(tmp_path / "." / path.name, 3)
+        writer.write(np.zeros((3, 3)))
+    with TrajectoryWriter(path, 3) as again:
+        again.write(np.ones((3, 3)))
+
+
 def test_bad_input(tmp_path):
     x = np.zeros((3 * N, 3))
     for path, match in ((tmp_path / "r.psf", r"r\.psf.*use \.dcd"), (tmp_path / "no" / "r.dcd", "no folder")):

@@ -1,6 +1,12 @@
 """Mutants of topologies and the check of trajectories."""
 
 MUTANTS = {
+    "mdanalysis/writing.py": [
+        (
+            "«other._writer is not None→False» and other.path.resolve()",
+            "mdanalysis/test_writing.py::test_a_file_has_one_writer",
+        ),
+    ],
     "mdanalysis/check/deviations.py": [
         (
             'self._table["slack"] = «of_targets + →»self.tolerance * self.sizes',
