@@ -152,6 +152,7 @@ def eased(geometry: Geometry) -> FloatArray | None:
             steps=EASING,
             still=1e-9 * reach,
             longest=reach,
+            bold=True,
         )
         left = np.abs(held.value(x, time)) / held.scale
     return x if np.all(left[held.holonomic] <= NEAR) else None

@@ -203,6 +203,7 @@ def least_squares(
     steps: int,
     still: float,
     longest: float = np.inf,
+    bold: bool = False,
 ) -> int:
     """Move some atoms so that a sum of squares becomes least, in place (Levenberg and Marquardt).
 
@@ -218,6 +219,8 @@ def least_squares(
     still, longest : float
         No coordinate changes by more than the second in a step, and steps that would are made whatever they gain; where
         none changes by more than the first, all is done.
+    bold : bool
+        Whether every step is made, whatever it gains: symmetric structures would stay as they are.
 
     Returns
     -------
@@ -245,7 +248,7 @@ def least_squares(
             trial = x.copy()
             trial.reshape(-1)[columns] += move * min(1.0, longest / largest if largest > 0 else 1.0)
             found = residuals(trial)
-            if largest > longest or float(found @ found) < error:
+            if bold or largest > longest or float(found @ found) < error:
                 break
             damping = max(4 * damping, 1e-3)
         else:

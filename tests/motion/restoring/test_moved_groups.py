@@ -204,6 +204,21 @@ def test_a_distance_within_a_molecule_turns_the_bonds_between(length: float) -> 
     kept(atoms, x)
 
 
+@pytest.mark.parametrize("length", [2.3, 2.45, 2.6])
+def test_centers_within_a_molecule_turn_the_bonds_between(length: float) -> None:
+    """Those of the halves of extended butane, 2.65 apart at first: nothing there says which way the torsion goes."""
+    atoms = molecule("trans-butane")
+    halves = [[0, 1, 4, 6, 7, 10, 11], [2, 3, 5, 8, 9, 12, 13]]
+    one, other = (atoms.get_center_of_mass(indices=half) for half in halves)
+    other = one + length * (other - one) / np.linalg.norm(other - one)
+    rows = [held.CenterOfMass([half], (0, 1, 2), at) for half, at in zip(halves, (one, other), strict=True)]
+    hydrogens = [pair for pair in bond_table(atoms) if 1 in atoms.numbers[list(pair)]]
+    motion = engine(atoms, [held.Distance(hydrogens), *rows])
+    x = motion.restore_positions(atoms.positions)
+    fulfilled(motion, x)
+    kept(atoms, x)
+
+
 # -- rings, and what cannot be -----------------------------------------------------------------------
 
 
