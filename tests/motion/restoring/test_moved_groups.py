@@ -214,7 +214,7 @@ def test_centers_within_a_molecule_turn_the_bonds_between(length: float) -> None
     rows = [held.CenterOfMass([half], (0, 1, 2), at) for half, at in zip(halves, (one, other), strict=True)]
     hydrogens = [pair for pair in bond_table(atoms) if 1 in atoms.numbers[list(pair)]]
     motion = engine(atoms, [held.Distance(hydrogens), *rows])
-    x = motion.restore_positions(atoms.positions)
+    x = motion.restore_positions(atoms.positions, bonds=bond_table(atoms))
     fulfilled(motion, x)
     kept(atoms, x)
 
