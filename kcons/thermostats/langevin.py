@@ -17,12 +17,12 @@ from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.program import Program, Row
 from kcons.thermostats.freedom import carried, refuse_dissipation
-from kcons.thermostats.noise import fill_normal
+from kcons.thermostats.noise import fill_next
 
 #: What the numbers of a bath begin with: the heat that has flowed in, the kinetic energy after noise, gamma and k_B T,
 #: whether something is added to noise in Python, the seed's halves, the number of the step, how often noise has been
 #: drawn in it, and how often it is in each; then masses and 1/sqrt(m) for each coordinate, 0 for fixed atoms; noise.
-HEAT, WARM, FRICTION, KT, ASIDE, SEED, NUMBER, PART, PARTS, MASSES = 0, 1, 2, 3, 4, 5, 7, 8, 9, 10
+HEAT, WARM, FRICTION, KT, ASIDE, SEED, MASSES = 0, 1, 2, 3, 4, 5, 10
 
 
 def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
@@ -172,12 +172,7 @@ def _exchange(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-d
     """Draw noise and mix it in; 1 where something has to be added to it before."""
     n = v.size
     roots, noise = numbers[MASSES + n : MASSES + 2 * n], numbers[MASSES + 2 * n : MASSES + 3 * n]
-    seed = (np.uint64(numbers[SEED]) << np.uint64(32)) | np.uint64(numbers[SEED + 1])
-    fill_normal(seed, np.uint64(numbers[NUMBER]), np.uint64(numbers[PART]), noise)
-    numbers[PART] += 1.0
-    if numbers[PART] == numbers[PARTS]:
-        numbers[PART] = 0.0
-        numbers[NUMBER] += 1.0
+    fill_next(numbers[SEED:MASSES], noise)
     spread = math.sqrt(-math.expm1(-2 * numbers[FRICTION] * time) * numbers[KT])
     for i in range(n):
         noise[i] *= spread * roots[i]

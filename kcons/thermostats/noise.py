@@ -85,3 +85,14 @@ def fill_normal(seed: Any, number: Any, part: Any, out: Any) -> None:
             if (fi_double[layer - _ONE] - fi_double[layer]) * share + fi_double[layer] < math.exp(-0.5 * x * x):
                 out[i] = x
                 i += 1
+
+
+@njit(cache=True, nogil=True)
+def fill_next(stream: Any, out: Any) -> None:
+    """The same for the next part of the steps; `stream` has the halves of the seed, step, part, and parts of a step."""
+    seed = (np.uint64(stream[0]) << np.uint64(32)) | np.uint64(stream[1])
+    fill_normal(seed, np.uint64(stream[2]), np.uint64(stream[3]), out)
+    stream[3] += 1.0
+    if stream[3] == stream[4]:
+        stream[3] = 0.0
+        stream[2] += 1.0

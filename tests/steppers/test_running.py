@@ -33,6 +33,8 @@ def test_states_made_by_hand_with_impossible_numbers(stepper, impossible) -> Non
         run(system, wrong, 0.1, 2, stepper=stepper, observers=[seen.append])
     assert caught.value.item == item and not seen
     with pytest.raises(InputError, match=f"^{item} is"):
+        run(system, wrong, 0.1, 0, stepper=stepper)
+    with pytest.raises(InputError, match=f"^{item} is"):
         (stepper or Rattle()).step(system, wrong, 0.1)
 
 

@@ -14,14 +14,14 @@ from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import MORE, packed_tangents
 from kcons.solvers.kernels.array_views import integers, table_array
 from kcons.steppers.stages.compiled_operations import all_finite
-from kcons.thermostats.noise import fill_normal
+from kcons.thermostats.noise import fill_next
 
 #: The arrays of a program's numbers, in `in_one_array`: those of `HEAD`, R^2, w, those of `SphereLayout`, 1/sqrt(m) for
 #: each coordinate, and room for accelerations or noise.
 HEAD, SQUARES, OWN, CLUSTER, SPHERES, MASSES, TOTALS, ROOTS, ROOM = range(9)
 #: In the head: gamma and k_B T, the seed's halves, the number of the step, how often noise has been drawn in it, and
 #: how often it is in each.
-FRICTION, KT, SEED, NUMBER, PART, PARTS = 0, 1, 2, 4, 5, 6
+FRICTION, KT, SEED = 0, 1, 2
 
 
 @njit(cache=True, nogil=True)
@@ -191,12 +191,7 @@ def exchange(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-de
     header, n = integers(numbers), v.size
     head, roots = table_array(numbers, header, HEAD), table_array(numbers, header, ROOTS)
     drawn = table_array(numbers, header, ROOM)
-    seed = (np.uint64(head[SEED]) << np.uint64(32)) | np.uint64(head[SEED + 1])
-    fill_normal(seed, np.uint64(head[NUMBER]), np.uint64(head[PART]), drawn)
-    head[PART] += 1.0
-    if head[PART] == head[PARTS]:
-        head[PART] = 0.0
-        head[NUMBER] += 1.0
+    fill_next(head[SEED : SEED + 5], drawn)
     for i in range(n):
         drawn[i] *= roots[i]
     noise = drawn[:n].reshape(v.shape)

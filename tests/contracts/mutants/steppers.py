@@ -122,11 +122,9 @@ MUTANTS = {
             "test_listings.py::test_what_is_reversible_is_the_same_backwards",
         ),
     ],
-    "thermostats/multistep/sphere_kernels.py": [
-        ("«head[PART] += 1.0→pass»", "test_spheres.py::test_noise_is_a_function_of_seed_step_and_part"),
-    ],
-    "thermostats/langevin.py": [
-        ("«numbers[PART] += 1.0→pass»", "test_respa.py::test_each_exchange_of_a_step_has_noise_of_its_own"),
+    "thermostats/noise.py": [
+        ("«stream[3] += 1.0→pass»", "test_spheres.py::test_noise_is_a_function_of_seed_step_and_part"),
+        ("«stream[3] = 0.0→pass»", "test_respa.py::test_each_exchange_of_a_step_has_noise_of_its_own"),
     ],
     "steppers/stages/compiled_operations.py": [
         ("room[FAR] = «1.0 if far else →»0.0", "test_interpreter.py::test_a_march_ends_where_remainders_begin"),
