@@ -578,7 +578,7 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
     if any(isinstance(item.target, MovingTarget) for item, _ in located):
         raise _refused(block, atoms, inside, x, "since a target among these atoms is a function of time")
     plane = _fitted(block, atoms, inside, x)
-    bases, weights = _bases(plane, block.pinned[atoms])
+    bases, weights = _bases(block, atoms, inside, plane)
     held = np.array(list(combinations(bases, 2)))
     lengths = np.linalg.norm(plane[held[:, 0]] - plane[held[:, 1]], axis=1)
     pairs, others = atoms[held], np.setdiff1d(np.arange(len(atoms)), bases)
@@ -622,18 +622,32 @@ def _fitted(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray) 
     return best
 
 
-def _bases(plane: FloatArray, fixed: BoolArray) -> tuple[IntArray, FloatArray]:
-    """Two or three bases far apart, fixed atoms before others not twice as far; and all atoms' weights."""
-    away, bases = plane - plane.mean(axis=0), list[int]()
-    for k in range(plane.shape[1] + 1):
-        far = np.linalg.norm(away, axis=1) * np.where(fixed, 2.0, 1.0)
-        bases.append(int(np.argmax(far > (1 - 1e-6) * far.max())))  # so that rounding does not choose
-        away = plane - plane[bases[0]]
-        if k == 1:
-            axis = away[bases[1]] / np.linalg.norm(away[bases[1]])
-            away = away - np.outer(away @ axis, axis)
-    system = np.vstack([plane[bases].T, np.ones(len(bases))])
-    weights = np.linalg.solve(system, np.vstack([plane.T, np.ones(len(plane))])).T
+def _bases(block: LocalRows, atoms: IntArray, inside: IntArray, plane: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Two or three bases far apart (fixed atoms and pairs already held preferred), and all atoms' weights."""
+    n, flat = plane.shape
+    held = {tuple(sorted(block.row_atoms[k])) for k in inside if len(block.row_atoms[k]) == 2}
+    fixed = block.pinned[atoms]
+    candidates = list(range(n))
+    if flat == 2 and n > 40:
+        # The outermost atoms in a few directions; all triples of a large sheet would be too many.
+        angles = np.linspace(0, np.pi, 16, endpoint=False)
+        reach = plane @ np.stack([np.cos(angles), np.sin(angles)])
+        outer = np.concatenate([np.argmax(reach, 0), np.argmin(reach, 0), np.flatnonzero(fixed)[:8]])
+        candidates = np.unique(outer).tolist()
+    choices = list(combinations(candidates, flat + 1))
+    corners = plane[np.array(choices)]
+    edges = corners[:, 1:] - corners[:, :1]
+    size = np.abs(edges[:, 0, 0]) if flat == 1 else np.abs(np.linalg.det(edges))
+    good = np.flatnonzero(size >= 0.5 * size.max()) if flat == 2 else np.flatnonzero(size >= 0.999 * size.max())
+
+    def merit(k: int) -> tuple[int, int, float]:
+        pairs = combinations(choices[k], 2)
+        kept = sum(tuple(sorted((atoms[i], atoms[j]))) in held for i, j in pairs)
+        return int(fixed[list(choices[k])].sum()), kept, float(size[k])
+
+    bases = list(choices[max(good.tolist(), key=merit)])
+    system = np.vstack([plane[bases].T, np.ones(flat + 1)])
+    weights = np.linalg.solve(system, np.vstack([plane.T, np.ones(n)])).T
     # Round so that the weights sum to one: the relation then does not depend on the origin.
     weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
     return np.array(bases), weights
