@@ -130,12 +130,6 @@ MUTANTS = {
             "test_target.py::test_derivatives_that_contradict_a_moving_target_are_refused",
         ),
     ],
-    "ase/topology.py": [
-        (
-            "if «→not »guessed and said != stamp:",
-            "ase/test_topology.py::test_guessed_bonds_are_guessed_anew_for_sorted_and_cut_atoms",
-        ),
-    ],
     "topology/rows_by_name.py": [
         (
             "long > «np.minimum(TORN, FAR * radii)→TORN»",

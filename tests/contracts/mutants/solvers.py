@@ -92,7 +92,7 @@ MUTANTS = {
             "test_distance_solvers.py::test_failure_changes_nothing_and_names_the_cluster[far-triangles-29]",
         ),
     ],
-    "solvers/chains/sweeps.py": [
+    "solvers/chains.py": [
         (
             "vx, vy, vz = vx - dx * inverse_dt, vy - dy * inverse_dt, vz - dz« * inverse_dt→»",
             "test_distance_solvers.py::test_matches_dense_newton[chains-short-free]",
@@ -109,19 +109,19 @@ MUTANTS = {
             "if not (along > «0.→-1e30»0) and",
             "test_mixed_rows.py::test_a_molecule_turned_through_a_point_is_no_solution_though_its_rows_hold",
         ),
-    ],
-    "solvers/sparse/row_values.py": [
         (
             "r = «(here - load_quad(moved, 4 * p))→here» + change",
-            "test_row_values.py::test_rows_with_a_place_take_off_what_positions_were_moved_by",
+            "test_places.py::test_a_molecule_is_the_same_in_the_cell_as_in_open_space",
         ),
         (
             "difference -= «period * np.rint(→0.5 * period * np.rint(2 * »difference / period)",
-            "test_row_values.py::test_rows_with_a_period_miss_by_the_shorter_way",
+            "test_mixed_rows.py::test_rows_with_a_period_miss_by_the_shorter_way",
         ),
+    ],
+    "solvers/kernels/lattices.py": [
         (
-            "y -= a * cell[0][1] + b * cell[1][1]« + c * cell[2][1]→»",
-            "test_row_values.py::test_rows_equal_their_constraints",
+            "y = y - (i * a[1] + j * b[1]« + k * c[1]→»)",
+            "test_distance_solvers.py::test_periodic_equals_unwrapped",
         ),
     ],
     "motion/restoring/nearest_point.py": [

@@ -55,7 +55,7 @@ MUTANTS = {
             "test_friction.py::test_a_body_sinks_as_fast_as_it_should_however_strong_the_friction",
         ),
     ],
-    "solvers/sparse/row_values.py": [
+    "solvers/sparse/mixed_rows.py": [
         (
             "time = «0.5 * (time + load_double(parameters, 1)→load_double(parameters, 0»)",
             "test_flights.py::test_driven_velocities_hold_at_the_middle_of_the_time",
@@ -63,7 +63,7 @@ MUTANTS = {
     ],
     "solvers/general_clusters.py": [
         (
-            "self.subset.jacobian(«0.5 * (self.start + end)→end», self.time)",
+            "subset.jacobian(«0.5 * (start + state)→state», middle)",
             "test_row_functions.py::test_rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
         ),
     ],
