@@ -95,7 +95,7 @@ class World:
         """Which atoms distances tie together, as a forest of parents, and the longest vector that this needs."""
         tied, parent = 0.0, list(range(len(x)))
         bonds = [(r, *r.vectors[0]) for i in self.items for r in _tying(i)]
-        for length, i, j in sorted((_length(r, x, cell), i, j) for r, i, j in bonds):
+        for length, i, j in sorted((length(r, x, cell), i, j) for r, i, j in bonds):
             a, b = _root(parent, i), _root(parent, j)
             if a != b:
                 parent[a] = b
@@ -103,7 +103,7 @@ class World:
         for item in self.items:
             for row in item.rows:
                 if row.images and np.any(row.images):
-                    tied = max(tied, _length(row, x, cell))
+                    tied = max(tied, length(row, x, cell))
         return parent, tied
 
     def nearness(self, x: Array, cell: Array | None = None, every: bool = False) -> float:
@@ -150,7 +150,7 @@ def _tying(item: Item) -> list[Row]:
     return [r for r in item.arguments["pairs_as_rows"] if not np.any(r.images)]
 
 
-def _length(row: Row, x: Array, cell: Array) -> float:
+def length(row: Row, x: Array, cell: Array) -> float:
     d = sum(w * x[a] for a, w in row.vectors[0].items())
     return float(np.linalg.norm(d + (np.array(row.images[0]) @ cell if row.images else 0.0)))
 
@@ -391,7 +391,7 @@ def _set_targets(w: World, rng: np.random.Generator) -> None:
         known = {id(r) for r in rows.rows}
         for row in item.arguments.get("pairs_as_rows", []):
             if id(row) not in known:
-                row.target = _length(row, w.x, w.cell)
+                row.target = length(row, w.x, w.cell)
         if item.how == "moving":
             for row in item.rows:
                 row.amplitude = float(rng.uniform(-0.08, 0.08))

@@ -108,8 +108,8 @@ def in_hosts() -> Iterator[tuple[str, Trail]]:
         for name in CASES:
             moving = begin(problem(name), 0.02, "suzuki4" if name == "Distance" else "rattle")
             with suppress(KconsError):  # not on the device
-                moving.step(5)
-                yield f"{host}: {name}", [moving.phase()]
+                moving.advance(5)
+                yield f"{host}: {name}", [moving.observe()]
 
 
 def hashes() -> dict[str, str]:
