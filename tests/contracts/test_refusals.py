@@ -145,7 +145,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("MOTION.report(X[:2])", "positions"),
     ("MOTION.project_positions(X, X, time=nan)", "time"),
     ("MOTION.project_velocities(X, X[:2])", "velocities"),
-    ("MOTION.set_cell([9.0, 9.0])", "cell"),
+    ("MOTION.set_cell(?)", "cell", "[9.0, 9.0]", "[9.0, 0.0, 9.0]", "[9.0, 9.0, nan]"),
     ("System(3)", "motion"),
     ('System(MOTION, "force")', "force"),
     ("System(MOTION, force, potential=3)", "potential"),
