@@ -336,7 +336,7 @@ class Judge:
                 atoms = item.arguments["atoms"]
                 expected += (moved[atoms] - rows.places[np.searchsorted(rows.pinned, atoms)]).ravel().tolist()
             elif item.family:
-                for row in item.arguments.get("pairs_as_rows") or item.rows:
+                for row in item.rows:
                     known = at.get(id(row))
                     expected.append(length(row, moved, w.cell) - row.target if known is None else float(known))
         here = w.stored(moved, self.elsewhere(0.5))
@@ -484,7 +484,7 @@ class Judge:
     def _cell_link(self, cell: Array, x: Array | None = None) -> float:
         """Rows are sorted once: a distance that becomes longer than half the cell may be refused as well."""
         w = self.w
-        rows = (r for i in w.items for r in (i.arguments.get("pairs_as_rows") or i.rows))
+        rows = (r for i in w.items for r in i.rows)
         lengths = [r.target for r in rows if r.kind == "norm" and not r.amplitude]
         half, before = half_width(cell, w.pbc), half_width(w.cell, w.pbc)
         grown = any(before > a >= half for a in lengths)
