@@ -26,10 +26,7 @@ MUTANTS = {
             "interpreter::steps_in_kernels_are_those_of_the_engine",
         ),
         ("self.time + «(end * self.dt + self.left_over)→end * self.dt»", "interpreter::times_within_a_step_are_exact"),
-        (
-            "size = max(«start, float(np.abs(push).max(initial=0.0)), →0.0, »float(",
-            "coming_to_rest::a_damped_pendulum_comes_to_rest",
-        ),
+        ("(«start, float(np.abs(push).max(initial=0.0)), →0.0, »", "coming_to_rest::a_damped_pendulum_comes_to_rest"),
         ("change <= «2→1e8» * _EPS * size", "coming_to_rest::settled_velocities_are_those_of_the_implicit_equation"),
         (
             "return «2.0 * math.sinh(0.5 * friction * h) / friction→h»",
