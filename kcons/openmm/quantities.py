@@ -1,4 +1,4 @@
-"""Quantities at the boundary to OpenMM: one way in for numbers, and one for constraints."""
+"""The boundary to OpenMM: one way in for numbers, one for constraints, and what a Context says of its state."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def number(value: Any, of: unit.Unit, item: str) -> float:
     InputError
         It is of another kind, or no number.
     """
-    found = plain(value, of, item)
+    found = value if isinstance(value, float | int) else plain(value, of, item)
     try:
         if isinstance(found, str | bytes):
             raise TypeError
@@ -101,6 +101,11 @@ def array(values: Any, of: unit.Unit, item: str) -> FloatArray:
         return np.array(found, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{item} are no array of numbers: {error}", item=item) from None
+
+
+def cell_of(vectors: Any) -> FloatArray:
+    """Box vectors, of a State (a Quantity) or of a System (a list of them), nm, shape (3, 3)."""
+    return array(vectors, unit.nanometer, "box")
 
 
 def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
@@ -162,3 +167,44 @@ def _accepted(item: Any) -> Any:
         if function is not None and not isinstance(function, Unitless):
             setattr(taken, name, Unitless(function, f"{item.family}: {name}", ANY))
     return taken
+
+
+# -- the state of a Context, in nm, ps and kJ/mol ---------------------------------------------------
+
+# A State is in nm and ps whatever else is in use: _value spares the conversion, which takes longer than small Systems.
+
+
+def positions_of(context: openmm.Context) -> FloatArray:
+    return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
+
+
+def velocities_of(context: openmm.Context) -> FloatArray:
+    return np.asarray(context.getState(velocities=True).getVelocities(asNumpy=True)._value)
+
+
+def motion_of(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
+    """Positions and velocities, as they are (not wrapped), shape (n_particles, 3) each."""
+    state = context.getState(positions=True, velocities=True)
+    return np.array(state.getPositions(asNumpy=True)._value), np.array(state.getVelocities(asNumpy=True)._value)
+
+
+def forces_at(context: openmm.Context, groups: int | Iterable[int]) -> FloatArray:
+    """Forces of some force groups, a bit mask or numbers, in kJ/mol/nm, shape (n_particles, 3)."""
+    state = context.getState(forces=True, groups=groups if isinstance(groups, int) else set(groups))
+    return np.array(state.getForces(asNumpy=True)._value)
+
+
+def energy_of(context: openmm.Context, groups: int | Iterable[int]) -> float:
+    """Potential energy of some force groups, a bit mask or numbers, in kJ/mol."""
+    state = context.getState(energy=True, groups=groups if isinstance(groups, int) else set(groups))
+    return float(state.getPotentialEnergy()._value)
+
+
+def box_of(context: openmm.Context) -> Any:
+    """Periodic box vectors in nm, as OpenMM has them."""
+    return context.getState().getPeriodicBoxVectors()._value
+
+
+def width_of(context: openmm.Context) -> float:
+    """Largest coordinate in the periodic box, nm."""
+    return float(np.abs(np.array(box_of(context))).sum(axis=0).max())

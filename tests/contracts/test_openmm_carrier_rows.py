@@ -12,7 +12,7 @@ from kcons.constraints import (
 )
 from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.callback_rows.hold import hold
+from kcons.openmm.callback_rows import hold
 
 # -- periodic boxes -------------------------------------------------------------------------------
 

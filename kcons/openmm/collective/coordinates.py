@@ -17,9 +17,8 @@ from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.system_checks import ROW_NAME, forces_alone, groups_of
-from kcons.openmm.quantities import nanometers
-from kcons.openmm.states import energy_of
+from kcons.openmm.integrator.guard import ROW_NAME, forces_alone, groups_of
+from kcons.openmm.quantities import energy_of, nanometers, number
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class Row:
     name: str = ""
 
 
-def number(value: Any, item: str, of: unit.Unit | None = None, per: unit.Unit = unit.dimensionless) -> float:
+def finite_number(value: Any, item: str, of: unit.Unit | None = None, per: unit.Unit = unit.dimensionless) -> float:
     """A finite number in nm, ps, radian, kJ/mol from a number or a Quantity.
 
     Parameters
@@ -70,16 +69,15 @@ def number(value: Any, item: str, of: unit.Unit | None = None, per: unit.Unit = 
     InputError
         It is neither, not finite, or of another unit.
     """
-    if unit.is_quantity(value):
-        fits = _may_be_a_coordinate(value.unit * per) if of is None else value.unit.is_compatible(of / per)
-        if not fits:
-            wanted = f"in {of / per}" if of is not None else "in nm, radian, kJ/mol or what the coordinate is in"
-            raise InputError(f"{item} is {value}, and the coordinate is of another kind; give it {wanted}", item=item)
+    if of is None and unit.is_quantity(value):
+        if not _may_be_a_coordinate(value.unit * per):
+            raise InputError(
+                f"{item} is {value}, and the coordinate is of another kind; give it in nm, radian, kJ/mol or what the "
+                "coordinate is in",
+                item=item,
+            )
         value = value.value_in_unit_system(unit.md_unit_system)
-    try:
-        result = float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{item} is {value!r}; give a number or a Quantity", item=item) from None
+    result = number(value, (unit.dimensionless if of is None else of) / per, item)
     if not math.isfinite(result):
         raise InputError(f"{item} is {result}; give a finite number", item=item)
     return result

@@ -11,8 +11,7 @@ import openmm
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import OverdeterminedError, UnsupportedError
-from kcons.openmm.integrator.ensemble import Ensemble, Integrator
-from kcons.openmm.integrator.system_checks import (
+from kcons.openmm.integrator.guard import (
     forces_alone,
     forces_of,
     groups_in,
@@ -20,8 +19,8 @@ from kcons.openmm.integrator.system_checks import (
     knows_a_place,
     removes_center_of_mass_motion,
 )
-from kcons.openmm.quantities import held_without_mass, masses_of
-from kcons.openmm.states import box_of, forces_at, positions_of, velocities_of
+from kcons.openmm.integrator.program import Ensemble, Integrator
+from kcons.openmm.quantities import box_of, forces_at, held_without_mass, masses_of, positions_of, velocities_of
 from kcons.thermostats.freedom import (
     BALANCED,
     SHAKE,

@@ -7,8 +7,7 @@ import openmm
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
-from kcons.openmm.quantities import masses_of
-from kcons.openmm.states import forces_at, positions_of, velocities_of
+from kcons.openmm.quantities import forces_at, masses_of, positions_of, velocities_of
 
 #: Longest way of a particle in one step, nm.
 _STRIDE = 0.01

@@ -109,10 +109,10 @@ MUTANTS = {
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         (
-            'self._advance(step.program, "«2→1»")',
+            'self._advance(p, "«2→1»")',
             "test_nose_hoover_ensemble.py::test_a_chain_in_the_middle_is_the_same_chain_in_small_steps",
         ),
-        ("«        step.project()\n→»", "test_nose_hoover_ensemble.py::test_a_chain_in_the_middle_is_time_reversible"),
+        ("«        p.project()\n→»", "test_nose_hoover_ensemble.py::test_a_chain_in_the_middle_is_time_reversible"),
     ],
     "topology/guessed_bonds.py": [
         (
