@@ -552,13 +552,7 @@ def great_circles(x: FloatArray, there: FloatArray, spheres: FloatArray) -> tupl
 
     d = x - c turns in the plane of d and u, the way that is tangent, by w = |u|/R: it becomes d cos(w) + u sin(w)/w,
     and u becomes u cos(w) - d w sin(w). d is brought to the length R on the way, so that rounding does not add up.
-
-    Parameters
-    ----------
-    x, there : ndarray, shape (n, 3)
-        Where the drift begins, and where it leads without the spheres.
-    spheres : ndarray, shape (n, 4)
-        Centers and radii.
+    Centers and radii are the rows of `spheres`, shape (n, 4).
     """
     radius, d, way = spheres[:, 3:], x - spheres[:, :3], there - x
     d *= radius / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None]

@@ -23,13 +23,7 @@ GAS_CONSTANT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole /
 
 
 def plain(value: Any, of: unit.Unit, item: str) -> Any:
-    """A Quantity, or nested lists of Quantities, as numbers in a unit; what has no unit is in it already.
-
-    Raises
-    ------
-    InputError
-        It is of another kind.
-    """
+    """A Quantity, or nested lists of them, as numbers in a unit; numbers are in it. `InputError` for another kind."""
     if isinstance(value, list | tuple) and has_units(value):
         return [plain(part, of, item) for part in value]
     if not has_units(value):
@@ -42,13 +36,7 @@ def plain(value: Any, of: unit.Unit, item: str) -> Any:
 
 
 def number(value: Any, of: unit.Unit, item: str) -> float:
-    """The same for one number.
-
-    Raises
-    ------
-    InputError
-        It is of another kind, or no number.
-    """
+    """The same for one number; `InputError` too for what is none."""
     found = value if isinstance(value, float | int) else plain(value, of, item)
     try:
         if isinstance(found, str | bytes):
@@ -61,13 +49,7 @@ def number(value: Any, of: unit.Unit, item: str) -> float:
 
 
 def relative_tolerance(value: Any) -> float:
-    """A tolerance of OpenMM's solvers.
-
-    Raises
-    ------
-    InputError
-        It is no number between 0 and 1.
-    """
+    """A tolerance of OpenMM's solvers; `InputError` for what is no number between 0 and 1."""
     found = number(value, unit.dimensionless, "tolerance")
     if not 0 < found < 1:
         raise InputError(f"the tolerance is {value}; give a positive number, such as 1e-10", item="tolerance")
@@ -75,13 +57,7 @@ def relative_tolerance(value: Any) -> float:
 
 
 def kelvins(temperature: unit.Quantity | float) -> float:
-    """A temperature in K, not below zero.
-
-    Raises
-    ------
-    InputError
-        It is none.
-    """
+    """A temperature in K; `InputError` for what is none, or below zero."""
     value = number(temperature, unit.kelvin, "temperature")
     if not 0 <= value < math.inf:
         raise InputError(f"temperature is {temperature}; give a number of K, not below zero", item="temperature")
@@ -89,13 +65,7 @@ def kelvins(temperature: unit.Quantity | float) -> float:
 
 
 def array(values: Any, of: unit.Unit, item: str) -> FloatArray:
-    """The same for an array, as a copy.
-
-    Raises
-    ------
-    InputError
-        They are of another kind, or no numbers.
-    """
+    """The same as `plain` for an array, as a copy; `InputError` too for what is no array of numbers."""
     found = plain(values, of, item)
     try:
         return np.array(found, dtype=np.float64)
@@ -109,13 +79,7 @@ def cell_of(vectors: Any) -> FloatArray:
 
 
 def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
-    """Positions as an array of shape (n, 3), nm.
-
-    Raises
-    ------
-    InputError
-        They are of another kind or shape.
-    """
+    """Positions as an array of shape (n, 3), nm; `InputError` for another shape or kind."""
     x = array(positions, unit.nanometer, "positions")
     if x.shape != (n, 3):
         raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")

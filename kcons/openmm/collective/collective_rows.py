@@ -542,20 +542,9 @@ class CollectiveRows(Part):
     def solver_at(self, context: openmm.Context, *, plain: bool = False) -> Solver:
         """The engine with these rows at their targets, and with the constraints of the System that they meet.
 
-        OpenMM computes the rows, in double precision.
-
-        Parameters
-        ----------
-        context : openmm.Context
-        plain : bool
-            Whether distances, angles and dihedrals are those of kcons: groups are moved whole towards these.
-
-        Raises
-        ------
-        InputError
-            The context was made before the rows were added to its System.
-        SingularGeometryError
-            A row has no gradient.
+        OpenMM computes the rows, in double precision; with `plain`, distances, angles and dihedrals are those of kcons:
+        groups are moved whole towards these. `InputError` for a context that was made before the rows were added to its
+        System, `SingularGeometryError` for a row without gradient.
         """
         require_context(context)
         x, masses = positions_of(context), masses_of(context.getSystem())

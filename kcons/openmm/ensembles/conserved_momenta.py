@@ -74,13 +74,7 @@ class CountsMomenta(Ensemble):
         return found
 
     def count(self, integrator: Integrator) -> int:
-        """g of an integrator: its momenta that are independent, less those that are conserved.
-
-        Raises
-        ------
-        OverdeterminedError
-            There is none.
-        """
+        """g: the momenta that are independent, less those that are conserved; `OverdeterminedError` for none."""
         guard = integrator._watch()
         if guard.thermal is None:
             count = integrator.independent_momenta() - len(self.momenta(integrator).directions)
@@ -93,15 +87,7 @@ class CountsMomenta(Ensemble):
         return integrator.degrees_of_freedom() / self.count(integrator)
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        """Find g, and tell of momenta that are conserved.
-
-        Raises
-        ------
-        OverdeterminedError
-            No degree of freedom is left.
-        UnsupportedError
-            Targets move.
-        """
+        """Find g, and tell of momenta that are conserved; `UnsupportedError` where targets move."""
         moving = [part for part in integrator.parts if part.driven]
         if moving:
             raise UnsupportedError(
@@ -122,19 +108,10 @@ class CountsMomenta(Ensemble):
 
 
 def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum: Momentum) -> Momenta:
-    """Find conserved momenta from the forces and the constraints.
+    """Conserved momenta, from the forces and the constraints.
 
-    Parameters
-    ----------
-    integrator : ProjectedIntegrator
-    context : openmm.Context
-    momentum : {'auto', 'conserved', 'free'}
-        'conserved': in all directions that the rows allow; 'free': in none.
-
-    Raises
-    ------
-    UnsupportedError
-        'conserved', and rows or particles without mass hold all directions.
+    `momentum` is 'auto', 'conserved' (in all directions that the rows allow; `UnsupportedError` where rows or particles
+    without mass hold all), or 'free' (in none).
     """
     if momentum == "free":
         return NONE

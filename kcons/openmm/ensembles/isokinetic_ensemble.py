@@ -153,12 +153,7 @@ class Isokinetic(CountsMomenta):
     def ready(self, integrator: Integrator, context: openmm.Context, masses: FloatArray, v: FloatArray) -> None:
         """Find K; scale the velocities, unless they are right to rounding.
 
-        Raises
-        ------
-        InputError
-            All velocities are zero.
-        OverdeterminedError
-            g is 1 where a temperature is asked for, or 0.
+        `InputError` for a start at rest, `OverdeterminedError` for g of 1 where a temperature is asked for, or 0.
         """
         found = float(masses @ np.einsum("ij,ij->i", v, v))
         if not found > 0:

@@ -127,13 +127,7 @@ class SystemRows:
 
     @classmethod
     def of(cls, system: openmm.System, *, rounded: bool = False) -> SystemRows:
-        """Those of a System; `rounded` where a platform computes as GPUs do, see `Precision.rounds_lengths`.
-
-        Raises
-        ------
-        InputError
-            A length that is not above zero.
-        """
+        """Those of a System, `rounded` as on GPUs; `InputError` for lengths of 0 and less."""
         masses = masses_of(system)
         pairs, lengths, numbers = [], [], []
         for k in range(system.getNumConstraints()):
@@ -264,12 +258,7 @@ def settled_rows(pairs: IntArray, lengths: FloatArray, n: int) -> NDArray[np.boo
 
 
 def require_context(context: openmm.Context) -> None:
-    """Refuse a Simulation, an integrator or whatever else is given for a Context.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise `InputError` for a Simulation, an integrator or whatever else is given for a Context."""
     if not isinstance(context, openmm.Context):
         raise InputError(
             f"context is a {type(context).__name__}; give the Context, such as simulation.context", item="context"
@@ -296,20 +285,8 @@ def forces_alone(
 ) -> openmm.Context:
     """A Context of copies of some Forces alone, each in the group of its number, in double precision.
 
-    Parameters
-    ----------
-    system : openmm.System
-        Of its particles.
-    forces : sequence of Force
-    box : sequence of three vectors, optional
-        In place of the System's default.
-    parameters : mapping of str to float, optional
-        Those of a Context.
-
-    Raises
-    ------
-    UnsupportedError
-        A PythonForce whose function cannot be copied.
+    In a box other than the System's default, and with the parameters of another Context, if these are given;
+    `UnsupportedError` for a PythonForce whose function cannot be copied.
     """
     alone = openmm.System()
     for k in range(system.getNumParticles()):
@@ -345,20 +322,10 @@ def knows_a_place(force: openmm.Force) -> bool:
 def check_system(system: openmm.System, row_groups: Iterable[int]) -> None:
     """Refuse Systems that a CustomIntegrator of kicks and drifts cannot propagate.
 
-    Parameters
-    ----------
-    system : openmm.System
-    row_groups : iterable of int
-        Groups of the Forces that carry rows, of the parts that the integrator has.
-
-    Raises
-    ------
-    UnsupportedError
-        Particles or forces that need an integrator of their own, more than one barostat, one that scales atoms one by
-        one although bonds are held, rigid triangles that OpenMM's solver gets wrong.
-    InputError
-        The pressure of a barostat is not finite, the length of a constraint not above zero. A Force carries rows of a
-        part that the integrator does not have: it would act as a force, or do nothing, and nothing would be held.
+    `UnsupportedError` for particles or forces that need an integrator of their own, more than one barostat, one that
+    scales atoms one by one although bonds are held, rigid triangles that OpenMM's solver gets wrong. `InputError` for a
+    pressure that is not finite, a length not above zero, and Forces that carry rows in a group that is not among
+    `row_groups`: they would act as forces, or do nothing, and nothing would be held.
     """
     _refuse_lopsided(SystemRows.of(system))
     found = [force for force in forces_of(system) if type(force).__name__ in BAROSTATS]
@@ -417,12 +384,9 @@ def virtual_sites(system: openmm.System) -> list[int]:
 
 
 def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
-    """Whether steps must be made in parts: forces are needed within the step, and virtual sites are placed at its end.
+    """Whether steps are made in parts: forces are needed within a step, and virtual sites are placed at its end.
 
-    Raises
-    ------
-    UnsupportedError
-        There are such sites, and steps cannot be made in parts.
+    `UnsupportedError` where there are such sites, and steps cannot be made in parts.
     """
     system, platform = context.getSystem(), context.getPlatform().getName()
     sites = virtual_sites(system)
@@ -454,21 +418,16 @@ def refuse_agents(
     rows: Iterable[tuple[IntArray, Callable[[int], str]]] = (),
     molecules: Callable[[], Iterable[Sequence[int]]] = tuple,
 ) -> None:
-    """Refuse what moves particles off rows between steps: barostats, and a CMMotionRemover.
+    """Refuse, by `UnsupportedError`, what moves particles off rows between steps: barostats, and a CMMotionRemover.
 
     Parameters
     ----------
-    system : openmm.System
     bound : str, optional
         A row that holds particles in space.
     rows : iterable of (ndarray of int of shape (n, width), function)
         The particles of rows of one kind, and their names by number.
     molecules : callable
         The molecules, which barostats move as wholes, each by a vector of its own.
-
-    Raises
-    ------
-    UnsupportedError
     """
     for force in forces_of(system):
         name = type(force).__name__
@@ -528,18 +487,7 @@ def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
 
 
 class Guard:
-    """Watches over one Context.
-
-    Parameters
-    ----------
-    context : openmm.Context
-    integrator : ProjectedIntegrator
-
-    Raises
-    ------
-    UnsupportedError
-        The System cannot be propagated, see `check_system`.
-    """
+    """Watches over one Context of an integrator; `UnsupportedError` for a System that it cannot propagate."""
 
     def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
         self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
@@ -704,14 +652,8 @@ class Guard:
     def begin(self) -> None:
         """Before the first step, and where others have moved x: x and v on the constraints, or refused.
 
-        Raises
-        ------
-        InputError
-            Positions are off the constraints by more than `NEAR`.
-        NonFiniteError
-            A NaN or infinity in positions or velocities.
-        KconsError
-            What a part finds wrong.
+        `InputError` for positions off the constraints by more than `NEAR`, `NonFiniteError` for a NaN, and what a part
+        finds wrong.
         """
         context, integrator = self.context, self.integrator
         x, v = motion_of(context)
@@ -806,12 +748,7 @@ class Guard:
     def look(self) -> None:
         """The end of a call: whether velocities are finite and slower than light, root mean square.
 
-        That is what can be seen at next to no cost.
-
-        Raises
-        ------
-        ConvergenceError, NonFiniteError
-            The Context is put back to where it was checked last.
+        That is what can be seen at next to no cost. If not, the Context is put back to where it was checked last.
         """
         v = None if self.sums else velocities_of(self.context)
         squares = self.integrator.getGlobalVariableByName("motion") if v is None else float(np.vdot(v, v))
@@ -836,14 +773,9 @@ class Guard:
             raise
 
     def count(self, steps: int) -> None:
-        """Count steps that were made; check where a check is due.
+        """Count steps that were made; check where a check is due, and put the Context back where that fails.
 
         Where the integrator may spare them, checks wait while they would take more than `SHARE` of the time.
-
-        Raises
-        ------
-        CertificateError, ConvergenceError, NonFiniteError
-            The Context is put back to where it was checked last.
         """
         self.since_check += steps
         if not 0 < self.integrator.check_every <= self.since_check:
@@ -868,12 +800,6 @@ class Guard:
 
         What is held is asked itself: the constraints of the System and the rows of the parts at the positions and
         velocities of the Context, whatever the solvers have found.
-
-        Raises
-        ------
-        CertificateError, ConvergenceError, NonFiniteError
-        InputError
-            Masses were changed after the rows of a part were built.
         """
         context, integrator = self.context, self.integrator
         step = context.getStepCount()

@@ -295,13 +295,7 @@ class Part(ABC):
         return None
 
     def apply_positions(self, context: openmm.Context) -> None:
-        """Bring the positions of the context onto the rows; velocities stay as they are.
-
-        Raises
-        ------
-        KconsError
-            The rows cannot be reached; nothing was changed.
-        """
+        """Bring the positions of the context onto the rows, or raise; velocities stay as they are."""
         self.restore_by(self.solver_at(context), context)
 
     def restore_by(self, solver: Solver | None, context: openmm.Context, bonds: ArrayLike | None = None) -> None:
@@ -324,13 +318,7 @@ class Part(ABC):
         context.computeVirtualSites()
 
     def apply_velocities(self, context: openmm.Context) -> None:
-        """Make the velocities of the context tangent to the rows: the nearest ones in the mass metric.
-
-        Raises
-        ------
-        KconsError
-            There are none; nothing was changed.
-        """
+        """Make the velocities of the context tangent to the rows, the nearest ones in the mass metric, or raise."""
         solver = self.solver_at(context)
         assert solver is not None
         motion, atoms, time = solver

@@ -75,13 +75,7 @@ SCHEMES: dict[str, Callable[[], Splitting]] = {
 
 
 def to_scheme(scheme: str | Splitting) -> Splitting:
-    """The splitting of a name.
-
-    Raises
-    ------
-    InputError
-        An unknown name.
-    """
+    """The splitting of a name; `InputError` for an unknown one."""
     if isinstance(scheme, Splitting):
         return scheme
     if not isinstance(scheme, str) or scheme not in SCHEMES:
@@ -286,12 +280,8 @@ class BetweenHalves(Ensemble):
 class Line(NamedTuple):
     """One computation.
 
-    Attributes
-    ----------
-    kind : str
-        'let' for a global variable, 'each' for one of each degree of freedom, 'sum'; 'hold' x or v; 'others';
-        'loop', 'when' and 'end' make blocks.
-    variable, expression, words : str
+    Its kind is 'let' for a global variable, 'each' for one of each degree of freedom, 'sum'; 'hold' x or v; 'others';
+    'loop', 'when' and 'end' make blocks.
     """
 
     kind: str

@@ -43,7 +43,7 @@ MUTANTS = {
     ],
     "openmm/collective/collective_rows.py": [
         (
-            "if not self._single« or _halved(integrator, scheme)→»:",
+            "(not self._single« or p.halves→»)",
             "test_row_program.py::test_the_second_half_of_a_drift_begins_in_the_middle",
         ),
     ],
