@@ -17,7 +17,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.openmm.callback_rows.carried_constraints import with_massless_atoms
+from kcons.openmm.callback_rows import with_massless_atoms
 from kcons.openmm.device.c_writer import c_functions
 from kcons.openmm.device.held_rows import IN_CELLS, STORED, HeldRows, Pattern, constraints_of
 from kcons.openmm.device.kernels import Array, Shape
