@@ -551,12 +551,12 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
 
         The method raises `InputError` if it is below zero; with `Isokinetic`, zero.
         """
-        if not self.thermostatted:
+        if not hasattr(self.ensemble, "temperature"):
             self._given("temperature")
         return self._set_temperature
 
     def _set_temperature(self, temperature: unit.Quantity | float) -> None:
-        self._take(self.ensemble.at(kelvins(temperature)))
+        self._take(self.ensemble.replaced(temperature=kelvins(temperature)))
         guard = self._guard
         if guard is not None and guard.alive is not None and guard.started:
             warn_of_barostat(guard.context, self._given("temperature"), stacklevel=3)
@@ -574,7 +574,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         The method raises `InputError` if it is below zero.
         """
         self._given("friction")
-        return lambda friction: self._take(self.ensemble.with_friction(friction))
+        return lambda friction: self._take(self.ensemble.replaced(friction=friction))
 
     @property
     def getFriction(self) -> Callable[[], unit.Quantity]:

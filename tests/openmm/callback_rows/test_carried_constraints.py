@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-import openmm
 import pytest
 from carried_systems import (
-    PEPTIDE,
     begun,
     context_of,
     driven,
     free,
     off_target,
-    peptide,
     pull,
-    started,
     state_of,
 )
-from openmm import app, unit
-from openmm_systems import forces_at, masses_of
+from openmm import unit
 
 from kcons.constraints import Angle, CenterOfMass, Distance, FixedAtoms, RadiusOfGyration, Sphere
-from kcons.errors import ConvergenceError, InputError
+from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator, hold
 from kcons.steppers import System, run
 
@@ -40,30 +35,6 @@ def test_particles_without_mass_take_no_degree_of_freedom():
     integrator.step(5)
     twice = 2 * integrator.kinetic_energy() / (4 * unit.MOLAR_GAS_CONSTANT_R)
     assert integrator.computeSystemTemperature() / unit.kelvin == pytest.approx(twice / unit.kelvin, rel=1e-12)
-
-
-def own_bonds(integrator):
-    """Alanine dipeptide whose bonds OpenMM holds itself."""
-    system = app.ForceField("amber14-all.xml").createSystem(
-        PEPTIDE.topology, constraints=app.AllBonds, rigidWater=False, removeCMMotion=False
-    )
-    return context_of(system, integrator)
-
-
-def test_the_motion_is_that_of_openmm():
-    """VerletIntegrator, whose velocities are half a step behind, has the same positions."""
-    _, integrator, context = peptide(rows=False)
-    verlet = openmm.VerletIntegrator(0.001)
-    verlet.setConstraintTolerance(1e-12)
-    x, v = state_of(context)
-    own = started(own_bonds(verlet), x, v)
-    own.setVelocities(v - 0.0005 * forces_at(own) / masses_of(own.getSystem())[:, None])
-    verlet.step(100)
-    integrator.step(100)
-    assert np.abs(state_of(own)[0] - state_of(context)[0]).max() <= 1e-9
-    with pytest.raises(ConvergenceError, match="step 101"):
-        integrator.setStepSize(0.1 * unit.picosecond)
-        integrator.step(1)
 
 
 @pytest.mark.parametrize("calls", [[40], [1, 2, 3]])

@@ -147,7 +147,7 @@ def test_a_chain_in_the_middle_takes_rattle_and_stays_itself():
             ProjectedIntegrator(1e-3, scheme, ensemble=NoseHooverMiddle(300.0, 20.0))
     ensemble = NoseHooverMiddle(300.0, 20.0, length=2)
     assert ensemble != NoseHoover(300.0, 20.0, length=2)
-    warmer = ensemble.at(310.0)
+    warmer = ensemble.replaced(temperature=310.0)
     assert type(warmer) is NoseHooverMiddle
     assert repr(warmer) == "NoseHooverMiddle(310 K, 20/ps, length=2)"
 
