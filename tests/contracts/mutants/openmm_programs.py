@@ -65,7 +65,7 @@ MUTANTS = {
         ),
     ],
     "openmm/ensembles/isokinetic_ensemble.py": [
-        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "thermostats_beside_parts::a_run_has_the_temperature"),
+        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "every_ensemble::a_run_has_the_temperature"),
         ('"max(qq«-wq→», wq^2/ww)"', "isokinetic_ensemble::two_sums_do_where_velocities_are_not_read"),
         (
             'program.set("exact", «float(precision == "double" and not rigid)→0.0»)',
@@ -106,7 +106,7 @@ MUTANTS = {
             "«groups_of(force)→{force.getForceGroup()}» - set(steps)",
             "langevin_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
-        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "langevin_ensemble"),
+        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         (', «_before(name)→name», "the chain', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),

@@ -116,28 +116,6 @@ def in_frame_of_its_center(ratio):
     return masses, x, v
 
 
-@pytest.mark.parametrize("every", [1, 500], ids=["looked at each step", "looked at now and then"])
-@pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
-@pytest.mark.parametrize("ratio", [10.0, 1e6])
-def test_the_center_of_mass_stays(scheme, every, ratio):
-    """What rounds positions, and velocities on their way, must not add up in the momenta."""
-    masses, x, v = in_frame_of_its_center(ratio)
-    system = free(masses)
-    part = hold(system, Distance([[k, k + 1] for k in range(len(masses) - 1)]), x)
-    integrator = ProjectedIntegrator(0.01, scheme=scheme, parts=[part])
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    context.setVelocities(v)
-    part.apply_velocities(context)
-    for _ in range(1000 // every):
-        integrator.step(every)
-        x, _ = state_of(context)
-    assert np.abs(masses @ x / masses.sum()).max() <= 2e-15
-    held = part.motion.constraint_set
-    v = state_of(context)[1]
-    assert np.abs(held.jacobian(x) @ v.ravel()).max() <= 1e-15
-
-
 @pytest.mark.parametrize("every", [1, 50])
 @pytest.mark.usefixtures("without_device")
 def test_velocities_are_those_of_the_core(every):
