@@ -35,7 +35,7 @@ DEVICE void rows_evaluate(ROWS int cluster, mixed time, mixed half_way, int move
             }
             else if (how) {ux -= x[s]; uy -= x[s+1]; uz -= x[s+2];}
             if (how == 3) {
-                GLOBAL const mixed* n = rows_cells+ROWS_FIRST_CELL+ROW(k, 8)+at;
+                GLOBAL const mixed* n = rows_cells+ROW(k, 8)+at;
                 ux += n[0]*box0.x+n[1]*box1.x+n[2]*box2.x; uy += n[1]*box1.y+n[2]*box2.y; uz += n[2]*box2.z;
             }
             if (rolls) for (int c = 0; c < 3; c++) r[size+at+c] = moved ? d[a+c] : (mixed) 0;

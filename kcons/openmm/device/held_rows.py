@@ -7,7 +7,6 @@ whose code or tables are written once.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,16 +64,6 @@ def constraints_of(parts: Any) -> list[Constraint]:
     return found
 
 
-def molecules_of(pairs: IntArray, parts: Any) -> list[IntArray]:
-    """Atoms that OpenMM has to keep together, row by row: `pairs` of the System, shape (n, 2), and rows of parts."""
-    return [
-        row for table in [pairs, *(item.atoms for item in constraints_of(parts) if item.width > 1)] for row in table
-    ]
-
-
-# -- functions --------------------------------------------------------------------------------------
-
-
 def function_on_device(item: Constraint) -> Function:
     """The function of an object's rows.
 
@@ -93,9 +82,6 @@ def function_on_device(item: Constraint) -> Function:
     return found
 
 
-# -- rows and clusters ------------------------------------------------------------------------------
-
-
 class Row(NamedTuple):
     """A row of a pattern: number of its function, its atoms in the cluster, how it takes them, and what it is."""
 
@@ -109,8 +95,7 @@ class Row(NamedTuple):
     period: float
 
 
-@dataclass(frozen=True)
-class Pattern:
+class Pattern(NamedTuple):
     """Clusters that look alike: its rows, those that depend on others last.
 
     `clusters` are their rows in the set, shape (n, n_rows), `atoms` their particles, shape (n, n_atoms).
@@ -151,27 +136,27 @@ class HeldRows:
         Of each row.
     doubtful : ndarray of bool, shape (n_rows,)
         Rows of clusters in which rows depend on others.
-    moving, in_cells : list of int
-        Rows whose targets move, and rows whose atoms stand in cells that are given, in the order of tables.
+    mover, cell : ndarray of int, shape (n_rows,)
+        Number of a row's moving target, and where its cells begin; of other rows the number of the next.
+    n_movers, n_cells : int
     """
 
     def __init__(self, motion: Motion, summed_from: int, time: float) -> None:
-        self.motion, self.set, self.summed_from = motion, motion.constraint_set, summed_from
-        self.functions: list[Function] = []
-        self.moving: list[int] = []
-        self.in_cells: list[int] = []
-        held = self.set
+        self.motion, self.summed_from = motion, summed_from
+        self.set = held = motion.constraint_set
+        plan = motion.plan
         self.target = held.target(time)
         size = np.concatenate([item.scale(time) for item in held.constraints] or [np.zeros(0)])
         self.scale = np.where(size > 0, size, 1.0)
+        self.doubtful = plan.eliminate_last.copy()
+        for some in plan.dependent:
+            self.doubtful[some] = True
         self.parameters: list[FloatArray] = []
+        #: Objects whose rows stand in cells that are given.
+        self._in_cells: list[Constraint] = []
+        known: dict[Function, int] = {}
         atoms: list[IntArray] = []
         rows: list[Row] = []
-        last = motion.plan.eliminate_last
-        self.doubtful = last.copy()
-        for some in motion.plan.dependent:
-            self.doubtful[some] = True
-        known: dict[Function, int] = {}
         for item, start in zip(held.constraints, held.starts, strict=False):
             self.parameters += list(item.parameters().reshape(item.n_rows, -1))
             atoms += list(item.atoms)
@@ -181,33 +166,41 @@ class HeldRows:
             how = np.full(item.n_rows, STORED if not item.relative else RELATIVE if open_ else NEAREST)
             if item.relative and item.whole is not None and not open_:
                 how[item.whole] = IN_CELLS
+                self._in_cells.append(item)
             moves, period = isinstance(item.target, MovingTarget), item.period or 0.0
-            if moves:
-                self.moving += range(start, start + item.n_rows)
-            for k in range(item.n_rows):
-                flags = not item.holonomic, moves, bool(last[start + k]), bool(start + k >= summed_from)
-                rows.append(Row(number, (), int(how[k]), *flags, period))
-        self.functions += known
-        self.patterns = self._patterns(rows, atoms)
-
-    def _patterns(self, rows: list[Row], atoms: list[IntArray]) -> list[Pattern]:
-        plan = self.motion.plan
-        found = alike(plan.labels, plan.eliminate_last, rows, atoms)
-        return [
+            for k in range(start, start + item.n_rows):
+                flags = not item.holonomic, moves, bool(plan.eliminate_last[k]), bool(k >= summed_from)
+                rows.append(Row(number, (), int(how[k - start]), *flags, period))
+        self.functions = list(known)
+        sizes = [[row.moves, 3 * len(a) * (row.how == IN_CELLS)] for row, a in zip(rows, atoms, strict=True)]
+        ends = np.cumsum([[0, 0], *sizes], axis=0)
+        (self.mover, self.cell), (self.n_movers, self.n_cells) = ends[:-1].T, ends[-1].tolist()
+        self.patterns = [
             Pattern(tuple(row._replace(atoms=local) for row, local in key), each.atoms, each.rows)
-            for key, each in found.items()
+            for key, each in alike(plan.labels, plan.eliminate_last, rows, atoms).items()
         ]
 
     def cells_of(self, x: FloatArray) -> FloatArray:
-        """Whole cells that bring the atoms of the rows `in_cells` beside the first one, one row after another."""
-        lattice = self.set.lattice
-        found: list[FloatArray] = []
-        made: dict[int, FloatArray] = {}
-        for row in self.in_cells:
-            item, k = self.set.locate(row)
-            if id(item) not in made:
-                assert lattice is not None
-                cells = np.round((self.set.gather(item, x) - x[item.atoms]) @ lattice[1])
-                made[id(item)] = cells - cells[:, :1]
-            found.append(made[id(item)][k].ravel())
-        return np.concatenate(found) if found else np.zeros(1)
+        """Whole cells that bring the atoms of rows that need it beside the first one, one row after another."""
+        found = [np.zeros(0)]
+        for item in self._in_cells:
+            assert self.set.lattice is not None
+            cells = np.round((self.set.gather(item, x) - x[item.atoms]) @ self.set.lattice[1])
+            found.append((cells - cells[:, :1])[item.whole].ravel())
+        return np.concatenate(found)
+
+    def knots(self, start: float, spacing: float, count: int) -> FloatArray:
+        """Times, then value, rate and acceleration of each moving row at each knot, in units of the spacing."""
+        times = start + spacing * np.arange(count)
+        tables = []
+        for item in self.set.constraints:
+            if isinstance(of := item.target, MovingTarget):
+                values = np.array([item.target_at(t) for t in times])
+                if item.period is not None:
+                    values = np.unwrap(values, axis=0, period=item.period)
+                slopes = (
+                    spacing**order * np.array([each(t, item.n_rows, item.period) for t in times])
+                    for order, each in ((1, of.rate_at), (2, of.acceleration_at))
+                )
+                tables.append(np.stack([values, *slopes], axis=2).swapaxes(0, 1).ravel())
+        return np.concatenate([[start, 1 / spacing, count], *tables])

@@ -15,7 +15,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Engine, cell_of, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
-from kcons.openmm.device.rows import DeviceRows, rows_of
+from kcons.openmm.device.rows import DeviceRows
 from kcons.openmm.integrator.part import Part, Solver
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
@@ -46,8 +46,6 @@ class KernelRows(CarriedConstraints):
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
         for part in carried:
             part._engine.served = True
-        #: The engine of what `hold` made, until the Context is known.
-        self._carried = carried[0]._engine if len(carried) == len(parts) == 1 else None
         #: Whether rows take periodic images: as `hold` was told, else as the System.
         self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
         self._bound: tuple[DeviceRows, Engine] | None = None
@@ -72,7 +70,7 @@ class KernelRows(CarriedConstraints):
         Raises
         ------
         KconsError
-            As `rows_of`.
+            As `DeviceRows`.
         """
         pairs, lengths = system_rows
         # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
@@ -83,7 +81,7 @@ class KernelRows(CarriedConstraints):
         made_of = masses.tobytes(), *(np.asarray(array).tobytes() for array in system_rows)
         if self._bound is None or self._of != made_of:
             cell = None if self._wraps is False else cell
-            rows = rows_of(masses, system_rows, self.given, positions, cell, time)
+            rows = DeviceRows(masses, system_rows, self.given, positions, cell, time)
             self._bound, self._of = (rows, Engine(rows.motion, masses, cell)), made_of
             self._slopes = None
         return self._bound[0]
@@ -114,8 +112,6 @@ class KernelRows(CarriedConstraints):
 
     @property
     def _engine(self) -> Any:  # type: ignore[override]
-        if self._bound is None and self._carried is not None:
-            return self._carried
         if self._bound is None:
             raise InputError(
                 "these rows are known at the first step of a Context; call integrator.attach(context) after its "

@@ -26,16 +26,9 @@ _SUMS = 7
 
 
 class Array(NamedTuple):
-    """An array on the device, which kernels know by its name.
+    """An array of 'mixed' or 'int' numbers, which kernels know by its name, and what it begins with.
 
-    Attributes
-    ----------
-    name : str
-    kind : {'mixed', 'int'}
-    values : ndarray
-        What it begins with.
-    saved : bool
-        Whether it belongs to a state: checkpoints and States have it.
+    One that is `saved` belongs to a state: checkpoints and States have it.
     """
 
     name: str
@@ -45,19 +38,11 @@ class Array(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Clusters of atoms whose code is the same.
+    """Clusters of atoms, shape (n_clusters, n), whose code is the same.
 
-    Attributes
-    ----------
-    name : str
-        Ending of the names of its functions; empty for single atoms.
-    atoms : ndarray of int, shape (n_clusters, n)
-    together : bool
-        Whether a work-group has a cluster; else a work-item.
-    n_rows : int
-        Independent rows of a cluster.
-    first : int
-        Number of the first cluster among those of this name.
+    The `name` ends those of its functions; it is empty for single atoms. A work-group has a cluster where it is held
+    `together`, else a work-item. A cluster has `n_rows` independent rows; the first of a shape has the number `first`
+    among those of the name.
     """
 
     name: str
@@ -234,24 +219,11 @@ def standard_arrays(
 
 
 class Op(NamedTuple):
-    """An operation as plain data.
+    """An operation as plain data: a verb of `VERBS`, the fraction of the step that it is over, and whose forces.
 
-    Attributes
-    ----------
-    verb : str
-        As `kcons.steppers.operations` has them; 'note' is for the kinetic energy that a State tells.
-    share : float
-        The fraction of the step that it is over.
-    group : str
-        Whose forces.
-    flights : tuple of float
-        Of a drift the RATTLE drifts, of a chain the parts that it consists of, as fractions of the step.
-    ends : tuple of float
-        At which fractions of the step they end; of others, when they are.
-    begun : int
-        0 in the step that is being made, -1 in the one before.
-    use : int
-        Number of its noise within the step.
+    A drift has `flights`, the RATTLE drifts that it consists of, a chain its parts, all as fractions of the step;
+    `ends` are when flights end, or when other operations are. `begun` is 0 in the step that is being made, -1 in the
+    one before. `use` is the number of its noise within the step.
     """
 
     verb: str
@@ -263,7 +235,7 @@ class Op(NamedTuple):
     use: int = 0
 
 
-#: What kernels can do.
+#: What kernels can do, as `kcons.steppers.operations` has it; 'note' is for the kinetic energy that a State tells.
 VERBS = ("kick", "fly", "project", "exchange", "turn", "chain", "evaluate", "note", "rescale", "restore")
 
 
@@ -462,15 +434,11 @@ class Spheres(NamedTuple):
 
 
 class Action(NamedTuple):
-    """What the plugin does: launch a kernel, evaluate forces."""
+    """What the plugin does: launch a kernel, or, where it has no name, evaluate forces of some groups for a slot."""
 
-    verb: int
-    kernel: str = ""
+    kernel: str
     groups: int = -1
     slot: int = 0
-
-
-LAUNCH, EVALUATE = range(2)
 
 
 class _Place(NamedTuple):
@@ -658,7 +626,7 @@ class Kernels:
     _restore = _rescale
 
     def _evaluate(self, op: Op) -> None:
-        self._close(Action(EVALUATE, "", self.groups[op.group], list(self.groups).index(op.group)))
+        self._close(Action("", self.groups[op.group], list(self.groups).index(op.group)))
 
     def _note(self, op: Op) -> None:
         self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc3 += v[3*a+c]*v[3*a+c]/w[a];\n")
@@ -678,8 +646,8 @@ class Kernels:
     def _close(self, action: Action | None = None) -> None:
         """A kernel of what was written since the last; `action` comes after it."""
         if self._used or self._before:
-            name = f"{self._name}{sum(a.verb == LAUNCH for a in self._actions)}"
-            self._actions.append(Action(LAUNCH, name))
+            name = f"{self._name}{len(self._actions)}"
+            self._actions.append(Action(name))
             ends = accumulators = ""
             places = {f"acc{k}": self._bank + k for k in range(self._sums)} | ({"acc3": 6} if self._noted else {})
             if places:
@@ -749,39 +717,23 @@ class Kernels:
 
 
 class Plan(NamedTuple):
-    """What the plugin needs for a Context.
-
-    Attributes
-    ----------
-    source : str
-    arrays : list of Array
-    parts : tuple of three lists of Action
-        Head, middle and tail of a step.
-    order : ndarray of int
-        Of atoms in the array `atoms`; -1-k for those that rest.
-    items, work_group, slots : int
-        Work-items that there is work for, their number in a group, and how many groups of forces are kept.
-    """
+    """What the plugin needs for a Context, see `Plan` in `plugin/program_integrator.h`."""
 
     source: str
     arrays: list[Array]
     parts: tuple[list[Action], list[Action], list[Action]]
-    order: IntArray
     items: int
     work_group: int
     slots: int
 
 
 def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, held: Any) -> Plan:
-    """Everything that the plugin needs.
+    """The plan for a platform.
 
     Parameters
     ----------
     described : mapping
         What `DeviceIntegrator.describe` says of a step.
-    platform : str
-        Its name.
-    masses : ndarray, shape (n_particles,)
     groups : int
         Bit mask of the force groups that act.
     held : DeviceRows
@@ -793,7 +745,7 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     parameters, memory, particles = described["settings"], described["memory"], len(masses)
     kernels = Kernels(described, masses, masks, held)
     parts = divided(operations, described["noisy"])
-    actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
+    head, middle, tail = (kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
     recorded, room = described["recorded"], room_for(len(described["recorded"]))
     order = np.concatenate([*kernels.order, np.array(recorded, dtype=np.int64)])
     arrays = standard_arrays([*parameters.values()], len(memory), seed, particles)
@@ -819,7 +771,7 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     source += "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
     items = kernels.items + kernels.crowds * work_group
-    return Plan(source, arrays, actions, order, items, work_group, len(masks))  # type: ignore[arg-type]
+    return Plan(source, arrays, (head, middle, tail), items, work_group, len(masks))
 
 
 def room_for(particles: int) -> int:

@@ -30,19 +30,14 @@ public:
         return sum/2;
     }
     vector<double> read(const string& name) override {
-        if (const vector<int>* found = find(integers, name)) return vector<double>(found->begin(), found->end());
-        if (const vector<double>* found = find(reals, name)) return *found;
-        throw OpenMMException("kcons: no array is called '"+name+"'");
+        if (!declared(name).whole) return reals[name];
+        return vector<double>(integers[name].begin(), integers[name].end());
     }
     void write(const string& name, const vector<double>& values) override {
         if (declared(name, values.size()).whole) copy(values.begin(), values.end(), integers[name].begin());
         else copy(values.begin(), values.end(), reals[name].begin());
     }
 protected:
-    template <class T> static const vector<T>* find(const map<string, vector<T>>& arrays, const string& name) {
-        auto it = arrays.find(name);
-        return it == arrays.end() ? nullptr : &it->second;
-    }
     void prepare(ContextImpl& c) override {
         forces.resize(plan.slots);
         for (auto& array : plan.arrays) {
