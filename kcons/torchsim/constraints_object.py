@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -47,7 +48,7 @@ class Constraints(SystemConstraint):
             self.check_fits(state)
             motions = [self.motions[k] for k in torch.argsort(self.system_idx).tolist()]
             part = torch.isin(state.system_idx, self.system_idx)
-            batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=1)
+            batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=sys.maxsize)
             self._made = seen, batch, None if bool(part.all()) else part.nonzero().ravel()
         return self._made[1:]
 
@@ -66,12 +67,19 @@ class Constraints(SystemConstraint):
                 )
 
     def move(self, state: SimState, new: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction."""
+        """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction.
+
+        Failures are kept until `check` looks for them.
+        """
         batch, atoms = self.batch(state)
         if atoms is None:
             return batch.solve_positions(new, state.positions)[:2]
         positions, push, _ = batch.solve_positions(new[atoms], state.positions[atoms])
         return new.index_copy(0, atoms, positions), torch.zeros_like(new).index_copy(0, atoms, push)
+
+    def check(self, state: SimState) -> None:
+        """Raise `ConvergenceError` where rows were not met since the last look, which waits for the device."""
+        self.batch(state)[0].check()
 
     def tangent(self, state: SimState, velocities: torch.Tensor) -> torch.Tensor:
         """The part of velocities that stays on the constraints."""
@@ -90,6 +98,7 @@ class Constraints(SystemConstraint):
         if isinstance(state, MDState):
             raise UnsupportedError(_OWN)
         new_positions.copy_(self.move(state, new_positions)[0])
+        self.check(state)
 
     def adjust_momenta(self, state: SimState, momenta: torch.Tensor) -> None:
         """Refuse integrators of TorchSim, before they move positions."""

@@ -77,6 +77,7 @@ def _start(state: SimState, model: ModelInterface, kT: Any, at_rest: bool) -> MD
     held.check_fits(state)
     start = copy.copy(state)
     start.positions = held.move(state, state.positions)[0]
+    held.check(state)
     away = (start.positions - state.positions).abs().amax(1)
     if bool(away.max() > FAR):
         atom = int(away.argmax())
@@ -165,6 +166,8 @@ def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
 
 
 def _evaluate(state: MDState, model: ModelInterface) -> None:
+    """Forces at the end of a step, at positions that are on the constraints: looked at here, once a step."""
+    constraints_of(state).check(state)
     output = model(state)
     state.energy, state.forces = output["energy"], output["forces"]
     state.store_model_extras(output)

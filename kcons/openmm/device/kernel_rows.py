@@ -13,7 +13,7 @@ import openmm
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Engine, cell_of, refuse_virtual_sites
+from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Engine, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
 from kcons.openmm.device.rows import DeviceRows
 from kcons.openmm.integrator.part import Part, Solver
@@ -88,20 +88,14 @@ class KernelRows(CarriedConstraints):
 
     def bind(self, context: openmm.Context) -> DeviceRows:
         """The rows for a Context, at its positions."""
-        if self._bound is not None and self._context() is context:
-            return self._bound[0]
-        self._context = weakref.ref(context)
-        system = context.getSystem()
-        known = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-        pairs = np.array([[i, j] for i, j, _ in known], dtype=np.int64).reshape(-1, 2)
-        lengths = np.array([length._value for _, _, length in known], dtype=float)
-        cell = None
-        if system.usesPeriodicBoundaryConditions():
-            cell = cell_of(context.getState().getPeriodicBoxVectors())
-        masses = masses_of(system)
-        refuse_virtual_sites(system, self.atoms, masses)
-        time = float(context.getTime()._value)
-        return self.rows_at(masses, (pairs, lengths), positions_of(context), cell, time)
+        if self._context() is not context:
+            system, program = context.getSystem(), self.program
+            assert program is not None
+            refuse_virtual_sites(system, self.atoms, masses_of(system))
+            program.integrator.read("seed")  # makes the plan, which asks `rows_at`
+            self._context = weakref.ref(context)
+        assert self._bound is not None
+        return self._bound[0]
 
     @property
     def atoms(self) -> IntArray:

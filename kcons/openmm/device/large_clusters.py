@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +73,7 @@ class LargeClusters:
         sizes = [len(held.parameters[row]) for row in rows]
         flags = [row.rolls + 2 * doubt + 4 * row.summed for row, doubt in zip(kinds, doubtful, strict=True)]
         moves = np.array([row.moves for row in kinds])
-        columns = [
+        columns: list[Any] = [
             [*(row.function for row in kinds), 0],
             np.searchsorted(slot_row, np.arange(count + 1)),
             np.cumsum([0, *sizes]),
@@ -86,7 +87,7 @@ class LargeClusters:
         base = np.repeat(
             [first_atom for _, first_atom, _ in clusters[:-1]], np.diff([first for first, _, _ in clusters])
         )
-        tables = {
+        tables: dict[str, Any] = {
             "cluster": clusters,
             "row": np.stack(columns, axis=1),
             "slot": np.stack([slot_atom - base[slot_row], slot_row], axis=1),

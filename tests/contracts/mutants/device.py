@@ -7,7 +7,7 @@ MUTANTS = {
             "test_device_integrator.py::test_operations_are_joined_where_nobody_looks",
         ),
         (
-            "step+({op.begun}), {op.use}, «seed[0]→7»);",
+            "step+({op.begun}), {{}}, «seed[0]→7»);",
             "test_device_integrator.py::test_noise_belongs_to_particle_and_step",
         ),
         (

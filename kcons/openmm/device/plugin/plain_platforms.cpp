@@ -12,7 +12,7 @@ using namespace std;
 namespace kcons {
 
 // Where kernels find pointers, see `kernels.py`.
-typedef void (*PlainKernel)(void** pointers, const double* reals, const int* integers, int group, int groups);
+typedef void (*PlainKernel)(void** pointers, const void* numbers, int group, int groups);
 
 class PlainStep : public StepKernel {
 public:
@@ -56,13 +56,12 @@ protected:
             pointers.push_back(plan.slots == 1 ? data.forces->data() : forces[slot].data());
         for (auto& array : plan.arrays)
             pointers.push_back(array.whole ? (void*) integers[array.name].data() : (void*) reals[array.name].data());
-        double given[12] = {numbers.dt, numbers.time, numbers.tolerance};
-        for (int k = 0; k < 9; k++) given[3+k] = numbers.box[k/3][k%3];
-        int whole[] = {numbers.step, numbers.launch++};
+        const Numbers given = numbers;
+        numbers.launch++;
         // A sum of few shares does not depend on the number of threads more than one of many.
         int groups = parallel && kernel != "look" ? min(data.threads.getNumThreads(), 256) : 1;
-        if (groups == 1) { code(pointers.data(), given, whole, 0, 1); return; }
-        data.threads.execute([&](ThreadPool&, int thread) { if (thread < groups) code(pointers.data(), given, whole, thread, groups); });
+        if (groups == 1) { code(pointers.data(), &given, 0, 1); return; }
+        data.threads.execute([&](ThreadPool&, int thread) { if (thread < groups) code(pointers.data(), &given, thread, groups); });
         data.threads.waitForThreads();
     }
     void keepForces(int slot) override { forces[slot] = *data.forces; }
