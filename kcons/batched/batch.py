@@ -114,10 +114,8 @@ class Batch:
         self._fixed = self._placed(
             self.atom_starts, lambda each: [each.constraint_set.row_atoms(row)[0] for row in each.plan.pinned_rows[::3]]
         )
-        self._massless = self.masses <= 0
-        self._free = ~self._massless
+        self._free = self.masses > 0
         self._free[self._fixed] = False
-        self._massless[self._fixed] = False
         self._inverse_masses = self._inverse(self.masses)
         self._moving = any(each.constraint_set.moving for each in self._numbers)
         self._is_position = self._joined(lambda each: each.constraint_set.holonomic, torch.bool)
@@ -317,14 +315,6 @@ class Batch:
             rates = rates - drift
         speeds = self._with_fixed(self._flat(v, "v"), rates)
         return Projection.apply(speeds, here, rates, self.weights(masses), task)[0].reshape(v.shape)
-
-    def project_forces(self, x: Tensor, forces: Tensor) -> Tensor:
-        """What is left of forces on the surface, for optimizers, as `Motion.project_forces`."""
-        here, f = self._flat(x, "x"), self._flat(forces, "forces")
-        pulled = self._inverse_masses[:, None] * f
-        task = self._task(False, 0.0, 0.0)
-        found = Projection.apply(pulled, here, self._still, self._inverse_masses, task)[0] * self.masses[:, None]
-        return torch.where(self._free[:, None], found, self._massless[:, None] * f).reshape(forces.shape)
 
     def multipliers(
         self, x: Tensor, v: Tensor, forces: Tensor, *, time: float = 0.0, masses: Tensor | None = None

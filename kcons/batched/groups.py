@@ -42,12 +42,8 @@ def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
         Rows that cannot be run on tensors; rows that depend on others in clusters where these are not known.
     """
     known = _KNOWN.setdefault(motion, {})
-    if velocity_rows not in known:
-        known[velocity_rows] = _kinds(motion, velocity_rows)
-    return known[velocity_rows]
-
-
-def _kinds(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
+    if velocity_rows in known:
+        return known[velocity_rows]
     held, plan, fixed = motion.constraint_set, motion.plan, set(motion.fixed_atoms.tolist())
     missing = int(((plan.labels >= 0) & ~plan.eliminate_last).sum()) + len(plan.pinned_rows) - motion.rank
     if missing:
@@ -61,7 +57,7 @@ def _kinds(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
     offsets: list[FloatArray] = []
     for item, start in zip(held.constraints, held.starts, strict=False):
         function = None if item.fixes_atoms else row_function(item)
-        table = np.zeros((item.n_rows, 0)) if item.fixes_atoms else item.parameters()
+        table = item.parameters().reshape(item.n_rows, -1)
         whole = np.zeros(item.n_rows, bool) if item.whole is None else item.whole
         cells = np.zeros((*item.atoms.shape, 3)) if item.cell_offsets is None else 1.0 * item.cell_offsets
         offsets += list((cells - cells[:, :1])[:, 1 if item.relative else item.width :])
@@ -83,6 +79,7 @@ def _kinds(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
             for t in (parameters, offsets)
         )
         found[pattern] = Kind(clusters, next(numbers), held.scale[clusters.rows], next(numbers))
+    known[velocity_rows] = found
     return found
 
 

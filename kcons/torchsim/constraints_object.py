@@ -38,18 +38,17 @@ class Constraints(SystemConstraint):
         super().__init__(system_idx)
         self.motions = tuple(motions)
         #: Tensors that the engine was made for, with their versions, the engine, and its atoms.
-        self._made: tuple[list[tuple[torch.Tensor, int]], Batch, torch.Tensor | None] | None = None
+        self._made: tuple[list[tuple[torch.Tensor, int]], Batch, torch.Tensor] | None = None
 
-    def batch(self, state: SimState) -> tuple[Batch, torch.Tensor | None]:
-        """The engine for all systems of a state, and its atoms, None if these are all of the state."""
+    def batch(self, state: SimState) -> tuple[Batch, torch.Tensor]:
+        """The engine for all systems of a state that have rows, and the numbers of their atoms."""
         # TorchSim sets another system_idx where it reorders systems; masses and cells can be edited in a run.
         seen = [(each, each._version) for each in (self.system_idx, state.masses, state.cell)]
         if self._made is None or any(a is not b or n != m for (a, n), (b, m) in zip(self._made[0], seen, strict=True)):
             self.check_fits(state)
             motions = [self.motions[k] for k in torch.argsort(self.system_idx).tolist()]
-            part = torch.isin(state.system_idx, self.system_idx)
             batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=sys.maxsize)
-            self._made = seen, batch, None if bool(part.all()) else part.nonzero().ravel()
+            self._made = seen, batch, torch.isin(state.system_idx, self.system_idx).nonzero().ravel()
         return self._made[1:]
 
     def check_fits(self, state: SimState) -> None:
@@ -72,8 +71,6 @@ class Constraints(SystemConstraint):
         Failures are kept until `check` looks for them.
         """
         batch, atoms = self.batch(state)
-        if atoms is None:
-            return batch.solve_positions(new, state.positions)[:2]
         positions, push, _ = batch.solve_positions(new[atoms], state.positions[atoms])
         return new.index_copy(0, atoms, positions), torch.zeros_like(new).index_copy(0, atoms, push)
 
@@ -84,8 +81,6 @@ class Constraints(SystemConstraint):
     def tangent(self, state: SimState, velocities: torch.Tensor) -> torch.Tensor:
         """The part of velocities that stays on the constraints."""
         batch, atoms = self.batch(state)
-        if atoms is None:
-            return batch.project_velocities(state.positions, velocities)
         return velocities.index_copy(0, atoms, batch.project_velocities(state.positions[atoms], velocities[atoms]))
 
     def get_removed_dof(self, state: SimState) -> torch.Tensor:

@@ -8,10 +8,10 @@ MUTANTS = {
     "batched/clusters.py": [
         ("torch.where(d > «0→-9e99», 0.0, torch.inf)", BATCH + "a_bond_that_has_turned_is_no_solution"),
         (
-            "back = [«-each→each» for each in self.spread(slope, a)]",
+            "back = _each(operator.«neg→pos», self.spread(slope, a))",
             GRADIENTS + "derivatives_are_those_of_the_solution",
         ),
-        ("way=of.way «-→+» moved)", GRADIENTS + "derivatives_are_those_of_the_solution[lanes-blade]"),
+        ("start=of.start «+→-» moved)", GRADIENTS + "derivatives_are_those_of_the_solution[lanes-blade]"),
         ("d, rest), «rest.T→0 * rest.T»])", ENGINE + "chains_and_rows_that_depend_on_others"),
     ],
     "batched/levels.py": [
