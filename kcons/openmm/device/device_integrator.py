@@ -19,8 +19,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
-from kcons.openmm.device.held_rows import constraints_of
-from kcons.openmm.device.held_rows import refusal as rows_refusal
+from kcons.openmm.device.held_rows import constraints_of, function_on_device
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
 from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
@@ -84,8 +83,11 @@ def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
         return f"{type(ensemble).__name__} has no kernels"
     if parts and isinstance(ensemble, LangevinRespa):
         return f"{type(ensemble).__name__} holds no parts"
-    if parts and (why := rows_refusal(parts)):
-        return why
+    try:
+        for item in constraints_of(parts):
+            function_on_device(item)
+    except UnsupportedError as error:
+        return str(error)
     for operation in ensemble.operations(scheme):
         if operation.verb not in VERBS or (isinstance(operation, Fly) and operation.exact):
             return f"the operation {operation.verb!r} has no kernel"

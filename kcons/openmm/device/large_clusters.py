@@ -9,7 +9,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.openmm.device.c_writer import c_functions
-from kcons.openmm.device.held_rows import HeldRows, Pattern, Row
+from kcons.openmm.device.held_rows import Pattern, Row
 from kcons.openmm.device.kernels import Array, Shape
 from kcons.plan.clusters_alike import elimination
 
@@ -27,7 +27,7 @@ class LargeClusters:
         The functions ``positions_large`` and ``velocities_large``.
     """
 
-    def __init__(self, patterns: list[Pattern], held: HeldRows, first_row: int) -> None:
+    def __init__(self, patterns: list[Pattern], held: Any, first_row: int) -> None:
         self.shapes: list[Shape] = []
         rows: list[int] = []
         kinds: list[Row] = []
@@ -120,7 +120,7 @@ class LargeClusters:
         self.source = self._source(sorted({row.function for row in kinds}), held, first_row)
 
     @staticmethod
-    def _source(used: list[int], held: HeldRows, first_row: int) -> str:
+    def _source(used: list[int], held: Any, first_row: int) -> str:
         functions = "".join(c_functions(f"rows_g{f}", held.functions[f], "GLOBAL ") for f in used)
         cases = "".join(f" case {f}: rows_g{f}(r, p, t, out); break;\n" for f in used)
         timed = [f for f in used if held.functions[f].rate is not None]

@@ -14,15 +14,26 @@ import numpy as np
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.target import FloatArray
+from kcons.constraints.functions.straight_line import Function
+from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.openmm.device.c_writer import c_functions
-from kcons.openmm.device.held_rows import STORED, HeldRows, constraints_of
+from kcons.openmm.device.held_rows import (
+    IN_CELLS,
+    NEAREST,
+    RELATIVE,
+    STORED,
+    Pattern,
+    Row,
+    constraints_of,
+    function_on_device,
+)
 from kcons.openmm.device.kernels import Array, Shape
 from kcons.openmm.device.large_clusters import LargeClusters
 from kcons.openmm.device.small_clusters import ItemWriter
 from kcons.openmm.quantities import with_massless_atoms
+from kcons.plan.clusters_alike import alike
 
 #: Newton iterations at most; those after which a large cluster is factored again.
 TURNS, CHORD = 30, 4
@@ -42,9 +53,12 @@ _COMMON = f"""
 #define ROWS_PIVOT ((mixed) {PIVOT})
 #define ROWS_ROUNDING ((mixed) 4e-16)
 #endif
-/* The shortest image of a vector. */
-#define ROWS_NEAR(a, b, c) {{mixed n_ = rint(c/box2.z); a -= n_*box2.x; b -= n_*box2.y; c -= n_*box2.z; \\
-  n_ = rint(b/box1.y); a -= n_*box1.x; b -= n_*box1.y; a -= rint(a/box0.x)*box0.x;}}
+/* Where atom a of a list is, after atom b before it, by the shortest image of the vector between them. */
+#define ROWS_STEP(to, at, from, a, b) {{ \\
+  mixed u_ = from[a]-from[b], v_ = from[(a)+1]-from[(b)+1], w_ = from[(a)+2]-from[(b)+2]; \\
+  mixed n_ = rint(w_/box2.z); u_ -= n_*box2.x; v_ -= n_*box2.y; w_ -= n_*box2.z; \\
+  n_ = rint(v_/box1.y); u_ -= n_*box1.x; v_ -= n_*box1.y; u_ -= rint(u_/box0.x)*box0.x; \\
+  to[at] = to[(at)-3]+u_; to[(at)+1] = to[(at)-2]+v_; to[(at)+2] = to[(at)-1]+w_;}}
 /* Moving target j or its rate, by polynomials between knots that have value, rate and acceleration; NaN beyond them. */
 DEVICE mixed rows_moving(GLOBAL const mixed* knots, int j, mixed time, int rate) {{
   int last = (int) knots[2]-1;
@@ -60,7 +74,7 @@ DEVICE mixed rows_moving(GLOBAL const mixed* knots, int j, mixed time, int rate)
 """
 
 
-class DeviceRows(HeldRows):
+class DeviceRows:
     """What kernels hold: the System's constraints and what was given beside them.
 
     Parameters
@@ -79,16 +93,29 @@ class DeviceRows(HeldRows):
 
     Attributes
     ----------
+    motion : Motion
+        The engine of all rows.
+    set : ConstraintSet
+        All rows, those of the System's constraints first.
+    functions : list of Function
+    target, scale : ndarray, shape (n_rows,)
+        The scale is what tolerances are relative to: the length held, 1 for all that is no length.
+    parameters : list of ndarray
+        Of each row.
+    doubtful : ndarray of bool, shape (n_rows,)
+        Rows of clusters in which rows depend on others.
+    mover, cell : ndarray of int, shape (n_rows,)
+        Number of a row's moving target, and where its cells begin; of other rows the number of the next.
+    n_movers, n_cells : int
     shapes : list of Shape
     arrays : list of Array
     source : str
         C text: functions of rows, and ``positions_NAME`` and ``velocities_NAME`` of each shape.
     scratch, work_group : int
         Numbers of LOCAL memory that a work-group needs, and its size.
-    fixed : ndarray of int
-        Particles that do not move, whatever their mass.
-    placed : ndarray of int
-        Particles whose rows have a place in space, so that positions as they are told of count.
+    fixed, placed : ndarray of int
+        Particles that do not move, whatever their mass; those whose rows have a place in space, so that positions as
+        they are told of count.
     block : int
         Steps after which `renew` is due.
 
@@ -119,9 +146,52 @@ class DeviceRows(HeldRows):
                     f"{item!r} moves, which the device does not do; leave it to the host (device=False)"
                 )
         # Rows that were converted stand in another order: then all are summed.
-        super().__init__(motion, 0 if motion.conversions else len(pairs), time)
-        self.fixed, self.shapes = motion.fixed_atoms, list[Shape]()
-        small, large = ([each for each in self.patterns if each.small is kind] for kind in (True, False))
+        self._summed_from = 0 if motion.conversions else len(pairs)
+        self.motion, self.set, self.fixed = motion, motion.constraint_set, motion.fixed_atoms
+        self._write(self._patterns(time))
+
+    def _patterns(self, time: float) -> list[Pattern]:
+        """What is known of rows, and clusters that look alike, whose code or tables are written once."""
+        held, plan = self.set, self.motion.plan
+        self.target = held.target(time)
+        size = np.concatenate([item.scale(time) for item in held.constraints] or [np.zeros(0)])
+        self.scale = np.where(size > 0, size, 1.0)
+        self.doubtful = plan.eliminate_last.copy()
+        for some in plan.dependent:
+            self.doubtful[some] = True
+        self.parameters: list[FloatArray] = []
+        #: Objects whose rows stand in cells that are given.
+        self._in_cells: list[Constraint] = []
+        known: dict[Function, int] = {}
+        atoms: list[IntArray] = []
+        rows: list[Row] = []
+        for item, start in zip(held.constraints, held.starts, strict=False):
+            self.parameters += list(item.parameters().reshape(item.n_rows, -1))
+            atoms += list(item.atoms)
+            number = -1 if item.fixes_atoms else known.setdefault(function_on_device(item), len(known))
+            # OpenMM keeps molecules in one piece: its own constraints know no images.
+            open_ = held.lattice is None or start + item.n_rows <= self._summed_from
+            how = np.full(item.n_rows, STORED if not item.relative else RELATIVE if open_ else NEAREST)
+            if item.relative and item.whole is not None and not open_:
+                how[item.whole] = IN_CELLS
+                self._in_cells.append(item)
+            moves, period = isinstance(item.target, MovingTarget), item.period or 0.0
+            for k in range(start, start + item.n_rows):
+                flags = not item.holonomic, moves, bool(plan.eliminate_last[k]), bool(k >= self._summed_from)
+                rows.append(Row(number, (), int(how[k - start]), *flags, period))
+        self.functions = list(known)
+        sizes = [[row.moves, 3 * len(a) * (row.how == IN_CELLS)] for row, a in zip(rows, atoms, strict=True)]
+        ends = np.cumsum([[0, 0], *sizes], axis=0)
+        (self.mover, self.cell), (self.n_movers, self.n_cells) = ends[:-1].T, ends[-1].tolist()
+        return [
+            Pattern(tuple(row._replace(atoms=local) for row, local in key), each.atoms, each.rows)
+            for key, each in alike(plan.labels, plan.eliminate_last, rows, atoms).items()
+        ]
+
+    def _write(self, patterns: list[Pattern]) -> None:
+        """Code and arrays."""
+        self.shapes: list[Shape] = []
+        small, large = ([each for each in patterns if each.small is kind] for kind in (True, False))
         texts = [_COMMON]
         for number in sorted({row.function for pattern in small for row in pattern.rows}):
             texts.append(c_functions(f"rows_f{number}", self.functions[number]))
@@ -142,7 +212,7 @@ class DeviceRows(HeldRows):
             self.shapes += clusters.shapes
             self.scratch, self.work_group = 2, 32 if max(len(pattern.rows) for pattern in large) <= 64 else 256
         self.source, self._order = "".join(texts), np.concatenate(order)
-        placed = [each.atoms[:, a] for each in self.patterns for r in each.rows if r.how == STORED for a in r.atoms]
+        placed = [each.atoms[:, a] for each in patterns for r in each.rows if r.how == STORED for a in r.atoms]
         self.placed: IntArray = np.unique(np.concatenate([*placed, np.zeros(0, np.int64)]))
         self.block = BLOCK if self.n_movers else 10**9
         self._n_knots = 3 + self.n_movers * 3 * ((BLOCK + 2 * BEYOND) * KNOTS + 1)
@@ -174,14 +244,39 @@ class DeviceRows(HeldRows):
         """
         found: dict[str, FloatArray] = {}
         if self.n_movers:
-            known = self.knots(time - BEYOND * dt, dt / KNOTS, (steps + 2 * BEYOND) * KNOTS + 1)
+            known = self._knots(time - BEYOND * dt, dt / KNOTS, (steps + 2 * BEYOND) * KNOTS + 1)
             found["rows_knots"] = np.pad(known, (0, self._n_knots - len(known)))
         if self.n_cells:
             assert positions is not None
             if cell is not None:
                 self.motion.set_cell(cell)
-            found["rows_cells"] = self.cells_of(positions)
+            found["rows_cells"] = self._cells(positions)
         return found
+
+    def _cells(self, x: FloatArray) -> FloatArray:
+        """Whole cells that bring the atoms of rows that need it beside the first one, one row after another."""
+        found = [np.zeros(0)]
+        for item in self._in_cells:
+            assert self.set.lattice is not None
+            cells = np.round((self.set.gather(item, x) - x[item.atoms]) @ self.set.lattice[1])
+            found.append((cells - cells[:, :1])[item.whole].ravel())
+        return np.concatenate(found)
+
+    def _knots(self, start: float, spacing: float, count: int) -> FloatArray:
+        """Times, then value, rate and acceleration of each moving row at each knot, in units of the spacing."""
+        times = start + spacing * np.arange(count)
+        tables = []
+        for item in self.set.constraints:
+            if isinstance(of := item.target, MovingTarget):
+                values = np.array([item.target_at(t) for t in times])
+                if item.period is not None:
+                    values = np.unwrap(values, axis=0, period=item.period)
+                slopes = (
+                    spacing**order * np.array([each(t, item.n_rows, item.period) for t in times])
+                    for order, each in ((1, of.rate_at), (2, of.acceleration_at))
+                )
+                tables.append(np.stack([values, *slopes], axis=2).swapaxes(0, 1).ravel())
+        return np.concatenate([[start, 1 / spacing, count], *tables])
 
     def multipliers(self, sums: FloatArray, time: float) -> FloatArray:
         """Mean multipliers by row of the `set`, from the array ``rows_sums`` of a time; NaN where they are not summed.
@@ -190,7 +285,7 @@ class DeviceRows(HeldRows):
         """
         found = np.full(self.set.n_rows, np.nan)
         found[self._order] = np.asarray(sums)[: len(self._order)] / time
-        found[: self.summed_from] = np.nan
+        found[: self._summed_from] = np.nan
         return found
 
     def failure(self, row: int, residual: float, step: int) -> KconsError:

@@ -7,13 +7,15 @@ is written as (u.u - t^2)/2t with the gradient u/t, which needs neither root nor
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.openmm.device.c_writer import literal
-from kcons.openmm.device.held_rows import IN_CELLS, NEAREST, STORED, HeldRows, Pattern, Row
+from kcons.openmm.device.held_rows import IN_CELLS, NEAREST, STORED, Pattern, Row
 
 #: Rows from which a matrix has the precision of forces: registers are then scarce, and residuals are exact still.
 FEW = 4
@@ -29,7 +31,7 @@ class ItemWriter:
         Numbers of each cluster; those of the first one begin at `start`, of the present one at ``n``.
     """
 
-    def __init__(self, name: str, pattern: Pattern, held: HeldRows, start: int, first_row: int) -> None:
+    def __init__(self, name: str, pattern: Pattern, held: Any, start: int, first_row: int) -> None:
         self.name, self.held, self.start = name, held, start
         self.rows, self.count = pattern.rows, len(pattern.rows)
         self.single = pattern.atoms.shape[1] == 1
@@ -108,14 +110,8 @@ class ItemWriter:
         """Shortest images along the list, once: atoms move by less than half the cell."""
         if row.how != NEAREST:
             return ""
-        lines = [f" b{k}[{c}] = 0;" for c in range(3)]
-        for i in range(1, len(row.atoms)):
-            a, s = 3 * row.atoms[i], 3 * row.atoms[i - 1]
-            lines.append(f" {{mixed ux = x[{a}]-x[{s}], uy = x[{a + 1}]-x[{s + 1}], uz = x[{a + 2}]-x[{s + 2}];")
-            lines.append(" ROWS_NEAR(ux, uy, uz)")
-            lines += [f" b{k}[{3 * i + c}] = b{k}[{3 * i - 3 + c}]+{u};" for c, u in enumerate(("ux", "uy", "uz"))]
-            lines.append("}")
-        return "".join(lines) + "\n"
+        steps = (f" ROWS_STEP(b{k}, {3 * i}, x, {3 * b}, {3 * a})" for i, (a, b) in enumerate(pairwise(row.atoms), 1))
+        return f" b{k}[0] = b{k}[1] = b{k}[2] = 0;{''.join(steps)}\n"
 
     def _value(self, k: int, row: Row, time: str, moved: bool, out: str) -> str:
         """Value less target, or value alone, and gradient of a row."""

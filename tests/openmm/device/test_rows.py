@@ -8,8 +8,10 @@ from kcons.constraints.functions.straight_line import Function
 from kcons.constraints.target import MovingTarget
 from kcons.errors import UnsupportedError
 from kcons.openmm.device.c_writer import c_functions
-from kcons.openmm.device.held_rows import refusal
+from kcons.openmm.device.device_integrator import refusal
 from kcons.openmm.device.rows import DeviceRows
+from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.schemes import to_scheme
 from kcons.plan.clusters_alike import elimination
 from tests.systems.constraint_cases import CASES, MASSES, TIME, scattered
 from tests.systems.device_rows import PlainRows
@@ -48,6 +50,10 @@ def compare(plain, x, w, cell, time, size, tolerance=1e-14, bound=1e-13):
     assert np.abs(v - tangent).max() > 1e-3 or len(plain.rows.fixed)
 
 
+def refused(parts):
+    return refusal(to_scheme("rattle"), parts, ConstantEnergy())
+
+
 def side_by_side(cases, x, masses):
     """Each case on particles of its own: constraints, positions and masses."""
     n, count = len(x), sum(len(items) for items in cases)
@@ -68,14 +74,14 @@ def test_families_are_held_as_the_engine_holds_them():
 @pytest.mark.parametrize("name", sorted(PYTHON))
 def test_functions_of_python_are_refused_with_the_remedy(name):
     item = CASES[name]()
-    assert "device=False" in refusal([item]) and "Formula" in refusal([item])
+    assert "device=False" in refused([item]) and "Formula" in refused([item])
     with pytest.raises(UnsupportedError, match="function of Python"):
         DeviceRows(MASSES, NONE, [item], positions=scattered(7), time=TIME)
 
 
 def test_what_else_is_refused():
-    assert refusal([Distance([[0, 1]])]) == ""
-    assert "not held on the device" in refusal([object()])
+    assert refused([Distance([[0, 1]])]) == ""
+    assert "not held on the device" in refused([object()])
     with pytest.raises(UnsupportedError, match="moves, which the device does not"):
         DeviceRows(MASSES, NONE, [CASES["FixedAtoms moving"]()], positions=scattered(7), time=TIME)
 
@@ -280,5 +286,5 @@ def test_whole_numbers_are_not_divided_as_such():
 def test_formulas_beside_custom_functions():
     """The remedy that a refusal names: the same coordinate as a Formula is taken."""
     item = Custom([0, 1], lambda r: float(np.sum((r[0] - r[1]) ** 2)))
-    assert refusal([item]) and not refusal([Formula("(x1-x2)**2+(y1-y2)**2+(z1-z2)**2", [[0, 1]], target=None)])
-    assert not refusal([CenterDistance([0, 1], [2, 3])])
+    assert refused([item]) and not refused([Formula("(x1-x2)**2+(y1-y2)**2+(z1-z2)**2", [[0, 1]], target=None)])
+    assert not refused([CenterDistance([0, 1], [2, 3])])
