@@ -29,8 +29,7 @@ from kcons.constraints import Distance, Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.motion import Motion
-from kcons.openmm import SurfaceIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm import SCHEMES, SurfaceIntegrator
 
 # -- what is refused --------------------------------------------------------------------------------
 

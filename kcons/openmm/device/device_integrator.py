@@ -26,15 +26,11 @@ from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
-from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
-from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.program import ConstantEnergy, Ensemble, Program, to_scheme, write_step
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.schemes import to_scheme
-from kcons.openmm.integrator.steps import write_step
-from kcons.openmm.quantities import nanometers
-from kcons.openmm.states import box_of, positions_of
+from kcons.openmm.quantities import box_of, nanometers, positions_of
 from kcons.openmm.surface_integrator import SurfaceIntegrator
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
@@ -187,7 +183,6 @@ class DeviceIntegrator(ProjectedIntegrator):
         There is no plugin, or it has no kernels for this step.
     """
 
-    _program_type = DeviceProgram
     program: DeviceProgram
     #: Rows of the Context, once they are known.
     rows: Any = None
@@ -207,20 +202,18 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _held(self, parts: Any) -> tuple[Part, ...]:
         return as_parts(parts)
 
-    def _write(self, program: Program) -> Step:
+    def _write(self) -> Program:
         """A step without parts: kernels hold their rows."""
-        step = Step(program, self.scheme, (), self._ensemble)
-        write_step(step)
-        for part in self.parts:
-            part.program = self.program
-        return step
+        program = DeviceProgram(self, self.scheme, (), self._ensemble)
+        write_step(program)
+        return program
 
     def describe(self) -> bool:
         """Tell the plugin what a step is; returns whether it knew another one."""
         program = self.program
         description = json.dumps(
             {
-                "operations": plain_operations(self._step.operations, self.ensemble),
+                "operations": plain_operations(self.program.operations, self.ensemble),
                 "settings": program.settings,
                 "memory": program.kept,
                 "seed": self._seed,

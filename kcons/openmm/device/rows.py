@@ -18,6 +18,10 @@ from kcons.constraints.functions.straight_line import Function
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
+<<<<<<< HEAD
+=======
+from kcons.openmm.callback_rows import with_massless_atoms
+>>>>>>> b611d813ff854e4104c0ca59079c0c5a6e65c3ab
 from kcons.openmm.device.c_writer import c_functions
 from kcons.openmm.device.held_rows import (
     IN_CELLS,

@@ -7,8 +7,7 @@ import openmm
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
-from kcons.openmm.quantities import masses_of
-from kcons.openmm.states import forces_at, positions_of, velocities_of
+from kcons.openmm.quantities import forces_at, masses_of, positions_of, velocities_of
 
 #: Longest way of a particle in one step, nm.
 _STRIDE = 0.01
@@ -18,19 +17,9 @@ def descend(integrator: openmm.Integrator, context: openmm.Context, tolerance: f
     """Fast inertial relaxation along the constraints of the System and of the parts.
 
     Velocities are the search direction in the mass metric: each step projects f/m, turns v towards it, goes, and
-    brings x back onto the constraints. Velocities of the context stay as they were.
-
-    Parameters
-    ----------
-    tolerance : float
-        Of the root mean square of the projected force components, kJ/mol/nm.
-    iterations : int
-        At most so many; 0 for 50,000.
-
-    Raises
-    ------
-    ConvergenceError
-        The constraints cannot be reached, however short the steps.
+    brings x back onto the constraints. Velocities of the context stay as they were. It ends where the root mean square
+    of the projected force components is below a tolerance (kJ/mol/nm), or after so many iterations (0: 50,000);
+    `ConvergenceError` where the constraints cannot be reached, however short the steps.
 
     References
     ----------

@@ -14,17 +14,11 @@ from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
 from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
-from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Step
-from kcons.openmm.integrator.guard import Guard, check_finite, find_context
+from kcons.openmm.integrator.guard import Guard, check_finite, find_context, require_context, warn_of_barostat
 from kcons.openmm.integrator.minimization import descend
-from kcons.openmm.integrator.part import Part
-from kcons.openmm.integrator.precision import TOLERANCES, Precision
-from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import to_scheme
-from kcons.openmm.integrator.steps import write_step
-from kcons.openmm.integrator.system_checks import require_context, warn_of_barostat
-from kcons.openmm.quantities import kelvins, number, relative_tolerance
-from kcons.openmm.states import motion_of, positions_of, velocities_of
+from kcons.openmm.integrator.part import TOLERANCES, Part, Precision
+from kcons.openmm.integrator.program import VARIABLES, ConstantEnergy, Ensemble, Program, to_scheme, write_step
+from kcons.openmm.quantities import kelvins, motion_of, number, positions_of, relative_tolerance, velocities_of
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
@@ -100,7 +94,6 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
     #: Of the System's constraints; None where the platform decides.
     asked_tolerance: float | None = None
     _guard: Guard | None = None
-    _program_type = Program
     #: Chooses the class, and says why it is not that whose steps are made on the device; of `kcons.openmm.device`.
     _on_device: ClassVar[Callable[..., tuple[type[ProjectedIntegrator], str]]]
     #: Why steps are not made on the device, where that was asked.
@@ -146,9 +139,10 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
         if self.row_groups:
             openmm.Integrator.setIntegrationForceGroups(self, set(range(32)) - self.row_groups)
-        self.program = self._program_type(self)
-        self._step = self._write(self.program)
+        self.program = self._write()
         self.program.hand_over()
+        for part in self.parts:
+            part.program = self.program
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
         """The parts, of what was given."""
@@ -158,15 +152,13 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """Make the integrator of OpenMM."""
         super().__init__(dt)
 
-    def _write(self, program: Program) -> Step:
-        """Write the program; parts keep what they need to know of it, and that it is the one they serve."""
+    def _write(self) -> Program:
+        """Write the program, of which parts keep what they need to know."""
         for k, part in enumerate(self.parts, start=1):
             part.code = k
-        step = Step(program, self.scheme, self.parts, self._ensemble)
-        write_step(step)
-        for part in self.parts:
-            part.program = self.program
-        return step
+        program = Program(self, self.scheme, self.parts, self._ensemble)
+        write_step(program)
+        return program
 
     def __repr__(self) -> str:
         held = "".join(f", {part!r}" for part in self.parts)
@@ -188,7 +180,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
 
     def operations(self) -> tuple[Operation, ...]:
         """What a step consists of, as for steppers on arrays; `listing` adds how OpenMM computes it."""
-        return self._step.operations
+        return self.program.operations
 
     # -- the Context ----------------------------------------------------------------------------
 
@@ -241,7 +233,9 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """Parts that have served another integrator since serve this one again."""
         if all(part.program is self.program for part in self.parts):
             return
-        self._write(self._program_type(self))  # the same as that which the integrator has
+        self._write()  # the same as the program that the integrator has
+        for part in self.parts:
+            part.program = self.program
         if self._guard is not None:
             self.take_precision(self._guard.precision)
             self._guard.started = False
@@ -297,8 +291,8 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
 
     def _run_block(self, guard: Guard, steps: int, ends: bool) -> None:
         """Make steps, with the shorter program for those after which the state is not read."""
-        unseen = steps - 1 if self._step.lazy and not guard.in_parts else 0
-        if unseen > 0 and guard.undisturbed and not (self._step.joined and guard.moving):
+        unseen = steps - 1 if self.program.lazy and not guard.in_parts else 0
+        if unseen > 0 and guard.undisturbed and not (self.program.joined and guard.moving):
             with self._control("between"):
                 self._run(guard, unseen, False)
             steps -= unseen
@@ -367,7 +361,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         for _ in range(steps):
             time, count = context.getTime()._value, context.getStepCount()
             with self._control("phase"):
-                openmm.CustomIntegrator.step(self, self._step.phases)
+                openmm.CustomIntegrator.step(self, self.program.phases)
             context.setTime(time + dt)
             context.setStepCount(count + 1)
 

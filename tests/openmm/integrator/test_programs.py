@@ -13,21 +13,26 @@ from tied_cluster import KINDS
 from kcons import thermostats
 from kcons.errors import InputError
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
-from kcons.openmm.integrator.ensemble import VARIABLES
-from kcons.openmm.integrator.program import Program, forces_at_old_positions
-from kcons.openmm.integrator.schemes import SCHEMES, stages_of, to_scheme
+from kcons.openmm.integrator.program import (
+    SCHEMES,
+    VARIABLES,
+    ConstantEnergy,
+    Program,
+    forces_at_old_positions,
+    stages_of,
+    to_scheme,
+)
 from kcons.steppers import Geodesic, Rattle
 
 
 def test_computations_and_listing_go_together():
     integrator = openmm.CustomIntegrator(0.5)
-    p = Program(integrator)
-    assert p.number("k", "stiffness", 2.0) == "k"
+    p = Program(integrator, Rattle(), (), ConstantEnergy())
+    p.number("k", "stiffness", 2.0)
     p.number("k", "declared twice is declared once", 3.0)
     p.vector("old", "positions before")
     p.table("share", [0.25, 0.75], "parts of the step")
     p.number("stage", "number of the stage")
-    p.number("total", "sum of x")
     p.each("old", "x", "remember")
     with p.loop("stage < 2", "both stages"):
         p.each("x", "x+share(stage)*dt*v", "fly")
@@ -47,7 +52,6 @@ def test_computations_and_listing_go_together():
         "  old: positions before (each degree of freedom)",
         "  share(k): parts of the step",
         "  stage: number of the stage",
-        "  total: sum of x",
         "each step",
         "  old = x                      # remember",
         "  while stage < 2:             # both stages",
@@ -122,7 +126,7 @@ def test_forces_at_old_positions_are_seen():
     """GPUs keep what a computation makes of x as a difference, until constraints are applied to positions."""
 
     def written(*lines):
-        p = Program(openmm.CustomIntegrator(1e-3))
+        p = Program(openmm.CustomIntegrator(1e-3), Rattle(), (), ConstantEnergy())
         for line in lines:
             p.hold_positions("hold") if line == "hold" else p.each(*line, "words")
         return p.lines

@@ -24,7 +24,7 @@ from openmm_systems import (
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Isokinetic, ProjectedIntegrator
-from kcons.openmm.integrator.system_checks import refuse_agents
+from kcons.openmm.integrator.guard import refuse_agents
 
 PS = unit.picosecond
 

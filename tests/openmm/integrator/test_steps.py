@@ -36,7 +36,7 @@ from kcons.openmm import (
     Row,
     hold,
 )
-from kcons.openmm.integrator.ensemble import Ensemble
+from kcons.openmm.integrator.program import Ensemble
 
 #: The trap of `tied_cluster` is round.
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -128,11 +128,11 @@ def test_parameters_of_forces_are_used_in_the_next_step(kind):
 class Friction(Ensemble):
     """An ensemble that is seen to be right: v falls exponentially during kicks."""
 
-    def declare(self, program):
-        program.number("rate", "of the friction", 1e3 * np.log(4.0))
+    def declare(self, p):
+        p.number("rate", "of the friction", 1e3 * np.log(4.0))
 
-    def kick(self, step, h, impulse="", tangent=False, unseen=False):
-        step.project()
+    def kick(self, p, h, impulse="", tangent=False, unseen=False):
+        p.project()
         return f"(v+{impulse or 0})*exp(-rate*{h})"
 
 
