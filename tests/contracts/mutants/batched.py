@@ -2,20 +2,13 @@
 
 MUTANTS = {
     "batched/clusters.py": [
-<<<<<<< HEAD
-        ("torch.where(d > «0→-9e99», 0.0, torch.inf)", BATCH + "a_bond_that_has_turned_is_no_solution"),
+        ("torch.where(d > «0→-9e99», 0.0, torch.inf)", "batched/batch::a_bond_that_has_turned_is_no_solution"),
         (
             "back = _each(operator.«neg→pos», self.spread(slope, a))",
-            GRADIENTS + "derivatives_are_those_of_the_solution",
+            "batched/gradients::derivatives_are_those_of_the_solution",
         ),
-        ("start=of.start «+→-» moved)", GRADIENTS + "derivatives_are_those_of_the_solution[lanes-blade]"),
-        ("d, rest), «rest.T→0 * rest.T»])", ENGINE + "chains_and_rows_that_depend_on_others"),
-=======
-        ("torch.where(d > «0→-9e99», 0.0, torch.inf)", "batched/batch::a_bond_that_has_turned_is_no_solution"),
-        ("«-each→each» for each in self.spread(slope, a)]", "batched/gradients::derivatives_are_those_of_the_solution"),
-        ("way=of.way «-→+» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
+        ("start=of.start «+→-» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
         ("d, rest), «rest.T→0 * rest.T»])", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
->>>>>>> b611d813ff854e4104c0ca59079c0c5a6e65c3ab
     ],
     "batched/levels.py": [
         ("[which] * s[beside], alpha=«-1→1»)", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
@@ -38,10 +31,7 @@ MUTANTS = {
             "torch.where(self._is_position, held, «flight→1.0» * middle)",
             "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-LinearVelocity]",
         ),
-<<<<<<< HEAD
-=======
         ("made._lattice = self._lattice[«numbers→:1»]", "batched/batch::systems_are_selected_with_their_cells"),
->>>>>>> b611d813ff854e4104c0ca59079c0c5a6e65c3ab
     ],
     "batched/steps.py": [
         ("if «given.shape != x.shape→False»:", "batched/batch::what_is_refused"),
