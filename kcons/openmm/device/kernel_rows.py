@@ -13,21 +13,13 @@ import openmm
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-<<<<<<< HEAD
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Engine, refuse_virtual_sites
-from kcons.openmm.device.held_rows import constraints_of
-from kcons.openmm.device.rows import DeviceRows
-from kcons.openmm.integrator.part import Part, Solver
-from kcons.openmm.integrator.precision import Precision
-=======
 from kcons.openmm.callback_rows import CarriedConstraints, Engine, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
-from kcons.openmm.device.rows import DeviceRows, rows_of
+from kcons.openmm.device.rows import DeviceRows
 from kcons.openmm.integrator.guard import SystemRows, settled_rows
 from kcons.openmm.integrator.part import Part, Precision, Solver
->>>>>>> b611d813ff854e4104c0ca59079c0c5a6e65c3ab
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.quantities import accepted, cell_of, masses_of, positions_of
+from kcons.openmm.quantities import accepted, masses_of, positions_of
 
 
 class KernelRows(CarriedConstraints):

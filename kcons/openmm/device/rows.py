@@ -18,10 +18,7 @@ from kcons.constraints.functions.straight_line import Function
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
-<<<<<<< HEAD
-=======
 from kcons.openmm.callback_rows import with_massless_atoms
->>>>>>> b611d813ff854e4104c0ca59079c0c5a6e65c3ab
 from kcons.openmm.device.c_writer import c_functions
 from kcons.openmm.device.held_rows import (
     IN_CELLS,
@@ -36,7 +33,6 @@ from kcons.openmm.device.held_rows import (
 from kcons.openmm.device.kernels import Array, Shape
 from kcons.openmm.device.large_clusters import LargeClusters
 from kcons.openmm.device.small_clusters import ItemWriter
-from kcons.openmm.quantities import with_massless_atoms
 from kcons.plan.clusters_alike import alike
 
 #: Newton iterations at most; those after which a large cluster is factored again.

@@ -10,8 +10,7 @@ from kcons.errors import UnsupportedError
 from kcons.openmm.device.c_writer import c_functions
 from kcons.openmm.device.device_integrator import refusal
 from kcons.openmm.device.rows import DeviceRows
-from kcons.openmm.integrator.ensemble import ConstantEnergy
-from kcons.openmm.integrator.schemes import to_scheme
+from kcons.openmm.integrator.program import ConstantEnergy, to_scheme
 from kcons.plan.clusters_alike import elimination
 from tests.systems.constraint_cases import CASES, MASSES, TIME, scattered
 from tests.systems.device_rows import PlainRows
