@@ -21,7 +21,7 @@ MUTANTS = {
     ],
     "batched/row_functions.py": [
         (
-            "(found * places[«self.width :→: self.width»]).sum()",
+            "(value * places[«item.width :→: item.width»]).sum()",
             "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-CustomVelocity]",
         ),
     ],
