@@ -237,7 +237,7 @@ class Motion:
         """
         x = as_array(x_new, self._shape, "x_new")
         ref = as_array(x_ref, self._shape, "x_ref")
-        if out is not None:
+        if out is not None and out is not x:
             check_out(out, self._shape)
         inv_dt = 0.0
         if velocities is not None:
@@ -295,7 +295,7 @@ class Motion:
             time = finite_number(time, "time")
         y = as_array(v, self._shape, "velocities")
         here = as_array(x, self._shape, "positions")
-        if out is not None:
+        if out is not None and out is not y:
             check_out(out, self._shape)
         if multipliers is not None:
             check_out(multipliers, (self.constraint_set.n_rows,), "multipliers")
