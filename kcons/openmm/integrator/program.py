@@ -325,6 +325,8 @@ class Program:
         Whether parts stand beside virtual sites.
     single : bool
         Whether there is one part, whose rows are all there is.
+    exact : bool
+        Whether the `land_alone` of that part flies exactly, as the scheme asks.
     lean : bool
         Whether velocity Verlet with parts leaves out what only a reader of velocities needs.
     joined : bool
@@ -356,13 +358,11 @@ class Program:
         verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
         self.sited = any(part.sited for part in self.parts)
         self.single = len(self.parts) == 1 and self.parts[0].alone and not self.sited
-        exact = self.single and plain and scheme.exact_flight and self.parts[0].flies_exactly
-        for part in self.parts:
-            part.exact = exact
-        self.operations = ensemble.operations(Splitting(scheme.kicks, scheme.drifts) if exact else scheme)
+        self.exact = self.single and plain and scheme.exact_flight and self.parts[0].flies_exactly
+        self.operations = ensemble.operations(Splitting(scheme.kicks, scheme.drifts) if self.exact else scheme)
         self.drifts, self.kicks = stages_of(self.operations)
         self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
-        self.one_drift = (len(self.drifts) == 1 and not exact) or self.halves
+        self.one_drift = (len(self.drifts) == 1 and not self.exact) or self.halves
         self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
         self.lean = plain and bool(self.parts) and verlet and not self.sited
         self.joined = ensemble.adds_up and not self.parts and verlet
@@ -745,7 +745,6 @@ def _declare_guards(p: Program) -> None:
     _declare_stages(p)
     p.force = "force"  # parts evaluate row groups, and OpenMM remembers the forces of the last groups only
     for part in p.parts:
-        part.lean = p.lean
         part.declare(p)
 
 
