@@ -284,6 +284,10 @@ class CollectiveRows(Part):
             p.setting(self._of("target", k), f"target of row {k}", self._targets[k])
             p.setting(self._of("rate", k), "change of this target in a ps", self._rates[k])
             p.number(self._of("work", k), "work done by moving the target")
+        if self.driven:
+            p.number(f"clock{c}", "time of the targets where the step began")
+            p.number(f"flown{c}", "time of its drifts")
+            p.number(f"began{c}", "good_steps when it began")
         p.setting(f"small{c}", "a pivot below this fraction of the row's own norm means dependence", PIVOT)
         p.setting(f"tolerance{c}", "what the residual may be", self.tolerance)
         if p.lean:

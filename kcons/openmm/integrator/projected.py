@@ -17,7 +17,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context, require_context, warn_of_barostat
 from kcons.openmm.integrator.part import TOLERANCES, Part, Precision
-from kcons.openmm.integrator.program import VARIABLES, ConstantEnergy, Ensemble, Program, to_scheme, write_step
+from kcons.openmm.integrator.program import ConstantEnergy, Ensemble, Program, to_scheme, write_step
 from kcons.openmm.quantities import (
     forces_at,
     kelvins,
@@ -697,9 +697,10 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         every = None if self.spare else self.check_every
         made_with = (self.getStepSize(), self.scheme, self.parts, self.asked_tolerance, every, self.ensemble)
         program = self.program
-        # What belongs to a state or a step a copy starts without; clocks of targets that move go by the good steps.
-        left = {*program.settings, *program.idle, *program.memory, *VARIABLES} - {"good_steps"}
-        run = {name: self.getGlobalVariableByName(name) for name in program.numbers if name not in left}
+        # What belongs to a state a copy starts without; clocks of targets that move go by the good steps.
+        left = {*program.settings, *program.idle, *program.memory, "stale"}
+        kept = [name for name in program.words if name in program.numbers and name not in left]
+        run = {name: self.getGlobalVariableByName(name) for name in kept}
         return made_with, program.settings, run, self.getIntegrationForceGroups(), self.getRandomNumberSeed()
 
     def __reduce__(self) -> tuple[Any, ...]:
