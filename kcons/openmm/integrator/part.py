@@ -152,16 +152,7 @@ class Violation:
 
 
 class Solver(NamedTuple):
-    """The engine of kcons for the rows of a part.
-
-    Attributes
-    ----------
-    motion : Motion
-    atoms : ndarray of int or slice
-        The particles that it knows, in its order.
-    time : float
-        That of the targets now, ps.
-    """
+    """The engine of kcons for the rows of a part, the particles that it knows, and the time of targets now, ps."""
 
     motion: Motion
     atoms: IntArray | slice = slice(None)
