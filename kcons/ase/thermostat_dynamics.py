@@ -37,9 +37,9 @@ from kcons.thermostats import (
     thermal_velocities,
     tune,
 )
+from kcons.thermostats.barostats import Barostat, ConstantPressure, require_barostat
 from kcons.thermostats.freedom import Momentum
-from kcons.thermostats.isokinetic.isokinetic import Convention
-from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
+from kcons.thermostats.isokinetic import Convention
 
 
 class ThermostattedDynamics(ConstrainedDynamics):

@@ -16,9 +16,8 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import address_of
-from kcons.steppers.operations import Fly, Kick, Operation
-from kcons.steppers.stages import compiled_operations as kernel
-from kcons.steppers.stages.compiled_operations import (
+from kcons.steppers import compiled_operations as kernel
+from kcons.steppers.compiled_operations import (
     ADDRESS,
     CALL,
     COUNT,
@@ -29,6 +28,7 @@ from kcons.steppers.stages.compiled_operations import (
     ROOM,
     WIDTH,
 )
+from kcons.steppers.operations import Fly, Kick, Operation
 
 #: Operations that show positions to a force function, after which they are not written to again.
 SHOWN = ("evaluate", "settle")
@@ -83,9 +83,12 @@ class Program:
         What the kernel calls for these verbs; those that it does not know and that are not here are left to Python.
     groups : sequence of str
         Names of the groups of forces, in the order in which the interpreter has them.
+    parts : sequence of Operation, optional
+        What is run: the operations, with what the program does between them.
 
     Attributes
     ----------
+    operations, parts : tuple of Operation
     rows : list of Row
     ends : list of float
         Of these.
@@ -100,8 +103,11 @@ class Program:
         operations: Sequence[Operation],
         functions: Mapping[str, Any] | None = None,
         groups: Sequence[str] = ("",),
+        parts: Sequence[Operation] | None = None,
     ) -> None:
-        self.rows = list(_rows(operations, functions or {}, {name: k for k, name in enumerate(groups)}))
+        self.operations = tuple(operations)
+        self.parts = self.operations if parts is None else tuple(parts)
+        self.rows = list(_rows(self.parts, functions or {}, {name: k for k, name in enumerate(groups)}))
         flights = [row.operation for row in self.rows if isinstance(row.operation, Fly)]
         self.pairs = len(flights) > 1 or any(flight.exact for flight in flights)
         self.ends = [row.end for row in self.rows]

@@ -30,18 +30,6 @@ from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, IsokineticSpher
 
 REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
 
-DECLARED = {
-    # order, reversible, symplectic, force evaluations
-    "Rattle()": (2, True, True, 1),
-    "Geodesic(substeps=4)": (2, True, True, 1),
-    "Yoshida4()": (4, True, True, 3),
-    "Suzuki4()": (4, True, True, 5),
-    "KahanLi6()": (6, True, True, 9),
-    "BlanesMoan4()": (4, True, True, 6),
-    "BlanesMoan6()": (6, True, True, 11),
-    "BlanesMoan6a()": (6, True, True, 14),
-}
-
 
 def copies(state: State) -> list[np.ndarray | None]:
     return [None if a is None else a.copy() for a in (state.positions, state.velocities, state.forces)]
@@ -67,13 +55,7 @@ def springs(x: np.ndarray, t: float) -> np.ndarray:
     return -np.sum(d * (1 - 0.5 / (1 + np.sum(d**2, axis=-1, keepdims=True))), axis=1)
 
 
-# -- what each states -------------------------------------------------------------------------------
-
-
-@REVERSIBLE
-def test_what_it_states(stepper) -> None:
-    declared = stepper.order, stepper.reversible, stepper.symplectic, stepper.force_evaluations
-    assert declared == DECLARED[repr(stepper)]
+# -- forces -----------------------------------------------------------------------------------------
 
 
 @REVERSIBLE

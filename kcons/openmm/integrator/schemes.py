@@ -8,7 +8,7 @@ from kcons.errors import InputError
 from kcons.steppers.operations import Fly, Kick, Operation, Turn
 from kcons.steppers.splitting import SCHEMES as STEPPERS
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.isokinetic.isokinetic import SCHEMES as ISOKINETIC
+from kcons.thermostats.isokinetic import SCHEMES as ISOKINETIC
 
 
 def _any_flows(order: int) -> Splitting:

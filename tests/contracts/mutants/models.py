@@ -14,7 +14,7 @@ MUTANTS = {
             "test_constrained.py::test_dependent_rows_may_disagree_by_a_part_in_a_thousand_million",
         ),
     ],
-    "steppers/stages/compiled_operations.py": [
+    "steppers/compiled_operations.py": [
         ("(«(r * n - d) + →»r", "test_flights.py::test_great_circles_end_on_the_sphere_wherever_they_start"),
     ],
     "models/growth/model.py": [

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from kcons.steppers.stages import compiled_operations as compiled
+from kcons.steppers import compiled_operations as compiled
 
 
 def test_many_stages_round_once() -> None:

@@ -9,8 +9,8 @@ from monte_carlo_systems import trap, trap_potential, trimer
 
 from kcons.steppers import run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, exchange
-from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.monte_carlo import EXCHANGE, POTENTIAL
+from kcons.thermostats.noise import noise_generator
 
 LADDER = [0.3, 0.45, 0.7]
 
