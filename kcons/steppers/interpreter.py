@@ -150,16 +150,6 @@ class Interpreter:
         moves, and as many as it takes if the system becomes far from the origin.
     numbers : ndarray, optional
         Those of the functions that the program calls, and of a thermostat.
-
-    Attributes
-    ----------
-    x, v : ndarray, shape (n_atoms, 3)
-        Where forces were evaluated last; where `here` is not 0, positions are in another array. Near the origin.
-    forces : ndarray, shape (n_groups n_atoms, 3)
-        Those that were evaluated last.
-    numbers : ndarray
-    number : int
-        Of the step that is made.
     """
 
     __slots__ = (
@@ -167,6 +157,8 @@ class Interpreter:
         *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
         "unchanging",
     )
+    # x, v, forces: where forces were evaluated last (near the origin; where `here` is not 0, positions are in another
+    # array), and these, shape (n_groups n_atoms, 3). number: of the step that is made.
 
     #: Whether forces are those of the System's function, all at once.
     simple = True

@@ -35,42 +35,20 @@ SHOWN = ("evaluate", "settle")
 
 
 class Row(NamedTuple):
-    """What is done at once.
+    """What is done at once."""
 
-    Attributes
-    ----------
-    name : str
-        The interpreter's method.
-    verb : int
-        What the kernel does.
-    here, there : int
-        Which array has the positions before and after it.
-    length, kick : float
-        Of the flight, and of the kick before it, as fractions of the step.
-    group : int
-        Whose forces.
-    begin, end : float
-        The fractions of the step at which time is before and after it.
-    number : int
-        How many of the same name are before it in the step.
-    operation : Operation or None
-        What it is made of; None for the end of the step.
-    function : compiled function or None
-        What is called.
-    """
-
-    name: str
-    verb: int
-    here: int
-    there: int
-    length: float
-    kick: float
-    group: int
-    begin: float
-    end: float
-    number: int = 0
-    operation: Operation | None = None
-    function: Any = None
+    name: str  # the interpreter's method
+    verb: int  # what the kernel does
+    here: int  # which array has the positions before it
+    there: int  # and after it
+    length: float  # of the flight, as a fraction of the step
+    kick: float  # of the kick before it, likewise
+    group: int  # whose forces
+    begin: float  # the fractions of the step at which time is before it
+    end: float  # and after it
+    number: int = 0  # how many of the same name are before it in the step
+    operation: Operation | None = None  # what it is made of; None for the end of the step
+    function: Any = None  # the compiled function that is called
 
 
 class Program:
@@ -85,17 +63,6 @@ class Program:
         Names of the groups of forces, in the order in which the interpreter has them.
     parts : sequence of Operation, optional
         What is run: the operations, with what the program does between them.
-
-    Attributes
-    ----------
-    operations, parts : tuple of Operation
-    rows : list of Row
-    ends : list of float
-        Of these.
-    shown, flies : list of bool
-        Whether they evaluate forces at positions that no force function has seen, and whether flights follow.
-    pairs : bool
-        Whether what rounding takes is kept: there are several flights, or great circles.
     """
 
     def __init__(
@@ -109,8 +76,10 @@ class Program:
         self.parts = self.operations if parts is None else tuple(parts)
         self.rows = list(_rows(self.parts, functions or {}, {name: k for k, name in enumerate(groups)}))
         flights = [row.operation for row in self.rows if isinstance(row.operation, Fly)]
+        #: Whether what rounding takes is kept: there are several flights, or great circles.
         self.pairs = len(flights) > 1 or any(flight.exact for flight in flights)
         self.ends = [row.end for row in self.rows]
+        #: Whether rows evaluate forces at positions that no force function has seen, and whether flights follow.
         self.shown = [row.name == "evaluate" and row.here == 1 for row in self.rows]
         self.flies = ["fly" in [later.name for later in self.rows[k:]] for k in range(len(self.rows))]
         self._numbers: FloatArray | None = None

@@ -69,24 +69,14 @@ MODES = 11
 
 
 class Strains:
-    """One of the kinds in which a cell changes, by k generators.
-
-    Attributes
-    ----------
-    generators, diagonals : ndarray, shape (k, 3, 3) and (k, 3)
-    traces, sizes : ndarray, shape (k,)
-        Of the generators, and sums of squares of their entries.
-    axes : ndarray of bool, shape (3,)
-        Those along which lengths change.
-    most : ndarray, shape (k,)
-        Largest |e_k| of a trial.
-    """
+    """One of the kinds in which a cell changes, by k generators, shape (k, 3, 3)."""
 
     @checked
     def __init__(self, kind: Kind) -> None:
         self.kind, self.generators, self.flexible = kind, GENERATORS[kind], kind == "flexible"
         self.diagonals: FloatArray = np.ascontiguousarray(np.diagonal(self.generators, axis1=1, axis2=2))
         self.traces: FloatArray = self.diagonals.sum(axis=1)
+        #: Sums of squares of their entries; axes along which lengths change; the largest |e_k| of a trial.
         self.sizes: FloatArray = (self.generators**2).sum(axis=(1, 2))
         self.axes: NDArray[np.bool_] = np.asarray(self.diagonals.sum(axis=0) > 0)
         self.most: FloatArray = MOST / np.abs(self.generators).max(axis=(1, 2))
@@ -143,24 +133,12 @@ class Press(Operation):
 
 
 class Place:
-    """Where a system is before or after a trial.
-
-    Attributes
-    ----------
-    pieces : BarostatBodies
-    cell : ndarray, shape (3, 3)
-    energy, volume, area : float
-        Area of the face spanned by the first two vectors.
-    rise : ndarray, shape (3, 3), or None
-        dU/d strain, see `energy_by_strain`, where the barostat asks for it.
-    forces : ndarray or None
-        Where they are known by then.
-    thermal_energy, dt : float
-    """
+    """Where a system is before or after a trial."""
 
     def __init__(
         self, system: CellSystem, pieces: BarostatBodies, state: State, thermal_energy: float, dt: float, rises: bool
     ) -> None:
+        #: dU/d strain, see `energy_by_strain`, where the barostat asks for it, and the forces that are known by then.
         self.rise: FloatArray | None = None
         self.forces: FloatArray | None = None
         if rises:

@@ -180,18 +180,10 @@ class CellSystem(System):
 
 @dataclass(eq=False)
 class BarostatBodies(Bodies):
-    """What moves as one when the cell changes, as `Bodies`, and how.
+    """What moves as one when the cell changes, and how."""
 
-    Attributes
-    ----------
-    open : ndarray of bool, shape (n_bodies, 3)
-        The axes along which a piece follows the cell.
-    axes : ndarray of bool, shape (3,)
-        Those along which the cell changes.
-    """
-
-    open: NDArray[np.bool_]
-    axes: NDArray[np.bool_]
+    open: NDArray[np.bool_]  # the axes along which each follows the cell, shape (n_bodies, 3)
+    axes: NDArray[np.bool_]  # those along which the cell changes, shape (3,)
 
     @property
     def moving(self) -> IntArray:

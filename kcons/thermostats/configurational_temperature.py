@@ -114,15 +114,7 @@ class SplitTemperatures:
 
 
 class Clusters(Bodies):
-    """What constraints tie together, free atoms by themselves, and which of it may shift and turn as a whole.
-
-    Attributes
-    ----------
-    several : ndarray of bool, shape (n_bodies,)
-        Whether a cluster has several atoms.
-    shifts, turns : ndarray of bool, shape (n_bodies,)
-        Whether a cluster may shift in every direction, and turn about every axis, without a change of any row.
-    """
+    """What constraints tie together, free atoms by themselves, and which of it may shift and turn as a whole."""
 
     def __init__(self, motion: Motion, positions: FloatArray, moving: NDArray[np.bool_]) -> None:
         held = motion.constraint_set
@@ -133,6 +125,8 @@ class Clusters(Bodies):
         pairs = np.stack([touched[np.searchsorted(rows, rows)], touched], axis=1).astype(np.int64)
         super().__init__(label, np.where(moving, masses / mass[label], 0.0), mass, spanning_tree(pairs, len(moving)))
         self._held, self._masses = held, masses
+        #: Whether a cluster has several atoms, shape (n_bodies,); may shift in every direction, and turn about every
+        #: axis, without a change of any row.
         self.several = np.bincount(label + 1)[1:] > 1
         self.shifts, self.turns = self._open(motion, positions)
 

@@ -28,23 +28,12 @@ UNCHANGED = 1e-9
 
 @dataclass(eq=False)
 class Bodies:
-    """What moves as one.
+    """What moves as one."""
 
-    Attributes
-    ----------
-    label : ndarray of int, shape (n_atoms,)
-        The body of each atom; -1 for atoms of none.
-    weight : ndarray, shape (n_atoms,)
-        Share of each atom in the mass of its body.
-    mass : ndarray, shape (n_bodies,)
-    tree : tuple of ndarray of int
-        Atoms and the parents next to which they are, for bodies cut by the faces of the cell.
-    """
-
-    label: IntArray
-    weight: FloatArray
-    mass: FloatArray
-    tree: tuple[IntArray, IntArray]
+    label: IntArray  # the body of each atom; -1 for atoms of none
+    weight: FloatArray  # share of each atom in the mass of its body
+    mass: FloatArray  # of each body
+    tree: tuple[IntArray, IntArray]  # atoms and the parents next to which they are, for bodies cut by faces of the cell
 
     def __len__(self) -> int:
         return len(self.mass)

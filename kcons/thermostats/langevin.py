@@ -269,14 +269,7 @@ def _measure(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-de
 
 
 class GroupedSteps(Interpreter):
-    """Steps on their way with forces in groups.
-
-    Attributes
-    ----------
-    groups : GroupedForces
-    simple : bool
-        Whether forces are those of the System's function, all at once.
-    """
+    """Steps on their way with forces in groups; `simple` steps have one, of the System's function."""
 
     def __init__(
         self,

@@ -47,27 +47,13 @@ _BEGIN = 2**63
 
 @dataclass(frozen=True, eq=False)
 class SphereLayout:
-    """The spheres of a system.
+    """The spheres of a system."""
 
-    Attributes
-    ----------
-    cluster : ndarray of int, shape (n_atoms,)
-        Cluster of each atom, -1 for fixed ones.
-    spheres : ndarray of int, shape (n_clusters, 4)
-        Those of the center of mass along x, y and z, all -1 where it has none of its own; that of the rest, or -1.
-    masses : ndarray, shape (n_atoms,)
-        0 for fixed atoms.
-    totals : ndarray, shape (n_clusters,)
-        Masses of the clusters.
-    freedom : ndarray of int, shape (n_spheres,)
-        Degrees of freedom g on each sphere.
-    """
-
-    cluster: IntArray
-    spheres: IntArray
-    masses: FloatArray
-    totals: FloatArray
-    freedom: IntArray
+    cluster: IntArray  # of each atom, -1 for fixed ones
+    spheres: IntArray  # (n_clusters, 4): of the center of mass along x, y and z (all -1: none of its own); of the rest
+    masses: FloatArray  # of the atoms, 0 for fixed ones
+    totals: FloatArray  # of the clusters
+    freedom: IntArray  # degrees of freedom g on each sphere
 
     @classmethod
     def of(cls, system: System, positions: FloatArray, kind: Spheres) -> SphereLayout:

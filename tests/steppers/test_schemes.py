@@ -1,6 +1,8 @@
-"""Each scheme by itself: order on problems with known solutions, exact maps, fractions, what it conserves."""
+"""Each scheme by itself: order on known solutions, exact maps, fractions, what it conserves; the sums of a step."""
 
 from __future__ import annotations
+
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -31,6 +33,7 @@ from kcons.steppers import (
     State,
     run,
 )
+from kcons.steppers import compiled_operations as compiled
 from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
 
 COMPOSITIONS = [stepper for stepper in COMPOSED if isinstance(stepper, Composition)]
@@ -241,3 +244,22 @@ def test_velocity_dependent_forces_are_refused(stepper) -> None:
         with pytest.raises(UnsupportedError, match="depend on the velocities; use Suzuki4 or KahanLi6"):
             attempt()
     assert not seen
+
+
+def test_many_stages_round_once() -> None:
+    """A hundred kicks and flights leave what one rounding does; a plain sum loses more."""
+    rng = np.random.default_rng(1)
+    x, v, w = 3 + rng.normal(size=(5, 3)), 3 + rng.normal(size=(5, 3)), rng.uniform(0.1, 1, (5, 3))
+    q, u, inverse = ([Fraction(a) for a in values.ravel()] for values in (x, v, w))
+    y, plain, low, push = x, v.copy(), np.zeros_like(x), np.zeros_like(x)
+    for kick in 0.01 * np.sin(np.arange(100)):
+        f, h, there, along = rng.normal(size=(5, 3)), -3 * kick, np.empty_like(x), np.empty_like(x)
+        assert compiled.fly(x, low, v, push, kick, f, w, h, there)
+        assert compiled.fly_once(y, plain, kick, f, w, h, along)
+        x, y = there, along
+        u = [a + Fraction(kick) * b * Fraction(c) for a, b, c in zip(u, inverse, f.ravel(), strict=True)]
+        q = [a + Fraction(h) * b for a, b in zip(q, u, strict=True)]
+    assert compiled.land(v, push, 0.0, w, w) and not push.any()
+    for found, exact in ((x, q), (v, u)):
+        assert np.abs(found.ravel() - np.array([float(a) for a in exact])).max() <= np.spacing(4.0)
+    assert np.abs(y.ravel() - np.array([float(a) for a in q])).max() > 2 * np.spacing(4.0)

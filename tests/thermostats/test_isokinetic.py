@@ -20,7 +20,6 @@ from thermostat_systems import (
     isokinetics,
     molecules,
     quartic,
-    quartic_potential,
     springs,
     swirling,
     system,
@@ -303,20 +302,6 @@ def test_reference_trajectories_to_their_tolerance(name):
         assert held.kinetic_energy(state.velocities) == pytest.approx(kinetic, rel=3e-15)
 
 
-@pytest.mark.filterwarnings(HAS_NO_TEMPERATURE)
-@ORDERS
-@pytest.mark.parametrize("name", NAMES)
-def test_order_on_the_reference_trajectories(name, order):
-    held, target = referenced(name), cases.load(name).solution[0]
-    counts = np.array(STEPS[order]) * (2 if "constant" not in name else 1)
-    if "lj4" in name:
-        counts = 12 * counts
-    errors = [
-        error(run(held, begin(name), target.time / n, n, stepper=Isokinetic(order=order)), target) for n in counts
-    ]
-    assert slope(counts, errors) == pytest.approx(order, abs=0.15), errors
-
-
 def on_ellipsoid():
     a, s = np.array([1.2, 0.9, 0.7]), np.array([0.5, 0.6, math.sqrt(0.39)])
     return [Ellipsoid([0], [0, 0, 0], a)], [a * s, [2.0, 1.0, 0.0]], [1.5, 1.0]
@@ -362,28 +347,6 @@ def test_order_with_constraints(made, order):
 
 
 # -- constants --------------------------------------------------------------------------------------
-
-
-def test_conserved_energy_has_no_slope():
-    held, x = dumbbells(2, force=quartic, potential=quartic_potential)
-    thermostat = Isokinetic(0.5)
-    state = thermostat.start(held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4)))
-    first = thermostat.conserved_energy(held, state)
-    values = []
-    run(
-        held,
-        state,
-        0.01,
-        20_000,
-        stepper=thermostat,
-        observers=[lambda s: values.append(thermostat.conserved_energy(held, s))],
-        every=20,
-    )
-    assert first == values[0] == pytest.approx(quartic_potential(x), rel=1e-14)
-    trend = np.polyfit(np.linspace(0, 200, len(values)), values, 1)[0]
-    assert np.std(values) <= 2e-3
-    # What a random walk leaves; a thermostat that leaks energy shows 1e-3 and more.
-    assert abs(trend) <= 3e-5
 
 
 def test_kinetic_energy_is_constant():

@@ -87,19 +87,19 @@ MUTANTS = {
     "thermostats/monte_carlo.py": [
         (
             "velocities=«-→»begin.velocities)",
-            "test_hamiltonian_monte_carlo.py::test_every_decision_follows_from_the_energies[0.7]",
+            "test_monte_carlo.py::test_every_decision_follows_from_the_energies[0.7]",
         ),
         (
             "ACCEPTED if threshold < «-→»change",
-            "test_hamiltonian_monte_carlo.py::test_every_decision_follows_from_the_energies[0.0]",
+            "test_monte_carlo.py::test_every_decision_follows_from_the_energies[0.0]",
         ),
         (
             "np.sqrt((1 - self.keep«**2→»)",
-            "test_hamiltonian_monte_carlo.py::test_velocities_are_those_of_the_temperature",
+            "test_monte_carlo.py::test_velocities_are_those_of_the_temperature",
         ),
         (
             "(1 / kt[k«] - 1 / kt[k + 1→ + 1] - 1 / kt[k»])",
-            "test_replica_exchange.py::test_the_rule_and_what_changes_places",
+            "test_monte_carlo.py::test_the_rule_and_what_changes_places",
         ),
     ],
     "steppers/reversibility_check.py": [
@@ -160,7 +160,7 @@ MUTANTS = {
         ("if steps and holds and «state is not system.last→False»:", "test_state.py::test_start_off_the_constraints"),
         (
             "    «refuse_clock(state.time, state.step, state.time_remainder)\n    →»if stepper",
-            "test_running.py::test_states_made_by_hand_with_impossible_numbers",
+            "test_stepper.py::test_states_made_by_hand_with_impossible_numbers",
         ),
     ],
     "steppers/state.py": [
