@@ -14,16 +14,14 @@ from collective_cases import (
     MASSES,
     bond,
     chain_system,
-    context_of,
     dihedral,
     energy_of,
     held_chain,
     some_velocities,
     spring_forces,
-    state_of,
 )
 from openmm import unit
-from openmm_systems import PLATFORMS
+from openmm_systems import PLATFORMS, started, state_of
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, RadiusOfGyration
@@ -102,7 +100,7 @@ def test_dihedral_held_across_its_jump(target):
     part = CollectiveRows(system, [Row(dihedral(0, 1, 2, 3), target)])
     assert part.periods == (2 * math.pi,)
     integrator = ProjectedIntegrator(0.001, parts=[part], tolerance=1e-13)
-    context = context_of(system, integrator, x, np.random.default_rng(3).normal(size=x.shape))
+    context = started(system, integrator, x, np.random.default_rng(3).normal(size=x.shape))
     part.restore(context)
     for _ in range(20):
         integrator.step(5)
@@ -171,7 +169,7 @@ def test_two_parts_of_rows_in_one_integrator():
     two = CollectiveRows(system, [bond(4, 5)], positions=CHAIN)
     assert (one.meets_system, two.meets_system) == (True, False)
     integrator = ProjectedIntegrator(0.002, parts=[one, two], tolerance=1e-13)
-    context = context_of(system, integrator, CHAIN, some_velocities())
+    context = started(system, integrator, CHAIN, some_velocities())
     # Each is asked in the integrator that is named: in one made later it has the number of the other here.
     ProjectedIntegrator(0.002, parts=[two, one])
     before = two.targets(context)
@@ -214,7 +212,7 @@ def _elsewhere(system):
 def test_systems_that_break_rows_are_refused(made, error, words):
     system = chain_system()
     part = made(system)
-    context = context_of(system, openmm.VerletIntegrator(0.001), CHAIN, np.zeros((6, 3)))
+    context = started(system, openmm.VerletIntegrator(0.001), CHAIN, np.zeros((6, 3)))
     with pytest.raises(error, match=words):
         part.check(context)
 
@@ -227,7 +225,7 @@ def test_what_is_no_context_and_no_integrator():
     rows = CollectiveRows(system, bond(0, 3), positions=CHAIN)  # one row alone
     assert rows.n_rows == 1
     integrator = ProjectedIntegrator(0.001, parts=[rows])
-    context = context_of(system, integrator, CHAIN)
+    context = started(system, integrator, CHAIN)
     for call in (rows.values, rows.targets, rows.rank, rows.multipliers, rows.check, rows.restore):
         with pytest.raises(InputError, match=r"context is a ProjectedIntegrator; give the Context"):
             call(integrator)
@@ -264,7 +262,7 @@ def test_rows_that_become_singular_within_a_step_are_named_by_the_program():
     force.addBond(0, 1)
     part = CollectiveRows(system, [Row(force, 0.01, rate=-0.5)])
     integrator = ProjectedIntegrator(0.001, parts=[part])
-    context = context_of(system, integrator, [[0, 0, 0], [0.4, 0, 0]], np.zeros((2, 3)))
+    context = started(system, integrator, [[0, 0, 0], [0.4, 0, 0]], np.zeros((2, 3)))
     part.restore(context)
     with pytest.raises((SingularGeometryError, ConvergenceError), match="row 0"):
         integrator.step(40)

@@ -12,16 +12,14 @@ from collective_cases import (
     angle,
     bond,
     chain_system,
-    context_of,
     dihedral,
     held_chain,
     peptide,
     points,
     some_velocities,
-    state_of,
 )
 from openmm import app
-from openmm_systems import GPUS, started
+from openmm_systems import GPUS, started, state_of
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, Dihedral, Distance
@@ -98,7 +96,7 @@ def _held_without_check(rows, constrained=False):
         system.addConstraint(0, 1, float(np.linalg.norm(CHAIN[0] - CHAIN[1])))
     part = CollectiveRows(system, rows, positions=CHAIN)
     integrator = ProjectedIntegrator(0.001, parts=[part], tolerance=1e-13)
-    return context_of(system, integrator, CHAIN, some_velocities()), integrator, part
+    return started(system, integrator, CHAIN, some_velocities()), integrator, part
 
 
 def test_functions_that_cannot_be_copied_are_refused():
@@ -119,7 +117,7 @@ def test_a_start_off_the_rows_is_refused_and_can_be_restored():
     system = chain_system()
     part = CollectiveRows(system, [Row(bond(0, 3), 0.3)])
     integrator = ProjectedIntegrator(0.002, parts=[part])
-    context = context_of(system, integrator, CHAIN, some_velocities())
+    context = started(system, integrator, CHAIN, some_velocities())
     with pytest.raises(ConstraintError, match="restore"):
         integrator.step(1)
     v = state_of(context)[1]
@@ -135,7 +133,7 @@ def test_positions_that_cannot_be_restored_stay():
     system = chain_system()
     part = CollectiveRows(system, [Row(points("cos(angle(p1, p2, p3))", (0, 2, 5)), 1.5, name="impossible")])
     integrator = ProjectedIntegrator(0.002, parts=[part])
-    context = context_of(system, integrator, CHAIN, some_velocities())
+    context = started(system, integrator, CHAIN, some_velocities())
     x, v = state_of(context)
     with pytest.raises((ConvergenceError, SingularGeometryError), match="impossible"):
         part.apply_positions(context)
