@@ -210,7 +210,7 @@ def check_finite(values: FloatArray, item: str, step: int) -> None:
 @njit(cache=True, nogil=True, fastmath=SUMS)
 def square_sum(u, masses):  # type: ignore[no-untyped-def]
     """u^T M u."""
-    a, m = u.ravel(), masses.ravel()
+    a, m = flat(u), flat(masses)
     uu = 0.0
     for i in range(a.size):
         uu += m[i] * a[i] * a[i]

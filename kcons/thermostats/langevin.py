@@ -303,12 +303,13 @@ class LangevinStep(GroupedSteps):
 
     def __init__(self, system: System, start: State, dt: float, thermostat: Langevin, steps: int) -> None:
         heat = float(start.thermostat[HEAT]) if carried(start, 1, type(thermostat).__name__) else 0.0  # type: ignore[index]
+        groups = thermostat.groups(system, start)
         program, masses = thermostat.program(system), system.moving_masses
         aside, seed = system.motion.plan.driven, divmod(thermostat.seed, 2**32)
         parts = sum(row.name == "exchange" for row in program.rows)
         head = heat, 0.0, thermostat.friction, thermostat.thermal_energy, aside, *seed, start.step + 1, 0, parts
         numbers = np.concatenate((head, masses, system.root_weights.ravel(), masses))
-        super().__init__(system, start, dt, thermostat.groups(system, start), program, steps, numbers)
+        super().__init__(system, start, dt, groups, program, steps, numbers)
         self.thermostat = thermostat
 
     def exchange(self, row: Row, begun: bool) -> None:
