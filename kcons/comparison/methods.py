@@ -448,7 +448,7 @@ def _engine(system: TestSystem) -> OpenMMEngine:
 
 def only_water(system: TestSystem) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
-    from kcons.openmm.callback_rows.hold import move_constraints
+    from kcons.openmm.callback_rows import move_constraints
 
     engine = _engine(system)
     return not engine.surfaces and not move_constraints(engine.copy())

@@ -15,7 +15,7 @@ from ase.calculators.calculator import Calculator, all_changes
 from ase.md.verlet import VelocityVerlet
 from cell_molecules import half_width
 from cell_oracle import EPS, Array, NoSolution, advance, stepper_of
-from cell_worlds import World, length, world, wrapping
+from cell_worlds import World, row_length, world, wrapping
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain
@@ -338,7 +338,7 @@ class Judge:
             elif item.family:
                 for row in item.rows:
                     known = at.get(id(row))
-                    expected.append(length(row, moved, w.cell) - row.target if known is None else float(known))
+                    expected.append(row_length(row, moved, w.cell) - row.target if known is None else float(known))
         here = w.stored(moved, self.elsewhere(0.5))
         link = max(w.nearness(moved, every=True), w.nearness(w.x, every=True))
         found = self.attempt("value", lambda: self.held.value(here), [here], link)

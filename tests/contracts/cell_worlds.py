@@ -95,7 +95,7 @@ class World:
         """Which atoms distances tie together, as a forest of parents, and the longest vector that this needs."""
         tied, parent = 0.0, list(range(len(x)))
         bonds = [(r, *r.vectors[0]) for i in self.items for r in _tying(i)]
-        for length, i, j in sorted((length(r, x, cell), i, j) for r, i, j in bonds):
+        for length, i, j in sorted((row_length(r, x, cell), i, j) for r, i, j in bonds):
             a, b = _root(parent, i), _root(parent, j)
             if a != b:
                 parent[a] = b
@@ -103,7 +103,7 @@ class World:
         for item in self.items:
             for row in item.rows:
                 if row.images and np.any(row.images):
-                    tied = max(tied, length(row, x, cell))
+                    tied = max(tied, row_length(row, x, cell))
         return parent, tied
 
     def nearness(self, x: Array, cell: Array | None = None, every: bool = False) -> float:
@@ -148,7 +148,7 @@ def _tying(item: Item) -> list[Row]:
     return [r for r in item.rows if not np.any(r.images)] if item.family == "Distance" else []
 
 
-def length(row: Row, x: Array, cell: Array) -> float:
+def row_length(row: Row, x: Array, cell: Array) -> float:
     d = sum(w * x[a] for a, w in row.vectors[0].items())
     return float(np.linalg.norm(d + (np.array(row.images[0]) @ cell if row.images else 0.0)))
 
@@ -385,7 +385,7 @@ def _set_targets(w: World, rng: np.random.Generator) -> None:
         row.target = float(q[k])
     for item in w.items:
         for row in () if item.held else item.rows:
-            row.target = length(row, w.x, w.cell)
+            row.target = row_length(row, w.x, w.cell)
         if item.how == "moving":
             for row in item.rows:
                 row.amplitude = float(rng.uniform(-0.08, 0.08))

@@ -21,8 +21,7 @@ from openmm_systems import (
 
 from kcons.constraints import Distance, projection
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm import SCHEMES, ProjectedIntegrator
 
 TIME = 0.048  # ps
 #: Order, and time steps in fs that divide the time, where the leading term rules and rounding does not. Other schemes

@@ -10,7 +10,7 @@ from carried_systems import context_of, free, pull, start, state_of
 from kcons.constraints import Distance
 from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.callback_rows.hold import hold
+from kcons.openmm.callback_rows import hold
 
 # -- periodic boxes -------------------------------------------------------------------------------
 

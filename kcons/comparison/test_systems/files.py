@@ -254,7 +254,7 @@ def _test_system(name: str, found: Plan, rng: int, forces: str | Sequence[str], 
     if isinstance(forces, str):
         potential = _of_ase(snapshot, forces)
     else:
-        from kcons.openmm.integrator.system_checks import SystemRows
+        from kcons.openmm.integrator.guard import SystemRows
 
         engine = _openmm_engine(snapshot, found.rows, forces, platform)
         potential, of_system = engine.potential(), SystemRows.of(engine.system)

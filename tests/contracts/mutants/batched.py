@@ -3,8 +3,11 @@
 MUTANTS = {
     "batched/clusters.py": [
         ("torch.where(d > «0→-9e99», 0.0, torch.inf)", "batched/batch::a_bond_that_has_turned_is_no_solution"),
-        ("«-each→each» for each in self.spread(slope, a)]", "batched/gradients::derivatives_are_those_of_the_solution"),
-        ("way=of.way «-→+» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
+        (
+            "back = _each(operator.«neg→pos», self.spread(slope, a))",
+            "batched/gradients::derivatives_are_those_of_the_solution",
+        ),
+        ("start=of.start «+→-» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
         ("d, rest), «rest.T→0 * rest.T»])", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
     ],
     "batched/levels.py": [
@@ -18,7 +21,7 @@ MUTANTS = {
     ],
     "batched/row_functions.py": [
         (
-            "(found * places[«self.width :→: self.width»]).sum()",
+            "(value * places[«item.width :→: item.width»]).sum()",
             "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-CustomVelocity]",
         ),
     ],

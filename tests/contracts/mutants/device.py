@@ -3,7 +3,7 @@
 MUTANTS = {
     "openmm/device/kernels.py": [
         ("_replace(share=done[-1].share «+→-» op.share", "device_integrator::operations_are_joined_where_nobody_looks"),
-        ("step+({op.begun}), {op.use}, «seed[0]→7»);", "device_integrator::noise_belongs_to_particle_and_step"),
+        ("step+({op.begun}), {{}}, «seed[0]→7»);", "device_integrator::noise_belongs_to_particle_and_step"),
         ("link[k] = (link[k]*damp+h*push«/2→»)*damp;", "device_integrator::settings_change_what_is_done"),
         ("scale = 1+(1«-→+»cosine)*twice/2;", "molecule_spheres::trajectories_are_those_on_arrays"),
     ],

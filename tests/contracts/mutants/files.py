@@ -69,8 +69,8 @@ MUTANTS = {
         ("_independent(rows[«held→:0»], rows[~held])", "ring_systems::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
-        ('(step.program, "«2→1»")', "nose_hoover_ensemble::a_chain_in_the_middle_is_the_same_chain_in_small_steps"),
-        ("«        step.project()\n→»", "nose_hoover_ensemble::a_chain_in_the_middle_is_time_reversible"),
+        ('(p, "«2→1»")', "nose_hoover_ensemble::a_chain_in_the_middle_is_the_same_chain_in_small_steps"),
+        ("«        p.project()\n→»", "nose_hoover_ensemble::a_chain_in_the_middle_is_time_reversible"),
     ],
     "topology/guessed_bonds.py": [
         (

@@ -47,7 +47,7 @@ MUTANTS = {
     ],
     "openmm/integrator/guard.py": [
         (
-            "«        refuse_forgotten_parts(self.system, integrator.row_groups)\n→»",
+            "force.getForceGroup() not in «row_groups→range(32)»:",
             "openmm/integrator/edits::forgotten_parts_are_refused",
         ),
     ],

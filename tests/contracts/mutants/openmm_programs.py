@@ -15,33 +15,6 @@ MUTANTS = {
             "guard::a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place",
         ),
         ("«self._left == self._place(context)→True»", "steps::change_of_the_box"),
-    ],
-    "openmm/integrator/steps.py": [
-        ("«*delta(v-v_end)→», v_middle, v", "reported_kinetic_energy::of_velocities_that_others_have_set_it_is_theirs"),
-        ("v+per_h*(x-xu)«→+0.5*dt*f/m»", "reported_kinetic_energy::with_noise_the_temperature_of_the_bath_is_reported"),
-        ('«exact+→»1-between != 0", "kicks need it")', "isokinetic_ensemble::calls_of_any_length_make_the_same_motion"),
-        ('", "good_steps+«delta(failed)→1»", "count it")', "steps::a_failed_step_is_taken_back_and_not_counted"),
-        (
-            '"failed > 0", "a solve failed"):\n        p.each("x", "x«_last→»"',
-            "collective_rows::a_step_too_large_is_taken_back",
-        ),
-        ('p.each("v", "v«_last→»", "back to where the step began")', "collective_rows::a_step_too_large_is_taken_back"),
-        ('"«select(looked, v_last, u-0.5*dt*f/m)→v_last»"', "steps::failure_where_nobody_looked"),
-        ('middle(step, f"«→v+»(x-x_start)/', "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
-        ('kicked("«kick→0.5»*dt", tangent=', "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
-        (
-            'asks = "«select(call-1, failed, select(moved, -1, 0))→failed»"',
-            "openmm/integrator/edits::positions_off_the_rows_are_not_pulled_back_in_silence",
-        ),
-        (
-            '"x and v may have been changed"):\n            with p.when("moved+stale«+abs(call-2)→»',
-            "steps::parameters_of_forces_are_used_in_the_next_step",
-        ),
-    ],
-    "openmm/integrator/program.py": [
-        ("in (*self.«settings→idle».items(), *self.idle.items()):", "settings::a_setting_has_a_method_of_its_own"),
-    ],
-    "openmm/integrator/system_checks.py": [
         (
             "rows = replace(rows, «lengths=given, others=given→others=given»)",
             "system_checks::lengths_of_rigid_water_are_compared_with_those_of_the_system",
@@ -61,8 +34,38 @@ MUTANTS = {
         ),
         ("        if «→not rows and »_scales_atoms(force):", "projected::what_moves_particles_off_rows_is_refused"),
     ],
+    "openmm/integrator/program.py": [
+        ("«*delta(v-v_end)→», v_middle, v", "reported_kinetic_energy::of_velocities_that_others_have_set_it_is_theirs"),
+        ("v+per_h*(x-xu)«→+0.5*dt*f/m»", "reported_kinetic_energy::with_noise_the_temperature_of_the_bath_is_reported"),
+        ('«exact+→»1-between != 0", "kicks need it")', "isokinetic_ensemble::calls_of_any_length_make_the_same_motion"),
+        ('", "good_steps+«delta(failed)→1»", "count it")', "steps::a_failed_step_is_taken_back_and_not_counted"),
+        (
+            '"failed > 0", "a solve failed"):\n        p.each("x", "x«_last→»"',
+            "collective_rows::a_step_too_large_is_taken_back",
+        ),
+        ('p.each("v", "v«_last→»", "back to where the step began")', "collective_rows::a_step_too_large_is_taken_back"),
+        ('"«select(looked, v_last, u-0.5*dt*f/m)→v_last»"', "steps::failure_where_nobody_looked"),
+        ('middle(p, f"«→v+»(x-x_start)/', "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
+        (
+            'kick(p, "«kick→0.5»*dt", tangent=',
+            "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves",
+        ),
+        (
+            'asks = "«select(call-1, failed, select(moved, -1, 0))→failed»"',
+            "openmm/integrator/edits::positions_off_the_rows_are_not_pulled_back_in_silence",
+        ),
+        (
+            '"x and v may have been changed"):\n            with p.when("moved+stale«+abs(call-2)→»',
+            "steps::parameters_of_forces_are_used_in_the_next_step",
+        ),
+        ("self.recall({**self.«settings→idle», **self.idle})", "settings::a_setting_has_a_method_of_its_own"),
+        (
+            "            kicks[«-1→0»] += operation.fraction",
+            "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves",
+        ),
+    ],
     "openmm/ensembles/isokinetic_ensemble.py": [
-        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "thermostats_beside_parts::a_run_has_the_temperature"),
+        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "every_ensemble::a_run_has_the_temperature"),
         ('"max(qq«-wq→», wq^2/ww)"', "isokinetic_ensemble::two_sums_do_where_velocities_are_not_read"),
         (
             'program.set("exact", «float(precision == "double" and not rigid)→0.0»)',
@@ -101,21 +104,18 @@ MUTANTS = {
     "openmm/ensembles/langevin_ensemble.py": [
         (
             "«groups_of(force)→{force.getForceGroup()}» - set(steps)",
-            "respa_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
+            "langevin_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
-        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "langevin_ensemble"),
+        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         (', «_before(name)→name», "the chain', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),
     ],
-    "openmm/integrator/schemes.py": [
-        ("            kicks[«-1→0»] += operation.fraction", "programs"),
-    ],
     "openmm/integrator/projected.py": [
-        ("        «→# »self._write(self._program_type(self))", "part::integrators_in_turn_hold_the_same_part"),
+        ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),
     ],
     "openmm/collective/collective_rows.py": [
-        ("(*held[:k], *«held[n:]→()») for k", "rows_in_context::row_that_repeats_a_constraint_of_the_system_is_named"),
+        ("(*held[:k], *«held[n:]→()») for k", "collective_rows::row_that_repeats_a_constraint_of_the_system_is_named"),
         ("weight{c}*({of('more', i)}«-→+»{of('expected', i)})", "row_program::the_iteration_learns_from_each_push"),
         ('let(f"back{c}_{i}_{j}", f"«-→»({done})*back{c}_{i}_{i}"', "row_program::the_iteration_learns_from_each_push"),
         ('again = f"select({sure}, «3→1», 1)"', "row_program::many_steps_look_less_often"),
@@ -123,13 +123,13 @@ MUTANTS = {
     "openmm/surface_integrator.py": [
         ("«positions is None→False»:", "surface_integrator::great_circles_at_any_time_step"),
     ],
-    "openmm/callback_rows/carried_constraints.py": [
+    "openmm/callback_rows.py": [
         ("if self._count == count + «1 > 0→2 > 0»:", "callbacks::an_integrator_that_does_not_hold_the_rows_is_refused"),
         (
             "elif self.timed and «self._integrator() is None→False»:",
             "callbacks::rows_that_need_the_time_are_not_held_without_their_integrator",
         ),
-        ("= «not integrator.thermostatted→False»", "carried_constraints::velocities_are_those_of_the_core"),
+        ("= «not p.integrator.thermostatted→False»", "carried_constraints::velocities_are_those_of_the_core"),
         (
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "part::integrators_in_turn_hold_the_same_part",

@@ -33,7 +33,7 @@ MUTANTS = {
         ("height = max(height« + least→», float(", "comparison/report::no_name_is_cut_or_covers_another"),
     ],
     "openmm/collective/collective_rows.py": [
-        ("._single« or _halved(integrator, scheme)→»:", "row_program::the_second_half_of_a_drift_begins_in_the_middle"),
+        ("._single« or p.halves→»)", "row_program::the_second_half_of_a_drift_begins_in_the_middle"),
     ],
     "free_energy/windows/driver.py": [
         ("= covariance + «→0 * »np.outer(half,", "free_energy::sides_that_differ_by_more_than_chance_widen_the_error"),
