@@ -68,15 +68,13 @@ class HeldCoordinatesReporter:
     ----------
     file : path or text file
         Comma-separated columns: step, time in ps, then value and multiplier of each coordinate in kJ/mol, nm and
-        radian, ln det Z, and the work that moving targets did since the first report of this reporter.
+        radian, and ln det Z.
     reportInterval : int
         Steps from one report to the next.
     coordinates : mapping of str to Constraint
         Quantities, or plain numbers of nm, ps, dalton, radian.
     beside : iterable of Constraint
         Other rows that are held on the same atoms.
-    append : bool
-        Whether to go on in a file that exists, without a new line of names.
 
     Attributes
     ----------
@@ -104,14 +102,13 @@ class HeldCoordinatesReporter:
         coordinates: Mapping[str, Constraint],
         *,
         beside: Iterable[Constraint] = (),
-        append: bool = False,
     ) -> None:
         self._interval = whole_number(reportInterval, "reportInterval")
         names = list(named(coordinates))
         self._coordinates = dict(zip(names, accepted(coordinates.values()), strict=True))
         self._beside = accepted(beside)
-        self._own, self._titled, self._work = not hasattr(file, "write"), append, 0.0
-        self._file: TextIO = open(file, "a" if append else "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
+        self._own = not hasattr(file, "write")
+        self._file: TextIO = open(file, "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
         self._held: HeldCoordinates | None = None
         self.series = Series(names)
 
@@ -133,8 +130,8 @@ class HeldCoordinatesReporter:
         if isinstance(ensemble, Isokinetic):
             self.series.isokinetic_degrees_of_freedom = ensemble.count(simulation.integrator)
         sample = self._held.sample(x, v, f, time)
-        self._work += self.series.append(sample)
-        numbers = [time, *np.stack([sample.value, sample.multiplier], axis=1).ravel(), sample.log_det_z, self._work]
+        self.series.append(sample)
+        numbers = [time, *np.stack([sample.value, sample.multiplier], axis=1).ravel(), sample.log_det_z]
         self._file.write(",".join([str(simulation.currentStep), *(f"{number:.12g}" for number in numbers)]) + "\n")
         self._file.flush()
 
@@ -166,10 +163,8 @@ class HeldCoordinatesReporter:
         self._held = HeldCoordinates(self._set, self._coordinates, x, time=time, bonds=bonds)
         self._context = simulation.context
         self.series = Series(self._held.names, self._held.periods)
-        if not self._titled:
-            titles = [title for name in self._held.names for title in (name, f"multiplier of {name}")]
-            titles = ["Step", "Time (ps)", *titles, "ln det Z", "work (kJ/mol)"]
-            self._file.write("#" + ",".join(f'"{title}"' for title in titles) + "\n")
+        titles = [title for name in self._held.names for title in (name, f"multiplier of {name}")]
+        self._file.write("#" + ",".join(f'"{title}"' for title in ("Step", "Time (ps)", *titles, "ln det Z")) + "\n")
 
     def __del__(self) -> None:
         if getattr(self, "_own", False) and hasattr(self, "_file"):
@@ -255,9 +250,8 @@ class _Simulation:
         self._seen = held.measured(window.target).seen
         if settings.relax:
             self.hold(window.start, window.start, window.seed, None)
-            integrator: Any = self.simulation.integrator
-            integrator.minimizeEnergy(self.simulation.context, _FORCE, settings.relax)
-            self._x = positions_of(self.simulation.context)
+            self._integrator.minimizeEnergy(self._context, _FORCE, settings.relax)
+            self._x = positions_of(self._context)
 
     def hold(self, begin: Sequence[float], end: Sequence[float], seed: int, velocities: int | None) -> None:
         settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
@@ -279,12 +273,8 @@ class _Simulation:
         integrator.setRandomNumberSeed(seed % 2**31 + 1)
         platform = sampler.platform
         chosen = [] if platform is None else [openmm.Platform.getPlatformByName(platform), sampler.properties]
-        topology = app.Topology()  # one with elements cannot be sent to other processes; this is all that is needed
-        residue = topology.addResidue("X", topology.addChain())
-        for _ in range(system.getNumParticles()):
-            topology.addAtom("X", None, residue)
-        self.simulation = app.Simulation(topology, system, integrator, *chosen)
-        context = self.simulation.context
+        context = openmm.Context(system, integrator, *chosen)
+        self._context, self._integrator = context, integrator
         context.setPositions(self._x)
         integrator.applyConstraints()
         if velocities is None:
@@ -294,24 +284,23 @@ class _Simulation:
             integrator.setVelocitiesToTemperature(context, settings.temperature, velocities % 2**31)
 
     def step(self, steps: int) -> None:
-        self.simulation.step(steps)
-        self._x, self._v = positions_of(self.simulation.context), velocities_of(self.simulation.context)
+        self._integrator.step(steps)
+        self._x, self._v = positions_of(self._context), velocities_of(self._context)
 
     def run(self, steps: int, every: int, take: Callable[..., None]) -> None:
         if not self._on_device:
             for _ in range(steps // every):
-                self.simulation.step(every)
+                self._integrator.step(every)
                 take(*self.state())
             return
         whole: FloatArray = np.zeros((3, *self._x.shape))
-        integrator: Any = self.simulation.integrator
-        for *seen, time in integrator.records(steps // every * every, every):
+        for *seen, time in self._integrator.records(steps // every * every, every):
             whole[:, self._seen] = seen
             take(*whole, time)
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        groups = self.simulation.integrator.getIntegrationForceGroups()
-        return _state(self.simulation.context.getState(positions=True, velocities=True, forces=True, groups=groups))
+        groups = self._integrator.getIntegrationForceGroups()
+        return _state(self._context.getState(positions=True, velocities=True, forces=True, groups=groups))
 
 
 def _state(state: openmm.State) -> tuple[FloatArray, FloatArray, FloatArray, float]:

@@ -191,9 +191,7 @@ class ParticleOnSphere(Flow):
 
     def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
         """The free motion x(t), shape (3,) or (k, 3)."""
-        x0, v0 = np.split(
-            self._state(np.concatenate([np.ravel(as_float_array(x0, "x0")), np.ravel(as_float_array(v0, "v0"))])), 2
-        )
+        x0, v0 = np.split(self._state(np.append(as_float_array(x0, "x0"), as_float_array(v0, "v0"))), 2)
         speed = float(np.linalg.norm(v0))
         if abs(np.linalg.norm(x0) - self.radius) > 1e-9 * self.radius:
             raise InputError(f"x0 is {np.linalg.norm(x0):.9g} from the center, not {self.radius:.9g}", item="x0")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from functools import cache
 from typing import NamedTuple
 
@@ -70,25 +69,6 @@ def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error):
     assert (np.abs(away) < 1.96).mean() >= 0.85
 
 
-@pytest.mark.validation
-@pytest.mark.parametrize(
-    ("name", "n", "error"),
-    [
-        ("Lennard-Jones", 20, 0.3),
-        ("Lennard-Jones", 40, 0.5),
-        ("double well", 9, 0.4),
-        ("torsion", 14, 1.0),
-        ("Morse", 12, 0.5),
-    ],
-)
-def test_bands_over_many_sets_of_noise(name, n, error):
-    """What docs/free_energy.md says of them."""
-    case = CASES[name]
-    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(25)])
-    assert 0.95 < math.sqrt((away**2).mean()) < 1.21
-    assert 0.89 < (np.abs(away) < 1.96).mean() < 0.98
-
-
 @pytest.mark.parametrize(
     ("seeds", "low", "high"),
     [(range(6), 0.7, 1.3), pytest.param(range(40), 0.9, 1.15, marks=pytest.mark.validation)],
@@ -113,13 +93,6 @@ def test_mean_forces_that_vanish_within_their_errors():
     assert one.error[-1] == pytest.approx(0.1 * x[1] * math.sqrt(10 + 2 / 4), rel=0.15)
     exact = integrate(x, np.zeros(12), np.zeros(12))
     assert np.abs(exact.F).max() == 0.0 and exact.error.max() < 1e-2
-
-
-def test_profiles_go_through_pickle():
-    """As they do from one process to another."""
-    profile = made(CASES["torsion"], 12, 0.3, 1)
-    again = pickle.loads(pickle.dumps(profile))
-    assert (again.F == profile.F).all() and again.next_windows(1) == profile.next_windows(1)
 
 
 def test_differences_are_those_of_the_covariance():
@@ -203,17 +176,6 @@ def uniform(name, n, error, seeds=2):
 def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side():
     """Each window is sampled equally long. Splines are the better method for equal distances here."""
     assert adapted("Lennard-Jones", 7, 10, 0.009)[10] < uniform("Lennard-Jones", 20, 0.009)
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize(("name", "to", "equal"), [("Lennard-Jones", 10, 28), ("Morse", 9, 17), ("torsion", 14, 28)])
-def test_what_proposed_windows_save(name, to, equal):
-    """Equal distances need as many windows for the same error, and no fewer."""
-    case = CASES[name]
-    error = 0.006 * float(np.ptp(case.F(np.linspace(case.low, case.high, 201)))) / (case.high - case.low)
-    reached = adapted(name, 7, to, error, seeds=3)[to]
-    assert uniform(name, equal, error, seeds=3) < 1.05 * reached
-    assert uniform(name, equal - 2, error, seeds=3) > reached
 
 
 def test_next_windows_lie_apart_and_where_little_is_known():

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ase.build import molecule
 from scan_systems import ANGLE, LENGTH, chain, threefold
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Dihedral, Distance, FixedAtoms
+from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.errors import ConvergenceError
 from kcons.free_energy.scans import relaxation
 from kcons.free_energy.scans.relaxation import Descent, Internals
@@ -127,3 +129,28 @@ def test_calculators_keep_their_threads_and_matrices_have_one(monkeypatch):
         with pytest.raises(ZeroDivisionError), relaxation.one_thread():
             _ = 1 / 0
         assert threads() == {2}
+
+
+# -- internal coordinates --
+
+
+@pytest.mark.parametrize("name", ["CH3CH2OH", "C2H2", "CH3SiH3", "2-butyne", "H2O"])
+def test_gradients_are_those_of_the_values(name):
+    atoms = molecule(name)
+    rng = np.random.default_rng(1)
+    x, d = atoms.positions, rng.normal(size=atoms.positions.shape)
+    internals = Internals(atoms.numbers, x)
+    h = 1e-5
+    slope = internals.change(internals.values(x + h * d), internals.values(x - h * d)) / (2 * h)
+    np.testing.assert_allclose(internals.jacobian(x) @ d.ravel(), slope, atol=1e-7)
+    assert len(internals.terms) == len(internals.constants) == len(slope)
+
+
+def test_terms_keep_their_images():
+    """Two atoms half a cell apart: the other image is as near, and nearer after a small move."""
+    x = np.array([[0.0, 0, 0], [1.25, 0, 0]])
+    internals = Internals([6, 6], x, lattice_of(np.diag([2.5, 9.0, 9.0]), True))
+    for d in (-1e-3, 1e-3):
+        change = internals.change(internals.values(x + np.array([[0, 0, 0], [d, 0, 0]])), internals.values(x))
+        assert abs(change) == pytest.approx([1e-3])
+        assert np.sign(change) == np.sign(d) * np.sign(internals.jacobian(x)[0, 3])

@@ -41,7 +41,6 @@ def test_two_torsions_far_from_the_structure(tmp_path):
     np.testing.assert_allclose(series.value, np.tile([-1.1, 2.0], (32, 1)), atol=1e-10)
     assert np.abs(series.multiplier).max() > 1
     assert np.isfinite(series.turned).all() and series.turned.std() < series.multiplier.std() / 2
-    assert series.seconds > 0
 
 
 @pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
