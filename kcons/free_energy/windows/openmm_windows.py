@@ -11,7 +11,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import app, unit
 
-from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, Formula
+from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet, same_rows
@@ -20,10 +20,9 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
-from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, Row
+from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, hold
 from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, cell_of, refuse_virtual_sites
 from kcons.openmm.callback_rows.hold import constraints_about
-from kcons.openmm.collective.coordinates import formula_rows
 from kcons.openmm.device.device_integrator import choose
 from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
 from kcons.openmm.states import positions_of, velocities_of
@@ -31,12 +30,6 @@ from kcons.openmm.topology import bonds_of
 
 #: What a relaxation leaves of the forces, kJ/mol/nm.
 _FORCE = 50.0
-#: Forces that are coordinates, their energies, and how a term is added.
-_FORCES: dict[type[Constraint], tuple[Any, str, str]] = {
-    Distance: (openmm.CustomBondForce, "r", "addBond"),
-    Angle: (openmm.CustomAngleForce, "theta", "addAngle"),
-    Dihedral: (openmm.CustomTorsionForce, "theta", "addTorsion"),
-}
 #: Part of the box by which files round it.
 _SAME_BOX = 1e-3
 
@@ -194,7 +187,7 @@ class OpenMMWindows(Sampler):
     InputError
         A Topology of another number of atoms, or of another box.
     UnsupportedError
-        A coordinate of another kind, or of virtual sites; a barostat.
+        A barostat; at `begin`, a coordinate of virtual sites, or of several rows.
     KconsError
         At `begin`: a coordinate that is undefined at the structure or depends on the constraints of the System.
     """
@@ -217,8 +210,6 @@ class OpenMMWindows(Sampler):
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
         self._bonds: IntArray = bonds_of(system, self.positions)
-        for name, item in self.coordinates.items():
-            _force_of(name, item, system.usesPeriodicBoundaryConditions())
 
     @property
     def digest(self) -> str:
@@ -256,17 +247,12 @@ class _Simulation:
     def hold(self, begin: Sequence[float], end: Sequence[float], seed: int, velocities: int | None) -> None:
         settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
         system = sampler.system()
-        duration, wraps = max(settings.pull, 1) * dt, system.usesPeriodicBoundaryConditions()
         ensemble = Langevin(settings.temperature, settings.friction)
         moves = tuple(begin) != tuple(end)
-        parts: list[Any] = self.held.towards(begin, end, duration) if moves else self.held.at(begin)
+        parts: list[Any] = self.held.towards(begin, end, settings.pull * dt) if moves else self.held.at(begin)
         self._on_device = choose(None, dt, parts=parts, ensemble=ensemble)[0] is DeviceIntegrator
         if not self._on_device:
-            rows = [
-                Row(_force_of(name, item, wraps), float(a), (float(b) - float(a)) / duration, item.period, name=name)
-                for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
-            ]
-            parts = [CollectiveRows(system, rows, positions=sampler.positions)]
+            parts = [hold(system, parts, self._x)]
         integrator: Any = ProjectedIntegrator(dt * unit.picosecond, parts=parts, ensemble=ensemble)
         if self._on_device:
             integrator.record(self._seen)
@@ -332,28 +318,3 @@ def _refuse_another(topology: app.Topology, system: openmm.System) -> None:
     barostats = [type(force).__name__ for force in system.getForces() if "Barostat" in type(force).__name__]
     if barostats:
         raise UnsupportedError(f"the System has a {barostats[0]}; windows are sampled in a box at rest: remove it")
-
-
-def _force_of(name: str, item: Constraint, periodic: bool) -> openmm.Force:
-    """The coordinate as a Force of OpenMM."""
-    if item.n_rows != 1:
-        raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row")
-    atoms = item.atoms[0].tolist()
-    force: Any
-    if isinstance(item, Formula):
-        return formula_rows(item)[0].force
-    if isinstance(item, DistanceDifference):
-        pairs = zip(item.slots, item.weights, strict=True)
-        terms = [f"({weight!r})*distance(p{i + 1},p{j + 1})" for (i, j), weight in pairs]
-        force, add, atoms = openmm.CustomCompoundBondForce(item.width, "+".join(terms)), "addBond", [atoms]
-    elif type(item) in _FORCES:
-        kind, energy, add = _FORCES[type(item)]
-        force = kind(energy)
-    else:
-        raise UnsupportedError(
-            f"{name} is {item!r}; windows in OpenMM hold a Distance, a DistanceDifference, an Angle, a Dihedral or a "
-            "Formula"
-        )
-    getattr(force, add)(*atoms, [])
-    force.setUsesPeriodicBoundaryConditions(periodic)
-    return force

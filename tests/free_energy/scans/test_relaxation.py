@@ -14,7 +14,6 @@ from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.errors import ConvergenceError
 from kcons.free_energy.scans import relaxation
 from kcons.free_energy.scans.relaxation import Descent, Internals
-from kcons.motion import minimize
 
 
 def forces_of(atoms):
@@ -47,15 +46,6 @@ def test_the_minimum_is_where_it_is():
     assert angle == pytest.approx(ANGLE, abs=1e-5)
 
 
-def test_it_needs_far_fewer_calls_than_forces_alone():
-    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=8)
-    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-3)
-    evaluate = forces_of(atoms)
-    other = minimize(motion, lambda y, t: evaluate(y)[1], x, tolerance=1e-3, longest=0.2)
-    assert found.energy == pytest.approx(evaluate(other.positions)[0], abs=1e-5)
-    assert 2 * found.evaluations < other.evaluations
-
-
 def test_what_was_learned_goes_along():
     atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=6)
     internals = Internals(atoms.numbers, x)
@@ -71,12 +61,6 @@ def test_fixed_atoms_stay():
     assert np.array_equal(found.positions[[0, 4]], x[[0, 4]])
     forces = motion.project_forces(found.positions, forces_of(atoms)(found.positions)[1])
     assert np.abs(forces[[1, 2, 3]]).max() < 1e-3
-
-
-def test_everything_fixed_is_a_minimum():
-    atoms, motion, x = setting([FixedAtoms(range(5))])
-    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-4)
-    assert found.evaluations == 1 and found.largest == 0.0 and np.array_equal(found.positions, x)
 
 
 def test_forces_that_are_no_gradient_are_told():

@@ -62,6 +62,7 @@ def test_two_coordinates():
     a, b = np.meshgrid(*grid, indexing="ij")
     np.testing.assert_allclose(found.energies, 0.4 + 0.2 * (np.cos(3 * a) + np.cos(3 * b)), atol=1e-6)
     assert found.energies.shape == (2, 3) and found.failed == {}
+    assert found.grid.neighbors((0, 0)) == [(1, 0), (0, 1)]
 
 
 def lowest(a):
@@ -84,6 +85,15 @@ def test_a_cell_that_cuts_the_molecule_changes_nothing():
         found.append(scan(atoms, Dihedral([[2, 0, 1, 3]]), [1.0, 1.4]))
     assert found[0].evaluations == found[1].evaluations
     np.testing.assert_allclose(found[0].energies, found[1].energies, atol=1e-6)
+
+
+def test_values_that_descend_stay_in_their_order():
+    """The first value, again at the end of a whole turn, is left out, and next to the last one."""
+    values = np.radians(np.arange(180, -181, -30))
+    found = scan(chain(4, threefold, turns=[1.0]), TURN, values, fmax=1e-3)
+    np.testing.assert_allclose(found.energies, 0.2 * (1 + np.cos(3 * values[:-1])), atol=2e-7)
+    assert found.grid.neighbors((0,)) == [(1,), (11,)] and found.attempts[0].point == (4,)
+    assert found.grid.said((1,)) == "Dihedral(0, 1, 2, 3) = 150"
 
 
 def test_both_ways_find_the_lower_of_two_minima():

@@ -91,18 +91,6 @@ def test_surfaces_of_a_part_of_a_turn_have_no_minima_beyond():
     assert surface.periods == (None, None) and surface.minima() == []
 
 
-def test_surfaces_of_torsions_beyond_their_period():
-    pairs = [(a, b) for a in (0, 120, 600) for b in (-60, 60, 180)]
-    windows = [
-        WindowResult(k, np.radians(p), -np.sin(np.radians(p)), 1e-4 * np.eye(2), {}, np.nan, np.zeros(2))
-        for k, p in enumerate(pairs)
-    ]
-    both = FreeEnergy(("a", "b"), np.full(2, PERIOD), windows)
-    assert np.degrees(both.surface.windows[:, 0].max()) == pytest.approx(240.0)
-    with pytest.raises(InputError, match="2 coordinates; see surface"):
-        _ = both.profile
-
-
 def test_where_all_windows_failed_a_profile_says_why():
     with pytest.raises(InputError, match=r"all windows failed.*window-0000-up: no force"):
         _ = FreeEnergy(("a",), np.full(1, PERIOD), [], {"window-0000-up": "no force"}).profile

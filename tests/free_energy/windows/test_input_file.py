@@ -173,7 +173,6 @@ def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
         ("[improve]", "[pulls]\nfrom = [1.0, 2.0]\n[improve]", r"from of \[pulls\] has 2 values.*turn"),
         ("[improve]", "[pulls]\ncount = 4\n[improve]", r"count of \[pulls\] is 4.*5 or more"),
         ("[improve]", "[pulls]\nsteps = 0.5\n[improve]", r"steps of \[pulls\] is 0.5"),
-        ("[improve]", "[pulls]\nsteps = true\n[improve]", r"steps of \[pulls\] is True"),
         ("[improve]", "[pulls]\nfrom = 3\nto = 3\n[improve]", "begin where they end"),
         ("windows = 12", "windows = 12\nvalues = [1, 2, 3]", "turn has values and from"),
         ("windows = 12", "windows = 2", r"\[improve\] adds windows.*has 1, with 2 windows"),
@@ -186,11 +185,8 @@ def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
             "platform of .forces. says nothing to a calculator",
         ),
         ("windows = 12", 'windows = "x"', r"windows of \[coordinate\] is 'x'; give a whole number, 1 or more"),
-        ("windows = 12", "windows = -2", r"windows of \[coordinate\] is -2"),
         ("dihedral = [2, 0, 1, 3]", "dihedral = [2.5, 0, 1, 3]", "give whole numbers"),
-        ("dihedral = [2, 0, 1, 3]", 'dihedral = "abc"', "give whole numbers"),
         ("both_sides = false", 'both_sides = "no"', "give true or false"),
-        ("temperature = 310", 'temperature = "x"', "temperature is 'x'"),
         ("most = 20", "", r"\[improve\] has no most; write most = "),
         ("error = 0.5", 'error = "x"', "give a positive number"),
         (
@@ -223,7 +219,6 @@ def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
         ("timestep = 0.5", f"timestep = 1{'0' * 400}", "give a positive number"),
         ("timestep = 0.5", f"timestep.{'.'.join('a' * 3000)} = 0.5", r"timestep of \[sampling\] is .*give one value"),
         ("[improve]", f"a = {'[' * 5000}{']' * 5000}\n[improve]", "lists or tables are too deep in each other"),
-        ("[improve]", f"a = {'{b = ' * 5000}1{'}' * 5000}\n[improve]", "lists or tables are too deep in each other"),
     ],
 )
 def test_wrong_files(folder, old, new, match):
