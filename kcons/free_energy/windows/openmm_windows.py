@@ -248,8 +248,7 @@ class _Simulation:
         settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
         system = sampler.system()
         ensemble = Langevin(settings.temperature, settings.friction)
-        moves = tuple(begin) != tuple(end)
-        parts: list[Any] = self.held.towards(begin, end, settings.pull * dt) if moves else self.held.at(begin)
+        parts: list[Any] = list(self.held.towards(begin, end, settings.pull * dt))
         self._on_device = choose(None, dt, parts=parts, ensemble=ensemble)[0] is DeviceIntegrator
         if not self._on_device:
             parts = [hold(system, parts, self._x)]

@@ -261,7 +261,9 @@ class Held:
         return [item.with_target([float(value)]) for item, value in pairs]
 
     def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
-        """The coordinates moved at a constant rate from time 0 on."""
+        """The coordinates moved at a constant rate from time 0 on; at rest where both ends are the same."""
+        if tuple(begin) == tuple(end):
+            return self.at(begin)
         rows = zip(self.coordinates.values(), begin, end, strict=True)
         return [
             item.with_target(MovingTarget(lambda t, a=a, b=b: a + (b - a) / duration * t))  # type: ignore[misc]
