@@ -26,8 +26,8 @@ def slow_share(
     """Share of the stiffness that one group of forces carries along the constraints, root mean square.
 
     With the second derivatives H of an energy along the constraints in the metric of the masses, the square root of
-    <tr H_slow^2>/<tr H^2>: fast motions count most, and no signs cancel. Kicks of slow forces drive fast motions by
-    about this share; of two splittings the one with the smaller share bears longer steps.
+    <tr H_slow^2>/<tr H^2>: fast motions count most, and no signs cancel. Heating of fast motions grows with this share;
+    of two splittings the one with the smaller share allows longer steps.
 
     Parameters
     ----------

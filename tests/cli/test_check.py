@@ -161,16 +161,6 @@ def test_the_check_of_another_trajectory_is_not_overwritten(folder, tmp_path, mo
     assert (tmp_path / "check-run" / "check.json").read_bytes() == before
 
 
-def test_what_is_no_check_is_not_overwritten(folder, tmp_path, capsys):
-    for name in report.FILES:
-        other = tmp_path / name / name
-        other.parent.mkdir()
-        other.write_text("precious")
-        assert command(folder, "good.xtc", "--out", str(other.parent)) == 2
-        assert "give another folder (--out)" in capsys.readouterr().err
-        assert list(other.parent.iterdir()) == [other] and other.read_text() == "precious"
-
-
 def test_the_usual_folder_is_no_link(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "elsewhere").mkdir()

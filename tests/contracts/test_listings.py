@@ -80,19 +80,13 @@ def test_every_public_stepper_is_here() -> None:
     listed = {each for each in public if isinstance(each, type) and issubclass(each, Listed)}
     assert listed == {type(stepper) for stepper in ALL}
     # Those that integrate an equation of motion, or choose their steps, have no such list.
-    others = {each.__name__ for each in public if isinstance(each, type) and hasattr(each, "step")} - {
-        each.__name__ for each in listed
-    }
-    assert others == {
-        "HamiltonianMonteCarlo",
-        "Stepper",
-    }
+    others = {each for each in public if isinstance(each, type) and hasattr(each, "step")} - listed
+    assert {each.__name__ for each in others} == {"HamiltonianMonteCarlo", "Stepper"}
 
 
 def each_system(stepper) -> Iterator[tuple[str, list[Operation]]]:
     """What a step consists of in every system, by its name."""
-    for name, system in SYSTEMS.items():
-        yield name, list(stepper.operations(system))
+    return ((name, list(stepper.operations(system))) for name, system in SYSTEMS.items())
 
 
 @STEPPERS

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import fluids as fluid
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from thermostat_systems import dumbbells, quartic, system, waves
 
 from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
@@ -133,18 +135,30 @@ def test_a_cluster_alone_has_no_temperature_of_shifts_and_turns():
 
 
 def test_curvatures_of_a_fluid():
-    """Against the compiled second derivatives: one configuration, many draws."""
+    """Against differences of forces and torques of whole molecules: one configuration, many draws."""
     chosen = fluid.dumbbells(8)
     forces, kt = chosen.forces, chosen.thermal_energy
     x = forces.metropolis(chosen.positions, kt, 500, 10, 1, chosen.shift, chosen.turn)[1]
     split = TemperatureSplit(chosen.system(), rng=3)
     for _ in range(1000):
         split.add(x)
-    forward, bend, torque, twist = forces.split_sample(x)
+    centers = x.reshape(8, 2, 3).mean(axis=1, keepdims=True)
+
+    def loads(arms, moved=0.0):
+        """Force and torque on each molecule."""
+        f = forces.force((centers + arms + moved).reshape(-1, 3)).reshape(8, 2, 3)
+        return f.sum(axis=1), np.cross(arms, f).sum(axis=1)
+
+    arms, h, bend, twist = x.reshape(8, 2, 3) - centers, 1e-5, 0.0, 0.0
+    for k, axis, sign in itertools.product(range(8), np.eye(3), (-1, 1)):
+        this = (np.arange(8) == k)[:, None, None]
+        turned = np.where(this, Rotation.from_rotvec(sign * h * axis).apply(arms[k]), arms)
+        bend -= sign * loads(arms, this * sign * h * axis)[0][k] @ axis / (2 * h)
+        twist -= sign * loads(turned)[1][k] @ axis / (2 * h)
     mass, inertia = 2.0, 2 * (0.5 * fluid.BOND) ** 2
     above = np.array(split._series)[0, 0]
-    assert above[0] == pytest.approx(forward / mass, rel=1e-9)
-    assert above[1] == pytest.approx(torque / inertia, rel=1e-9)
+    for found, each, size in zip(above[:2], loads(arms), (mass, inertia), strict=True):
+        assert found == pytest.approx((each**2).sum() / size, rel=1e-9)
     shift, turn, rest = curvatures(split)
     assert abs(shift.off(bend / mass)) <= 3.5 and shift.error < 0.04 * shift.value
     assert abs(turn.off(twist / inertia)) <= 3.5 and turn.error < 0.04 * turn.value

@@ -21,11 +21,17 @@ from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
 from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, hold
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, cell_of, refuse_virtual_sites
-from kcons.openmm.callback_rows.hold import constraints_about
+from kcons.openmm.callback_rows import CarriedConstraints, constraints_about, refuse_virtual_sites
 from kcons.openmm.device.device_integrator import choose
-from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
-from kcons.openmm.states import positions_of, velocities_of
+from kcons.openmm.quantities import (
+    accepted,
+    cell_of,
+    masses_of,
+    nanometers,
+    positions_of,
+    velocities_of,
+    with_massless_atoms,
+)
 from kcons.openmm.topology import bonds_of
 
 #: What a relaxation leaves of the forces, kJ/mol/nm.

@@ -177,12 +177,10 @@ def described(precisions: Sequence[FilePrecision], largest: float) -> str:
     return f"{usual.format} stores coordinates in single precision: steps of {step}"
 
 
-def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision] | None:
-    """Precision of each frame, by where it begins, of an XTC file put together from several; None if all are alike."""
+def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision]:
+    """Precision of each frame, by where it begins, of an XTC file, which may be put together from several."""
     with open(path, "rb") as file:
         found = [_xtc_precision(file, int(offset)) for offset in offsets]
-    if len(set(found)) < 2:
-        return None
     kinds = {steps: replace(usual, step=10.0 / steps, exact=True) if steps else usual for steps in set(found)}
     return [kinds[steps] for steps in found]
 

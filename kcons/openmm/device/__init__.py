@@ -2,7 +2,7 @@
 
 - `kernels`: operations as the text of kernels, the same for every platform
 - `c_writer`: families of constraints as C
-- `held_rows`: what is held: functions, numbers, clusters that look alike
+- `held_rows`: what is held: constraint objects of parts, clusters that look alike
 - `small_clusters`: a cluster in the registers of a work-item
 - `large_clusters`: tables of clusters that have a work-group
 - `rows`: all rows for the kernels

@@ -52,8 +52,8 @@ def folder() -> Path:
 
 def headers() -> Path | None:
     """OpenMM's headers: beside its libraries, as pip and conda have them."""
-    libraries = Path(openmm.version.openmm_library_path)
-    return next((path for path in (libraries.parent / "include",) if (path / "OpenMM.h").exists()), None)
+    path = Path(openmm.version.openmm_library_path).parent / "include"
+    return path if (path / "OpenMM.h").exists() else None
 
 
 def digest() -> str:

@@ -217,8 +217,7 @@ def test_verdict_names_row_frame_and_amount(water):
     more = f"violated by {worst.largest:.3g} Å ({worst.largest - worst.allowed:.2g} more than allowed): Distance SOL6:"
     assert result.verdict.startswith(more)
     assert f"in frame {frame}; 4 of 120 rows; {result.violated_frames} of 23 frames, from frame" in result.verdict
-    line = result.units[0].drift
-    assert line is not None and line.significant and line.slope > 0
+    assert result.units[0].drift > 3 * result.units[0].drift_error
 
 
 STEPS = {"xtc": "0.01 Å (0.001 nm)", "pdb": "0.001 Å", "gro": "0.01 Å", "dcd": "single", "trr": "single"}

@@ -200,14 +200,6 @@ def test_a_break_in_the_part_of_one_worker(tmp_path, x):
     assert result.frames == list(range(7)) and result.broken is not None and result.broken.frame == 7
 
 
-def test_nan_coordinates_end_what_can_be_read(tmp_path, x):
-    y = x.copy()
-    y[5, 4, 1] = np.nan
-    result = checked(files.write(tmp_path / "nan.dcd", y))
-    assert result.broken is not None and result.broken.frame == 5 and "atom 4" in result.broken.reason
-    assert result.status == "incomplete" and "frame 5 cannot be used, nor what follows: position" in result.verdict
-
-
 # -- formats of structures --------------------------------------------------------------------------
 
 

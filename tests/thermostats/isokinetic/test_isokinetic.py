@@ -9,9 +9,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from isokinetic_systems import ORDERS, water_and_more
 from reference import cases
-from thermostat_systems import dumbbells, integrated, quartic, quartic_potential, swirling, system, waves
+from thermostat_systems import (
+    dumbbells,
+    integrated,
+    quartic,
+    quartic_potential,
+    swirling,
+    system,
+    water_and_more,
+    waves,
+)
 
 from kcons.constraints import Ellipsoid, Torus
 from kcons.constraints.constraint_set import ConstraintSet
@@ -19,6 +27,7 @@ from kcons.motion import Motion
 from kcons.steppers import State, System, run
 from kcons.thermostats import Isokinetic, thermal_velocities
 
+ORDERS = pytest.mark.parametrize("order", [2, 4, 6])
 NAMES = [name for name in cases.NAMES if "isokinetic" in name]
 #: Single atoms and free clusters: there is no temperature, and it is said.
 HAS_NO_TEMPERATURE = "ignore:(total momentum|the forces exert):UserWarning"

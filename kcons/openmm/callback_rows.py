@@ -1,4 +1,4 @@
-"""Constraint objects of kcons as a part of an integrator: PythonForces carry positions to the engine, corrections back.
+"""Constraint objects of kcons in a System of OpenMM: PythonForces carry positions to the engine, corrections back.
 
 A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three or
 four of them, each in a force group of its own, serve one set of rows:
@@ -19,6 +19,9 @@ GPUs keep forces as multiples of 2^-32, and CustomIntegrator reads them divided 
 positions are pairs of single numbers, 48 bits: a PythonForce of all particles gets both, one of some particles only the
 first. What it returns becomes single numbers: corrections have relative errors up to 6e-8. From the rounded correction
 the engine knows the positions in OpenMM, to rounding.
+
+What stays in the System is solved by OpenMM and must not share atoms with rows of kcons. Constraints that share
+atoms with each other are solved as one, so that whole clusters of them change hands.
 """
 
 from __future__ import annotations
@@ -26,27 +29,24 @@ from __future__ import annotations
 import uuid
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Self, cast
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 import openmm
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from openmm import unit
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from kcons.constraints import Constraint
-from kcons.constraints.constraint import IntArray
+from kcons.constraints import Constraint, Distance
+from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.openmm.collective.coordinates import free_groups
-from kcons.openmm.integrator.ensemble import Integrator
-from kcons.openmm.integrator.part import NEAR, Part, Solver, Violation
-from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import stages_of
-from kcons.openmm.integrator.system_checks import (
+from kcons.openmm.integrator.guard import (
     ROW_NAME,
     forces_of,
     groups_in,
@@ -54,10 +54,19 @@ from kcons.openmm.integrator.system_checks import (
     require_context,
     virtual_sites,
 )
-from kcons.openmm.quantities import accepted, masses_of, nanometers, number, with_massless_atoms
-from kcons.openmm.states import forces_at, positions_of
+from kcons.openmm.integrator.part import NEAR, Part, Precision, Solver, Violation
+from kcons.openmm.integrator.program import Integrator, Program
+from kcons.openmm.quantities import (
+    accepted,
+    cell_of,
+    forces_at,
+    masses_of,
+    nanometers,
+    number,
+    positions_of,
+    with_massless_atoms,
+)
 from kcons.openmm.topology import bonds_of
-from kcons.steppers.operations import Exchange
 from kcons.steppers.stages.packed_system import spheres_of
 
 #: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbor list, and v is rounded to
@@ -74,6 +83,168 @@ CARRY_SCALE = 2.0**20
 _TO_WHOLE, _FROM_WHOLE = 2.0**32, 2.0**32 - 1
 
 PHASES = ("remember", "land", "project", "turn")
+#: Name of the force whose bonds of no strength keep molecules together.
+TIES = "kcons molecules"
+
+
+def move_constraints(system: openmm.System, *, keep_water: bool = True) -> list[Constraint]:
+    """Take the constraints out of a System and return them as constraints of kcons.
+
+    Bonds of no strength are added between their atoms, so that the molecules of a Context, which barostats and the
+    wrapping of positions go by, stay what they were.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Changed in place, before a Context is made of it.
+    keep_water : bool
+        Whether rigid water stays with OpenMM, whose SETTLE is fastest there.
+
+    Returns
+    -------
+    list of Constraint
+        A Distance in nm; empty if there is nothing to take.
+
+    Raises
+    ------
+    InputError
+        No System.
+    """
+    table = _Table(system)
+    return table.release(table.all_but_water() if keep_water else table.all())
+
+
+def hold(
+    system: openmm.System,
+    constraints: Constraint | Iterable[Constraint],
+    positions: unit.Quantity | ArrayLike,
+    *,
+    take: Literal["touched", "all"] = "touched",
+    keep_water: bool = True,
+    periodic: bool | None = None,
+    join: bool = False,
+    time: unit.Quantity | float = 0.0,
+) -> CarriedConstraints:
+    """Hold rows of kcons in a System: all that has to be done before its Context is made.
+
+    Constraints of the System that share atoms with the rows move over to kcons, and the forces that carry the rows
+    are added.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Changed in place.
+    constraints : Constraint or iterable of Constraint
+        What is held: Quantities, or plain numbers of nm, ps, dalton, radian; functions get numbers and may return
+        either. Empty if only constraints of the System are to move over.
+    positions : Quantity or array_like, shape (n_particles, 3)
+        On or near the constraints, in nm if without unit; targets left at None are taken from them.
+    take : {'touched', 'all'}
+        Which of the System's constraints move over: those that share atoms with the rows, directly or through others,
+        or all.
+    keep_water
+        As for `move_constraints`; water that a row touches moves over.
+    periodic : bool, optional
+        Whether rows take minimum images; by default if the System is periodic. Turn it off for rows longer than
+        half the box among molecules that are never cut.
+    time : Quantity or float
+        Time of `positions` in ps, for targets that move.
+    join : bool
+        Whether molecules that a row connects count as one from now on, for barostats and wrapping. Needed where
+        a barostat would move them apart.
+
+    Returns
+    -------
+    CarriedConstraints
+        For ``ProjectedIntegrator(..., parts=[...])``.
+
+    Raises
+    ------
+    KconsError
+        As `CarriedConstraints`. The System was not changed.
+    """
+    given = constraints_in(constraints, "constraints")
+    table = _Table(system)
+    if take not in ("touched", "all"):
+        raise InputError(f"take is {take!r}; give 'touched' or 'all'", item="take")
+    chosen = table.sharing(np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)]))
+    if take == "all":
+        chosen |= table.all_but_water() if keep_water else table.all()
+    part = CarriedConstraints(system, [*table.rows(chosen), *given], positions, periodic=periodic, time=time)
+    # Nothing can fail from here on.
+    table.release(chosen)
+    for item in given if join else ():
+        for before, after in zip(item.atoms.T[:-1], item.atoms.T[1:], strict=True):
+            _tie(system, np.stack([before, after], axis=1))
+    part.add_to(system)
+    return part
+
+
+# -- what the System holds ------------------------------------------------------------------------
+
+
+def constraints_about(system: openmm.System, atoms: IntArray) -> list[Constraint]:
+    """The constraints of a System in the clusters of some atoms, as a `Distance` in nm; the System keeps them."""
+    table = _Table(system)
+    return table.rows(table.sharing(atoms))
+
+
+class _Table:
+    """The constraints of a System: pairs (n, 2), lengths in nm (n,); clusters of particles and of constraints."""
+
+    def __init__(self, system: openmm.System) -> None:
+        if not isinstance(system, openmm.System):
+            raise InputError(
+                f"system is a {type(system).__name__}; give the openmm.System, as createSystem makes it", item="system"
+            )
+        known = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+        self.system, n = system, system.getNumParticles()
+        self.pairs = np.array([[i, j] for i, j, _ in known], dtype=np.int64).reshape(-1, 2)
+        # In nm; converting a Quantity takes longer than all else here.
+        self.lengths = np.array([length._value for _, _, length in known], dtype=np.float64)
+        links = coo_array((np.ones(len(known)), self.pairs.T), shape=(n, n))
+        self.clusters = connected_components(links, directed=False)[1].astype(np.int64)
+        self.cluster = self.clusters[self.pairs[:, 0]]
+
+    def all(self) -> NDArray[np.bool_]:
+        return np.ones(len(self.pairs), dtype=bool)
+
+    def all_but_water(self) -> NDArray[np.bool_]:
+        """All but those of molecules that are a triangle of constraints and nothing else."""
+        rows = np.bincount(self.cluster, minlength=len(self.clusters))[self.cluster]
+        atoms = np.bincount(self.clusters)[self.cluster]
+        return (rows != 3) | (atoms != 3)
+
+    def sharing(self, atoms: IntArray) -> NDArray[np.bool_]:
+        """Constraints of the clusters that these atoms belong to; what is no particle is told later."""
+        return np.asarray(np.isin(self.cluster, self.clusters[atoms[atoms < len(self.clusters)]]))
+
+    def rows(self, chosen: NDArray[np.bool_]) -> list[Constraint]:
+        return [Distance(self.pairs[chosen], self.lengths[chosen])] if chosen.any() else []
+
+    def release(self, chosen: NDArray[np.bool_]) -> list[Constraint]:
+        """Remove constraints, which are returned, and keep their atoms together by bonds of no strength."""
+        for k in np.flatnonzero(chosen)[::-1].tolist():
+            self.system.removeConstraint(k)
+        _tie(self.system, self.pairs[chosen])
+        return self.rows(chosen)
+
+
+def _tie(system: openmm.System, pairs: IntArray) -> None:
+    """Make the pairs count as bonded."""
+    if not len(pairs):
+        return
+    force = next((f for f in system.getForces() if f.getName() == TIES), None)
+    if force is None:
+        force = openmm.HarmonicBondForce()
+        force.setName(TIES)
+        system.addForce(force)
+        force = system.getForce(system.getNumForces() - 1)
+    for i, j in pairs.tolist():
+        force.addBond(i, j, 0.0, 0.0)
+
+
+# -- the engine -----------------------------------------------------------------------------------
 
 
 def hands_over_all() -> bool:
@@ -82,34 +253,95 @@ def hands_over_all() -> bool:
     return any("Precision" in platform.getPropertyNames() for platform in platforms)
 
 
-class Passage:
-    """Between OpenMM and an engine that knows some of its particles.
+class Engine:
+    """The engine of rows in a System, the cell that it knows, and the precision of the Context."""
 
-    Parameters
-    ----------
-    atoms : ndarray of int, shape (n_atoms,)
-        The particles of the engine.
-    n_particles : int
-        Of the System.
-
-    Attributes
-    ----------
-    precision : Precision
-        That of the Context.
-    some : bool
-        Whether OpenMM hands over the engine's particles only; all where a platform here may have mixed precision.
-    """
-
-    def __init__(self, atoms: IntArray, n_particles: int) -> None:
-        self.atoms = atoms
+    def __init__(self, motion: Motion, masses: FloatArray, cell: FloatArray | None) -> None:
+        self.motion, self.masses, self.cell = motion, masses, cell
+        self.atoms: IntArray = motion.sources[0].touched
         self.precision = Precision("", "double")
-        self.some = len(atoms) < n_particles and not hands_over_all()
-        #: Positions and corrections of all particles, where OpenMM hands over all.
-        self._all = None if self.some or len(atoms) == n_particles else np.zeros((2, n_particles, 3))
-        self._nothing = np.zeros((len(atoms), 3))
+
+    def follow_cell(self, state: openmm.State) -> None:
+        cell = np.asarray(state.getPeriodicBoxVectors(asNumpy=True)._value)
+        if self.cell is None or not np.array_equal(cell, self.cell):
+            self.motion.set_cell(cell)
+            self.cell = cell
+
+
+class CallbackEngine(Engine):
+    """What the callbacks share: the engine, where the particles are, and how far the step is."""
+
+    def __init__(
+        self,
+        constraints: tuple[Constraint, ...],
+        positions: FloatArray,
+        masses: FloatArray,
+        cell: FloatArray | None,
+        time: unit.Quantity | float,
+    ) -> None:
+        time = number(time, unit.picosecond, "time")
+        held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
+        super().__init__(Motion(held, positions, time=time), masses, cell)
+        n, local = masses.shape[0], (len(self.atoms), 3)
+        every = len(self.atoms) == n
+        #: Where the carried particles are in arrays of all.
+        self._held: slice | IntArray = slice(None) if every else self.atoms
+        #: Whether OpenMM hands over these particles only; if not, positions and corrections of all.
+        self.some = not every and not hands_over_all()
+        self._all = None if self.some or every else np.zeros((2, n, 3))
+        #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
+        self._start, self._there, self._v, self._moved = np.zeros((4, n, 3))
+        #: Where the carried particles are, in step with OpenMM's own positions to the last bit.
+        self._x, self._read, self._nothing = np.zeros(local), np.zeros(local), np.zeros(local)
+        #: Whether the times of a drift matter, or its length.
+        self.timed = self.motion.constraint_set.moving or not self.motion.constraint_set.holonomic.all()
+        resting = [c.atoms.ravel() for c in held.constraints if c.fixes_atoms]
+        fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
+        #: Which of the carried particles do not move.
+        self._fixed = np.searchsorted(self.atoms, fixed)
+        #: Center and radius of each carried particle, where all of them are on resting spheres.
+        spheres = spheres_of(self.motion)
+        self.spheres = None if spheres is None or len(fixed) else spheres[self.atoms]
+        #: Whether drifts are great circles on these, and what the last one has done to v times its length.
+        self.exact, self._turned = False, np.zeros(local)
+        self._integrator: Callable[[], Integrator | None] = lambda: None
+        #: Whether an integrator of kcons knows of the rows; where none does, the step count at the last evaluation.
+        self.served, self._count = False, -1
+        self._fractions: Sequence[float] = (1.0,)
+        #: Whether velocities are projected between the drifts of a step, too.
+        self._within = False
+        self._error: BaseException | None = None
+        self._between_steps, self._began, self._stage = True, (0.0, 0), 0
+        #: Time and step count where the present run of steps began.
+        self._ran: tuple[float, int] | None = None
+        #: Whether what is lost in carrying v is carried after it, and whether that comes next.
+        self.carries_rest, self._rest_to_come = False, False
+        #: Whether it is known where the drift begins.
+        self._begun = False
+        #: Free positions of the drift and what brings them onto the rows.
+        self._landing: tuple[FloatArray, FloatArray] | None = None
+
+    def follow(self, p: Program, exact: bool) -> None:
+        """Take times and step sizes from the integrator of this program; `exact` as for parts."""
+        self.exact, self.served = exact, True
+        self._integrator = weakref.ref(p.integrator)
+        self.carries_rest = not p.integrator.thermostatted
+        self._within, self._fractions = p.halves, p.drifts
+
+    def take_precision(self, precision: Precision) -> None:
+        """The Context is known. Where positions have 48 bits, what v loses on its way is less than forces know."""
+        self.precision = precision
+        if precision.name != "double":
+            self.carries_rest = False
+
+    def begin_run(self) -> None:
+        """Whatever was asked between steps, the next call belongs to the beginning of one."""
+        self._between_steps, self._rest_to_come, self._ran = True, False, None
+
+    # -- what passes ----------------------------------------------------------------------------
 
     def take(self, state: openmm.State, out: FloatArray) -> None:
-        """Positions of the engine's particles, shape (n_atoms, 3), nm."""
+        """Positions of the carried particles, shape (n_atoms, 3), nm."""
         # The public getPositions(asNumpy=True) makes the same call, and a Quantity: 20 times as slow.
         if self._all is None:
             state._getVectorAsNumpy(openmm.State.Positions, out)
@@ -118,7 +350,7 @@ class Passage:
             np.take(self._all[0], self.atoms, axis=0, out=out)
 
     def give(self, force: FloatArray | None) -> FloatArray:
-        """What is returned to OpenMM for a force on the engine's particles; None for no force."""
+        """What is returned to OpenMM for a force on the carried particles; None for no force."""
         force = self._nothing if force is None else force
         if self._all is None:
             return force
@@ -139,95 +371,6 @@ class Passage:
         if not self.precision.rounds_lengths:
             return np.array_equal(x, y)
         return bool(np.abs(x - y).max(initial=0.0) <= 4 * self.precision.place * np.abs(y).max(initial=0.0))
-
-
-class Engine:
-    """The engine of rows in a System, the cell that it knows, and the precision of the Context."""
-
-    def __init__(self, motion: Motion, masses: FloatArray, cell: FloatArray | None) -> None:
-        self.motion, self.masses, self.cell = motion, masses, cell
-        self.atoms: IntArray = motion.sources[0].touched
-        self.precision = Precision("", "double")
-
-    def follow_cell(self, state: openmm.State) -> None:
-        cell = cell_of(state.getPeriodicBoxVectors())
-        if self.cell is None or not np.array_equal(cell, self.cell):
-            self.motion.set_cell(cell)
-            self.cell = cell
-
-
-class CallbackEngine(Engine):
-    """What the callbacks share: the engine, where the particles are, and how far the step is."""
-
-    def __init__(
-        self,
-        constraints: tuple[Constraint, ...],
-        positions: FloatArray,
-        masses: FloatArray,
-        cell: FloatArray | None,
-        time: unit.Quantity | float,
-    ) -> None:
-        time = number(time, unit.picosecond, "time")
-        held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
-        super().__init__(Motion(held, positions, time=time), masses, cell)
-        #: Where the carried particles are in arrays of all.
-        self._held: slice | IntArray = slice(None) if len(self.atoms) == len(masses) else self.atoms
-        n, local = masses.shape[0], (len(self.atoms), 3)
-        #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
-        self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
-        self._moved = np.zeros((n, 3))
-        #: Where the carried particles are, in step with OpenMM's own positions to the last bit.
-        self._x, self._read = np.zeros(local), np.zeros(local)
-        #: To and from OpenMM.
-        self.passage = Passage(self.atoms, n)
-        #: Whether the times of a drift matter, or its length.
-        self.timed = self.motion.constraint_set.moving or not self.motion.constraint_set.holonomic.all()
-        resting = [c.atoms.ravel() for c in held.constraints if c.fixes_atoms]
-        fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
-        #: Which of the carried particles do not move.
-        self._fixed = np.searchsorted(self.atoms, fixed)
-        #: Center and radius of each carried particle, where all of them are on resting spheres.
-        spheres = spheres_of(self.motion)
-        self.spheres = None if spheres is None or len(fixed) else spheres[self.atoms]
-        #: Whether drifts are great circles on these, and what the last one has done to v times its length.
-        self.exact, self._turned = False, np.zeros(local)
-        self._integrator: Callable[[], Integrator | None] = lambda: None
-        #: Whether an integrator of kcons knows of the rows; where none does, the step count at the last evaluation.
-        self.served, self._count = False, -1
-        self._fractions: tuple[float, ...] = (1.0,)
-        self._nodes: tuple[float, ...] = (0.0, 1.0)
-        #: Whether velocities are projected between the drifts of a step, too.
-        self._within = False
-        self._error: BaseException | None = None
-        self._between_steps, self._began, self._stage = True, (0.0, 0), 0
-        #: Time and step count where the present run of steps began.
-        self._ran: tuple[float, int] | None = None
-        #: Whether what is lost in carrying v is carried after it, and whether that comes next.
-        self.carries_rest, self._rest_to_come = False, False
-        #: Whether it is known where the drift begins.
-        self._begun = False
-        #: Free positions of the drift and what brings them onto the rows.
-        self._landing: tuple[FloatArray, FloatArray] | None = None
-
-    def follow(self, integrator: Integrator, exact: bool) -> None:
-        """Take times and step sizes from this integrator; `exact` as for parts."""
-        self.exact = exact
-        self._integrator, self.served = weakref.ref(integrator), True
-        self.carries_rest = not integrator.thermostatted
-        operations = integrator.ensemble.operations(integrator.scheme)
-        self._within = any(isinstance(operation, Exchange) for operation in operations)
-        self._fractions = tuple(stages_of(operations)[0])
-        self._nodes = (0.0, *np.cumsum(self._fractions)[:-1].tolist(), 1.0)
-
-    def take_precision(self, precision: Precision) -> None:
-        """The Context is known. Where positions have 48 bits, what v loses on its way is less than forces know."""
-        self.precision = self.passage.precision = precision
-        if precision.name != "double":
-            self.carries_rest = False
-
-    def begin_run(self) -> None:
-        """Whatever was asked between steps, the next call belongs to the beginning of one."""
-        self._between_steps, self._rest_to_come, self._ran = True, False, None
 
     # -- callbacks ------------------------------------------------------------------------------
 
@@ -250,7 +393,7 @@ class CallbackEngine(Engine):
             if self.cell is not None:
                 self.follow_cell(state)
         self._stage += 1
-        self.passage.take(state, self._x)
+        self.take(state, self._x)
         self._begin_drift()
 
     def stand_at(self, x: FloatArray) -> None:
@@ -265,10 +408,10 @@ class CallbackEngine(Engine):
 
     def land(self, state: openmm.State) -> FloatArray | None:
         there, read = self._there, self._read
-        self.passage.take(state, read)
+        self.take(state, read)
         if self._landing is not None and np.array_equal(read, self._landing[0]):
             return self._landing[1]  # force and energy are asked for one by one
-        if not self.timed and self.passage.same(read, self._x):
+        if not self.timed and self.same(read, self._x):
             return None  # at rest, or forces are asked for between steps
         if not self._begun:
             self._begin_drift()  # where the last drift ended: nobody has moved x since
@@ -287,14 +430,14 @@ class CallbackEngine(Engine):
             change = np.array(moved[self._held])
             fixed = self._fixed
             change[fixed] = there[self.atoms[fixed]] - read[fixed]
-        change, arriving = self.passage.carried(change)
+        change, arriving = self.carried(change)
         np.add(read, arriving, out=self._x)
         self._landing = (read.copy(), change)
         return change
 
     def project(self, state: openmm.State) -> FloatArray | None:
         read = self._read
-        self.passage.take(state, read)
+        self.take(state, read)
         read -= self._x
         if self._rest_to_come:
             self._rest_to_come = False
@@ -305,10 +448,10 @@ class CallbackEngine(Engine):
             return None
         self._rest_to_come = self.carries_rest
         read *= SPEED_SCALE
-        return self.passage.carried(self._tangent(read) - read)[0]
+        return self.carried(self._tangent(read) - read)[0]
 
     def turn(self, state: openmm.State) -> FloatArray | None:
-        return None if self._between_steps else self.passage.carried(self._turned)[0]
+        return None if self._between_steps else self.carried(self._turned)[0]
 
     def _project_rest(self, read: FloatArray) -> FloatArray:
         """The same for what was too small to be carried with v, as large as it comes: any factor will do."""
@@ -317,19 +460,19 @@ class CallbackEngine(Engine):
         if self.motion.plan.driven:
             # The rate that the rows demand is in v already.
             change -= self._tangent(np.zeros_like(read))
-        return self.passage.carried(change)[0]
+        return self.carried(change)[0]
 
     def _tangent(self, read: FloatArray) -> FloatArray:
         """Velocities of the carried particles, projected."""
         v, x = self._v, self._start
         v[self._held], x[self._held] = read, self._x
-        now = self._times(self._stage if self._within else len(self._nodes) - 2)[1]
+        now = self._times(self._stage if self._within else len(self._fractions) - 1)[1]
         self.motion.project_velocities(x, v, time=now, out=v)
         return np.array(v[self._held])
 
     def _time(self, state: openmm.State) -> float:
         """Where a step begins. After setStepSize the clock of Reference and CPU goes on with the first step size."""
-        time, count = _number(state.getTime()), state.getStepCount()
+        time, count = float(state.getTime()._value), state.getStepCount()
         self._ran = self._ran or (time, count)
         dt = self._dt
         expected = self._ran[0] + (count - self._ran[1]) * dt
@@ -338,15 +481,17 @@ class CallbackEngine(Engine):
     @property
     def _dt(self) -> float:
         integrator = self._integrator()
-        return 0.0 if integrator is None else _number(integrator.getStepSize())
+        return 0.0 if integrator is None else float(integrator.getStepSize()._value)
 
     def _times(self, stage: int) -> tuple[float, float, float]:
         """Beginning, end and length of a drift."""
         if not self.timed:
             return 0.0, 0.0, 0.0
-        dt, start = self._dt, self._began[0]
-        stage = min(max(stage, 0), len(self._fractions) - 1)
-        return start + self._nodes[stage] * dt, start + self._nodes[stage + 1] * dt, self._fractions[stage] * dt
+        shares, dt, start = self._fractions, self._dt, self._began[0]
+        stage = min(max(stage, 0), len(shares) - 1)
+        then = sum(shares[:stage])
+        now = 1.0 if stage == len(shares) - 1 else then + shares[stage]
+        return start + then * dt, start + now * dt, shares[stage] * dt
 
     def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
         """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
@@ -360,7 +505,7 @@ class CallbackEngine(Engine):
                 self._between_steps, self._rest_to_come = True, False
         except BaseException as error:
             self._error, change = error, None
-        return (0.0 if self._error is None else 1.0), self.passage.give(change)
+        return (0.0 if self._error is None else 1.0), self.give(change)
 
     # -- afterwards -----------------------------------------------------------------------------
 
@@ -407,13 +552,7 @@ def great_circles(x: FloatArray, there: FloatArray, spheres: FloatArray) -> tupl
 
     d = x - c turns in the plane of d and u, the way that is tangent, by w = |u|/R: it becomes d cos(w) + u sin(w)/w,
     and u becomes u cos(w) - d w sin(w). d is brought to the length R on the way, so that rounding does not add up.
-
-    Parameters
-    ----------
-    x, there : ndarray, shape (n, 3)
-        Where the drift begins, and where it leads without the spheres.
-    spheres : ndarray, shape (n, 4)
-        Centers and radii.
+    Centers and radii are the rows of `spheres`, shape (n, 4).
     """
     radius, d, way = spheres[:, 3:], x - spheres[:, :3], there - x
     d *= radius / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None]
@@ -423,21 +562,7 @@ def great_circles(x: FloatArray, there: FloatArray, spheres: FloatArray) -> tupl
     return end - there, u * np.cos(w) - d * (w * np.sin(w)) - way
 
 
-# -- what OpenMM gives ----------------------------------------------------------------------------
-
-
-def _number(quantity: unit.Quantity) -> float:
-    return float(quantity.value_in_unit(unit.picosecond))
-
-
-def cell_of(vectors: Any) -> FloatArray:
-    """Box vectors of a State (a Quantity) or of a System (a list of them), nm, shape (3, 3)."""
-    plain = (
-        vectors.value_in_unit(unit.nanometer)
-        if unit.is_quantity(vectors)
-        else [edge.value_in_unit(unit.nanometer) for edge in vectors]
-    )
-    return np.array([[edge[0], edge[1], edge[2]] for edge in plain], dtype=np.float64)
+# -- the part -------------------------------------------------------------------------------------
 
 
 class CarriedConstraints(Part):
@@ -490,7 +615,7 @@ class CarriedConstraints(Part):
         """Put the forces that carry the rows into the System; before the Context is made."""
         for phase, group in self._groups.items():
             force = openmm.PythonForce(Callback(self._engine, phase))
-            if self._engine.passage.some:
+            if self._engine.some:
                 force.setParticles(self.atoms.tolist())
             force.setUsesPeriodicBoundaryConditions(self._engine.cell is not None)
             force.setForceGroup(group)
@@ -539,7 +664,7 @@ class CarriedConstraints(Part):
         """
         require_context(context)
         system = context.getSystem()
-        self._check_system(system, Precision.of(context))
+        self._check_system(system)
         held = self.motion.constraint_set
         bound = next((repr(item) for item in held.constraints if not item.translation_invariant), None)
         starts = zip(held.constraints, held.starts, strict=False)
@@ -554,7 +679,7 @@ class CarriedConstraints(Part):
                 atoms=miss.atoms,
             )
 
-    def _check_system(self, system: openmm.System, precision: Precision) -> None:
+    def _check_system(self, system: openmm.System) -> None:
         """Raise where the System is not the one that the rows were built for."""
         engine = self._engine
         if not any(force.getName().startswith(self._name) for force in forces_of(system)):
@@ -660,18 +785,23 @@ class CarriedConstraints(Part):
     # -- the program ----------------------------------------------------------------------------
 
     def declare(self, program: Program) -> None:
-        self._engine.follow(program.integrator, self.exact)
+        self._engine.follow(program, self.exact)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Refuse single precision; what passes through OpenMM is known now."""
-        refuse_single_precision(precision)
+        if precision.name == "single":
+            raise UnsupportedError(
+                f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make "
+                "the Context with {'Precision': 'mixed'}, or hold the rows by CollectiveRows, which the platform "
+                "computes"
+            )
         self._engine.take_precision(precision)
         if f"rest{self.code}" in program.settings:
             program.set(f"rest{self.code}", float(self._engine.carries_rest))
 
     def begin(self, program: Program) -> None:
         """Where x is not where the last step ended, and velocities are projected before the first drift."""
-        if program.integrator.ensemble.stays_tangent:
+        if program.ensemble.stays_tangent:
             self.remember(program)
 
     def _guard(self, program: Program, phase: str, words: str) -> None:
@@ -693,7 +823,7 @@ class CarriedConstraints(Part):
         change = f"f{self._groups['land']}"
         if self.lean:  # where a step may end without a projection, this solve must tell of failures itself
             self._guard(program, "land", "carried rows: solve for positions")
-            force, change = change, program.vector(f"change{self.code}", "what brings carried particles onto the rows")
+            force, change = change, f"change{self.code}"
             program.each(change, force, "from the evaluation that tells of failures")
         program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: onto them")
 
@@ -722,7 +852,6 @@ class CarriedConstraints(Part):
         carried = f"(x-xu)*{SPEED_SCALE!r}"
         if rest:
             program.setting(f"rest{self.code}", "1 where the rest of v matters: forces are double", 1.0)
-            program.vector("v_low", "what of v was too small to be carried together with x")
             program.each("v_low", f"select({change}, v-{carried}, 0)", "the rest of v")
         program.each("v", f"select({change}, {carried}+{1 / CARRY_SCALE!r}*{change}, v)", "tangent to the carried rows")
         if rest:
@@ -757,12 +886,3 @@ def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatAr
     for atom in atoms[masses[atoms] == 0].tolist():
         if system.isVirtualSite(atom):
             raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
-
-
-def refuse_single_precision(precision: Precision) -> None:
-    """Refuse positions in single precision."""
-    if precision.name == "single":
-        raise UnsupportedError(
-            f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
-            "Context with {'Precision': 'mixed'}, or hold the rows by CollectiveRows, which the platform computes"
-        )
