@@ -65,7 +65,7 @@ def mass_ratio_12(program: Program, quick: bool) -> Outcome:
     rng = np.random.default_rng(0)
     v = problem.tangent(rng.standard_normal((20, 3)) / np.sqrt(masses)[:, None])
     a = motion.acceleration(x, v, rng.standard_normal((20, 3)))
-    held = problem.oracle()
+    held = problem.oracle
     rows = held.jacobian(x).toarray()
     miss = np.abs(rows @ a.ravel() - held.acceleration_target(x, v)) / np.linalg.norm(rows, axis=1)
     return outcome(*found.checks, ("|J a - b|", miss.max() / np.linalg.norm(a), 1e-14), remark=found.remark)
@@ -113,7 +113,7 @@ def long_chain(program: Program, quick: bool) -> Outcome:
             spent = max(spent, time.perf_counter() - start)
             peak = tracemalloc.get_traced_memory()[1]
             tracemalloc.stop()
-            rows = problem.oracle().jacobian(x)
+            rows = problem.oracle.jacobian(x)
             found += [
                 (f"{shape}: |A v|", float(np.abs(rows @ tangent.ravel()).max()), 1e-12),
                 (f"{shape}: seconds a solve", spent, 0.5),

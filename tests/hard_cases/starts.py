@@ -24,7 +24,7 @@ def _first(program: Program, problem: Problem, steps: int = 0) -> tuple[Frame, F
 
 def _tangent_checks(problem: Problem, first: Frame) -> list[tuple[str, float, float]]:
     """Velocities against the dense projection at the positions found; kinetic energy against its formula."""
-    held, m = problem.oracle(), problem.m
+    held, m = problem.oracle, problem.m
     rows = held.jacobian(first.x).toarray()
     jv = rows @ problem.v.ravel()
     loss = 0.5 * jv @ np.linalg.pinv(rows / np.repeat(m, 3) @ rows.T, rcond=1e-12) @ jv
@@ -124,7 +124,7 @@ def bad_velocities_unasked(program: Program, quick: bool) -> Outcome:
     rng = np.random.default_rng(1)
     problem = Problem(x, rng.uniform(1, 16, 6), bonds(6), velocities=rng.standard_normal((6, 3)))
     end = program.run(problem, 1e-4, 1)
-    held = problem.oracle()
+    held = problem.oracle
     rate = np.abs(held.jacobian(end.x).toarray() @ end.v.ravel()).max()
     return outcome(("|J v| after a step", rate, 1e-10))
 

@@ -9,8 +9,7 @@ import openmm
 from openmm import app, unit
 from openmm_systems import DATA, started
 
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.collective import CollectiveRows
+from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 #: A bent chain with a branch: no three atoms in a line.
 CHAIN = np.array(

@@ -201,6 +201,7 @@ class CollectiveRows(Part):
         self._meet = [[bool(a & b) for b in bodies] for a in bodies]
         together = _components(self.n_rows, [(i, j) for i, row in enumerate(self._meet) for j in range(i) if row[j]])
         self._blocks = [np.flatnonzero(together == k).tolist() for k in range(int(together.max()) + 1)]
+        self._block_of = {k: block for block in self._blocks for k in block}
 
     # -- told by an integrator ------------------------------------------------------------------
 
@@ -270,9 +271,9 @@ class CollectiveRows(Part):
     def _pushes(self) -> str:
         return _sum(f"{self._of('push', k)}*{self._of('row', k)}" for k in range(self.n_rows))
 
-    def _solved(self, block: list[int], i: int, name: str) -> str:
+    def _solved(self, i: int, name: str) -> str:
         """Expression for (inverse vector)_i."""
-        return _sum(f"{self._inverse(i, j)}*{self._of(name, j)}" for j in block)
+        return _sum(f"{self._inverse(i, j)}*{self._of(name, j)}" for j in self._block_of[i])
 
     # -- variables ------------------------------------------------------------------------------
 
@@ -350,11 +351,10 @@ class CollectiveRows(Part):
     def _invert(self, p: Program, sizes: bool = False) -> None:
         """G and its inverse, by Cholesky's factor; `singular` tells the first row whose pivot vanishes."""
         c, singular = self.code, f"singular{self.code}"
-        for block in self._blocks:
-            for i in block:
-                for j in block:
-                    if j <= i and self._meet[i][j]:
-                        p.sum(self._gram(i, j), f"m*{self._of('row', i)}*{self._of('row', j)}", "G")
+        for i in range(self.n_rows):
+            for j in range(i + 1):
+                if self._meet[i][j]:
+                    p.sum(self._gram(i, j), f"m*{self._of('row', i)}*{self._of('row', j)}", "G")
         if sizes and not self.meets_system:
             for k in range(self.n_rows):
                 p.let(self._of("own", k), self._gram(k, k), "its size")
@@ -460,10 +460,9 @@ class CollectiveRows(Part):
             f"*step({_ITERATIONS - 1}-iterations{c}), {again}, 2), 0)",
             "done, or once more, or give up",
         )
-        for block in self._blocks:
-            for k in block:
-                more = f"select(delta(state{c}-1)+delta(state{c}-3), -({self._solved(block, k, 'sigma')}), 0)"
-                p.let(self._of("more", k), more, "what is missing")
+        for k in rows:
+            more = f"select(delta(state{c}-1)+delta(state{c}-3), -({self._solved(k, 'sigma')}), 0)"
+            p.let(self._of("more", k), more, "what is missing")
         for k in rows:
             push = self._of("push", k)
             p.let(push, f"select(delta(state{c}-2), 0, {push}+{self._of('more', k)})", "push more")
@@ -476,7 +475,7 @@ class CollectiveRows(Part):
         c, of = self.code, self._of
         for block in self._blocks:
             for i in block:
-                p.let(of("expected", i), self._solved(block, i, "change"), "push that explains the change")
+                p.let(of("expected", i), self._solved(i, "change"), "push that explains the change")
                 p.let(of("left", i), _sum(f"{of('more', j)}*{self._inverse(j, i)}" for j in block), "more^T inverse")
             p.let(f"weight{c}", _sum(f"{of('left', j)}*{of('change', j)}" for j in block), "denominator of the update")
             p.let(f"length{c}", _sum(f"{of('more', j)}^2" for j in block), "square of the push")
@@ -506,9 +505,8 @@ class CollectiveRows(Part):
         for k in rows:
             if self._rates[k] != 0.0:
                 p.let(self._of("slope", k), f"{self._of('slope', k)}-({self._rate(k)})", "less that of the target")
-        for block in self._blocks:
-            for k in block:
-                p.let(self._of("more", k), f"-({self._solved(block, k, 'slope')})", "multiplier times time")
+        for k in rows:
+            p.let(self._of("more", k), f"-({self._solved(k, 'slope')})", "multiplier times time")
         p.let(f"bad_sum{c}", _sum(f"abs({self._of('more', k)})" for k in rows), "to find what is no number")
         bad = f"select(singular{c}, {c}, select(step(1e200-bad_sum{c}), 0, {c}))"
         p.let("failed", f"select(failed, failed, {bad})", "independent rows, finite velocities?")
@@ -611,19 +609,6 @@ class CollectiveRows(Part):
             raise
         finally:
             context.setVelocities(velocities)
-
-    def apply_velocities(self, context: openmm.Context) -> None:
-        """Make the velocities of the context tangent to the rows and to the System's constraints.
-
-        Raises
-        ------
-        SingularGeometryError
-            A row has no gradient.
-        """
-        require_context(context)
-        if context.getSystem().getNumConstraints():
-            context.applyVelocityConstraints(context.getIntegrator().getConstraintTolerance())
-        super().apply_velocities(context)
 
     def restore(self, context: openmm.Context) -> None:
         """`apply_positions`, then `apply_velocities`; raises what these do."""

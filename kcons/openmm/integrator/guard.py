@@ -669,10 +669,16 @@ class Guard:
             self._put_right(x)
             self._make_tangent(velocities_of(context))
             for part in integrator.parts:
-                if self.started:
-                    self._refuse(part.worst_violation(context))
-                else:
+                if not self.started:
                     part.check(context)
+                elif (miss := part.worst_violation(context)) is not None:
+                    raise InputError(
+                        f"the {miss}. What moved them does not know the rows that are held (OpenMM's minimizer is one: "
+                        "take integrator.minimizeEnergy); call integrator.applyConstraints(context) and "
+                        "integrator.applyVelocityConstraints(context)",
+                        item=miss.what,
+                        atoms=miss.atoms,
+                    )
             if not self.started:
                 self._tell_of_rounding(positions_of(context))
                 warn_of_barostat(context, getattr(integrator.ensemble, "temperature", None), stacklevel=5)
@@ -725,16 +731,6 @@ class Guard:
             worst = f"{self.rows.name(row)} was off by {miss[row]:.2g} of its length" if len(miss) else ""
             worst = f"the {misses[0]}" if misses else worst
             logger.warning("the start was put right: %s; particles were moved by up to %.3g nm", worst, moved)
-
-    def _refuse(self, miss: Violation | None) -> None:
-        if miss is not None:
-            raise InputError(
-                f"the {miss}. What moved them does not know the rows that are held (OpenMM's minimizer is one: take "
-                "integrator.minimizeEnergy); call integrator.applyConstraints(context) and "
-                "integrator.applyVelocityConstraints(context)",
-                item=miss.what,
-                atoms=miss.atoms,
-            )
 
     def _make_tangent(self, v: FloatArray) -> None:
         """Project velocities that were set from outside; those of a run that is continued stay bit for bit."""

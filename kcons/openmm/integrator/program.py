@@ -213,18 +213,6 @@ class Ensemble:
         """The global variables of the program that are settings of the ensemble, by name."""
         return {}
 
-    def at(self, temperature: float) -> Self:
-        """The same at another temperature (K)."""
-        if "temperature" not in vars(self):
-            raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")
-        return self.replaced(temperature=temperature)
-
-    def with_friction(self, friction: Any) -> Self:
-        """The same with another friction (1/ps)."""
-        if "friction" not in vars(self):
-            raise UnsupportedError("there is no friction; give ensemble=Langevin(temperature, friction)")
-        return self.replaced(friction=friction)
-
     def follow(self, integrator: Integrator) -> None:
         """The integrator takes this ensemble, perhaps in the middle of a run; raise `KconsError` if it cannot."""
 

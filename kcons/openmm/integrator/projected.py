@@ -13,17 +13,28 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
-from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context, require_context, warn_of_barostat
-from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import TOLERANCES, Part, Precision
 from kcons.openmm.integrator.program import VARIABLES, ConstantEnergy, Ensemble, Program, to_scheme, write_step
-from kcons.openmm.quantities import kelvins, motion_of, number, positions_of, relative_tolerance, velocities_of
+from kcons.openmm.quantities import (
+    forces_at,
+    kelvins,
+    masses_of,
+    motion_of,
+    number,
+    positions_of,
+    relative_tolerance,
+    velocities_of,
+)
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
 #: A time step in ps without a unit that is longer may be one in fs.
 _LONG = 0.02
+#: Longest way of a particle in one step of a minimization, nm.
+_STRIDE = 0.01
 #: What `failed` is where others have moved x between two calls.
 _MOVED = -1
 
@@ -486,7 +497,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         tolerance = positive(number(tolerance, unit.kilojoule_per_mole / unit.nanometer, "tolerance"), "tolerance")
         maxIterations = whole_number(maxIterations, "maxIterations", 0)
         if self.parts:
-            descend(self, context, tolerance, maxIterations)
+            _descend(self, context, tolerance, maxIterations)
         else:
             openmm.LocalEnergyMinimizer.minimize(context, tolerance, maxIterations)
             self.applyConstraints(context)
@@ -551,12 +562,12 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
 
         The method raises `InputError` if it is below zero; with `Isokinetic`, zero.
         """
-        if not self.thermostatted:
+        if not hasattr(self.ensemble, "temperature"):
             self._given("temperature")
         return self._set_temperature
 
     def _set_temperature(self, temperature: unit.Quantity | float) -> None:
-        self._take(self.ensemble.at(kelvins(temperature)))
+        self._take(self.ensemble.replaced(temperature=kelvins(temperature)))
         guard = self._guard
         if guard is not None and guard.alive is not None and guard.started:
             warn_of_barostat(guard.context, self._given("temperature"), stacklevel=3)
@@ -574,7 +585,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         The method raises `InputError` if it is below zero.
         """
         self._given("friction")
-        return lambda friction: self._take(self.ensemble.with_friction(friction))
+        return lambda friction: self._take(self.ensemble.replaced(friction=friction))
 
     @property
     def getFriction(self) -> Callable[[], unit.Quantity]:
@@ -762,3 +773,68 @@ def _refuse_shared(parts: Sequence[Part]) -> None:
                 "kcons.openmm.hold"
             )
         known |= atoms
+
+
+# -- minima on the constraints --------------------------------------------------------------------
+
+
+def _descend(integrator: ProjectedIntegrator, context: openmm.Context, tolerance: float, iterations: int) -> None:
+    """Fast inertial relaxation along the constraints of the System and of the parts.
+
+    Velocities are the search direction in the mass metric: each step projects f/m, turns v towards it, goes, and
+    brings x back onto the constraints. Velocities of the context stay as they were. It ends where the root mean square
+    of the projected force components is below a tolerance (kJ/mol/nm), or after so many iterations (0: 50,000);
+    `ConvergenceError` where the constraints cannot be reached, however short the steps.
+
+    References
+    ----------
+    Bitzek et al., Phys. Rev. Lett. 97, 170201 (2006).
+    """
+    system = context.getSystem()
+    masses = masses_of(system)[:, None]
+    inverse = np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0)
+    groups = integrator.getIntegrationForceGroups()
+    kept = velocities_of(context)
+    dt, alpha, since_turn = 1e-3, 0.1, 0
+    v = np.zeros((len(masses), 3))
+    try:
+        integrator.applyConstraints(context)
+        for _ in range(iterations or 50_000):
+            pull = _tangent(integrator, context, forces_at(context, groups) * inverse)
+            if np.sqrt(np.mean((masses * pull) ** 2)) <= tolerance:
+                return
+            v = _tangent(integrator, context, v + dt * pull)
+            if np.sum(masses * v * pull) > 0:
+                since_turn += 1
+                v = (1 - alpha) * v + alpha * pull * np.sqrt(np.sum(masses * v * v) / np.sum(masses * pull * pull))
+                if since_turn > 5:
+                    dt, alpha = 1.1 * dt, 0.99 * alpha
+            else:
+                v[:], alpha, since_turn = 0.0, 0.1, 0
+                dt *= 0.5
+            dt, v = _move(integrator, context, v, dt)
+    finally:
+        context.setVelocities(kept)
+
+
+def _move(
+    integrator: ProjectedIntegrator, context: openmm.Context, v: FloatArray, dt: float
+) -> tuple[float, FloatArray]:
+    x = positions_of(context)
+    for _ in range(30):
+        stride = dt * v
+        longest = float(np.sqrt(np.max(np.sum(stride**2, axis=1))))
+        context.setPositions(x + stride * min(1.0, _STRIDE / longest if longest > 0 else 1.0))
+        try:
+            integrator.applyConstraints(context)
+            return dt, v
+        except ConvergenceError:
+            dt, v = 0.25 * dt, 0.25 * v
+    context.setPositions(x)
+    raise ConvergenceError("the constraints cannot be kept along the descent, however short the steps")
+
+
+def _tangent(integrator: ProjectedIntegrator, context: openmm.Context, v: FloatArray) -> FloatArray:
+    context.setVelocities(v)
+    integrator.applyVelocityConstraints(context)
+    return velocities_of(context)

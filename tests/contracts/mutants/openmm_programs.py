@@ -59,10 +59,13 @@ MUTANTS = {
             "steps::parameters_of_forces_are_used_in_the_next_step",
         ),
         ("self.recall({**self.«settings→idle», **self.idle})", "settings::a_setting_has_a_method_of_its_own"),
-        ("            kicks[«-1→0»] += operation.fraction", "programs"),
+        (
+            "            kicks[«-1→0»] += operation.fraction",
+            "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves",
+        ),
     ],
     "openmm/ensembles/isokinetic_ensemble.py": [
-        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "thermostats_beside_parts::a_run_has_the_temperature"),
+        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "every_ensemble::a_run_has_the_temperature"),
         ('"max(qq«-wq→», wq^2/ww)"', "isokinetic_ensemble::two_sums_do_where_velocities_are_not_read"),
         (
             'program.set("exact", «float(precision == "double" and not rigid)→0.0»)',
@@ -101,9 +104,9 @@ MUTANTS = {
     "openmm/ensembles/langevin_ensemble.py": [
         (
             "«groups_of(force)→{force.getForceGroup()}» - set(steps)",
-            "respa_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
+            "langevin_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
-        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "langevin_ensemble"),
+        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         (', «_before(name)→name», "the chain', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),
@@ -112,7 +115,7 @@ MUTANTS = {
         ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),
     ],
     "openmm/collective/collective_rows.py": [
-        ("(*held[:k], *«held[n:]→()») for k", "rows_in_context::row_that_repeats_a_constraint_of_the_system_is_named"),
+        ("(*held[:k], *«held[n:]→()») for k", "collective_rows::row_that_repeats_a_constraint_of_the_system_is_named"),
         ("weight{c}*({of('more', i)}«-→+»{of('expected', i)})", "row_program::the_iteration_learns_from_each_push"),
         ('let(f"back{c}_{i}_{j}", f"«-→»({done})*back{c}_{i}_{i}"', "row_program::the_iteration_learns_from_each_push"),
         ('again = f"select({sure}, «3→1», 1)"', "row_program::many_steps_look_less_often"),

@@ -23,23 +23,10 @@ from openmm_systems import DATA, started, state_of
 
 from kcons.constraints import Dihedral
 from kcons.errors import ConstraintError, ConvergenceError, InputError
-from kcons.openmm import Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
-from kcons.openmm.collective import CollectiveRows
+from kcons.openmm import CollectiveRows, Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
 from kcons.openmm.collective.coordinates import Row
 
 # -- multipliers ----------------------------------------------------------------------------------------
-
-
-def test_multiplier_of_a_rotor():
-    """A dumbbell of two masses, turning freely: the bond pulls with lambda = -mu omega^2 d."""
-    system = openmm.System()
-    for mass in (2.0, 3.0):
-        system.addParticle(mass)
-    part = CollectiveRows(system, [Row(bond(0, 1), 0.2)])
-    integrator = ProjectedIntegrator(0.001, "suzuki4", parts=[part])
-    context = started(system, integrator, [[0, 0, 0], [0.2, 0, 0]], [[0, -3.0, 0], [0, 2.0, 0]])
-    integrator.step(5)
-    assert part.multipliers(context) == pytest.approx([-(2.0 * 3.0 / 5.0) * 5.0**2 / 0.2], rel=1e-9)
 
 
 # -- order, reversibility, energy -----------------------------------------------------------------------

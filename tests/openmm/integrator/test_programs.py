@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 
-import numpy as np
 import openmm
 import pytest
 from openmm_systems import context_of, holding, state_of
@@ -19,7 +18,6 @@ from kcons.openmm.integrator.program import (
     ConstantEnergy,
     Program,
     forces_at_old_positions,
-    stages_of,
     to_scheme,
 )
 from kcons.steppers import Geodesic, Rattle
@@ -151,18 +149,6 @@ def test_names_of_schemes():
     assert by_name.program.lines == by_object.program.lines
     assert by_name.program.tables == by_object.program.tables
     assert "Geodesic(substeps=3)" in repr(ProjectedIntegrator(1e-3, Geodesic(3)))
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_stages_add_up_to_a_step(scheme):
-    drifts, kicks = stages_of(to_scheme(scheme).operations())
-    assert len(kicks) == len(drifts) + 1
-    assert sum(drifts) == pytest.approx(1, abs=1e-14)
-    assert sum(kicks) == pytest.approx(1, abs=1e-14)
-    np.testing.assert_allclose(kicks, kicks[::-1], atol=1e-15)
-    np.testing.assert_allclose(drifts, drifts[::-1], atol=1e-15)
-    # The kick at the end of a step and that at the beginning of the next use the same forces.
-    assert np.count_nonzero(kicks[1:]) == SCHEMES[scheme]().force_evaluations
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

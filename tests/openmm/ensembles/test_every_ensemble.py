@@ -1,17 +1,20 @@
-"""Every ensemble has its temperature; those that scale velocities beside rows that parts hold."""
+"""Every ensemble has its temperature, also beside rows that parts hold, and a barostat of another is told of."""
 
 from __future__ import annotations
 
 import copy
+import itertools
+import warnings
 
 import numpy as np
 import openmm
 import pytest
 from ensemble_runs import on_their_rows, run, twice_kinetic, two_parts, warm
 from openmm_ensembles import ENSEMBLES
-from openmm_systems import context_of, loose_alanine, state_of, water_box
+from openmm_systems import context_of, loose_alanine, started, state_of, water_box
 
-from kcons.openmm import ProjectedIntegrator, hold
+from kcons.errors import InputError
+from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, hold
 from kcons.openmm.quantities import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
@@ -87,3 +90,60 @@ def test_parts_keep_their_rows(bath):
     assert ensemble.count(integrator) == 15
     if bath == "NoseHoover":
         assert np.ptp(values) < 0.05 < abs(integrator.getGlobalVariableByName("chain_place"))
+
+
+# -- barostats ------------------------------------------------------------------------------------
+
+
+BAROSTATS = [
+    lambda t: openmm.MonteCarloBarostat(1.0, t, 5),
+    lambda t: openmm.MonteCarloAnisotropicBarostat(openmm.Vec3(1, 1, 1), t),
+    lambda t: openmm.MonteCarloMembraneBarostat(1.0, 0.0, t, 0, 0),
+    lambda t: openmm.MonteCarloFlexibleBarostat(1.0, t),
+]
+
+
+def pressed(barostat, ensemble):
+    system, x = water_box(27)
+    system.addForce(barostat)
+    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+    context = started(system, integrator, x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    return integrator, context
+
+
+@pytest.mark.parametrize(
+    ("ensemble", "barostat"), list(zip(ENSEMBLES.values(), itertools.cycle(BAROSTATS), strict=False))
+)
+def test_a_barostat_of_another_temperature(ensemble, barostat):
+    integrator, context = pressed(barostat(310), ensemble(300, momentum="free"))
+    with pytest.warns(UserWarning, match=r"temperature of 310 K, and the integrator one of 300 K") as told:
+        integrator.step(1)
+    assert told[0].filename == __file__
+    name = str(told[0].message).split("'")[1]
+    context.setParameter(name, 300)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        integrator.step(1)
+        integrator.setTemperature(300)
+    with pytest.warns(UserWarning, match=r"temperature of 300 K, and the integrator one of 350 K") as told:
+        integrator.setTemperature(350)
+    assert told[0].filename == __file__
+
+
+def test_without_a_temperature_there_is_nothing_to_compare():
+    integrator, _ = pressed(openmm.MonteCarloBarostat(1.0, 310), Isokinetic(momentum="free"))
+    integrator.step(1)
+
+
+@pytest.mark.parametrize(
+    "barostat",
+    [
+        openmm.MonteCarloBarostat(float("nan"), 300),
+        openmm.MonteCarloAnisotropicBarostat(openmm.Vec3(1, float("inf"), 1), 300),
+    ],
+)
+def test_a_pressure_that_is_none(barostat):
+    """OpenMM accepts every trial then, and the box wanders."""
+    with pytest.raises(InputError, match=r"Barostat has a pressure of .*; give a finite one"):
+        pressed(barostat, Langevin(300, 1))
