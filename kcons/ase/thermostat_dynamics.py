@@ -34,9 +34,9 @@ from kcons.thermostats import (
     NoseHooverChain,
     thermal_velocities,
 )
+from kcons.thermostats.barostats import Barostat, ConstantPressure, require_barostat
 from kcons.thermostats.freedom import Momentum
-from kcons.thermostats.isokinetic.isokinetic import Convention
-from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
+from kcons.thermostats.isokinetic import Convention
 
 
 class ThermostattedDynamics(ConstrainedDynamics):

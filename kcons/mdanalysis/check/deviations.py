@@ -270,7 +270,9 @@ def _by_row(constraints: Sequence[Constraint], values: Sequence[Any]) -> Any:
 
 @njit(cache=True, nogil=True)
 def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untyped-def]
-    """Deviations of all rows in one frame.
+    """Put deviations of all rows in one frame, the `frame`-th, into `by_row` and `by_unit`.
+
+    The first atom of a row that is not finite is returned, and nothing changed then; -1 if there is none.
 
     Parameters
     ----------
@@ -281,14 +283,6 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
         grid of the coordinates in the file, 0 if there is none; what their rounding is, see `FilePrecision`.
     held : (ndarray, ndarray, ndarray)
         See `_HELD`; deviation, rounding and rate of rows that are no lengths; first row, end and unit of runs.
-    by_row, by_unit : structured arrays
-        Changed in place.
-    frame : int
-
-    Returns
-    -------
-    int
-        The first atom of a row that is not finite; nothing was changed then. -1 if there is none.
     """
     x, bits, is_held, v = atoms
     lattice, limit, step, base, factor, reach = space

@@ -27,8 +27,7 @@ from kcons.ase import (
 )
 from kcons.constraints import Distance, FixedAtoms
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.thermostats import mean
-from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
+from kcons.thermostats import CellRescaling, MonteCarloBarostat, mean
 
 KT = units.kB * TEMPERATURE
 N, SIDE = 60, 40.0

@@ -106,7 +106,10 @@ MUTANTS = {
         ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
-        (', «_before(name)→name», "the chain', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),
+        (
+            'p.let(name, «f"{name}_last"→name», "the chain',
+            "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was",
+        ),
     ],
     "openmm/integrator/projected.py": [
         ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),
