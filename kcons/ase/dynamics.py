@@ -73,8 +73,8 @@ class ConstrainedDynamics(MolecularDynamics):
     time : float
         Time at the start, for targets that move.
     state : State, optional
-        Go on from here: what `state` of another run gave, or `State.load` read. Positions, momenta, time and the number
-        of steps are taken from it, `time` is not looked at. Forces are asked of the calculator.
+        Go on from here: what `state` of another run gave, or `kcons.State.load` read. Positions, momenta, time and the
+        number of steps are taken from it, `time` is not looked at. Forces are asked of the calculator.
     check_every : int, optional
         As for `kcons.run`: steps from one certificate of the state to the next.
     trajectory, logfile, loginterval, **kwargs

@@ -15,6 +15,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.device.held_rows import Shape
 
 #: Platforms whose kernels are plain C++.
 PLAIN = ("Reference", "CPU")
@@ -35,21 +36,6 @@ class Array(NamedTuple):
     kind: str
     values: FloatArray | IntArray
     saved: bool = False
-
-
-class Shape(NamedTuple):
-    """Clusters of atoms, shape (n_clusters, n), whose code is the same.
-
-    The `name` ends those of its functions; it is empty for single atoms. A work-group has a cluster where it is held
-    `together`, else a work-item. A cluster has `n_rows` independent rows; the first of a shape has the number `first`
-    among those of the name.
-    """
-
-    name: str
-    atoms: IntArray
-    together: bool = False
-    n_rows: int = 0
-    first: int = 0
 
 
 _COMMON = """
@@ -468,7 +454,7 @@ class Kernels:
         everything = np.arange(len(masses))
         moving = (masses > 0) & ~np.isin(everything, held.fixed)
         free = np.setdiff1d(everything, np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
-        for shape in [*held.shapes, *([Shape("", free[:, None])] if len(free) else [])]:
+        for shape in [*held.shapes, *([Shape(free[:, None])] if len(free) else [])]:
             clusters = len(shape.atoms)
             self.places.append(_Place(shape, self.crowds if shape.together else self.items, self.particles, self.work))
             atoms = (shape.atoms if shape.together else shape.atoms.T).ravel()

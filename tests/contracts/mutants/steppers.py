@@ -33,7 +33,7 @@ MUTANTS = {
             "friction::a_body_sinks_as_fast_as_it_should_however_strong_the_friction",
         ),
     ],
-    "solvers/sparse/row_values.py": [
+    "solvers/sparse/mixed_rows.py": [
         (
             "time = «0.5 * (time + load_double(parameters, 1)→load_double(parameters, 0»)",
             "flights::driven_velocities_hold_at_the_middle_of_the_time",
@@ -41,12 +41,15 @@ MUTANTS = {
     ],
     "solvers/general_clusters.py": [
         (
-            "self.subset.jacobian(«0.5 * (self.start + end)→end», self.time)",
+            "subset.jacobian(«0.5 * (start + state)→state», middle)",
             "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
         ),
     ],
     "constraints/velocity.py": [
-        ("half = «→-»0.5 * (bx * gx", "row_functions::gradients_of_rows_of_velocities[KnifeEdge]"),
+        (
+            "half = «→-»0.5 * (bx * gx",
+            "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
+        ),
     ],
     "steppers/program.py": [
         ("kick.fraction, group, time, «end→1.0»", "langevin::each_substep_meets_targets_at_its_own_time"),
