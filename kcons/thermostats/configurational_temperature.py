@@ -270,7 +270,8 @@ class TemperatureSplit:
         counts = 3 * int(exists[0].sum()), int(exists[1].sum())
         squares = [max(float(series[:, 1, kind].mean()), 0.0) / max(counts[kind], 1) for kind in (0, 1)]
         frequencies = math.sqrt(squares[0]), math.sqrt(squares[1])
-        return SplitTemperatures(*found, *counts, *frequencies, len(series), tuple(notes))
+        shift, turn, internal = found
+        return SplitTemperatures(shift, turn, internal, *counts, *frequencies, len(series), tuple(notes))
 
     # -- inner ----------------------------------------------------------------------------------
 
