@@ -24,7 +24,7 @@ MUTANTS = {
     ],
     "mdanalysis/check/constraint_check.py": [
         (
-            "precision.half_step(universe.atoms.positions)«→.max()»",
+            ".half_step(universe.atoms.positions)«→.max()»",
             "mdanalysis/check/precision::a_wild_molecule_of_the_topology_excuses_no_other",
         ),
     ],
