@@ -79,9 +79,6 @@ MUTANTS = {
         ),
     ],
     "steppers/stepper.py": [
-        (
-            '{name: «None if name in ("_known", "_left") else →»value',
-            "stepper::copies_leave_behind_what_was_found_for_a_system",
-        ),
+        (': «None if name in ("_known", "_left") else →»', "stepper::copies_leave_behind_what_was_found_for_a_system"),
     ],
 }
