@@ -67,7 +67,7 @@ from kcons.openmm.quantities import (
     with_massless_atoms,
 )
 from kcons.openmm.topology import bonds_of
-from kcons.steppers.stages.packed_system import spheres_of
+from kcons.steppers.packed_system import spheres_of
 
 #: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbor list, and v is rounded to
 #: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost

@@ -29,7 +29,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.steppers.splitting import SCHEMES as STEPPERS
 from kcons.steppers.splitting import Rattle, Splitting
-from kcons.thermostats.isokinetic.isokinetic import SCHEMES as ISOKINETIC
+from kcons.thermostats.isokinetic import SCHEMES as ISOKINETIC
 
 #: A `ProjectedIntegrator` and a `Part`, whose modules import this one.
 Integrator = Any

@@ -82,9 +82,6 @@ MUTANTS = {
     "constraints/target.py": [
         (".abs(fine - given) > «WRONG→100» * size)", "target::derivatives_that_contradict_a_moving_target_are_refused"),
     ],
-    "ase/topology.py": [
-        ("«→not »guessed and said != stamp:", "ase/topology::guessed_bonds_are_guessed_anew_for_sorted_and_cut_atoms"),
-    ],
     "topology/rows_by_name.py": [
         ("long > «np.minimum(TORN, FAR * radii)→TORN»", "ase/topology::bonds_that_are_far_too_long_are_not_held"),
     ],
