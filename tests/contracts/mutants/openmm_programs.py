@@ -2,7 +2,7 @@
 
 MUTANTS = {
     "openmm/integrator/guard.py": [
-        ("()._value if «driven→False» else 0.0", "carried_constraints::time_that_is_set_is_no_way_of_moving_targets"),
+        ("()._value if «driven→False» else 0.0", "hold::time_that_is_set_is_no_way_of_moving_targets"),
         (
             "for part in integrator.parts:\n                «part.check_masses(self.system)→pass»",
             "callbacks::masses_that_change_in_a_run_are_noticed_at_the_next_check",
@@ -120,13 +120,13 @@ MUTANTS = {
             "elif self.timed and «self._integrator() is None→False»:",
             "callbacks::rows_that_need_the_time_are_not_held_without_their_integrator",
         ),
-        ("= «not p.integrator.thermostatted→False»", "carried_constraints::velocities_are_those_of_the_core"),
+        ("= «not p.integrator.thermostatted→False»", "hold::velocities_are_those_of_the_core"),
         (
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "part::integrators_in_turn_hold_the_same_part",
         ),
         ("u * np.cos(w) - d * (w * np.sin(w))« - way→»", "surface_integrator::great_circles_at_any_time_step"),
         ('"ij,ij->i", d, way)[:, None] / radius«**2→»)', "surface_integrator::the_steps_are_those_of_the_core"),
-        ("self.motion.rank« - 3 * fixed→»", "carried_constraints::particles_without_mass_take_no_degree_of_freedom"),
+        ("self.motion.rank« - 3 * fixed→»", "hold::particles_without_mass_take_no_degree_of_freedom"),
     ],
 }
