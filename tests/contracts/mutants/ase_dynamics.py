@@ -52,8 +52,7 @@ MUTANTS = {
     "ase/respect.py": [
         ("scaled = «changed and self._scaled(motion, x, cell)→True»", "ase/edits::an_edit_between_runs_is_refused"),
         (
-            "«not (changed or (differ(self._positions, x) if elsewhere is None else elsewhere))→"
-            "self._cell is not None»",
+            "«not (changed or elsewhere or differ(self._positions, x))→self._cell is not None»",
             "ase/edits::an_edit_between_runs_is_refused",
         ),
         ("        if «along < stayed→False»:", "virial::filters_beside_atoms_that_stay_are_refused"),
