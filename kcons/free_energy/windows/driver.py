@@ -310,7 +310,7 @@ class Windows:
     rng : int, numpy.random.Generator or None
         A folder goes on with the same number only.
     executor : Executor, optional
-        Anything with the interface of `concurrent.futures`: of Dask, ``Client(address).get_executor()``. By default
+        Anything with the interface of `concurrent.futures`: of Dask, ``Client(address).get_executor(pure=False)``. By default
         processes of this machine.
     workers : int, optional
         How many of these; by default one for each core.
