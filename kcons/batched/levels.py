@@ -13,21 +13,14 @@ from kcons.batched.clusters import Clusters, Pattern, Problem, Vector
 from kcons.plan.clusters_alike import elimination
 
 
-class _Level(NamedTuple):
-    """Rows that are eliminated at once; their factors, and products of these with what is beside the pivots.
+class _Program(NamedTuple):
+    """Elimination by levels; of entries row, column, and the entry across the diagonal; entries on the diagonal.
 
-    A factor has its entry, the row and a later row; a product the factor, the entry beside, and that it is taken from.
+    A level has rows that are eliminated at once, their factors, and products of these with what is beside the pivots. A
+    factor has its entry, the row and a later row; a product the factor, the entry beside, and that it is taken from.
     """
 
-    rows: Tensor
-    factor: Tensor
-    product: Tensor
-
-
-class _Program(NamedTuple):
-    """Levels; of entries row, column, and the entry across the diagonal; entries on the diagonal."""
-
-    levels: list[_Level]
+    levels: list[tuple[Tensor, Tensor, Tensor]]
     row: Tensor
     column: Tensor
     across: Tensor
@@ -55,7 +48,7 @@ def _program(pattern: Pattern, device: torch.device) -> tuple[_Program, dict[tup
                 product += [(len(factor), numbers[here, j], numbers[there, j]) for j in some]
                 factor.append((numbers[there, here], here, there))
         rows = torch.tensor(place[begin:end], device=device)
-        levels.append(_Level(rows, _table(factor, 3, device), _table(product, 3, device)))
+        levels.append((rows, _table(factor, 3, device), _table(product, 3, device)))
     row, column, across = _table(((i, j, numbers[j, i]) for i, j in numbers), 3, device)
     (diagonal,) = _table(([numbers[k, k]] for k in range(len(place))), 1, device)
     return _Program(levels, row, column, across, diagonal), numbers
@@ -67,16 +60,13 @@ class _Solution(torch.autograd.Function):
     @staticmethod
     def forward(s: Tensor, b: Tensor, program: _Program) -> Tensor:
         s, b = s.clone(), b.clone()
-        for level in program.levels:
-            entry, here, there = level.factor
-            which, beside, taken = level.product
+        for _, (entry, here, there), (which, beside, taken) in program.levels:
             factor = s[entry] / s[program.diagonal[here]]
             s.index_add_(0, taken, factor[which] * s[beside], alpha=-1)
             b.index_add_(0, there, factor * b[here], alpha=-1)
-        for level in reversed(program.levels):
-            entry, here, there = level.factor
+        for rows, (entry, here, there), _ in reversed(program.levels):
             b.index_add_(0, here, s[program.across[entry]] * b[there], alpha=-1)
-            b[level.rows] = b[level.rows] / s[program.diagonal[level.rows]]
+            b[rows] = b[rows] / s[program.diagonal[rows]]
         return b
 
     @staticmethod

@@ -6,7 +6,7 @@ import ctypes
 import json
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import partial, partialmethod
 from typing import Any
 
 import numpy as np
@@ -168,7 +168,7 @@ class DeviceProgram(Program):
 
     def listing(self) -> str:
         """The variables, and what is done between two evaluations of forces."""
-        known = [f"  {name}: {self._words[name]}" for name in [*self.settings, *self.kept]]
+        known = [f"  {name}: {self.words[name]}" for name in [*self.settings, *self.kept]]
         return "\n".join(["on the device: one kernel between two evaluations of forces or sums", "variables", *known])
 
 
@@ -389,18 +389,15 @@ class DeviceIntegrator(ProjectedIntegrator):
         return self._seed
 
 
-def _refuse_of_programs(name: str) -> Any:
-    def refuse(self: DeviceIntegrator, *args: Any, **options: Any) -> None:
-        raise UnsupportedError(
-            f"{name} is about the program of a CustomIntegrator, and these steps have kernels; give device=False"
-        )
-
-    return refuse
+def _refuse(self: DeviceIntegrator, name: str, *_: Any, **__: Any) -> None:
+    raise UnsupportedError(
+        f"{name} is about the program of a CustomIntegrator, and these steps have kernels; give device=False"
+    )
 
 
 for _name, _method in vars(openmm.CustomIntegrator).items():
     if _name[0].islower() and getattr(DeviceIntegrator, _name) is _method and not hasattr(openmm.Integrator, _name):
-        setattr(DeviceIntegrator, _name, _refuse_of_programs(_name))
+        setattr(DeviceIntegrator, _name, partialmethod(_refuse, _name))
 
 
 # -- plans for a Context ------------------------------------------------------------------------------

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.functions.straight_line import Function, function_of
@@ -58,7 +60,7 @@ def function_on_device(item: Constraint) -> Function:
 
 
 class Row(NamedTuple):
-    """A row of a pattern: number of its function, its atoms in the cluster, how it takes them, and what it is."""
+    """A row of a shape: number of its function, its atoms in the cluster, how it takes them, and what it is."""
 
     function: int
     atoms: tuple[int, ...]
@@ -70,22 +72,26 @@ class Row(NamedTuple):
     period: float
 
 
-class Pattern(NamedTuple):
-    """Clusters that look alike: its rows, those that depend on others last.
+class Shape(NamedTuple):
+    """Clusters that look alike, whose code or tables are written once: its rows, those that depend on others last.
 
-    `clusters` are their rows in the set, shape (n, n_rows), `atoms` their particles, shape (n, n_atoms).
+    `atoms` are their particles, shape (n, n_atoms), `clusters` their rows in the set, (n, n_rows); single atoms have no
+    rows and no `name`, which ends those of functions. The first cluster has the number `first` among those of the name.
     """
 
-    rows: tuple[Row, ...]
     atoms: IntArray
-    clusters: IntArray
+    rows: tuple[Row, ...] = ()
+    clusters: IntArray = np.zeros((0, 0), np.int64)
+    name: str = ""
+    first: int = 0
 
     @property
-    def small(self) -> bool:
-        """Whether a work-item has a cluster."""
-        widest = max(len(row.atoms) for row in self.rows)
-        return len(self.rows) <= ITEM_ROWS and self.atoms.shape[1] <= ITEM_ATOMS and widest <= ITEM_WIDTH
+    def together(self) -> bool:
+        """Whether a work-group has a cluster; else a work-item."""
+        widest = max((len(row.atoms) for row in self.rows), default=0)
+        return len(self.rows) > ITEM_ROWS or self.atoms.shape[1] > ITEM_ATOMS or widest > ITEM_WIDTH
 
     @property
-    def rank(self) -> int:
+    def n_rows(self) -> int:
+        """Independent rows of a cluster."""
         return sum(not row.depends for row in self.rows)

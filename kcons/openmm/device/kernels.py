@@ -15,6 +15,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.device.held_rows import Shape
 
 #: Platforms whose kernels are plain C++.
 PLAIN = ("Reference", "CPU")
@@ -35,21 +36,6 @@ class Array(NamedTuple):
     kind: str
     values: FloatArray | IntArray
     saved: bool = False
-
-
-class Shape(NamedTuple):
-    """Clusters of atoms, shape (n_clusters, n), whose code is the same.
-
-    The `name` ends those of its functions; it is empty for single atoms. A work-group has a cluster where it is held
-    `together`, else a work-item. A cluster has `n_rows` independent rows; the first of a shape has the number `first`
-    among those of the name.
-    """
-
-    name: str
-    atoms: IntArray
-    together: bool = False
-    n_rows: int = 0
-    first: int = 0
 
 
 _COMMON = """
@@ -306,7 +292,7 @@ def _once(code: str, *names: str) -> str:
     return f" if (LOCAL_ID == 0) {{\n{code}{stored}}}\n SYNC_THREADS;{read}\n SYNC_THREADS;\n"
 
 
-#: The closed form of `kcons.thermostats.isokinetic.kick`, everything divided by exp(z).
+#: The closed form of `kcons.thermostats.isokinetic`, everything divided by exp(z).
 _CLOSED_FORM = """ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(-z);
  mixed aim = sum0/sqrt(max((mixed) (sum2*sum1), TINY));
  aim = min(max(aim, (mixed) -1), (mixed) 1);
@@ -367,7 +353,7 @@ _RECORD = """ if (failure[0] != 0) return;
 """
 
 
-#: What happens on the spheres of a cluster, see `kcons.thermostats.multistep.sphere_kernels`: component c of an atom is
+#: What happens on the spheres of a cluster, see `kcons.thermostats.sphere_kernels`: component c of an atom is
 #: its part of the center of mass, which is on sphere OF[c], and the rest on OF[3]; -1 for none. KEEP and PUSH are what
 #: v and d are multiplied by, OWN what auxiliary variables are.
 _SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};
@@ -468,7 +454,7 @@ class Kernels:
         everything = np.arange(len(masses))
         moving = (masses > 0) & ~np.isin(everything, held.fixed)
         free = np.setdiff1d(everything, np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
-        for shape in [*held.shapes, *([Shape("", free[:, None])] if len(free) else [])]:
+        for shape in [*held.shapes, *([Shape(free[:, None])] if len(free) else [])]:
             clusters = len(shape.atoms)
             self.places.append(_Place(shape, self.crowds if shape.together else self.items, self.particles, self.work))
             atoms = (shape.atoms if shape.together else shape.atoms.T).ravel()

@@ -25,13 +25,13 @@ from kcons.openmm.device.held_rows import (
     NEAREST,
     RELATIVE,
     STORED,
-    Pattern,
     Row,
+    Shape,
     constraints_of,
     function_on_device,
 )
-from kcons.openmm.device.kernels import Array, Shape
-from kcons.openmm.device.large_clusters import LargeClusters
+from kcons.openmm.device.kernels import Array
+from kcons.openmm.device.large_clusters import large_clusters
 from kcons.openmm.device.small_clusters import ItemWriter
 from kcons.plan.clusters_alike import alike
 
@@ -148,9 +148,9 @@ class DeviceRows:
         # Rows that were converted stand in another order: then all are summed.
         self._summed_from = 0 if motion.conversions else len(pairs)
         self.motion, self.set, self.fixed = motion, motion.constraint_set, motion.fixed_atoms
-        self._write(self._patterns(time))
+        self._write(self._alike(time))
 
-    def _patterns(self, time: float) -> list[Pattern]:
+    def _alike(self, time: float) -> list[Shape]:
         """What is known of rows, and clusters that look alike, whose code or tables are written once."""
         held, plan = self.set, self.motion.plan
         self.target = held.target(time)
@@ -184,35 +184,34 @@ class DeviceRows:
         ends = np.cumsum([[0, 0], *sizes], axis=0)
         (self.mover, self.cell), (self.n_movers, self.n_cells) = ends[:-1].T, ends[-1].tolist()
         return [
-            Pattern(tuple(row._replace(atoms=local) for row, local in key), each.atoms, each.rows)
+            Shape(each.atoms, tuple(row._replace(atoms=local) for row, local in key), each.rows)
             for key, each in alike(plan.labels, plan.eliminate_last, rows, atoms).items()
         ]
 
-    def _write(self, patterns: list[Pattern]) -> None:
+    def _write(self, shapes: list[Shape]) -> None:
         """Code and arrays."""
-        self.shapes: list[Shape] = []
-        small, large = ([each for each in patterns if each.small is kind] for kind in (True, False))
+        small = [each for each in shapes if not each.together]
+        self.shapes = [each._replace(name=f"s{k}") for k, each in enumerate(small)]
         texts = [_COMMON]
-        for number in sorted({row.function for pattern in small for row in pattern.rows}):
+        for number in sorted({row.function for shape in small for row in shape.rows}):
             texts.append(c_functions(f"rows_f{number}", self.functions[number]))
         order, tables = [np.zeros(0, np.int64)], [np.zeros(1)]
-        for k, pattern in enumerate(small):
-            writer = ItemWriter(f"s{k}", pattern, self, sum(map(len, tables)), sum(map(len, order)))
+        for shape in self.shapes:
+            writer = ItemWriter(shape, self, sum(map(len, tables)), sum(map(len, order)))
             texts.append(writer.text())
             tables.append(writer.table.ravel())
-            order.append(pattern.clusters.ravel())
-            self.shapes.append(Shape(writer.name, pattern.atoms, False, pattern.rank))
+            order.append(shape.clusters.ravel())
         self.arrays = [Array("rows_numbers", "mixed", np.concatenate(tables))]
         self.scratch, self.work_group = 0, 64
-        if large:
-            clusters = LargeClusters(large, self, sum(map(len, order)))
-            order.append(clusters.rows)
-            self.arrays += clusters.arrays
-            texts.append(clusters.source)
-            self.shapes += clusters.shapes
-            self.scratch, self.work_group = 2, 32 if max(len(pattern.rows) for pattern in large) <= 64 else 256
+        if large := [each for each in shapes if each.together]:
+            arrays, rows, numbered, source = large_clusters(large, self, sum(map(len, order)))
+            order.append(rows)
+            self.arrays += arrays
+            texts.append(source)
+            self.shapes += numbered
+            self.scratch, self.work_group = 2, 32 if max(len(shape.rows) for shape in large) <= 64 else 256
         self.source, self._order = "".join(texts), np.concatenate(order)
-        placed = [each.atoms[:, a] for each in patterns for r in each.rows if r.how == STORED for a in r.atoms]
+        placed = [each.atoms[:, a] for each in shapes for r in each.rows if r.how == STORED for a in r.atoms]
         self.placed: IntArray = np.unique(np.concatenate([*placed, np.zeros(0, np.int64)]))
         self.block = BLOCK if self.n_movers else 10**9
         self._n_knots = 3 + self.n_movers * 3 * ((BLOCK + 2 * BEYOND) * KNOTS + 1)

@@ -15,26 +15,25 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.openmm.device.c_writer import literal
-from kcons.openmm.device.held_rows import IN_CELLS, NEAREST, STORED, Pattern, Row
+from kcons.openmm.device.held_rows import IN_CELLS, NEAREST, STORED, Row, Shape
 
 #: Rows from which a matrix has the precision of forces: registers are then scarce, and residuals are exact still.
 FEW = 4
 
 
 class ItemWriter:
-    """The two functions of a pattern for a work-item, and what they read of each cluster.
+    """The two functions of a shape for a work-item, and what they read of each cluster.
 
     Attributes
     ----------
-    name : str
     table : ndarray, shape (n_clusters, size)
         Numbers of each cluster; those of the first one begin at `start`, of the present one at ``n``.
     """
 
-    def __init__(self, name: str, pattern: Pattern, held: Any, start: int, first_row: int) -> None:
-        self.name, self.held, self.start = name, held, start
-        self.rows, self.count = pattern.rows, len(pattern.rows)
-        self.single = pattern.atoms.shape[1] == 1
+    def __init__(self, shape: Shape, held: Any, start: int, first_row: int) -> None:
+        self.name, self.held, self.start = shape.name, held, start
+        self.rows, self.count = shape.rows, len(shape.rows)
+        self.single = shape.atoms.shape[1] == 1
         self.row_number = f"{first_row}+cluster*{self.count}"
         #: Whether the matrix is in the precision of forces.
         self.coarse = self.count >= FEW and not any(row.depends for row in self.rows)
@@ -44,8 +43,8 @@ class ItemWriter:
         self.scales: list[str] = []
         self.cells: list[str] = []
         self.parameters: list[str] = []
-        self.table: FloatArray = np.zeros((len(pattern.clusters), 0))
-        for row, mine in zip(self.rows, pattern.clusters.T, strict=True):
+        self.table: FloatArray = np.zeros((len(shape.clusters), 0))
+        for row, mine in zip(self.rows, shape.clusters.T, strict=True):
             self.targets.append(self._number((held.mover if row.moves else held.target)[mine], row))
             self.scales.append(self._number(held.scale[mine], row))
             self.cells.append(self._number(held.cell[mine], row) if row.how == IN_CELLS else "")

@@ -9,6 +9,7 @@ MUTANTS = {
             "torchsim/torchsim_states::slices_take_the_right_rows_along",
         ),
         ("(0, atoms, «positions→new[atoms]»)", "torchsim/torchsim_states::systems_with_nothing_held_stay_free"),
+        ("«self.check(state)→pass»", "torchsim/torchsim_optimizers::steps_that_cannot_be_held_are_told"),
         ("self.system_idx + «system_offset→0»", "torchsim/torchsim_states::splitting_joining_popping_and_copies"),
     ],
     "torchsim/holding.py": [
@@ -20,6 +21,7 @@ MUTANTS = {
         ("* push / «dt→(2 * dt)»", "torchsim/torchsim_dynamics::constant_energy_is_the_trajectory_of_the_engine"),
         ("(1 - keep**«2→1»)", "torchsim/torchsim_dynamics::short_runs_have_the_temperature_of_the_bath[langevin]"),
         ("- 3 * «_free(self)→1»", "torchsim/torchsim_states::fixed_atoms_are_taken_over"),
+        ("constraints_of(state).«check→batch»(state)", "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"),
         ("state.__dict__.update(«before→{}»)", "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"),
     ],
 }
