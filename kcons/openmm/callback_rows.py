@@ -67,7 +67,7 @@ from kcons.openmm.quantities import (
     with_massless_atoms,
 )
 from kcons.openmm.topology import bonds_of
-from kcons.steppers.stages.packed_system import spheres_of
+from kcons.steppers.packed_system import spheres_of
 
 #: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbor list, and v is rounded to
 #: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
@@ -321,9 +321,9 @@ class CallbackEngine(Engine):
         #: Free positions of the drift and what brings them onto the rows.
         self._landing: tuple[FloatArray, FloatArray] | None = None
 
-    def follow(self, p: Program, exact: bool) -> None:
-        """Take times and step sizes from the integrator of this program; `exact` as for parts."""
-        self.exact, self.served = exact, True
+    def follow(self, p: Program) -> None:
+        """Take times and step sizes from the integrator of this program."""
+        self.exact, self.served = p.exact, True
         self._integrator = weakref.ref(p.integrator)
         self.carries_rest = not p.integrator.thermostatted
         self._within, self._fractions = p.halves, p.drifts
@@ -785,7 +785,7 @@ class CarriedConstraints(Part):
     # -- the program ----------------------------------------------------------------------------
 
     def declare(self, program: Program) -> None:
-        self._engine.follow(program, self.exact)
+        self._engine.follow(program)
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Refuse single precision; what passes through OpenMM is known now."""
@@ -813,7 +813,7 @@ class CarriedConstraints(Part):
 
     def remember(self, program: Program) -> None:
         words = "carried rows: positions whose gradients are taken"
-        if not self.lean or self._engine.timed:
+        if not program.lean or self._engine.timed:
             self._guard(program, "remember", words)
             return
         with program.when("looked+moving != 0", "x need not be where the last drift ended"):
@@ -821,7 +821,7 @@ class CarriedConstraints(Part):
 
     def land(self, program: Program, h: str) -> None:
         change = f"f{self._groups['land']}"
-        if self.lean:  # where a step may end without a projection, this solve must tell of failures itself
+        if program.lean:  # where a step may end without a projection, this solve must tell of failures itself
             self._guard(program, "land", "carried rows: solve for positions")
             force, change = change, f"change{self.code}"
             program.each(change, force, "from the evaluation that tells of failures")
@@ -834,12 +834,12 @@ class CarriedConstraints(Part):
         program.each("x", f"x+{h}*{u}", "move freely (drift)")
         self._guard(program, "land", "carried rows: solve for positions")
         onto = f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them"
-        if self.exact:
+        if program.exact:
             program.each("x", *onto)
             group = self._groups["turn"]
         # Force and energy come from one evaluation, for this moves no x.
         program.each("v", f"{u}+{1 / CARRY_SCALE!r}*f{group}/{h}", "the constraint forces act on v as well")
-        if not self.exact:
+        if not program.exact:
             program.each("x", *onto)
 
     def project(self, program: Program) -> None:

@@ -14,8 +14,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError
 from kcons.plan.clusters import Shape, classify, cluster_labels
 from kcons.plan.rank import mark_dependent_rows, rank_of_small, small_enough
-from kcons.solvers.addressable_solvers import AddressableSolver
-from kcons.solvers.chains.open_chains import Chains
+from kcons.solvers.chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rank_revealing import independent
@@ -235,7 +234,7 @@ def make_plan(
             lattice = None if whole else constraint_set.lattice
             if isinstance(solver, GeneralClusters):
                 rank = solver.rank(whole_positions, time, moved)
-            elif isinstance(solver, AddressableSolver):
+            elif isinstance(solver, SparseDistances | SparseRows | SingleRows):
                 rank = solver.rank(whole_positions, lattice, time, moved)
             else:
                 rank = rank_of_small(shape, inverse_masses, whole_positions, lattice)

@@ -9,7 +9,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
-from kcons.solvers.rank_revealing import independent, rank
+from kcons.solvers.rank_revealing import independent, rank, stacks
 
 #: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
 ORDERED_ROWS = 400
@@ -38,9 +38,8 @@ def mark_dependent_rows(
     found = 0
     for rows in clusters:
         part = jacobian[rows]
-        columns, place = np.unique(part.indices, return_inverse=True)
-        b = np.zeros((len(rows), len(columns)))
-        b[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * root_w[part.indices]
+        (stack,) = stacks(part, np.zeros(len(rows), np.int64))
+        (b,) = stack.dense(part.data * root_w[part.indices])
         size = np.linalg.norm(b, axis=1, keepdims=True)
         triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
         diagonal = np.zeros(len(rows))

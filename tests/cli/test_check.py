@@ -99,13 +99,6 @@ def test_nothing_that_can_be_read_is_incomplete_too(folder, capsys):
     assert [path.name for path in out.iterdir()] == ["check.json"]
 
 
-def test_the_help_says_what_the_exit_status_means(capsys):
-    with pytest.raises(SystemExit):
-        main(["check", "--help"])
-    text = " ".join(capsys.readouterr().out.split())
-    assert "Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete" in text
-
-
 def test_formats_by_option(folder, tmp_path, capsys):
     for name in ("good.trr", "t.gro"):
         (tmp_path / name.partition(".")[0]).write_bytes((folder / name).read_bytes())

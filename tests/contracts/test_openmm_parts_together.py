@@ -9,7 +9,7 @@ from kcons.openmm import ProjectedIntegrator
 
 
 def test_what_cannot_be_reached_leaves_positions_as_they_were():
-    """That the rows are held: `test_thermostats_beside_parts`."""
+    """That the rows are held: `test_every_ensemble`."""
     system, x, parts = two_parts()
     integrator = ProjectedIntegrator(0.002, parts=parts)
     x[5] = 0.0  # the center of the sphere: no nearest point

@@ -87,11 +87,12 @@ class LennardJones:
 
         Moves are at most `shift` along each axis and `turn` about a random one; energies are recorded each `every`.
         """
-        y = np.array(x, dtype=np.float64)
-        energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)
-        common = self.first, self.sites, self.box, self.cutoff, thermal_energy, every, rng
-        accepted = _metropolis(y, *common, (shift, turn), energies)
-        return energies, y, accepted / (every * len(energies) * (len(self.first) - 1))
+        y, rng, n = np.array(x, dtype=np.float64), np.random.default_rng(seed), len(self.first) - 1
+        energies = np.empty(sweeps // every)
+        draws, axes = (draw((len(energies), every * n, k)) for draw, k in ((rng.random, 6), (rng.standard_normal, 3)))
+        molecules = self.first, self.sites, self.box, self.cutoff
+        accepted = _metropolis(y, *molecules, thermal_energy, draws, axes, (shift, turn), energies)
+        return energies, y, accepted / (every * len(energies) * n)
 
 
 @njit(cache=True, nogil=True)
@@ -157,37 +158,41 @@ def _one(y, a, b, x, sites, box, cutoff):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _proposed(y, moves, rng):  # type: ignore[no-untyped-def]
-    """A molecule at places y, turned about its center and moved, in place; shape (n, 3)."""
-    center = np.zeros(3)
-    for i in range(len(y)):
-        center += y[i] / len(y)
-    axis = rng.normal(0.0, 1.0, 3)
-    axis /= np.sqrt((axis * axis).sum())
-    angle = moves[1] * (2.0 * rng.random() - 1.0)
+def _propose(y, draw, axis, moves):  # type: ignore[no-untyped-def]
+    """Turn a molecule at places y, shape (n, 3), about its center and move it, in place."""
+    size = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+    angle = moves[1] * (2.0 * draw[0] - 1.0)
     sine, cosine = np.sin(angle), np.cos(angle)
-    move = moves[0] * (2.0 * rng.random(3) - 1.0)
+    center, p = np.zeros(3), np.empty(3)
     for i in range(len(y)):
-        p = y[i] - center
-        y[i] = center + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
+        for c in range(3):
+            center[c] += y[i, c] / len(y)
+    for i in range(len(y)):
+        along = 0.0
+        for c in range(3):
+            p[c] = y[i, c] - center[c]
+            along += p[c] * axis[c] / size**2
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            across = (axis[d] * p[e] - axis[e] * p[d]) / size
+            turned = cosine * p[c] + sine * across + (1.0 - cosine) * along * axis[c]
+            y[i, c] = center[c] + moves[0] * (2.0 * draw[1 + c] - 1.0) + turned
 
 
 @njit(cache=True, nogil=True)
-def _metropolis(x, first, sites, box, cutoff, kt, every, rng, moves, energies):  # type: ignore[no-untyped-def]
-    molecules = len(first) - 1
-    energy = 0.0
+def _metropolis(x, first, sites, box, cutoff, kt, draws, axes, moves, energies):  # type: ignore[no-untyped-def]
+    molecules, accepted, energy = len(first) - 1, 0, 0.0
     for k in range(molecules):
         energy += 0.5 * _one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, sites, box, cutoff)
-    accepted = 0
     for record in range(len(energies)):
-        for _ in range(every * molecules):
-            k = int(rng.random() * molecules)
+        for trial in range(draws.shape[1]):
+            draw = draws[record, trial]
+            k = int(draw[4] * molecules)
             a, b = first[k], first[k + 1]
             y = x[a:b].copy()
-            _proposed(y, moves, rng)
-            change = _one(y, a, b, x, sites, box, cutoff)
-            change -= _one(x[a:b], a, b, x, sites, box, cutoff)
-            if change <= 0.0 or rng.random() < np.exp(-change / kt):
+            _propose(y, draw, axes[record, trial], moves)
+            change = _one(y, a, b, x, sites, box, cutoff) - _one(x[a:b], a, b, x, sites, box, cutoff)
+            if change <= 0.0 or draw[5] < np.exp(-change / kt):
                 x[a:b] = y
                 energy += change
                 accepted += 1

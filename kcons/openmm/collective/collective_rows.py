@@ -284,9 +284,13 @@ class CollectiveRows(Part):
             p.setting(self._of("target", k), f"target of row {k}", self._targets[k])
             p.setting(self._of("rate", k), "change of this target in a ps", self._rates[k])
             p.number(self._of("work", k), "work done by moving the target")
+        if self.driven:
+            p.number(f"clock{c}", "time of the targets where the step began")
+            p.number(f"flown{c}", "time of its drifts")
+            p.number(f"began{c}", "good_steps when it began")
         p.setting(f"small{c}", "a pivot below this fraction of the row's own norm means dependence", PIVOT)
         p.setting(f"tolerance{c}", "what the residual may be", self.tolerance)
-        if self.lean:
+        if p.lean:
             p.number(f"renew{c}", "1 if G is to be computed", 1.0)
         #: Where the other parts leave positions, and where they are at the start of the drift.
         self._base = "xu" if len(p.parts) == 1 else f"base{c}"
@@ -329,7 +333,7 @@ class CollectiveRows(Part):
 
     def _directions(self, p: Program, *, sizes: bool = False, slopes: bool = False) -> None:
         """row = M_par^+ gradient, at x. Where v is needed for that, lean programs keep it themselves."""
-        keep = self.meets_system and not (self.lean and not slopes)
+        keep = self.meets_system and not (p.lean and not slopes)
         if keep:
             p.each(f"v_kept{self.code}", "v", "v is needed to project the rows")
         v = f"v_kept{self.code}" if self.meets_system else "v"
@@ -407,13 +411,13 @@ class CollectiveRows(Part):
             self._push(p)
             self._measure(p)
             self._decide(p, first=False)
-        if self.lean:
+        if p.lean:
             with p.when(f"state{c} > 2", "one more, which need not be measured"):
                 self._push(p)
             p.let(f"held{c}", f"max(held{c}, delta(state{c}-3))", "it does what it did before")
         p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")
         self._note_impulses(p, h)
-        if self.lean:
+        if p.lean:
             p.let(f"renew{c}", f"max(step(iterations{c}-2.5), 1-behind)", "has it become slow?")
         if not self._single:
             self._gradients(p)
@@ -451,7 +455,7 @@ class CollectiveRows(Part):
             self._update(p, f"delta(state{c}-1)*step(1e10-residual{c})")
         p.let(f"iterations{c}", f"iterations{c}+delta(state{c}-1)", "count")
         again = "1"
-        if self.lean:
+        if p.lean:
             sure = f"between*step(tolerance{c}-{_LEFT!r}*residual{c})"
             again = f"select({sure}, 3, 1)"
         p.let(
@@ -489,7 +493,7 @@ class CollectiveRows(Part):
     def _note_impulses(self, p: Program, h: str) -> None:
         for k in self._driven_rows:
             push, impulse = self._of("push", k), self._of("impulse", k)
-            before = "0" if self.lean else f"select(delta(stage), 0, {impulse})"
+            before = "0" if p.lean else f"select(delta(stage), 0, {impulse})"
             p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
 
     # -- velocities -----------------------------------------------------------------------------

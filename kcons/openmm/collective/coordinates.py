@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -169,7 +169,8 @@ def _variables(force: openmm.CustomCVForce) -> list[openmm.Force]:
 def _atoms_of(force: openmm.Force) -> set[int] | None:
     """The particles a Force depends on; None where that cannot be told, or where it is all of them."""
     if isinstance(force, openmm.CustomCVForce):
-        return _united(map(_atoms_of, _variables(force)))
+        found = [_atoms_of(variable) for variable in _variables(force)]
+        return None if None in found else set().union(*found)  # type: ignore[arg-type]
     if isinstance(force, openmm.CustomCentroidBondForce):
         return {atom for groups, *_ in _terms(force) for g in groups for atom in force.getGroupParameters(g)[0]}
     if isinstance(force, openmm.CustomCompoundBondForce):
@@ -178,11 +179,6 @@ def _atoms_of(force: openmm.Force) -> set[int] | None:
         return set(force.getParticles()) or None
     kind = type(force).__name__
     return {int(a) for term in _terms(force) for a in term[: _TERMS[kind][1]]} if kind in _TERMS else None
-
-
-def _united(sets: Iterable[set[int] | None]) -> set[int] | None:
-    found = list(sets)
-    return None if None in found else set().union(*found)  # type: ignore[arg-type]
 
 
 def moved_atoms(system: openmm.System, force: openmm.Force) -> set[int]:

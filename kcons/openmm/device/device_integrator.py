@@ -168,7 +168,7 @@ class DeviceProgram(Program):
 
     def listing(self) -> str:
         """The variables, and what is done between two evaluations of forces."""
-        known = [f"  {name}: {self._words[name]}" for name in [*self.settings, *self.kept]]
+        known = [f"  {name}: {self.words[name]}" for name in [*self.settings, *self.kept]]
         return "\n".join(["on the device: one kernel between two evaluations of forces or sums", "variables", *known])
 
 

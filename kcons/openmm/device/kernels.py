@@ -292,7 +292,7 @@ def _once(code: str, *names: str) -> str:
     return f" if (LOCAL_ID == 0) {{\n{code}{stored}}}\n SYNC_THREADS;{read}\n SYNC_THREADS;\n"
 
 
-#: The closed form of `kcons.thermostats.isokinetic.kick`, everything divided by exp(z).
+#: The closed form of `kcons.thermostats.isokinetic`, everything divided by exp(z).
 _CLOSED_FORM = """ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(-z);
  mixed aim = sum0/sqrt(max((mixed) (sum2*sum1), TINY));
  aim = min(max(aim, (mixed) -1), (mixed) 1);
@@ -353,7 +353,7 @@ _RECORD = """ if (failure[0] != 0) return;
 """
 
 
-#: What happens on the spheres of a cluster, see `kcons.thermostats.multistep.sphere_kernels`: component c of an atom is
+#: What happens on the spheres of a cluster, see `kcons.thermostats.sphere_kernels`: component c of an atom is
 #: its part of the center of mass, which is on sphere OF[c], and the rest on OF[3]; -1 for none. KEEP and PUSH are what
 #: v and d are multiplied by, OWN what auxiliary variables are.
 _SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};

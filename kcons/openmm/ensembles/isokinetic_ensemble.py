@@ -31,7 +31,7 @@ class Isokinetic(CountsMomenta):
 
     Configurations are canonical at T for 2K = (g - 1) kT, g being the independent momenta: three for each particle
     with a mass, less the rank of all constraints, less three where total momentum is conserved. A kick at fixed
-    positions has the closed form of `kcons.thermostats.isokinetic.kick` with F = M_par^+ f.
+    positions has the closed form of `kcons.thermostats.isokinetic` with F = M_par^+ f.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Isokinetic(CountsMomenta):
         p.number("lost", "kicks that turned velocities round and lost digits")
 
     def kick(self, p: Program, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
-        """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
+        """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic`.
 
         F = M_par^+ f only enters as q = h F, which is of the size of velocities.
         """

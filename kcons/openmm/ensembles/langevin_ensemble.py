@@ -17,7 +17,7 @@ from kcons.openmm.integrator.program import BetweenHalves, Integrator, Program
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.multistep.respa import SlowKicks, levels_of, middle_of, nested
+from kcons.thermostats.force_groups import SlowKicks, levels_of, middle_of, nested
 
 #: Operations of an inner step: a kick, half a drift, the bath, half a drift, forces, a kick.
 _INNER = 6
@@ -176,7 +176,7 @@ class LangevinRespa(Langevin):
 
     @property
     def levels(self) -> tuple:  # type: ignore[type-arg]
-        """Groups from the slowest to the fastest, see `kcons.thermostats.multistep.respa`."""
+        """Groups from the slowest to the fastest, see `kcons.thermostats.force_groups`."""
         return levels_of({str(group): count for group, count in self.steps})
 
     def operations(self, scheme: Splitting) -> tuple[Operation, ...]:

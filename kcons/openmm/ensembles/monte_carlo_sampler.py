@@ -25,7 +25,6 @@ from kcons.openmm.quantities import GAS_CONSTANT, energy_of, kelvins, masses_of,
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats import Counts
-from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.monte_carlo import (
     ACCEPTED,
     CHANGE,
@@ -41,6 +40,7 @@ from kcons.thermostats.monte_carlo import (
     UNSOLVED,
     step_range,
 )
+from kcons.thermostats.noise import noise_generator
 
 #: What acts on a state between steps and knows no way back.
 OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")

@@ -133,11 +133,11 @@ class NoseHoover(CountsMomenta):
     def _remember(self, p: Program) -> None:
         if p.parts:
             for name in self._state():
-                p.let(_before(name), name, "to come back to")
+                p.let(f"{name}_last", name, "to come back to")
 
     def take_back(self, p: Program) -> None:
         for name in self._state():
-            p.let(name, _before(name), "the chain is back where the step began")
+            p.let(name, f"{name}_last", "the chain is back where the step began")
 
     def _advance(self, p: Program, halves: str) -> None:
         """Move the chain on for half a step, or two halves one after the other; see `kcons.thermostats.nose_hoover`."""
@@ -236,10 +236,6 @@ class NoseHooverMiddle(BetweenHalves, NoseHoover):
         p.each("v", u, "the constraint forces act on v as well")
         p.project()
         self._advance(p, "2")
-
-
-def _before(name: str) -> str:
-    return f"{name}_last"
 
 
 def _per_picosecond(frequency: unit.Quantity | float) -> float:

@@ -152,16 +152,7 @@ class Violation:
 
 
 class Solver(NamedTuple):
-    """The engine of kcons for the rows of a part.
-
-    Attributes
-    ----------
-    motion : Motion
-    atoms : ndarray of int or slice
-        The particles that it knows, in its order.
-    time : float
-        That of the targets now, ps.
-    """
+    """The engine of kcons for the rows of a part, the particles that it knows, and the time of targets now, ps."""
 
     motion: Motion
     atoms: IntArray | slice = slice(None)
@@ -178,7 +169,7 @@ class Part(ABC):
     error to raise.
 
     Steps after which the state is not read may end without `project` (see `kcons.openmm.integrator.program`): the next
-    drift absorbs what v has across the rows. `lean` is set to True before `declare` where a program has such steps.
+    drift absorbs what v has across the rows. A program with such steps is `lean`.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
     `kcons.openmm.integrator.guard.refuse_agents`.
@@ -194,12 +185,8 @@ class Part(ABC):
         Whether it adds to x of its own particles only, so that it comes after the constraints of the System.
     groups : frozenset of int
         Force groups that carry rows, not forces.
-    lean : bool
-        Set by the integrator.
-    exact : bool
-        Whether `land_alone` flies exactly; set by the integrator where `flies_exactly` and the scheme asks for it.
     flies_exactly : bool
-        Whether `land_alone` can do so.
+        Whether `land_alone` can fly exactly, as it does where the program is `exact`.
     alone : bool
         Whether it is known that the System has no constraints. Where there is no other part, `land_alone` is the
         whole drift then.
@@ -213,8 +200,6 @@ class Part(ABC):
     meets_system: bool = False
     lands_last: bool = False
     groups: frozenset[int] = frozenset()
-    lean: bool = False
-    exact: bool = False
     flies_exactly: bool = False
     alone: bool = False
     stays_finite: bool = False

@@ -29,7 +29,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.steppers.splitting import SCHEMES as STEPPERS
 from kcons.steppers.splitting import Rattle, Splitting
-from kcons.thermostats.isokinetic.isokinetic import SCHEMES as ISOKINETIC
+from kcons.thermostats.isokinetic import SCHEMES as ISOKINETIC
 
 #: A `ProjectedIntegrator` and a `Part`, whose modules import this one.
 Integrator = Any
@@ -311,6 +311,8 @@ class Program:
         Variables with a value for each degree of freedom.
     tables : dict
         Constants, written name(k) in expressions.
+    words : dict of str
+        What variables stand for that Python sets or reads, and tables; what lines compute for others has none.
     kinetic_energy : str
         Expression of the kinetic energy that a State tells.
     operations : tuple of Operation
@@ -325,6 +327,8 @@ class Program:
         Whether parts stand beside virtual sites.
     single : bool
         Whether there is one part, whose rows are all there is.
+    exact : bool
+        Whether the `land_alone` of that part flies exactly, as the scheme asks.
     lean : bool
         Whether velocity Verlet with parts leaves out what only a reader of velocities needs.
     joined : bool
@@ -352,17 +356,15 @@ class Program:
         self.vectors: list[str] = []
         self.tables: dict[str, tuple[float, ...]] = {}
         self.kinetic_energy, self.force = "m*v*v/2", "f"
-        self._words: dict[str, str] = {}
+        self.words: dict[str, str] = {}
         verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
         self.sited = any(part.sited for part in self.parts)
         self.single = len(self.parts) == 1 and self.parts[0].alone and not self.sited
-        exact = self.single and plain and scheme.exact_flight and self.parts[0].flies_exactly
-        for part in self.parts:
-            part.exact = exact
-        self.operations = ensemble.operations(Splitting(scheme.kicks, scheme.drifts) if exact else scheme)
+        self.exact = self.single and plain and scheme.exact_flight and self.parts[0].flies_exactly
+        self.operations = ensemble.operations(Splitting(scheme.kicks, scheme.drifts) if self.exact else scheme)
         self.drifts, self.kicks = stages_of(self.operations)
         self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
-        self.one_drift = (len(self.drifts) == 1 and not exact) or self.halves
+        self.one_drift = (len(self.drifts) == 1 and not self.exact) or self.halves
         self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
         self.lean = plain and bool(self.parts) and verlet and not self.sited
         self.joined = ensemble.adds_up and not self.parts and verlet
@@ -379,8 +381,8 @@ class Program:
 
     def number(self, name: str, words: str, value: float = 0.0) -> None:
         """Declare a global variable."""
-        if name not in self._words:
-            self._words[name] = words
+        if name not in self.words:
+            self.words[name] = words
             self.numbers[name] = float(value)
 
     def setting(self, name: str, words: str, value: float = 0.0) -> None:
@@ -400,13 +402,13 @@ class Program:
 
     def vector(self, name: str, words: str) -> None:
         """Declare a variable with a value for each degree of freedom."""
-        if name not in self._words:
-            self._words[name] = f"{words} (each degree of freedom)"
+        if name not in self.words:
+            self.words[name] = f"{words} (each degree of freedom)"
             self.vectors.append(name)
 
     def table(self, name: str, values: Sequence[float], words: str) -> None:
         """Declare a table of constants, written name(k) in expressions."""
-        self._words[f"{name}(k)"] = words
+        self.words[f"{name}(k)"] = words
         self.tables[name] = tuple(float(value) for value in values)
 
     def use(self, *names: str) -> None:
@@ -599,7 +601,7 @@ class Program:
             depth += line.kind in ("loop", "when")
         width = min(max((len(code) for code, _ in rows), default=0), 60)
         steps = [f"  {code:<{width}}  # {words}" for code, words in rows]
-        known = [f"{name}: {words}" for name, words in self._words.items()]
+        known = [f"{name}: {words}" for name, words in self.words.items()]
         return "\n".join(["variables", *(f"  {line}" for line in (_GIVEN, *known)), "each step", *steps])
 
 
@@ -742,10 +744,10 @@ def _of_dt(share: float) -> str:
 def _declare_guards(p: Program) -> None:
     """Variables of steps with parts, their stages, and what parts need."""
     p.use("failed", "stale", "call")
+    p.number("good_steps", "steps done since the integrator was made")
     _declare_stages(p)
     p.force = "force"  # parts evaluate row groups, and OpenMM remembers the forces of the last groups only
     for part in p.parts:
-        part.lean = p.lean
         part.declare(p)
 
 

@@ -17,7 +17,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
 from kcons.openmm.integrator.guard import Guard, check_finite, find_context, require_context, warn_of_barostat
 from kcons.openmm.integrator.part import TOLERANCES, Part, Precision
-from kcons.openmm.integrator.program import VARIABLES, ConstantEnergy, Ensemble, Program, to_scheme, write_step
+from kcons.openmm.integrator.program import ConstantEnergy, Ensemble, Program, to_scheme, write_step
 from kcons.openmm.quantities import (
     forces_at,
     kelvins,
@@ -144,9 +144,6 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             )
         self._ensemble.check(self.scheme)
         self.parts = self._held(parts)
-        if sum(part.meets_system for part in self.parts) > 1:
-            raise UnsupportedError("only one part may share atoms with the constraints of the System")
-        _refuse_shared(self.parts)
         self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
         if self.row_groups:
             openmm.Integrator.setIntegrationForceGroups(self, set(range(32)) - self.row_groups)
@@ -156,8 +153,26 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             part.program = self.program
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
-        """The parts, of what was given."""
-        return _listed(parts)
+        """Parts, or a single one, as a tuple; refused are others, and parts each of which would undo what others do."""
+        given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
+        known: set[int] = set()
+        for part in given:
+            if not isinstance(part, Part):
+                raise InputError(
+                    f"parts has {part!r:.80}, which is no part of an integrator; kcons.openmm.hold(system, "
+                    "constraints, positions) makes one of constraints, CollectiveRows of Forces",
+                    item="parts",
+                )
+            atoms = {int(a) for held in getattr(part, "atoms", ()) for a in np.ravel(held)}
+            if known & atoms:
+                raise UnsupportedError(
+                    f"two parts hold particle {min(known & atoms)}; give all rows that share particles to one call of "
+                    "kcons.openmm.hold"
+                )
+            known |= atoms
+        if sum(part.meets_system for part in given) > 1:
+            raise UnsupportedError("only one part may share atoms with the constraints of the System")
+        return given
 
     def _make(self, dt: float) -> None:
         """Make the integrator of OpenMM."""
@@ -697,9 +712,10 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         every = None if self.spare else self.check_every
         made_with = (self.getStepSize(), self.scheme, self.parts, self.asked_tolerance, every, self.ensemble)
         program = self.program
-        # What belongs to a state or a step a copy starts without; clocks of targets that move go by the good steps.
-        left = {*program.settings, *program.idle, *program.memory, *VARIABLES} - {"good_steps"}
-        run = {name: self.getGlobalVariableByName(name) for name in program.numbers if name not in left}
+        # What belongs to a state a copy starts without; clocks of targets that move go by the good steps.
+        left = {*program.settings, *program.idle, *program.memory, "stale"}
+        kept = [name for name in program.words if name in program.numbers and name not in left]
+        run = {name: self.getGlobalVariableByName(name) for name in kept}
         return made_with, program.settings, run, self.getIntegrationForceGroups(), self.getRandomNumberSeed()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -747,32 +763,6 @@ def picoseconds(timestep: Any) -> float:
             stacklevel=3,
         )
     return dt
-
-
-def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
-    """Parts, or a single one, as a tuple; `InputError` for what is none."""
-    given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
-    for part in given:
-        if not isinstance(part, Part):
-            raise InputError(
-                f"parts has {part!r:.80}, which is no part of an integrator; kcons.openmm.hold(system, constraints, "
-                "positions) makes one of constraints, CollectiveRows of Forces",
-                item="parts",
-            )
-    return given
-
-
-def _refuse_shared(parts: Sequence[Part]) -> None:
-    """Refuse particles that two parts hold: each would undo what the other does."""
-    known: set[int] = set()
-    for part in parts:
-        atoms = {int(a) for held in getattr(part, "atoms", ()) for a in np.ravel(held)}
-        if known & atoms:
-            raise UnsupportedError(
-                f"two parts hold particle {min(known & atoms)}; give all rows that share particles to one call of "
-                "kcons.openmm.hold"
-            )
-        known |= atoms
 
 
 # -- minima on the constraints --------------------------------------------------------------------

@@ -62,7 +62,7 @@ MUTANTS = {
     "ase/logger.py": [
         ("row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)", "logger::multipliers_by_name"),
     ],
-    "thermostats/pressure/measured.py": [
+    "thermostats/cells.py": [
         ("motion.multipliers(x, v, f«, time→»)", "measured::a_rod_that_is_made_longer"),
     ],
     "thermostats/freedom.py": [
@@ -79,6 +79,9 @@ MUTANTS = {
         ),
     ],
     "steppers/stepper.py": [
-        ("{name: «None if name in found else →»value", "stepper::copies_leave_behind_what_was_found_for_a_system"),
+        (
+            '{name: «None if name in ("_known", "_left") else →»value',
+            "stepper::copies_leave_behind_what_was_found_for_a_system",
+        ),
     ],
 }

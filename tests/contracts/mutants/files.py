@@ -24,7 +24,7 @@ MUTANTS = {
     ],
     "mdanalysis/check/constraint_check.py": [
         (
-            "precision.half_step(universe.atoms.positions)«→.max()»",
+            ".half_step(universe.atoms.positions)«→.max()»",
             "mdanalysis/check/precision::a_wild_molecule_of_the_topology_excuses_no_other",
         ),
     ],
@@ -78,13 +78,11 @@ MUTANTS = {
             "moved_groups::bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored",
         ),
     ],
-    "motion/failures.py": [
-        ("_beside(then[first], then[first + 1]) <= «0→-1».0", "failures::a_dihedral_that_becomes_straight_is_named"),
-    ],
     "plan/clusters.py": [
         ("single &= «~anchored→anchored >= 0»", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
     ],
     "motion/solver_sequence.py": [
+        ("_beside(then[first], then[first + 1]) <= «0→-1».0", "failures::a_dihedral_that_becomes_straight_is_named"),
         (
             "                moved = None« if places is None else rows.moved_places(places, x)→»",
             "places::a_molecule_is_the_same_in_the_cell_as_in_open_space",

@@ -4,21 +4,19 @@ MUTANTS = {
     "free_energy/scans/relaxed_scan.py": [
         ("attempt.energy «<→>» best[point].energy:", "relaxed_scan::both_ways_find_the_lower_of_two_minima"),
         ("if «with_it.rank != rank + n + 1→False»:", "free_energy/refusals::refusals"),
+        (
+            "if attempt is «not None and (attempt.point, attempt.source) != (point, source)→None and source == point»:",
+            "relaxed_scan::relaxations_in_files_are_whole_and_of_this_scan",
+        ),
     ],
     "free_energy/scans/relaxation.py": [
         ("missing = change - size «-→+» self._learned(move)", "relaxation::what_was_learned_goes_along"),
-        ("[«x[atoms] +→lined_up(x[atoms], self.lattice) + 0 *» images for", "model_hessian::terms_keep_their_images"),
-    ],
-    "free_energy/scans/scan_result.py": [
-        (
-            "if found is «not None and (found.point, found.source) != (point, source)→None and source == point»:",
-            "scan_result::an_attempt_of_another_scan_is_refused",
-        ),
+        ("[«x[atoms] +→lined_up(x[atoms], self.lattice) + 0 *» images for", "relaxation::terms_keep_their_images"),
     ],
     "free_energy/windows/input_file.py": [
         ("np.where([item.held «is ANGLE→is not None» for", "free_energy/windows/input_file::a_difference_of_distances"),
         (
-            'return np.radians(places) if «family in ("angle", "dihedral")→family != "distance"» else places',
+            'return np.radians(places) if «self.family in ("angle", "dihedral")→self.family != "distance"» else places',
             "free_energy/windows/input_file::a_difference_of_distances",
         ),
     ],
@@ -70,7 +68,7 @@ MUTANTS = {
         ("process = process«.closed()→»", "profile::a_period_closes"),
     ],
     "free_energy/profiles/mean_force_surface.py": [
-        ("consistency.p_value < «_CHANCE→0.0»", "mean_force_surface::vectors_that_are_no_gradient_are_warned_of"),
+        ("if chance < «_CHANCE→0.0»:", "mean_force_surface::vectors_that_are_no_gradient_are_warned_of"),
     ],
     "free_energy/profiles/pulls.py": [
         ("np.asarray(«math.log(works.shape[-1]) →»- logsumexp(-works", "pulls::a_spring_that_is_dragged"),

@@ -8,7 +8,7 @@ MUTANTS = {
         ("= 1e-«9→8»", "constrained::dependent_rows_may_disagree_by_a_part_in_a_thousand_million"),
         ("= 1e-«9→10»", "constrained::dependent_rows_may_disagree_by_a_part_in_a_thousand_million"),
     ],
-    "steppers/stages/compiled_operations.py": [
+    "steppers/compiled_operations.py": [
         ("(«(r * n - d) + →»r", "flights::great_circles_end_on_the_sphere_wherever_they_start"),
     ],
     "models/growth/model.py": [

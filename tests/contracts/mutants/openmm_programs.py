@@ -82,9 +82,6 @@ MUTANTS = {
     "constraints/target.py": [
         (".abs(fine - given) > «WRONG→100» * size)", "target::derivatives_that_contradict_a_moving_target_are_refused"),
     ],
-    "ase/topology.py": [
-        ("«→not »guessed and said != stamp:", "ase/topology::guessed_bonds_are_guessed_anew_for_sorted_and_cut_atoms"),
-    ],
     "topology/rows_by_name.py": [
         ("long > «np.minimum(TORN, FAR * radii)→TORN»", "ase/topology::bonds_that_are_far_too_long_are_not_held"),
     ],
@@ -109,7 +106,10 @@ MUTANTS = {
         ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
-        (', «_before(name)→name», "the chain', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),
+        (
+            'p.let(name, «f"{name}_last"→name», "the chain',
+            "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was",
+        ),
     ],
     "openmm/integrator/projected.py": [
         ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),

@@ -41,7 +41,7 @@ MUTANTS = {
         ("c10, c11, c12 = -(a12 * a20 «+→-» a10 * a22)", "distance_solvers::newton_and_a_chord_step_gain_together"),
         ("3, kept_points, «3→0»)", "distance_solvers::failure_changes_nothing_and_names_the_cluster[far-triangles-29]"),
     ],
-    "solvers/chains/sweeps.py": [
+    "solvers/chains.py": [
         ("vy - dy * inverse_dt, vz - dz« * inverse_dt→»", "distance_solvers::matches_dense_newton[chains-short-free]"),
         ("dx = dx - w * (sx * later« - px * later_p→»)", "distance_solvers::ten_thousand_bonds[straight]"),
         ("rx + real * (gx «-→+» fx)", "distance_solvers::ten_thousand_bonds[free]"),
@@ -49,18 +49,18 @@ MUTANTS = {
     "solvers/sparse/mixed_rows.py": [
         ("if abs(d) > «PIVOT_TOLERANCE * abs(whole)→0.0» else 0.0", "mixed_rows::dependent_rows_are_dropped"),
         ("(along > «0.→-1e30»0)", "mixed_rows::a_molecule_turned_through_a_point_is_no_solution_though_its_rows_hold"),
-    ],
-    "solvers/sparse/row_values.py": [
         (
             "r = «(here - load_quad(moved, 4 * p))→here» + change",
-            "row_values::rows_with_a_place_take_off_what_positions_were_moved_by",
+            "places::a_molecule_is_the_same_in_the_cell_as_in_open_space",
         ),
-        ("= «period * np.rint(→0.5 * period * np.rint(2 * »", "row_values::rows_with_a_period_miss_by_the_shorter_way"),
-        ("y -= a * cell[0][1] + b * cell[1][1]« + c * cell[2][1]→»", "row_values::rows_equal_their_constraints"),
+        ("= «period * np.rint(→0.5 * period * np.rint(2 * »", "mixed_rows::rows_with_a_period_miss_by_the_shorter_way"),
+    ],
+    "solvers/kernels/lattices.py": [
+        ("y = y - (i * a[1] + j * b[1]« + k * c[1]→»)", "distance_solvers::periodic_equals_unwrapped"),
     ],
     "motion/restoring/nearest_point.py": [
         (
-            "            «self._descend(start, here)→pass»\n",
+            "        «self._descend(start, here)→pass»\n",
             "nearest_point::the_nearest_point_is_found_where_the_surface_is_much_bent",
         ),
     ],

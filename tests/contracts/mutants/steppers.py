@@ -33,7 +33,7 @@ MUTANTS = {
             "friction::a_body_sinks_as_fast_as_it_should_however_strong_the_friction",
         ),
     ],
-    "solvers/sparse/row_values.py": [
+    "solvers/sparse/mixed_rows.py": [
         (
             "time = «0.5 * (time + load_double(parameters, 1)→load_double(parameters, 0»)",
             "flights::driven_velocities_hold_at_the_middle_of_the_time",
@@ -41,26 +41,29 @@ MUTANTS = {
     ],
     "solvers/general_clusters.py": [
         (
-            "self.subset.jacobian(«0.5 * (self.start + end)→end», self.time)",
+            "subset.jacobian(«0.5 * (start + state)→state», middle)",
             "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
         ),
     ],
     "constraints/velocity.py": [
-        ("half = «→-»0.5 * (bx * gx", "row_functions::gradients_of_rows_of_velocities[KnifeEdge]"),
+        (
+            "half = «→-»0.5 * (bx * gx",
+            "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
+        ),
     ],
     "steppers/program.py": [
         ("kick.fraction, group, time, «end→1.0»", "langevin::each_substep_meets_targets_at_its_own_time"),
         ('row.name == "evaluate"« and row.here == 1→»', "interpreter::kicks_in_succession_and_before_other_operations"),
-        ("«met[verb] += 1→pass»", "thermostats/multistep/spheres::noise_is_a_function_of_seed_step_and_part"),
+        ("«met[verb] += 1→pass»", "isokinetic_spheres::noise_is_a_function_of_seed_step_and_part"),
     ],
     "thermostats/monte_carlo.py": [
-        ("velocities=«-→»begin.velocities)", "hamiltonian_monte_carlo::every_decision_follows_from_the_energies[0.7]"),
-        ("ACCEPTED if threshold < «-→»", "hamiltonian_monte_carlo::every_decision_follows_from_the_energies[0.0]"),
-        ("np.sqrt((1 - self.keep«**2→»)", "hamiltonian_monte_carlo::velocities_are_those_of_the_temperature"),
-        ("(1 / kt[k«] - 1 / kt[k + 1→ + 1] - 1 / kt[k»])", "replica_exchange::the_rule_and_what_changes_places"),
+        ("velocities=«-→»begin.velocities)", "monte_carlo::every_decision_follows_from_the_energies[0.7]"),
+        ("ACCEPTED if threshold < «-→»", "monte_carlo::every_decision_follows_from_the_energies[0.0]"),
+        ("np.sqrt((1 - self.keep«**2→»)", "monte_carlo::velocities_are_those_of_the_temperature"),
+        ("(1 / kt[k«] - 1 / kt[k + 1→ + 1] - 1 / kt[k»])", "monte_carlo::the_rule_and_what_changes_places"),
     ],
     "steppers/reversibility_check.py": [
-        ("if not residual <«= self.tolerance→ 1e300»:", "hamiltonian_monte_carlo::what_cannot_be_taken_back_is_seen"),
+        ("if not residual <«= self.tolerance→ 1e300»:", "stepper::check_finds_a_stepper_that_is_not_reversible"),
     ],
     "thermostats/nose_hoover.py": [
         ("q[0] *= «count→1.0»", "nose_hoover::temperature_oscillates_with_the_period_asked_for"),
@@ -74,10 +77,10 @@ MUTANTS = {
         ),
     ],
     "thermostats/noise.py": [
-        ("«stream[3] += 1.0→pass»", "spheres::noise_is_a_function_of_seed_step_and_part"),
-        ("«stream[3] = 0.0→pass»", "respa::each_exchange_of_a_step_has_noise_of_its_own"),
+        ("«stream[3] += 1.0→pass»", "isokinetic_spheres::noise_is_a_function_of_seed_step_and_part"),
+        ("«stream[3] = 0.0→pass»", "several_time_steps::each_exchange_of_a_step_has_noise_of_its_own"),
     ],
-    "steppers/stages/compiled_operations.py": [
+    "steppers/compiled_operations.py": [
         ("room[FAR] = «1.0 if far else →»0.0", "interpreter::a_march_ends_where_remainders_begin"),
         ("            if «pairs→False»:", "interpreter::steps_in_kernels_are_those_of_the_engine"),
     ],
@@ -96,7 +99,7 @@ MUTANTS = {
         ("if steps and holds and «state is not system.last→False»:", "state::start_off_the_constraints"),
         (
             "    «refuse_clock(state.time, state.step, state.time_remainder)\n    →»if stepper",
-            "running::states_made_by_hand_with_impossible_numbers",
+            "stepper::states_made_by_hand_with_impossible_numbers",
         ),
     ],
     "steppers/state.py": [
@@ -114,21 +117,19 @@ MUTANTS = {
     "thermostats/freedom.py": [
         ("for k in range(1, «NEARER + 1→2»)", "freedom::bodies_that_feel_another_are_not[gas]"),
     ],
-    "thermostats/pressure/barostat.py": [
+    "thermostats/barostats.py": [
         (
             "«spread = np.minimum(spread, 0.5 * (strains.most / _WITHIN) ** 2)→pass»",
-            "cell_rescaling::noise_of_few_pieces_stays_within_what_a_trial_may_change[anisotropic]",
+            "barostat::noise_of_few_pieces_stays_within_what_a_trial_may_change[anisotropic]",
         ),
     ],
     "thermostats/configurational_temperature.py": [
         ("if «not np.all(miss <= OFF)→False»:", "configurational_temperature::frames_off_the_constraints"),
-    ],
-    "thermostats/slow_share.py": [
         (
             "«constrained_acceleration(system, there, f, 0.0)→f * system.weights»",
-            "slow_share::a_rigid_pair_turns_freely_in_a_trap",
+            "configurational_temperature::a_rigid_pair_turns_freely_in_a_trap",
         ),
-        ("np.array([name == group, «True→name != group»])", "slow_share::springs_of_free_atoms"),
+        ("np.array([name == group, «True→name != group»])", "configurational_temperature::springs_of_free_atoms"),
     ],
     "constraints/arguments.py": [
         ('if «array.dtype.kind == "c"→False»:', "arguments::every_way_in_refuses_them"),

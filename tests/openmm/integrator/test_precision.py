@@ -33,7 +33,6 @@ from kcons.openmm import (
 from kcons.openmm.integrator.guard import SystemRows
 from kcons.openmm.integrator.part import Precision
 
-less_than_double = pytest.mark.parametrize("platform", [p for p in on_gpus("single") if "double" not in str(p.id)])
 mixed = pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
 #: Half a femtosecond, so that what is seen is rounding.
 STEP = 5e-4
@@ -222,21 +221,6 @@ def test_parts_run_in_any_precision(scheme, platform):
 
 
 # -- rows of constraint objects ---------------------------------------------------------------------
-
-
-@less_than_double
-def test_rows_of_constraint_objects_need_more_than_single_numbers(platform):
-    precision = Precision(*platform.split())
-    system, x, v = free_alanine()
-    integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
-    context = started(system, integrator, x, v, platform)
-    if precision.name != "single":
-        integrator.step(5)
-        integrator.check()
-    else:
-        with pytest.raises(UnsupportedError, match="'Precision': 'mixed'"):
-            integrator.step(1)
-        np.testing.assert_allclose(state_of(context)[0], x, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ with its solver, behind one array of numbers.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,12 +17,12 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import Motion
-from kcons.solvers.addressable_solvers import Addressable, AddressableSolver, pack_solver_tables, set_lattice
-from kcons.solvers.chains.open_chains import Chains
+from kcons.solvers.addressable_solvers import AddressableSolver, pack_solver_tables, set_lattice
+from kcons.solvers.chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver
-from kcons.solvers.distance_clusters import SimdClusterSolver
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
+from kcons.solvers.small_clusters import SmallClusters
 from kcons.solvers.sparse.distances import SparseDistances
 from kcons.solvers.sparse.mixed_rows import SparseRows
 from kcons.solvers.sparse.row_functions import COUNT
@@ -31,6 +32,10 @@ MOST_ROWS = 96
 #: Chains have a kernel of their own, which costs as much as that for all shapes on so many rows, and so many more a
 #: slot of eight lanes; where others are held so that both are called, on more.
 CHAIN_ROWS, CHAIN_ROWS_BESIDES, ROWS_A_SLOT = 20, 40, 2
+
+
+#: Solvers of held distances.
+OF_DISTANCES = RigidTriangles, SmallClusters, Chains, SparseDistances
 
 
 class PackedSystem:
@@ -117,7 +122,7 @@ class PackedRows(NamedTuple):
     """The tables of all rows, and whom the kernels call by what stands there: to be kept as long as these."""
 
     tables: FloatArray
-    called: list[Addressable]
+    called: list[AddressableSolver]
 
 
 def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
@@ -137,9 +142,9 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     triangles: RigidTriangles | None = None
     chains: Chains | None = None
     rows: list[IntArray] = [np.zeros(0, dtype=np.int64)]
-    mixed = [solver for solver in plan.solvers if not isinstance(solver, SimdClusterSolver | SparseDistances)]
+    mixed = [solver for solver in plan.solvers if not isinstance(solver, OF_DISTANCES)]
     for solver in plan.solvers:
-        if isinstance(solver, SimdClusterSolver | SparseDistances):
+        if isinstance(solver, OF_DISTANCES):
             if triangles is None and not compact and not mixed and isinstance(solver, RigidTriangles):
                 triangles = solver
             elif chains is None and not mixed and isinstance(solver, Chains):
@@ -155,15 +160,15 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     if mixed and (held.images is not None or sum(len(each.rows) for each in mixed) > MOST_ROWS):
         return None
     # Solvers of their own, for the atoms of the whole system: those of the plan may be at work for another one.
-    called: list[Addressable] = [_solver_like(each, held, inverse_masses, plan.eliminate_last) for each in mixed]
+    called: list[AddressableSolver] = [_solver_like(each, held, inverse_masses, plan.eliminate_last) for each in mixed]
     if len(others):
         pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64)
         numbers, lengths = np.arange(len(others)), held.target(0.0)[others]
         called.append(SparseDistances(numbers, pairs, lengths, inverse_masses, plan.eliminate_last[others]))
     if triangles is not None:
-        called.append(triangles.packed())
+        called.append(copy(triangles))
     if chains is not None:
-        called.append(chains.packed(held.touched if compact else None))
+        called.append(chains.renumbered(held.touched) if compact else copy(chains))
     return PackedRows(pack_solver_tables(called, pinned, plan.pinned_targets(None), *more), called)
 
 

@@ -1,4 +1,4 @@
-"""Barostats: the ways in which a cell may change, trial cells, and the rule by which they are accepted.
+"""Barostats: the ways in which a cell may change, trial cells, the rule by which they are accepted, and a stepper.
 
 A cell h (vectors as rows) becomes h S, S = exp(sum of e_k E_k), with generators E_k of unit trace where the volume
 changes: e_k is then the change of ln V. In orthogonal kinds S is diagonal. 'flexible' keeps a lower triangular cell
@@ -35,19 +35,15 @@ from kcons.constraints.arguments import (
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.steppers import State
+from kcons.steppers import State, Stepper, System
+from kcons.steppers.compiled_operations import check_finite
 from kcons.steppers.operations import Operation
-from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.steppers.stepper import DropsSystemCaches
-from kcons.thermostats.langevin import noise_generator
-from kcons.thermostats.pressure.cell_system import CellSystem
-from kcons.thermostats.pressure.pieces import (
-    BarostatBodies,
-    Held,
-    find_pieces,
-    lattice_of,
-    require_periodic,
-)
+from kcons.steppers.stepper import DropsSystemCaches, Listed, require_stepper
+from kcons.thermostats.cells import BarostatBodies, CellSystem, Held, energy_by_strain, find_pieces, require_periodic
+from kcons.thermostats.isokinetic import Isokinetic
+from kcons.thermostats.langevin import Langevin
+from kcons.thermostats.noise import noise_generator
+from kcons.thermostats.nose_hoover import NoseHooverChain
 
 Kind = Literal["isotropic", "semi-isotropic", "anisotropic", "flexible", "lateral", "normal"]
 
@@ -73,24 +69,14 @@ MODES = 11
 
 
 class Strains:
-    """One of the kinds in which a cell changes, by k generators.
-
-    Attributes
-    ----------
-    generators, diagonals : ndarray, shape (k, 3, 3) and (k, 3)
-    traces, sizes : ndarray, shape (k,)
-        Of the generators, and sums of squares of their entries.
-    axes : ndarray of bool, shape (3,)
-        Those along which lengths change.
-    most : ndarray, shape (k,)
-        Largest |e_k| of a trial.
-    """
+    """One of the kinds in which a cell changes, by k generators, shape (k, 3, 3)."""
 
     @checked
     def __init__(self, kind: Kind) -> None:
         self.kind, self.generators, self.flexible = kind, GENERATORS[kind], kind == "flexible"
         self.diagonals: FloatArray = np.ascontiguousarray(np.diagonal(self.generators, axis1=1, axis2=2))
         self.traces: FloatArray = self.diagonals.sum(axis=1)
+        #: Sums of squares of their entries; axes along which lengths change; the largest |e_k| of a trial.
         self.sizes: FloatArray = (self.generators**2).sum(axis=(1, 2))
         self.axes: NDArray[np.bool_] = np.asarray(self.diagonals.sum(axis=0) > 0)
         self.most: FloatArray = MOST / np.abs(self.generators).max(axis=(1, 2))
@@ -147,33 +133,19 @@ class Press(Operation):
 
 
 class Place:
-    """Where a system is before or after a trial.
-
-    Attributes
-    ----------
-    pieces : BarostatBodies
-    cell : ndarray, shape (3, 3)
-    energy, volume, area : float
-        Area of the face spanned by the first two vectors.
-    rise : ndarray, shape (3, 3), or None
-        dU/d strain, see `energy_by_strain`, where the barostat asks for it.
-    forces : ndarray or None
-        Where they are known by then.
-    thermal_energy, dt : float
-    """
+    """Where a system is before or after a trial."""
 
     def __init__(
         self, system: CellSystem, pieces: BarostatBodies, state: State, thermal_energy: float, dt: float, rises: bool
     ) -> None:
-        x, self.rise, self.forces = state.positions, None, None
+        #: dU/d strain, see `energy_by_strain`, where the barostat asks for it, and the forces that are known by then.
+        self.rise: FloatArray | None = None
+        self.forces: FloatArray | None = None
         if rises:
-            stress = system.stress(x, state.time)  # first: most calculators find all else on the way
-            self.forces = system.with_forces(state).forces
-            assert self.forces is not None
-            self.rise = energy_by_strain(system, pieces, x, self.forces, stress)
+            self.rise, self.forces = energy_by_strain(system, pieces, state)
         self.pieces, self.cell, self.thermal_energy, self.dt = pieces, system.cell, thermal_energy, dt
-        self.energy = system.energy(x, state.time, state.step)
-        self.volume = float(abs(np.linalg.det(self.cell)))
+        self.energy = system.energy(state.positions, state.time, state.step)
+        self.volume = system.volume
         self.area = float(np.linalg.norm(np.cross(self.cell[0], self.cell[1])))
 
 
@@ -246,10 +218,6 @@ class Barostat(DropsSystemCaches):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.pressure!r}, every={self.every}, kind={self.strains.kind!r})"
-
-    @property
-    def operation(self) -> Press:
-        return Press(f"{self.what} ({self.strains.kind}), every {self.every} steps")
 
     def pieces(self, system: CellSystem, positions: FloatArray, time: float = 0.0) -> BarostatBodies:
         """What moves as one; errors as of `find_pieces`."""
@@ -324,7 +292,7 @@ class Barostat(DropsSystemCaches):
         matrix = self.strains.matrix(e, self.strains.frame(before.cell))
         chance, positions, remainder, after = 0.0, state.positions, state.remainder, before
         if kept.all():
-            d = pieces.moved(state.positions, matrix - np.eye(3), lattice_of(system))
+            d = pieces.moved(state.positions, matrix - np.eye(3), system.lattice)
             positions, remainder = _added(state.positions, d, state.remainder)
             check_finite(positions, "position", state.step)
             try:
@@ -507,17 +475,6 @@ class CellRescaling(Barostat):
         return np.full(len(self.strains), super().acceptance(state)[0])
 
 
-def energy_by_strain(
-    system: CellSystem, pieces: BarostatBodies, x: FloatArray, forces: FloatArray, stress: FloatArray
-) -> FloatArray:
-    """dU/d strain, shape (3, 3), where the cell is strained and pieces move by their centers.
-
-    The stress is that of all atoms moving along; what they would move relative to the center of their piece does work
-    against the forces, and is taken out again.
-    """
-    return system.volume * stress + pieces.work_of_shapes(x, forces, lattice_of(system))
-
-
 def _log_normal(e: FloatArray, mean: FloatArray, wide: FloatArray) -> float:
     return float(-0.5 * (((e - mean) / wide) ** 2).sum() - np.log(wide).sum())
 
@@ -525,3 +482,147 @@ def _log_normal(e: FloatArray, mean: FloatArray, wide: FloatArray) -> float:
 def require_barostat(given: object) -> None:
     """Raise `InputError` for what is no barostat."""
     refuse_other(given, Barostat, "barostat", "MonteCarloBarostat(pressure) or CellRescaling(...)")
+
+
+class ConstantPressure(Listed):
+    """Steps of a thermostat, and a trial of the barostat after every so many.
+
+    Parameters
+    ----------
+    stepper : Langevin, NoseHooverChain or Isokinetic
+        Others keep no temperature, or remember energies and forces of the cell that was.
+    barostat : Barostat
+
+    Raises
+    ------
+    InputError
+        What is given is no barostat.
+
+    Notes
+    -----
+    `State.barostat` holds the cell (`State.cell`), the energy that trials have brought, and what the barostat has
+    learned. Trials are a function of the seed and of the number of the step: a run that is continued from a saved state
+    is the same to the last bit. The cell of the `System` follows the state that a step begins with.
+    """
+
+    reversible = False
+    symplectic = False
+
+    def __init__(self, stepper: Stepper, barostat: Barostat) -> None:
+        require_stepper(stepper)
+        require_barostat(barostat)
+        self.stepper, self.barostat = stepper, barostat
+
+    def __repr__(self) -> str:
+        return f"ConstantPressure({self.stepper!r}, {self.barostat!r})"
+
+    @property
+    def order(self) -> int:
+        return self.stepper.order
+
+    @property
+    def force_evaluations(self) -> int:
+        """Of the stepper; a trial takes one more, and two energies."""
+        return self.stepper.force_evaluations
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        inner = self.stepper.operations(system) if isinstance(self.stepper, Listed) else ()
+        return *inner, self._press
+
+    def parts(self, system: System | None = None) -> tuple[Operation, ...]:
+        inner = self.stepper.parts(system) if isinstance(self.stepper, Listed) else ()
+        return *inner, self._press
+
+    @property
+    def _press(self) -> Press:
+        barostat = self.barostat
+        return Press(f"{barostat.what} ({barostat.strains.kind}), every {barostat.every} steps")
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` without a thermostat, and where the stepper may not be used."""
+        if not isinstance(system, CellSystem):
+            raise UnsupportedError("a barostat needs a system whose cell can change: make a CellSystem")
+        # Not what derives from them, with several time steps, which remembers forces.
+        if type(self.stepper) not in (Langevin, NoseHooverChain, Isokinetic):
+            raise UnsupportedError(
+                f"{self.stepper!r} keeps no temperature, by which a barostat judges its trials, or does not know that "
+                "the cell has changed; use Langevin, NoseHooverChain or Isokinetic"
+            )
+        self.stepper.check(system)
+
+    def start(self, system: System, state: State) -> State:
+        """The state in its cell, with variables of the barostat."""
+        self.check(system)
+        assert isinstance(system, CellSystem)
+        known = self.barostat.variables_of(state)
+        system.enter(state)
+        if known is None:
+            self.barostat.pieces(system, state.positions, state.time)
+            state = replace(state, barostat=self.barostat.begin(system))
+            if self.barostat.needs_stress:
+                system.stress(state.positions, state.time)
+        return state
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`.
+
+        Raises
+        ------
+        KconsError
+            As the stepper and the barostat; the state is as it was, also the cell of the system.
+        """
+        return self.march(system, state, dt, 1)
+
+    def march(self, system: System, state: State, dt: float, steps: int) -> State:
+        """The state after so many steps, the same to the last bit as by `step`."""
+        while steps > 0:
+            n = min(steps, self.barostat.every - state.step % self.barostat.every)
+            state = self._advanced(system, state, dt, n)
+            steps -= n
+        return state
+
+    def _advanced(self, system: System, state: State, dt: float, steps: int) -> State:
+        if dt < 0:
+            raise InputError(
+                f"the time step is {system.shown_time(dt)}; trials of a barostat cannot be taken back", item="dt"
+            )
+        state = self.start(system, state)
+        assert isinstance(system, CellSystem)
+        after = self.stepper.march(system, state, dt, steps)  # type: ignore[attr-defined]  # see `check`
+        if dt and after.step % self.barostat.every == 0:
+            after = self._pressed(system, after, dt)
+        return after
+
+    def _pressed(self, system: CellSystem, state: State, dt: float) -> State:
+        try:
+            after = self.barostat.move(system, state, self.thermal_energy(state), dt)
+        except Exception as error:
+            if getattr(error, "step", None) is None:
+                error.step = state.step  # type: ignore[attr-defined]
+            raise
+        if isinstance(self.stepper, Isokinetic) and after.positions is not state.positions:
+            # Its variables know of the forces: it finds both anew.
+            return replace(after, forces=None)
+        return after
+
+    def thermal_energy(self, state: State) -> float:
+        """kT of the configurations that the stepper samples."""
+        if isinstance(self.stepper, Isokinetic):
+            assert state.thermostat is not None
+            return float(state.thermostat[0] / (state.thermostat[3] - 1))
+        return float(self.stepper.thermal_energy)  # type: ignore[attr-defined]  # see `check`
+
+    def conserved_energy(self, system: System, state: State) -> float:
+        """What the thermostat conserves, less the energy that trials have brought."""
+        state = self.start(system, state)
+        assert state.barostat is not None
+        return float(self.stepper.conserved_energy(system, state)) - float(state.barostat[WORK])  # type: ignore[attr-defined]
+
+
+def in_cell(variables: FloatArray | None, cell: FloatArray) -> FloatArray | None:
+    """Variables of a barostat that goes on in a cell that somebody else has changed."""
+    if variables is None:
+        return None
+    own = variables.copy()
+    own[:WORK] = cell.ravel()
+    return own

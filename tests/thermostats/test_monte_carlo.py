@@ -1,4 +1,4 @@
-"""Hamiltonian Monte Carlo: an involution, its energies, its flips, averages, restarts, bad input."""
+"""Hamiltonian Monte Carlo: an involution, its energies, averages, restarts; tuned steps; exchange of temperatures."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from monte_carlo_systems import no_energy, no_force, trimer
+from monte_carlo_systems import KT, no_energy, no_force, trap, trap_potential, trimer
 from scipy.stats import kstest
 from thermostat_systems import dumbbells, system, waves, waves_potential
 
 from kcons.constraints import Distance, Formula, MovingTarget
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, ReversibilityError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6,
@@ -25,9 +25,9 @@ from kcons.steppers import (
     System,
     run,
 )
-from kcons.thermostats import Counts, HamiltonianMonteCarlo, thermal_velocities
-from kcons.thermostats.langevin import noise_generator
-from kcons.thermostats.monte_carlo import CHANGE, POTENTIAL, PROPOSAL, ReversedSteps
+from kcons.thermostats import Counts, HamiltonianMonteCarlo, exchange, thermal_velocities, tune
+from kcons.thermostats.monte_carlo import CHANGE, EXCHANGE, POTENTIAL, PROPOSAL, SIZE, SUM, ReversedSteps
+from kcons.thermostats.noise import noise_generator
 
 
 def started(n=2):
@@ -210,25 +210,96 @@ def test_the_way_back_costs_no_force_and_the_step_is_the_stepper_s(stepper):
     assert np.array_equal(plain.positions, state.positions) and np.array_equal(plain.velocities, state.velocities)
 
 
-class Skewed(Rattle):
-    """A step that is not undone by the step back."""
+class Law:
+    """A sampler whose dH is normal with deviation dt^p and mean half its square."""
+
+    def __init__(self, order: int, rng: np.random.Generator) -> None:
+        self.order, self._rng, self._held = order, rng, np.zeros(SIZE)
+
+    def check(self, system):
+        pass
 
     def step(self, system, state, dt):
-        after = super().step(system, state, dt)
-        return State(after.positions, after.velocities + 1e-6, after.time, after.forces, after.step)
+        spread = dt**self.order
+        change = self._rng.normal(spread**2 / 2, spread) if dt < 2 else math.inf
+        self._held[SUM] += min(1.0, math.exp(-max(change, 0.0)))
+        return replace(state, thermostat=self._held.copy())
 
 
-class Stuck(Rattle):
-    """A step that has no way back."""
+@pytest.mark.parametrize("start", [0.1, 0.5, 2.5])
+@pytest.mark.parametrize("order", [2, 4, 6])
+def test_a_known_law_is_found(order, start):
+    (held, state), rng = trimer(trap, trap_potential), np.random.default_rng(1)
+    found = [tune(held, state, start, Law(order, rng)).dt for _ in range(40)]
+    shares = [math.erfc(dt**order / math.sqrt(8)) for dt in found]
+    assert abs(np.mean(shares) - order / (order + 1)) < 0.09
+    assert np.std(shares) < 0.06
 
-    def step(self, system, state, dt):
-        if dt < 0:
-            raise ConvergenceError("no solution")
-        return super().step(system, state, dt)
+
+def test_a_step_is_found_and_stays():
+    held, state = trimer(trap, trap_potential)
+    sampler = HamiltonianMonteCarlo(KT, 6, 3)
+    found = tune(held, state, 0.02, sampler, wanted=0.8, proposals=100)
+    assert Counts.of(found.state).proposals == 0 and found.state.step == 100
+    assert 0.1 < found.dt < 1.0 and 0.6 < found.acceptance < 1.0
+    after = run(held, found.state, found.dt, 150, stepper=sampler, check_every=0)
+    assert abs(Counts.of(after).acceptance - 0.8) < 0.13
+    again = tune(held, state, 0.02, sampler, wanted=0.8, proposals=100)
+    assert again.dt == found.dt
 
 
-@pytest.mark.parametrize(("stepper", "words"), [(Skewed(), "misses its start by"), (Stuck(), "cannot be taken back")])
-def test_what_cannot_be_taken_back_is_seen(stepper, words):
-    held, state = started()
-    with pytest.raises(ReversibilityError, match=words):
-        ReversedSteps(held, stepper, 1e-9).step(held, state, 0.05)
+def test_where_nothing_succeeds():
+    held, x = dumbbells(2)
+    state = held.initial_state(x)
+    worse = iter(range(10**9))
+    uphill = System(held.motion, held.force, potential=lambda x, t: 1e6 * next(worse))
+    with pytest.raises(ConvergenceError, match="no proposal succeeded"):
+        tune(uphill, state, 0.1, HamiltonianMonteCarlo(0.5, 1, 3, stepper=Rattle()), proposals=20)
+
+
+LADDER = [0.3, 0.45, 0.7]
+
+
+def ladder(proposals=3):
+    held, state = trimer(trap, trap_potential)
+    return held, [
+        run(held, state, 0.3, proposals, stepper=HamiltonianMonteCarlo(kt, 3, k, keep=0.2))
+        for k, kt in enumerate(LADDER)
+    ]
+
+
+def test_the_rule_and_what_changes_places():
+    _, states = ladder()
+    energies = [float(s.thermostat[POTENTIAL]) for s in states]
+    seen = set()
+    for number in range(40):
+        after, made = exchange(states, LADDER, 5, number)
+        pair = number % 2
+        u = noise_generator((5, 0), number, EXCHANGE).random(3)[pair]
+        power = (1 / LADDER[pair] - 1 / LADDER[pair + 1]) * (energies[pair] - energies[pair + 1])
+        assert made == [(math.log1p(-u) < power) if k == pair else None for k in range(2)]
+        seen.add(made[pair])
+        for k, new in enumerate(after):
+            partner = {pair: pair + 1, pair + 1: pair}.get(k, k) if made[pair] else k
+            assert np.array_equal(new.positions, states[partner].positions)
+            scale = math.sqrt(LADDER[k] / LADDER[partner])
+            np.testing.assert_allclose(new.velocities, scale * states[partner].velocities, rtol=1e-14)
+            assert new.thermostat[POTENTIAL] == energies[partner]
+            assert Counts.of(new) == Counts.of(states[k]) and new.step == states[k].step
+    assert seen == {True, False}
+    assert energies == [float(s.thermostat[POTENTIAL]) for s in states]
+
+
+def test_a_run_of_exchanges_keeps_each_temperature():
+    """The mean energy in the trap: 9 - 2 momenta kT/2 each, and the same potential energy as without exchanges."""
+    held, states = ladder()
+    samplers = [HamiltonianMonteCarlo(kt, (2, 4), 10 + k) for k, kt in enumerate(LADDER)]
+    kinetic, made = [], []
+    for number in range(250):
+        states = [s.step(held, x, 0.3) for s, x in zip(samplers, states, strict=True)]
+        states, told = exchange(states, LADDER, 9, number)
+        made += [t for t in told if t is not None]
+        kinetic.append([held.kinetic_energy(s.velocities) for s in states])
+    assert 0.3 < np.mean(made) < 0.99
+    mean, spread = np.mean(kinetic, axis=0), np.std(kinetic, axis=0) / math.sqrt(250)
+    assert (np.abs(mean - 3.5 * np.array(LADDER)) < 3.5 * spread).all()

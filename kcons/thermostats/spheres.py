@@ -15,7 +15,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Literal
 
 import numpy as np
 
@@ -27,45 +27,33 @@ from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.solvers.kernels.aligned_memory import in_one_array
 from kcons.solvers.rank_revealing import rank
 from kcons.steppers import State, System
+from kcons.steppers.compiled_operations import check_finite
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Operation, Project
 from kcons.steppers.program import Program, Row
-from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.freedom import MARK, carried, placed_rows
-from kcons.thermostats.multistep import sphere_kernels as kernels
-from kcons.thermostats.multistep.respa import GroupedSteps, SeveralSteps, SlowKicks
+from kcons.thermostats import sphere_kernels as kernels
+from kcons.thermostats.force_groups import SlowKicks
+from kcons.thermostats.freedom import MARK, carried, placed_rows, refuse_driven
+from kcons.thermostats.langevin import GroupedSteps, SeededBath
 
 Spheres = Literal["split", "axes", "cluster", "global"]
 
 logger = logging.getLogger("kcons.thermostats")
 
+_NO_BATH = "which the spheres of an isokinetic bath do not follow; use Langevin or LangevinRespa"
 #: Part of a step whose noise is drawn for the auxiliary variables at the start of a run.
 _BEGIN = 2**63
 
 
 @dataclass(frozen=True, eq=False)
 class SphereLayout:
-    """The spheres of a system.
+    """The spheres of a system."""
 
-    Attributes
-    ----------
-    cluster : ndarray of int, shape (n_atoms,)
-        Cluster of each atom, -1 for fixed ones.
-    spheres : ndarray of int, shape (n_clusters, 4)
-        Those of the center of mass along x, y and z, all -1 where it has none of its own; that of the rest, or -1.
-    masses : ndarray, shape (n_atoms,)
-        0 for fixed atoms.
-    totals : ndarray, shape (n_clusters,)
-        Masses of the clusters.
-    freedom : ndarray of int, shape (n_spheres,)
-        Degrees of freedom g on each sphere.
-    """
-
-    cluster: IntArray
-    spheres: IntArray
-    masses: FloatArray
-    totals: FloatArray
-    freedom: IntArray
+    cluster: IntArray  # of each atom, -1 for fixed ones
+    spheres: IntArray  # (n_clusters, 4): of the center of mass along x, y and z (all -1: none of its own); of the rest
+    masses: FloatArray  # of the atoms, 0 for fixed ones
+    totals: FloatArray  # of the clusters
+    freedom: IntArray  # degrees of freedom g on each sphere
 
     @classmethod
     def of(cls, system: System, positions: FloatArray, kind: Spheres) -> SphereLayout:
@@ -78,7 +66,7 @@ class SphereLayout:
         OverdeterminedError
             Nothing can move.
         """
-        refuse_driven(system)
+        refuse_driven(system, _NO_BATH)
         moving = system.inverse_masses[:, 0] > 0
         if kind == "global":
             cluster, tied = np.where(moving, 0, -1), np.ones(1, dtype=bool)
@@ -116,17 +104,6 @@ class SphereLayout:
                 item="auxiliary",
             )
         return np.asarray(thermal_energy * sizes)
-
-
-def refuse_driven(system: System) -> None:
-    """Raise `UnsupportedError` for targets that move and rows that hold velocities."""
-    for item in system.motion.constraint_set.constraints:
-        if item.moving or not item.holonomic:
-            what = "has a target that moves" if item.holonomic else "holds velocities"
-            raise UnsupportedError(
-                f"{item.family} {what}: the spheres of an isokinetic bath go with constraints that rest. Use "
-                "Langevin or LangevinRespa"
-            )
 
 
 def _clusters(system: System, moving: BoolArray, positions: FloatArray) -> tuple[IntArray, BoolArray, IntArray]:
@@ -173,7 +150,7 @@ def _ranks(system: System, count: int, positions: FloatArray) -> IntArray:
     return ranks
 
 
-class IsokineticSpheres(SeveralSteps):
+class IsokineticSpheres(SeededBath):
     """Canonical configurations at long steps: a stochastic isokinetic bath on spheres, with several time steps.
 
     Dynamics are lost: diffusion, relaxation times and spectra mean nothing. Beside several time steps it needs a
@@ -218,6 +195,8 @@ class IsokineticSpheres(SeveralSteps):
     3579 (2013).
     """
 
+    turns = True
+
     @checked
     def __init__(
         self,
@@ -231,10 +210,9 @@ class IsokineticSpheres(SeveralSteps):
         substeps: int = 3,
         slow_kicks: SlowKicks = "ends",
     ) -> None:
-        super().__init__(thermal_energy, friction, rng, substeps)
+        super().__init__(thermal_energy, friction, rng, substeps, steps, slow_kicks)
         self.spheres: Spheres = spheres
         self.auxiliary = auxiliary
-        self.nest(steps, slow_kicks, _listed_and_made, turns=True)
         self._known: tuple[System, SphereLayout, FloatArray, float] | None = None
         self._told = False
 
@@ -243,11 +221,25 @@ class IsokineticSpheres(SeveralSteps):
         given = f"{steps}, spheres={self.spheres!r}, auxiliary={self.auxiliary}{others}"
         return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{given})"
 
+    def _made(self, operations: tuple[Operation, ...]) -> tuple[Program, Program]:
+        """One that is compiled, and one that leaves to Python what needs projections."""
+        parts: list[Operation] = [_Restore()]
+        for operation in operations:
+            parts += [operation, _Rescale()] if isinstance(operation, Project) else [operation]
+        moved = {"restore": kernels.restore, "rescale": kernels.shorten}
+        whole = moved | {"turn": kernels.turn_along, "exchange": kernels.exchange}
+        compiled, other = (Program(operations, functions, self.names, parts) for functions in (whole, moved))
+        return compiled, other
+
+    def program(self, system: System | None) -> Program:
+        made: tuple[Program, Program] = super().program(system)  # type: ignore[assignment]
+        return made[system is not None and system.packed is None]
+
     def check(self, system: System) -> None:
         """Raise where the groups of forces are not those that have steps, for targets that move and velocity rows."""
         if self._known is None or self._known[0] is not system:
             super().check(system)
-            refuse_driven(system)
+            refuse_driven(system, _NO_BATH)
 
     def layout(self, system: System, positions: FloatArray) -> SphereLayout:
         """The spheres of a system."""
@@ -291,16 +283,6 @@ class _Restore(Operation):
     verb, meaning = "restore", "onto the spheres"
 
 
-def _listed_and_made(operations: tuple[Operation, ...], names: tuple[str, ...]) -> tuple[Any, tuple[Program, Program]]:
-    """Operations, and the programs that are compiled, and that leave to Python what needs projections."""
-    parts: list[Operation] = [_Restore()]
-    for operation in operations:
-        parts += [operation, _Rescale()] if isinstance(operation, Project) else [operation]
-    moved = {"restore": kernels.restore, "rescale": kernels.shorten}
-    whole = moved | {"turn": kernels.turn_along, "exchange": kernels.exchange}
-    return operations, (Program(parts, whole, names), Program(parts, moved, names))
-
-
 class SphereStep(GroupedSteps):
     """Steps on their way; velocities are on the constraints and on their spheres but between a drift and `project`."""
 
@@ -314,31 +296,27 @@ class SphereStep(GroupedSteps):
         squares: FloatArray,
         steps: int,
     ) -> None:
-        drawn, made = len(squares) * bath.auxiliary, cast(tuple[Program, Program], bath.listed(system)[1])
+        drawn = len(squares) * bath.auxiliary
         known = carried(start, 1 + drawn, "IsokineticSpheres", marked=True)
-        self.groups = bath.groups(system, start)
+        groups = bath.groups(system, start)
         if known:
             assert start.thermostat is not None
             own = start.thermostat[1:]
         else:
             own = math.sqrt(bath.thermal_energy) * bath.drawn(start.step, (drawn,), _BEGIN)
-        program = made[system.packed is None]
+        program = bath.program(system)
         parts = sum(row.name == "exchange" for row in program.rows)
         head = bath.friction, bath.thermal_energy, *divmod(bath.seed, 2**32), start.step + 1, 0, parts
         atoms = layout.cluster, layout.spheres.ravel(), layout.masses, layout.totals
         roots = system.root_weights.ravel()
         numbers = in_one_array((np.array(head, dtype=float), squares, own, *atoms, roots, np.zeros(roots.size + drawn)))
-        super().__init__(system, start, dt, program, steps, numbers)
-        self.forces, self.bath = self.groups.stacked(), bath
+        super().__init__(system, start, dt, groups, program, steps, numbers, system.packed is not None)
+        self.bath = bath
         self.w, self.squares, *self.tables = kernels.unpacked(self.numbers)
         #: Accelerations along the constraints, by groups, of forces that Python has evaluated.
         self.paces: dict[int, FloatArray] = {}
         if not known:
             self.along(self.v, self.place(0), self.time)
-
-    @property
-    def simple(self) -> bool:  # type: ignore[override]
-        return super().simple and self.system.packed is not None
 
     def evaluate(self, row: Row, begun: bool) -> None:
         self.paces.clear()

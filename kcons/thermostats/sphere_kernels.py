@@ -13,7 +13,7 @@ import numpy as np
 from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import MORE, packed_tangents
 from kcons.solvers.kernels.array_views import integers, table_array
-from kcons.steppers.stages.compiled_operations import all_finite
+from kcons.steppers.compiled_operations import all_finite
 from kcons.thermostats.noise import fill_next
 
 #: The arrays of a program's numbers, in `in_one_array`: those of `HEAD`, R^2, w, those of `SphereLayout`, 1/sqrt(m) for

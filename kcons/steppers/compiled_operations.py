@@ -39,6 +39,9 @@ WIDTH = 7
 #: the last flight, whether all was far from the origin at the end of the last step, and how many operations there are.
 PAIRS, ENGINE, ITERATIONS, FAR, COUNT, ROOM = range(6)
 
+#: Sums may be taken in any order, so that they are compiled to vector instructions; NaN stays NaN.
+SUMS = {"reassoc", "contract", "arcp", "nsz"}
+
 _POINTS, _NUMBERS = numba.float64[:, ::1], numba.float64[::1]
 #: Of functions that programs call, (x, v, forces, time, numbers, tables): 0, or what else than 0 says that nothing has
 #: been done. `numbers` are what a room ends with.
@@ -84,7 +87,7 @@ def perform(at, more, dt, x, out, v, forces, room, tables):  # type: ignore[no-u
         `ROOM` numbers, `WIDTH` for each operation, with pairs three arrays of the size of v (what rounding took from
         positions and from velocities, and room for positions), and numbers of the functions that the program calls.
     tables : ndarray
-        Of `kcons.steppers.stages.packed_system`.
+        Of `kcons.steppers.packed_system`.
 
     Returns
     -------
@@ -202,6 +205,16 @@ def check_finite(values: FloatArray, item: str, step: int) -> None:
         atom=atom,
         step=step,
     )
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def square_sum(u, masses):  # type: ignore[no-untyped-def]
+    """u^T M u."""
+    a, m = flat(u), flat(masses)
+    uu = 0.0
+    for i in range(a.size):
+        uu += m[i] * a[i] * a[i]
+    return uu
 
 
 @njit(cache=True, nogil=True)

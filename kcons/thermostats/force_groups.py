@@ -1,4 +1,4 @@
-"""Several time steps on constraints: forces in groups, the operations of a step, Langevin dynamics made of them.
+"""Several time steps on constraints: forces in groups, and the operations of a step.
 
 The slowest group kicks at the ends of the step, and between its kicks the next one makes its steps, and so on
 (Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1990 (1992)). The innermost group moves the atoms, with the heat bath
@@ -9,23 +9,18 @@ middle of a step, and states are those halfway between two kicks.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import Rng, as_float_array, check_call, checked, read_only_view, whole_number
+from kcons.constraints.arguments import as_float_array, check_call, read_only_view, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
-from kcons.steppers.interpreter import Interpreter
+from kcons.steppers.compiled_operations import check_finite
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
-from kcons.steppers.program import Row
-from kcons.steppers.stages.compiled_operations import check_finite
-from kcons.thermostats.freedom import carried
-from kcons.thermostats.langevin import Langevin, LangevinStep, SeededBath, listed_and_made
 
 ForceFunction = Callable[[FloatArray, float], ArrayLike]
 
@@ -89,21 +84,16 @@ class ForceGroups:
 
     def __call__(self, x: FloatArray, time: float) -> FloatArray:
         """The sum over all groups."""
-        total: FloatArray | None = None
-        for name in self.groups:
-            f = self.of(name, x, time)
-            if total is None:
-                total = np.array(f)
-            elif f.shape != total.shape:
+        first, *others = [np.array(self.of(name, x, time)) for name in self.groups]  # functions may share an array
+        for name, f in zip(list(self.groups)[1:], others, strict=True):
+            if f.shape != first.shape:
                 raise InputError(
-                    f"group {name!r} gives forces of shape {f.shape}, the groups before it {total.shape}: they are of "
+                    f"group {name!r} gives forces of shape {f.shape}, the groups before it {first.shape}: they are of "
                     "different systems",
                     item=name,
                 )
-            else:
-                total += f
-        assert total is not None
-        return total
+            first += f
+        return first
 
     def of(self, name: str, x: FloatArray, time: float) -> FloatArray:
         """Forces of one group."""
@@ -203,8 +193,7 @@ class GroupedForces:
 SlowKicks = Literal["ends", "middle"]
 
 
-@dataclass(frozen=True)
-class Level:
+class Level(NamedTuple):
     """A group of forces, and its steps in one step of the whole."""
 
     group: str
@@ -300,148 +289,3 @@ def _level(levels: tuple[Level, ...], at: int, flights: Iterator[Fly], turns: bo
     else:
         yield from (next(flights), *settled, Exchange(length), next(flights), *settled)
     yield from (Evaluate(group), kick)
-
-
-class SeveralSteps(SeededBath):
-    """Base of the baths with several time steps.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Groups of forces from the slowest to the fastest.
-    middle : bool
-        Whether the slowest kicks in the middle of a step.
-    """
-
-    def nest(
-        self,
-        steps: Mapping[str, int] | None,
-        slow_kicks: SlowKicks,
-        listed: Callable[[tuple[Operation, ...], tuple[str, ...]], Any],
-        turns: bool = False,
-    ) -> None:
-        """Make the operations of a step from the arguments of a bath, and its programs by `listed`."""
-        levels = levels_of(steps)
-        self.names = tuple(level.group for level in levels)
-        self.middle = middle_of(levels, slow_kicks)
-        flight = (1.0 / self.substeps,) * self.substeps
-        in_flights = nested(levels, flight, turns=turns, middle=self.middle)
-        self._in_flights = listed(in_flights, self.names)
-        self._great_circles = listed(nested(levels, (1.0,), turns=turns, exact=True, middle=self.middle), self.names)
-        self.force_evaluations = sum(isinstance(operation, Evaluate) for operation in in_flights)
-        counts = {level.group: level.steps for level in levels}
-        self._words = "" if steps is None else f", steps={counts}", ", slow_kicks='middle'" if self.middle else ""
-
-    def check(self, system: System) -> None:
-        """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""
-        super().check(system)
-        group_names(system.force, self.names)
-
-    def depends_on(self, system: System, state: State) -> Any:
-        # Where slow forces kick in the middle, each step begins with an evaluation of the others.
-        return None if self.middle else super().depends_on(system, state)
-
-    def groups(self, system: System, state: State) -> GroupedForces:
-        """Forces at a state that steps begin with; remembered, they are not evaluated anew where steps go on."""
-        found = GroupedForces(system, state, self.names, self.middle, self._left)
-        self._left = None, found
-        return found
-
-    def note(self, state: State) -> None:
-        self._left = state.positions, self._left[1]
-
-
-class GroupedSteps(Interpreter):
-    """Steps on their way with forces in groups, `groups`."""
-
-    groups: GroupedForces
-
-    @property
-    def simple(self) -> bool:  # type: ignore[override]
-        """Whether forces are those of the System's function, all at once."""
-        return self.groups.names == ("",)
-
-    def evaluate(self, row: Row, begun: bool) -> None:
-        if self.simple:
-            return super().evaluate(row, begun)
-        assert isinstance(row.operation, Evaluate)
-        self.show(row)
-        self.groups.evaluate(row.operation.group, self.whole(self.x), self.at(row.end), self.number)
-        self.forces = self.groups.stacked()
-
-    def applied(self, here: int) -> FloatArray | None:
-        return super().applied(here) if self.simple else self.groups.total()
-
-
-class LangevinRespa(SeveralSteps, Langevin):
-    """Langevin dynamics on constraints with several time steps: kicks of slow forces about steps of fast ones.
-
-    Each group of forces kicks at the ends of its own step, and the fastest one moves the atoms by geodesic BAOAB, with
-    friction and noise in the middle of each of its steps. Slow forces in steps of half a period of the fastest motion,
-    or of its multiples, drive it (resonance), by the share of its stiffness that they have (`slow_share`): with bonds
-    to hydrogen or whole molecules held and near pairs as fast forces, 8 to 16 fs are safe. `IsokineticSpheres` takes
-    longer steps.
-
-    Parameters
-    ----------
-    thermal_energy : float
-        k_B T in the units of energy in use.
-    friction : float
-        gamma, in inverse units of time; 0 for constant energy.
-    rng : int, numpy.random.Generator or None
-        As for `Langevin`.
-    steps : mapping of str to int, optional
-        Steps of each group of forces in one step, ``{"slow": 1, "medium": 4, "fast": 12}``; each divides the next. The
-        System has the forces, as `ForceGroups`. Without it all forces are one group.
-    substeps : int
-        RATTLE substeps in each drift.
-    slow_kicks : {'ends', 'middle'}
-        Where the slowest forces kick: half at each end of the step, or once in its middle. States halfway between two
-        slow kicks are nearer to the canonical distribution than those at the kicks; they know no slow forces, so that
-        each energy that is read costs an evaluation, and the other groups are evaluated once more a step.
-
-    Raises
-    ------
-    InputError
-        As for `Langevin`; numbers of steps that do not divide each other.
-
-    Notes
-    -----
-    `State.thermostat` holds the heat, as for `Langevin`.
-
-    References
-    ----------
-    Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1990 (1992); Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138
-    (2016).
-    """
-
-    @checked
-    def __init__(
-        self,
-        thermal_energy: float,
-        friction: float,
-        rng: Rng,
-        *,
-        steps: Mapping[str, int] | None = None,
-        substeps: int = 3,
-        slow_kicks: SlowKicks = "ends",
-    ) -> None:
-        super().__init__(thermal_energy, friction, rng, substeps=substeps)
-        self.nest(steps, slow_kicks, listed_and_made)
-
-    def __repr__(self) -> str:
-        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, rng={self.seed}{''.join(self._words)})"
-
-    def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
-        self.refuse_back(system, dt)
-        return RespaStep(system, state, dt, self, steps)
-
-
-class RespaStep(GroupedSteps, LangevinStep):
-    """Steps on their way."""
-
-    def __init__(self, system: System, start: State, dt: float, thermostat: LangevinRespa, steps: int) -> None:
-        carried(start, 1, "LangevinRespa")
-        self.groups = thermostat.groups(system, start)
-        super().__init__(system, start, dt, thermostat, 1 if thermostat.middle else steps)
-        self.forces = self.groups.stacked()

@@ -2,27 +2,35 @@
 
 Gauss's principle with the row v^T M (notes, eqs. 111-113) gives dv/dt = M_par^+ f - alpha v with
 alpha = v.f/(2K). The row is M^-1-orthogonal to those of the holonomic constraints wherever v is tangent to them, so
-that a kick at fixed positions has the closed form it has without constraints.
+that a kick at fixed positions has the closed form it has without constraints, for any strength of the force: with u the
+velocities on the surface and F = M_par^+ f, du/dt = F - (u.f/2K) u has the solution u(t) = (u + s F)/s', where
+c^2 = f.F/2K, a = u.f/2K and
+
+    s = (a/c^2)(cosh ct - 1) + sinh(ct)/c,    s' = (a/c) sinh ct + cosh ct.
+
+Everything is divided by e^{ct}, which overflows for ct > 710. Only sums over the atoms enter: u^T M u, u.f and f.F.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
 from kcons.constraints.arguments import Positive, checked
+from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.errors import InputError, OverdeterminedError
+from kcons.solvers.addressable_solvers import MORE, packed_tangents
+from kcons.solvers.kernels.array_views import flat, integers, table_array
 from kcons.steppers import Splitting, State, System
+from kcons.steppers.compiled_operations import SUMS, all_finite, check_finite, square_sum
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
 from kcons.steppers.program import Program, Row
 from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
-from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import (
     LOOK_AT,
     Momentum,
@@ -30,11 +38,10 @@ from kcons.thermostats.freedom import (
     freedom,
     may_be,
     refuse_dissipation,
+    refuse_driven,
     warn_of_bodies_apart,
     warn_of_conserved_momenta,
 )
-from kcons.thermostats.isokinetic import kick as closed_form
-from kcons.thermostats.isokinetic.kick import INTEGRAL, SIZE, SQUARE, TWICE, square_sum
 
 Convention = Literal["exact", "notes"]
 
@@ -44,6 +51,13 @@ ROUNDING = 1e-12
 KEPT = 1e-9
 #: Kinetic energy below which v.f/2K may overflow.
 SMALLEST = 1e-290
+#: Below this share of the terms, their sum has lost digits.
+_CANCELS = 0.01
+#: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.
+MANY = 1e4
+#: What the numbers of a program begin with, as `State.thermostat`: 2K, the integral of alpha, f.M_par^+ f, and g; after
+#: them the masses for each coordinate, 0 for fixed atoms, and room for accelerations.
+TWICE, INTEGRAL, SQUARE, COUNT, SIZE = range(5)
 
 _S6 = (0.0792036964311957, 0.353172906049774, -0.0420650803577195)
 _S6_OTHER = (0.209515106613362, -0.143851773179818)
@@ -63,16 +77,156 @@ SCHEMES: dict[int, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]
 class _FirstTurn(Turn):
     """The turn that a step begins with, whose forces need not be projected: the drift takes out the rest."""
 
-    verb = "first_turn"
+    verb, meaning = "first_turn", "the same, by forces that the drift brings onto the constraints"
 
 
-def programs(operations: Sequence[Operation]) -> tuple[Program, Program]:
-    """A step compiled, and with the turns in Python."""
-    first, *others = operations
-    assert isinstance(first, Turn)
-    parts = _FirstTurn(first.fraction), *others
-    functions = {"first_turn": closed_form.first_turn, "turn": closed_form.turn}
-    return Program(parts, functions), Program(parts)
+@njit(cache=True, nogil=True)
+def weights_of(aligned, square, twice, t):  # type: ignore[no-untyped-def]
+    """Keep, push and log of the growth of the kick over a time t, which may be negative: u' = keep u + push F.
+
+    Of u.f, f.F and 2K. Last, whether digits were lost, or c^2 is too large a number, so that `turned` must find u'.
+    """
+    a = aligned / twice
+    c2 = square / twice if square > 0 else 0.0
+    if not math.isfinite(c2):
+        return math.nan, math.nan, math.nan, True
+    z = math.sqrt(c2) * abs(t)
+    decay = math.exp(-z)
+    # sinh z/z, (cosh z - 1)/z^2 and cosh z, times e^-z; expm1 is exact near 0.
+    sinh = -0.5 * math.expm1(-2 * z) / z if z > 0 else 1.0
+    cosh_less = 0.5 * (math.expm1(-z) / z) ** 2 if z > 0 else 0.5
+    cosh = 0.5 * (1 + decay * decay)
+    growth = a * t * sinh + cosh
+    if not growth > _CANCELS:
+        return math.nan, math.nan, math.nan, True
+    return decay / growth, t * (a * t * cosh_less + sinh) / growth, z + math.log(growth), False
+
+
+def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t: float) -> tuple[FloatArray, float]:
+    """The kick of velocities that run against a strong force, and log of its growth.
+
+    There u + s F and s' are differences of numbers that are nearly equal. The part of u across F decides how fast u
+    turns round; with e = F/|F|, p = u.e/|u|, and q that part:
+
+        u(t) = (q e^{-z} + e |u| [(1 + p) - (1 - p) e^{-2z}]/2)/g,    g = [(1 + p) + (1 - p) e^{-2z}]/2.
+    """
+    largest = float(np.abs(pace).max())
+    axis = pace / largest  # squares of the strongest forces overflow
+    length = math.sqrt(float((masses * axis * axis).sum()))
+    axis *= math.copysign(1.0, t) / length
+    speed = math.sqrt(twice)
+    along = float((masses * u * axis).sum())
+    across = u - along * axis
+    across -= float((masses * across * axis).sum()) * axis  # what rounding left along the force
+    q2 = min(float((masses * across * across).sum()) / twice, 1.0)
+    p = math.copysign(math.sqrt(1.0 - q2), along)
+    one_plus = q2 / (1.0 - p) if p < 0 else 1.0 + p
+    z = largest * (length / speed * abs(t))
+    decay = math.exp(-z)
+    growth = 0.5 * (one_plus + (1.0 - p) * decay * decay)
+    if growth == 0:  # exactly against the force, for longer than any rounding
+        return -speed * axis, -z
+    lead = 0.5 * (one_plus - (1.0 - p) * decay * decay) * speed
+    after = (decay * across + lead * axis) / growth
+    after *= math.sqrt(twice / float((masses * after * after).sum()))
+    return after, z + math.log(growth)
+
+
+# -- sums over the atoms ----------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def sums(u, pace, masses):  # type: ignore[no-untyped-def]
+    """u^T M u, u^T M F and F^T M F, flat."""
+    a, b, m = u.ravel(), pace.ravel(), masses.ravel()
+    uu = up = pp = 0.0
+    for i in range(a.size):
+        w = m[i] * a[i]
+        uu += w * a[i]
+        up += w * b[i]
+        pp += m[i] * b[i] * b[i]
+    return uu, up, pp
+
+
+@njit(cache=True, nogil=True, fastmath=SUMS)
+def raw_sums(u, f, weights, masses):  # type: ignore[no-untyped-def]
+    """u.f and f.M^-1 f of the atoms that move; `weights` is 1/m."""
+    a, b, w, m = u.ravel(), f.ravel(), weights.ravel(), masses.ravel()
+    uf = ff = 0.0
+    for i in range(a.size):
+        taken = m[i] * w[i]  # 1 or 0
+        uf += taken * (a[i] * b[i])
+        ff += taken * (w[i] * b[i] * b[i])
+    return uf, ff
+
+
+@njit(cache=True, nogil=True)
+def after_drift(u, pace, masses, twice, t):  # type: ignore[no-untyped-def]
+    """Bring u to its length, and u = keep u + push F.
+
+    Returns f.F, the factor of u, log of the growth, and whether it was done: it is not where digits would be lost.
+    """
+    uu, aligned, square = sums(u, pace, masses)
+    factor = math.sqrt(twice / uu) if uu > 0 else math.nan
+    aligned *= factor
+    keep, push, log_growth, cancels = weights_of(aligned, square, twice, t)
+    if cancels:
+        return square, factor, -math.log(factor), False
+    # What rounding has left to correct.
+    got = keep * (keep * twice + 2 * push * aligned) + push * push * square
+    right = math.sqrt(twice / got) if got > 0 else math.nan
+    left, more = right * factor * keep, right * push
+    a, b = flat(u), flat(pace)
+    for i in range(a.size):
+        a[i] = left * a[i] + more * b[i]
+    return square, factor, log_growth - math.log(factor), True
+
+
+# -- as operations of a program -----------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def first_turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """v = keep v + push M^-1 f, from velocities on the constraints, with forces that are not projected.
+
+    It is not made (1) where digits would be lost, or where a drift would have to take out more than `MANY` times 2K.
+    """
+    n, twice = v.size, numbers[TWICE]
+    weights, masses = table_array(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
+    if not all_finite(forces):
+        return 1
+    aligned, raw = raw_sums(v, forces, weights, masses)
+    keep, push, log_growth, cancels = weights_of(aligned, numbers[SQUARE], twice, time)
+    if cancels or not push * push * raw <= MANY * twice:
+        return 1
+    u = flat(v)
+    for i in range(n):
+        u[i] = keep * u[i] + push * (weights[i] * forces[i])
+    numbers[INTEGRAL] += log_growth
+    return 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def turn(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
+    """`after_drift`, from velocities on the constraints and forces, which are projected first."""
+    n = v.size
+    weights, masses = table_array(tables, integers(tables), MORE), numbers[SIZE : SIZE + n]
+    if not all_finite(forces):
+        return 1
+    pace = numbers[SIZE + n : SIZE + 2 * n]
+    for i in range(n):
+        pace[i] = weights[i] * forces[i]
+    if not packed_tangents(x, pace.reshape(v.shape), tables):
+        return 1
+    square, _, growth, done = after_drift(v, pace, masses, numbers[TWICE], time)
+    if not done or not all_finite(v):
+        return 1
+    numbers[SQUARE] = square
+    numbers[INTEGRAL] += growth
+    return 0
+
+
+# -- the thermostat -----------------------------------------------------------------------------------
 
 
 @np.errstate(over="ignore")  # velocities are checked
@@ -154,8 +308,10 @@ class Isokinetic(Splitting):
             operations += [Turn(operation.fraction)] if isinstance(operation, Kick) else [operation]
             if isinstance(operation, Evaluate):
                 operations.append(Project())
-        self._operations = tuple(operations[:-1])
-        self._programs = programs(self._operations)
+        operations.pop()
+        parts, first = [_FirstTurn(operations[0].fraction), *operations[1:]], {"first_turn": first_turn}
+        #: Compiled, and with the turns after drifts in Python.
+        self._programs = [Program(operations, verbs, parts=parts) for verbs in ({**first, "turn": turn}, first)]
 
     def __repr__(self) -> str:
         given = [f"{self.thermal_energy!r}"] if self.thermal_energy is not None else []
@@ -165,16 +321,13 @@ class Isokinetic(Splitting):
             given.append(f"convention={self.convention!r}")
         return f"Isokinetic({', '.join(given)})"
 
-    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        return self._operations
+    def program(self, system: System | None) -> Program:
+        return self._programs[system is not None and system.packed is None]
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for targets that move, velocity-dependent forces, and friction besides its own."""
         refuse_dissipation(system, "closed kick; use Langevin for friction, or leave it out")
-        if system.motion.plan.driven:
-            raise UnsupportedError(
-                "targets move, or rows hold velocities, and do work that no closed kick takes out; use Langevin"
-            )
+        refuse_driven(system, "and do work that no closed kick takes out; use Langevin")
 
     # -- steps ----------------------------------------------------------------------------------
 
@@ -262,7 +415,7 @@ class Isokinetic(Splitting):
         begin = self.start(system, state)
         if begin.step == LOOK_AT and self.thermal_energy is not None:
             warn_of_bodies_apart(system, begin, stacklevel=7)
-        return IsokineticStep(system, begin, dt, self._programs, steps)
+        return IsokineticStep(system, begin, dt, self.program(system), steps)
 
     def at_once(self, state: State, steps: int) -> int:
         return min(steps, LOOK_AT - state.step) if state.step < LOOK_AT else steps
@@ -287,44 +440,28 @@ class Isokinetic(Splitting):
 class IsokineticStep(Interpreter):
     """Steps on their way."""
 
-    def __init__(self, system: System, start: State, dt: float, made: tuple[Program, Program], steps: int) -> None:
+    def __init__(self, system: System, start: State, dt: float, program: Program, steps: int) -> None:
         assert start.thermostat is not None
         self.masses = system.moving_masses
         numbers = np.concatenate((start.thermostat, self.masses, self.masses))
-        super().__init__(system, start, dt, made[system.packed is None], steps, numbers)
-        #: How long v must be, squared.
-        self.left = float(start.thermostat[TWICE])
-
-    def first_turn(self, row: Row, begun: bool) -> None:
-        """With forces as they are: the drift takes out what they would do across the constraints."""
-        t, system = row.length * self.dt, self.system
-        check_finite(self.forces, "force", self.number)
-        if not begun:
-            growth, done = closed_form.before_drift(
-                self.v, self.forces, system.weights, self.masses, float(self.numbers[SQUARE]), self.left, t
-            )
-            if done:
-                self.numbers[INTEGRAL] += growth
-                return
-        self._turn_by_projected_forces(row, t)
+        super().__init__(system, start, dt, program, steps, numbers)
 
     def turn(self, row: Row, begun: bool) -> None:
         """Bring v, projected, to its length, and follow the closed form."""
+        t, twice = row.length * self.dt, float(self.numbers[TWICE])
         check_finite(self.v, "velocity", self.number)
-        self._turn_by_projected_forces(row, row.length * self.dt)
-        check_finite(self.v, "velocity", self.number)
-
-    def _turn_by_projected_forces(self, row: Row, t: float) -> None:
         check_finite(self.forces, "force", self.number)
         pace = constrained_acceleration(self.system, self.place(row.here), self.forces, self.at(row.end))
-        square, factor, growth, done = closed_form.after_drift(self.v, pace, self.masses, self.left, t)
+        square, factor, growth, done = after_drift(self.v, pace, self.masses, twice, t)
         if not done:
             # The force is strong, and v runs against it.
-            masses = self.masses.reshape(pace.shape)
-            self.v[:], more = closed_form.turned(factor * self.v, pace, masses, self.left, t)
+            self.v[:], more = turned(factor * self.v, pace, self.masses.reshape(pace.shape), twice, t)
             growth += more
         self.numbers[SQUARE] = square
         self.numbers[INTEGRAL] += growth
+        check_finite(self.v, "velocity", self.number)
+
+    first_turn = turn
 
     def variables(self) -> FloatArray:
         return self.numbers[:SIZE].copy()

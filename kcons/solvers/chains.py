@@ -5,14 +5,18 @@ separators' multipliers are known, the pieces are independent. Each lane elimina
 couples it to the separators at its two ends; a tridiagonal system of seven separators remains. So the division that
 every pivot waits for is shared by eight rows. Short chains take one lane each, eight chains at a time.
 
-A sweep substitutes back along the pieces, and as it passes moves the bonds, measures their residuals and eliminates
-for the next Newton step in the opposite direction: a Newton step reads the chain once.
+A strip is a table of slots by lanes. A long chain is cut so that the bond from a piece to the next is the bond of its
+last slot. A sweep substitutes back along the pieces, and as it passes moves the bonds, measures their residuals and
+eliminates for the next Newton step in the opposite direction: a Newton step reads the chain once.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.distance_clusters import dot
+from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
+from kcons.solvers.distance_clusters import dot, resolved
+from kcons.solvers.kernels.aligned_memory import aligned, in_one_array, room
 from kcons.solvers.kernels.array_views import at_first, halves, integers, octets, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
@@ -35,14 +39,16 @@ from kcons.solvers.kernels.eight_wide import (
     where_zero,
 )
 from kcons.solvers.kernels.lattices import OPEN, lattice_numbers, minimum_image
-from kcons.solvers.tolerances import CHAIN_SPEED_TOLERANCE, MAX_ITERATIONS, NEWTON_TOLERANCE, TINY
+from kcons.solvers.tolerances import CHAIN_SPEED_TOLERANCE, MAX_ITERATIONS, MAX_ROUNDS, NEWTON_TOLERANCE, TINY
 
 # Fields of a slot: vectors of WIDTH doubles, one a lane. Slot t of a lane holds
 # the bond from its atom t to t + 1; the last slot's bond is the separator.
 _S, _R, _TARGET, _RIGHT, _AHEAD, _ASIDE, _FIRST, _LATER = (WIDTH * k for k in (0, 3, 6, 7, 8, 9, 10, 11))
 SLOT = 12 * WIDTH
 #: Of the pieces of the tables, those that are named.
-LENGTHS, BONDS = 8, 9
+_LENGTHS, _BONDS = 8, 9
+#: Atoms of the longest chain that gets one lane instead of eight.
+SHORT = 32
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
@@ -375,13 +381,12 @@ def _solve(
 
 
 @njit(fastmath=FASTMATH)
-def _shift(points, velocities, inverse_dt, atoms, owned, full, weights, work, first, n_slots, solves, undo, keep):
+def _shift(points, velocities, inverse_dt, atoms, owned, full, weights, work, first, n_slots, solves, undo, keep, move):
     """Add the displacements of a strip, keeping what was there.
 
     The first solve's part is repeated as the sweep computed it, number for number: multipliers of a straight chain are
     much larger than displacements, and the later solves corrected just this rounding.
     """
-    move = velocities.shape[0] > 0
     seam = (n_slots - 1) * SLOT
     px, py, pz = load_triple(work, seam + _S)
     px, py, pz = from_previous(px), from_previous(py), from_previous(pz)
@@ -439,7 +444,7 @@ def _restore(points, atoms, undo, end, first):
 
 @njit(fastmath=FASTMATH)
 def _report(multipliers, rows, present, work, first, n_slots, solves, sign):
-    """Multipliers of unit gradients."""
+    """Add the multipliers of unit gradients."""
     for k in range(n_slots * WIDTH):
         if present[first + k] > 0.0:
             at = (k // WIDTH) * SLOT + k % WIDTH
@@ -447,18 +452,18 @@ def _report(multipliers, rows, present, work, first, n_slots, solves, sign):
             value = work[at + _FIRST] if solves > 0 else 0.0
             if solves > 1:
                 value += work[at + _LATER]
-            multipliers[rows[first + k]] = sign * value * np.sqrt(square)
+            multipliers[rows[first + k]] += sign * value * np.sqrt(square)
 
 
 @njit(cache=True, fastmath=FASTMATH, error_model="numpy")
-def project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
-    """Project one strip after another; `SimdClusterSolver` says what the arguments are."""
+def _project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, tables, multipliers):
+    """Project one strip after another; `distance_clusters` says what the arguments are."""
     t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
     starts, atoms, owned, full = table_array(h, h, 0), table_array(u, h, 1), table_array(b, h, 2), table_array(b, h, 3)
     rows, present = table_array(u, h, 4), table_array(t, h, 5)
     weights, wholes = table_array(t, h, 6), table_array(h, h, 7)
     work, undo = table_array(t, h, 10), table_array(t, h, 11)
-    small = np.empty(8 * WIDTH)
+    small, move = np.empty(8 * WIDTH), tangent is None and inverse_dt != 0.0
     cell = lattice_numbers(lattice)
     worst, worst_row, most = 0.0, -1, 0
     last = starts.shape[0] - 2
@@ -474,21 +479,151 @@ def project(tangent, points, references, velocities, inverse_dt, given, lattice,
             worst, worst_row = residual, rows[first + place]
         if not ok:
             _restore(points, atoms, undo, first, 0)
-            if velocities.shape[0] > 0:
+            if move:
                 _restore(velocities, atoms, undo, first, 3 * WIDTH)
             return False, worst, most, worst_row
         if solves > 0:
             _shift(
                 points, velocities, inverse_dt, atoms, owned, full, weights, work,
-                first, n_slots, solves, undo, strip < last,
+                first, n_slots, solves, undo, strip < last, move,
             )  # fmt: skip
         elif strip < last:
             for at in range(first, starts[strip + 1], WIDTH):
                 x, y, z = gather_points(points, atoms, at)
                 store_triple(undo, 6 * at, x, y, z)
-                if velocities.shape[0] > 0:
+                if move:
                     x, y, z = gather_points(velocities, atoms, at)
                 store_triple(undo, 6 * at + 3 * WIDTH, x, y, z)
         if multipliers.shape[0] > 0:
             _report(multipliers, rows, present, work, first, n_slots, solves, -1.0 if tangent is not None else 1.0)
     return True, worst, most, worst_row
+
+
+@njit(cache=True, nogil=True)
+def _positions(alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
+    """As `kcons.solvers.addressable_solvers` says, with a last look at the positions themselves.
+
+    The multipliers of a long stretched chain can be so large that their rounding shows in the positions although the
+    bond vectors of the iteration were exact; another round from there takes it away.
+    """
+    h = integers(tables)
+    lengths = wanted if wanted.size else table_array(tables, h, _LENGTHS)
+    numbers[:] = 0.0
+    found = _project(None, x, x_ref, v, inv_dt, lengths, lattice, kind, tables, numbers)
+    for _ in range(MAX_ROUNDS):
+        if not (alone and found[0]) or resolved(x, table_array(halves(tables), h, _BONDS), lengths, lattice, kind):
+            break
+        if not _project(None, x, x_ref, v, inv_dt, lengths, lattice, kind, tables, numbers)[0]:
+            break
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _tangents(alone, y, x, v, inv_dt, wanted, lattice, kind, tables, numbers):
+    numbers[:] = 0.0
+    return _project((), y, x, v, inv_dt, wanted, lattice, kind, tables, numbers)
+
+
+@njit(cache=True, nogil=True)
+def _resolved(x, lattice, kind, tables):
+    h = integers(tables)
+    return resolved(x, table_array(halves(tables), h, _BONDS), table_array(tables, h, _LENGTHS), lattice, kind)
+
+
+def _strip(
+    bounds: NDArray[np.int64], sizes: NDArray[np.int64], chains: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_], NDArray[np.int64]]:
+    """Tables (slot, lane) of path atoms and which of them are real, and of bonds that there are and their rows.
+
+    One long chain is cut into eight pieces; of up to eight short ones each takes a lane, and idle lanes stay behind the
+    last chain's end. A slot beyond the end of a chain repeats its last atom. Chain number c has c rows fewer before it
+    than atoms.
+    """
+    lanes = np.arange(WIDTH)
+    chain = chains[np.minimum(lanes, len(chains) - 1)]
+    slots = sizes[chains].max()
+    begin = np.where(lanes < len(chains), 0, sizes[chain])
+    if slots > SHORT:
+        slots = -(-slots // WIDTH)
+        begin = slots * lanes
+    step = begin + np.arange(slots)[:, None]
+    first, last = bounds[chain], sizes[chain] - 1
+    return first + np.clip(step, 0, last), step <= last, step < last, first - chain + np.clip(step, 0, last - 1)
+
+
+def _whole_slots(present: NDArray[np.bool_]) -> int:
+    """Where the slots begin that lack a bond in some lane; the separators' do not count."""
+    lacking = np.flatnonzero(~present[:-1].all(axis=1))
+    return WIDTH * int(lacking[0] if len(lacking) else len(present) - 1)
+
+
+class Chains(AddressableSolver):
+    """Open paths of held distances, one after another.
+
+    Parameters
+    ----------
+    rows : array_like of int, shape (n_rows,)
+        Global row numbers, chain by chain, in the order of the path.
+    offsets : array_like of int, shape (n_chains + 1,)
+        Where each chain begins in `atoms`; the last entry is their number.
+    atoms : array_like of int, shape (n_path_atoms,)
+        Atoms of the paths, at least two each.
+    lengths : array_like of float, shape (n_rows,)
+        Lengths used where a request names none.
+    inv_mass : array_like of float, shape (n_path_atoms,)
+        Inverse masses along the paths; 0 for a pinned atom.
+
+    Attributes
+    ----------
+    slots : int
+        Groups of eight lanes that a sweep goes through.
+    """
+
+    name = "Chains"
+    kernels = Kernels(_positions, _tangents, resolved=_resolved)
+
+    def __init__(
+        self,
+        rows: ArrayLike,
+        offsets: ArrayLike,
+        atoms: ArrayLike,
+        lengths: ArrayLike,
+        inv_mass: ArrayLike,
+    ) -> None:
+        self._made_of = rows, offsets, atoms, lengths, inv_mass
+        self.rows = np.array(rows, dtype=np.int64)
+        bounds = np.array(offsets, dtype=np.int64)
+        path = np.array(atoms, dtype=np.int64)
+        inverse = np.array(inv_mass, dtype=np.float64)
+        sizes = np.diff(bounds)
+        if (sizes < 2).any():
+            raise ValueError("a chain has at least two atoms")
+        long, short = np.flatnonzero(sizes > SHORT), np.flatnonzero(sizes <= SHORT)
+        # Chains of similar length share a strip.
+        short = short[np.argsort(-sizes[short], kind="stable")]
+        shares = [*long[:, None], *(short[k : k + WIDTH] for k in range(0, len(short), WIDTH))]
+        strips = [_strip(bounds, sizes, share) for share in shares]
+        place, owned, present, row = (np.concatenate([strip[k].reshape(-1) for strip in strips]) for k in range(4))
+        starts = np.concatenate([[0], np.cumsum([strip[0].size for strip in strips])]).astype(np.int64)
+        lane_atoms, lane_rows = (3 * path[place]).astype(np.uint32), row.astype(np.uint32)
+        # Numbers of one byte, which can be views of other arrays.
+        full = np.asarray(owned.reshape(-1, WIDTH).all(axis=1), dtype=np.uint8)
+        bonds, weights = aligned(len(place)), aligned(len(place))
+        bonds[:] = present
+        weights[:] = np.where(owned, inverse[place], 0.0)
+        wholes = np.array([_whole_slots(strip[2]) for strip in strips]) + starts[:-1]
+        ends = np.column_stack((np.delete(path, bounds[1:] - 1), np.delete(path, bounds[:-1]))).astype(np.uint32)
+        self.slots = int(starts[-1]) // WIDTH
+        self.tables = in_one_array(
+            (
+                *(starts, lane_atoms, np.asarray(owned, dtype=np.uint8), full, lane_rows, bonds, weights, wholes),
+                *(np.array(lengths, dtype=np.float64), ends.ravel()),
+                # To work in, and to undo with: the last strip is written once everything is known.
+                *(room(int(np.diff(starts).max()) // WIDTH * SLOT), room(6 * int(starts[-2]))),
+            )
+        )
+
+    def renumbered(self, numbers: NDArray[np.int64]) -> "Chains":
+        """The same for atoms with other numbers: `numbers` by those here."""
+        rows, offsets, atoms, *more = self._made_of
+        return Chains(rows, offsets, numbers[atoms], *more)
