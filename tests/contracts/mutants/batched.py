@@ -31,7 +31,6 @@ MUTANTS = {
             "torch.where(self._is_position, held, «flight→1.0» * middle)",
             "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-LinearVelocity]",
         ),
-        ("made._lattice = self._lattice[«numbers→:1»]", "batched/batch::systems_are_selected_with_their_cells"),
     ],
     "batched/steps.py": [
         ("if «given.shape != x.shape→False»:", "batched/batch::what_is_refused"),
