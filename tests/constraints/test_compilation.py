@@ -72,7 +72,7 @@ def test_kept_in_a_folder_and_announced_once(tmp_path):
     assert second == ("1 0", "")
 
 
-#: A few hundred projections by kernels of several kinds: a digest of the last bits of each.
+#: A few hundred steps with kernels of several kinds: a digest of the last bits of each.
 BITS = """
 import hashlib
 import numpy as np
