@@ -3,10 +3,7 @@
 MUTANTS = {
     "batched/clusters.py": [
         ("torch.where(d > «0→-9e99», 0.0, torch.inf)", "batched/batch::a_bond_that_has_turned_is_no_solution"),
-        (
-            "back = _each(operator.«neg→pos», self.spread(slope, a))",
-            "batched/gradients::derivatives_are_those_of_the_solution",
-        ),
+        ("_each(operator.«neg→pos», self.spread(slope, a)", "batched/gradients::derivatives_are_those_of_the_solution"),
         ("start=of.start «+→-» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
         ("d, rest), «rest.T→0 * rest.T»])", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
     ],
