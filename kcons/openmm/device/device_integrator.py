@@ -20,7 +20,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import constraints_of, function_on_device
-from kcons.openmm.device.kernel_rows import KernelRows, as_parts
+from kcons.openmm.device.kernel_rows import KernelRows
 from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
@@ -200,7 +200,9 @@ class DeviceIntegrator(ProjectedIntegrator):
         _ALIVE[int(made.this)] = self
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
-        return as_parts(parts)
+        given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
+        known = len(given) < 2 and all(isinstance(part, KernelRows) for part in given)
+        return given if known else (KernelRows(given),)
 
     def _write(self) -> Program:
         """A step without parts: kernels hold their rows."""
@@ -430,17 +432,17 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     masses = np.ctypeslib.as_array(given.masses, (given.particles,)).copy()
     positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
     box = np.array(given.box[:9]).reshape(3, 3)
-    rows = part.rows_at(masses, (pairs, lengths), positions, box if box.any() else None, given.time)
+    rows = part.rows_at(masses, pairs, lengths, positions, box if box.any() else None, given.time)
     if integrator is not None:
         integrator.rows = rows
-    done = plan(described, platform, masses, given.groups, rows)
-    compiled = str(build.kernels_library(done.source)) if platform in PLAIN else ""
-    library.kcons_plan_source(made, done.source.encode(), compiled.encode(), done.items, done.work_group, done.slots)
-    for array in done.arrays:
+    source, arrays, parts, sizes = plan(described, platform, masses, given.groups, rows)
+    compiled = str(build.kernels_library(source)) if platform in PLAIN else ""
+    library.kcons_plan_source(made, source.encode(), compiled.encode(), *sizes)
+    for array in arrays:
         values = np.ascontiguousarray(array.values, dtype=np.float64)
         about = array.name.encode(), int(array.kind == "int"), int(array.saved)
         library.kcons_plan_array(made, *about, values.ctypes.data_as(_DOUBLES), values.size)
-    for number, actions in enumerate(done.parts):
+    for number, actions in enumerate(parts):
         for kernel, groups, slot in actions:
             library.kcons_plan_action(made, number, kernel.encode(), ctypes.c_int32(groups), slot)
 
