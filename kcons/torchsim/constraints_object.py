@@ -92,8 +92,9 @@ class Constraints(SystemConstraint):
         """Bring positions that an optimizer asks for onto the constraints, in place."""
         if isinstance(state, MDState):
             raise UnsupportedError(_OWN)
-        new_positions.copy_(self.move(state, new_positions)[0])
+        found = self.move(state, new_positions)[0]
         self.check(state)
+        new_positions.copy_(found)
 
     def adjust_momenta(self, state: SimState, momenta: torch.Tensor) -> None:
         """Refuse integrators of TorchSim, before they move positions."""

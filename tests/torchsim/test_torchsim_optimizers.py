@@ -112,5 +112,7 @@ def test_steps_that_cannot_be_held_are_told():
     hold(state, "water")
     far = state.positions.clone()
     far[6:9] += torch.tensor([[0.0], [40.0], [-40.0]], dtype=far.dtype)
+    given = far.clone()
     with pytest.raises(ConvergenceError, match="copy 1, row"):
         state.constraints[0].adjust_positions(state, far)
+    assert torch.equal(far, given)

@@ -615,8 +615,9 @@ class CollectiveRows(Part):
             context.setVelocities(velocities)
 
     def restore(self, context: openmm.Context) -> None:
-        """`apply_positions`, then `apply_velocities`; raises what these do."""
+        """`apply_positions`, then `apply_velocities`, also for the System's other constraints; raises what these do."""
         self.apply_positions(context)
+        context.applyVelocityConstraints(context.getIntegrator().getConstraintTolerance())
         self.apply_velocities(context)
 
     def check(self, context: openmm.Context) -> None:

@@ -206,6 +206,9 @@ class DeviceIntegrator(ProjectedIntegrator):
 
     def _write(self) -> Program:
         """A step without parts: kernels hold their rows."""
+        for part in self.parts:
+            assert isinstance(part, KernelRows)
+            part.serve(self)
         program = DeviceProgram(self, self.scheme, (), self._ensemble)
         write_step(program)
         return program

@@ -42,8 +42,7 @@ class KernelRows(CarriedConstraints):
         carried = [part for part in parts if isinstance(part, CarriedConstraints)]
         self.given = list(accepted(constraints_of(parts)))
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
-        for part in carried:
-            part._engine.served = True
+        self._carried = carried
         #: Whether rows take periodic images: as `hold` was told, else as the System.
         self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
         self._bound: tuple[DeviceRows, Engine] | None = None
@@ -54,6 +53,14 @@ class KernelRows(CarriedConstraints):
         self._since = self.left = math.nan
 
     # -- a Context ------------------------------------------------------------------------------
+
+    def serve(self, integrator: Any) -> None:
+        """PythonForces of the rows know that kernels hold them, and ask for the time step where no program does."""
+        for part in self._carried:
+            part._engine.served = True
+            other = part._engine._integrator()
+            if other is None or other.program.on_device:
+                part._engine._integrator = weakref.ref(integrator)
 
     def rows_at(
         self,

@@ -390,7 +390,7 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
     """
     system, platform = context.getSystem(), context.getPlatform().getName()
     sites = virtual_sites(system)
-    if not sites:
+    if not sites or integrator.program.on_device:  # which places them itself before it evaluates forces
         return False
     late = platform in _LATE
     where = f"particle {sites[0]} is a virtual site"

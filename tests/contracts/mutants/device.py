@@ -7,6 +7,15 @@ MUTANTS = {
         ("link[k] = (link[k]*damp+h*push«/2→»)*damp;", "device_integrator::settings_change_what_is_done"),
         ("scale = 1+(1«-→+»cosine)*twice/2;", "molecule_spheres::trajectories_are_those_on_arrays"),
     ],
+    "openmm/device/kernel_rows.py": [
+        (
+            "part._engine._integrator = «weakref.ref(integrator)→other»",
+            "kernel_rows::states_with_energies_of_rows_of_hold_that_move",
+        ),
+    ],
+    "openmm/device/plugin/program_integrator.cpp": [
+        ('!(exactly || array.name == «"memory"→""»)', "device_integrator::states_of_other_rows_are_refused"),
+    ],
     "openmm/device/build.py": [
         ("if not (accelerated() «or→and» is_built()):", "device_integrator::which_steps_are_made_on_the_device"),
     ],

@@ -2,6 +2,7 @@
 
 MUTANTS = {
     "openmm/integrator/guard.py": [
+        ("if not sites or «integrator.program.on_device→False»:", "device_integrator::virtual_sites_follow"),
         ("()._value if «driven→False» else 0.0", "hold::time_that_is_set_is_no_way_of_moving_targets"),
         (
             "for part in integrator.parts:\n                «part.check_masses(self.system)→pass»",
@@ -106,6 +107,10 @@ MUTANTS = {
         ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),
     ],
     "openmm/collective/collective_rows.py": [
+        (
+            "«context.applyVelocityConstraints→print»(context.get",
+            "collective_rows::restore_keeps_the_constraints_of_other_molecules",
+        ),
         ("(*held[:k], *«held[n:]→()») for k", "collective_rows::row_that_repeats_a_constraint_of_the_system_is_named"),
         ("weight{c}*({of('more', i)}«-→+»{of('expected', i)})", "row_program::the_iteration_learns_from_each_push"),
         ('let(f"back{c}_{i}_{j}", f"«-→»({done})*back{c}_{i}_{i}"', "row_program::the_iteration_learns_from_each_push"),

@@ -24,7 +24,7 @@ from collective_cases import (
     spring_forces,
 )
 from openmm import app, unit
-from openmm_systems import GPUS, PLATFORMS, started, state_of
+from openmm_systems import GPUS, PLATFORMS, residuals, started, state_of
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, RadiusOfGyration
@@ -266,6 +266,17 @@ def test_rows_that_become_singular_within_a_step_are_named_by_the_program():
 
 
 # -- rows at the state of a Context ---------------------------------------------------------------
+
+
+def test_restore_keeps_the_constraints_of_other_molecules():
+    system, x = chain_system(), np.vstack([CHAIN, [[2.0, 0, 0], [2.1, 0, 0]]])
+    for _ in range(2):
+        system.addParticle(12.0)
+    system.addConstraint(len(CHAIN), len(CHAIN) + 1, 0.1)
+    rows = CollectiveRows(system, [Row(bond(0, 1))], positions=x)
+    context = started(system, ProjectedIntegrator(1e-3, parts=[rows]), x, np.sin(np.arange(x.size)).reshape(x.shape))
+    rows.restore(context)
+    assert max(residuals(system, context)) < 1e-9 and np.abs(rows.rates(context)).max() < 1e-9
 
 
 THREE = [Distance([0, 3]), Dihedral([0, 1, 2, 3]), Angle([2, 3, 4])]

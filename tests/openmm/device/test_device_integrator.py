@@ -21,6 +21,7 @@ from kcons.openmm import (
     NoseHoover,
     NoseHooverMiddle,
     ProjectedIntegrator,
+    hold,
 )
 from kcons.openmm.device import build
 from kcons.openmm.device.kernels import Op, divided, joined
@@ -209,6 +210,34 @@ def test_checkpoints_and_states_continue_bit_for_bit(ensemble, platform):
     assert max(np.abs(a - b).max() for a, b in zip(ahead, state_of(second), strict=True)) <= allowed + 1e-13
 
 
+def test_states_of_other_rows_are_refused():
+    def made(pairs, ensemble=None):
+        system, field = openmm.System(), openmm.CustomExternalForce("10*x^2+20*y^2+30*z^2")
+        for _ in range(6):
+            field.addParticle(system.addParticle(12.0))
+        system.addForce(field)
+        x = np.arange(18).reshape(6, 3) ** 1.1 * 0.03
+        integrator = ProjectedIntegrator(0.001, parts=[Distance(pairs)], ensemble=ensemble, device=True)
+        context = started(system, integrator, x, 0.01 * np.sin(x))
+        integrator.step(3)
+        return system, context
+
+    _, many = made([[0, 1], [2, 3], [4, 5]])
+    state = many.getState(positions=True, velocities=True, parameters=True, integratorParameters=True)
+    system, few = made([[0, 1]])
+    with pytest.raises(openmm.OpenMMException, match="other steps or rows"):
+        few.setState(state)
+    with pytest.raises(openmm.OpenMMException, match="other steps or rows"):
+        made([[0, 1]], NoseHoover(300.0, 10.0))[1].loadCheckpoint(many.createCheckpoint())
+    # A row more in the same System: the run goes on.
+    before = state_of(few)
+    system.addConstraint(2, 3, float(np.linalg.norm(before[0][2] - before[0][3])))
+    few.reinitialize(True)
+    assert np.abs(np.array(state_of(few)) - before).max() == 0.0
+    few.getIntegrator().step(1)
+    assert residuals(system, few)[0] < 1e-12
+
+
 def test_settings_change_what_is_done():
     system, x, v = waters()
     made = [ProjectedIntegrator(0.001, ensemble=NoseHoover(300.0, 10.0), device=d) for d in (True, False)]
@@ -256,13 +285,16 @@ def test_barostats_and_removers_act_on_whole_velocities(platform):
     assert np.abs(masses @ state_of(context)[1]).max() / masses.sum() < 1e-8  # forces of single numbers on the CPU
 
 
-def test_virtual_sites_follow():
+@pytest.mark.parametrize("rows", [False, True])
+def test_virtual_sites_follow(rows):
     system, x, v = dumbbell()
     system.addParticle(0.0)
     system.setVirtualSite(2, openmm.TwoParticleAverageSite(0, 1, 0.3, 0.7))
     system.getForce(0).addParticle(2, [])
     x, v = np.vstack([x, 0.3 * x[:1] + 0.7 * x[1:]]), np.vstack([v, np.zeros((1, 3))])
-    contexts = [run(ProjectedIntegrator(0.001, device=d), system, x, v, calls=(30,)) for d in (True, False)]
+    parts = [hold(system, [Distance([[0, 1]])], x)] if rows else []
+    made = [ProjectedIntegrator(0.001, parts=parts, device=d) for d in (True, False)]
+    contexts = [run(integrator, system, x, v, calls=(30,)) for integrator in made]
     assert difference(*contexts) < 1e-10
 
 

@@ -107,6 +107,21 @@ def test_rows_of_hold_go_over_to_the_device(carried):
     assert copied.degrees_of_freedom(fresh) == 81 - 27 - 6
 
 
+def test_states_with_energies_of_rows_of_hold_that_move():
+    system, x = waters(2)
+    length = float(np.linalg.norm(x[0] - x[3]))
+    part = hold(system, [Distance([[0, 3]], lambda t: length + 0.1 * t)], x)
+    energies = []
+    for device in (True, False):
+        integrator = ProjectedIntegrator(0.001, parts=[part], device=device)
+        context = started(system, integrator, x)
+        integrator.applyVelocityConstraints()
+        integrator.step(5)
+        energies.append(context.getState(energy=True).getPotentialEnergy()._value)
+        del integrator, context
+    assert energies[0] == pytest.approx(energies[1], rel=1e-10)
+
+
 def protein(constraints):
     """Villin without water, near its constraints."""
     pdb = app.PDBFile(str(Path(app.__file__).parent / "data" / "test.pdb"))

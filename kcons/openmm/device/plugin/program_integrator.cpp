@@ -100,28 +100,39 @@ vector<double> ProgramIntegrator::saved() const {
     vector<double> all = {middleKinetic, endKinetic};
     for (auto& array : kernel().plan.arrays) if (array.saved) {
         vector<double> values = read(array.name);
+        all.push_back(values.size());
         all.insert(all.end(), values.begin(), values.end());
     }
     return all;
 }
-void ProgramIntegrator::restore(const vector<double>& all) {
-    auto next = all.begin()+2;
-    for (auto& array : kernel().plan.arrays) if (array.saved) {
-        size_t size = array.values.size();
-        if (all.end()-next < (long) size) throw OpenMMException("kcons: this state belongs to other steps or rows");
-        write(array.name, vector<double>(next, next+size));
-        next += size;
+void ProgramIntegrator::restore(const vector<double>& all, bool exactly) {
+    map<string, vector<double>> found;
+    size_t next = 2;
+    bool known = all.size() >= next;
+    for (auto& array : kernel().plan.arrays) if (array.saved && known) {
+        double size = next < all.size() ? all[next++] : -1;
+        bool same = size == array.values.size();
+        known = size >= 0 && next+size <= all.size() && (same || !(exactly || array.name == "memory"));
+        if (known && same) found[array.name].assign(&all[next], &all[next]+array.values.size());
+        if (known) next += (size_t) size;
     }
+    if (!known || next != all.size())
+        throw OpenMMException("kcons: this state belongs to other steps or rows; take over its positions and velocities only");
+    for (auto& each : found) write(each.first, each.second);
     middleKinetic = all[0]; endKinetic = all[1];
 }
 void ProgramIntegrator::createCheckpoint(ostream& out) const {
     vector<double> all = saved();
+    all.insert(all.begin(), all.size());
     out.write((const char*) all.data(), all.size()*sizeof(double));
 }
 void ProgramIntegrator::loadCheckpoint(istream& in) {
-    vector<double> all = saved();
-    in.read((char*) all.data(), all.size()*sizeof(double));
-    restore(all);
+    double size = 0;
+    in.read((char*) &size, sizeof(size));
+    vector<double> all(size >= 2 && size < 1e8 ? (size_t) size : 0);
+    if (!in.read((char*) all.data(), all.size()*sizeof(double))) all.clear();
+    // Where constraints were added, `Context::reinitialize` brings what belongs to fewer rows.
+    restore(all, false);
     kernel().valid = false;
 }
 void ProgramIntegrator::serializeParameters(SerializationNode& node) const {
@@ -134,7 +145,7 @@ void ProgramIntegrator::deserializeParameters(const SerializationNode& node) {
     istringstream text(node.getStringProperty("state", ""));
     vector<double> all;
     for (double value; text >> value;) all.push_back(value);
-    if (!all.empty()) restore(all);            // else it is the state of another integrator
+    if (!all.empty()) restore(all, true);      // else it is the state of another integrator
 }
 
 class Proxy : public SerializationProxy {

@@ -81,7 +81,8 @@ private:
     StepKernel& kernel() const;    // with all that it needs, which is made when it is used first
     Plan planned() const;
     std::vector<double> saved() const;         // all that belongs to a state beside x and v
-    void restore(const std::vector<double>& all);
+    // `exactly` that of these rows; else arrays of other rows stay as they are.
+    void restore(const std::vector<double>& all, bool exactly);
     mutable OpenMM::Kernel handle;
     // Of the middle of the last step, and of the velocities that it ended with: those of others have another. -1: none.
     double middleKinetic = -1, endKinetic = -1;
