@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import json
 import weakref
@@ -201,8 +202,11 @@ class DeviceIntegrator(ProjectedIntegrator):
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
         given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
-        known = len(given) < 2 and all(isinstance(part, KernelRows) for part in given)
-        return given if known else (KernelRows(given),)
+        made = [part for part in given if isinstance(part, KernelRows)]
+        if len(given) == len(made) < 2:
+            # Kernels are those of one Context: what serves another integrator is made again.
+            return tuple(part if part.program is None else copy.deepcopy(part) for part in made)
+        return (KernelRows(given),)
 
     def _write(self) -> Program:
         """A step without parts: kernels hold their rows."""
@@ -252,6 +256,11 @@ class DeviceIntegrator(ProjectedIntegrator):
     def bound(self) -> bool:
         """Whether there is a Context."""
         return bool(build.library().kcons_is_bound(self._address))
+
+    @property
+    def planned(self) -> bool:
+        """Whether the Context has its kernels; not after `reinitialize`."""
+        return bool(build.library().kcons_is_planned(self._address))
 
     def read(self, name: str) -> FloatArray:
         """An array of the device, by its name in `kcons.openmm.device.kernels`."""

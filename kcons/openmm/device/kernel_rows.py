@@ -92,9 +92,10 @@ class KernelRows(CarriedConstraints):
 
     def bind(self, context: openmm.Context) -> DeviceRows:
         """The rows for a Context, at its positions."""
-        if self._context() is not context:
-            system, program = context.getSystem(), self.program
-            assert program is not None
+        program = self.program
+        assert program is not None
+        if self._context() is not context or not program.integrator.planned:
+            system = context.getSystem()
             refuse_virtual_sites(system, self.atoms, masses_of(system))
             program.integrator.read("seed")  # makes the plan, which asks `rows_at`
             self._context = weakref.ref(context)

@@ -586,6 +586,9 @@ class Guard:
         excess = miss / limit
         row = int(np.argmax(excess))
         if not excess[row] <= 1:  # also NaN
+            if self._read_again():
+                self.check_lengths(x, step)
+                return
             tolerance = self.integrator.getConstraintTolerance()
             raise ConvergenceError(
                 f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g} "
@@ -613,7 +616,16 @@ class Guard:
             return None
         allowed = (10 * tolerance + self.precision.solvers) * rows.speeds_of_one(v)
         allowed += (self.limit(x) + self.precision.speeds) * np.sqrt(np.mean(v * v))
-        return Violation.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
+        found = Violation.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
+        return self.speed_violation(x, v) if found is not None and self._read_again() else found
+
+    def _read_again(self) -> bool:
+        """Whether the System has other constraints or masses since it was read, as before `Context.reinitialize`."""
+        now = SystemRows.of(self.system, rounded=self.precision.rounds_lengths)
+        if all(np.array_equal(value, vars(self.rows)[name]) for name, value in vars(now).items()):
+            return False
+        self.rows, self._freedom, self.thermal, self.momenta = now, None, None, None
+        return True
 
     # -- calls ----------------------------------------------------------------------------------
 

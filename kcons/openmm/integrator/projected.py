@@ -481,9 +481,14 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             A temperature below zero; a number for `rng` outside 0 to 2^31 - 1.
         """
         temperature = kelvins(temperature)
-        self._watch(context)  # refuses before velocities are changed
-        context.setVelocitiesToTemperature(temperature, seed_from(rng, bits=31))
-        self.applyVelocityConstraints(context)
+        seed, context = seed_from(rng, bits=31), self._watch(context).context  # refuse before velocities are changed
+        velocities = velocities_of(context)
+        context.setVelocitiesToTemperature(temperature, seed)
+        try:
+            self.applyVelocityConstraints(context)
+        except KconsError:
+            context.setVelocities(velocities)
+            raise
 
     def minimizeEnergy(
         self,
@@ -539,7 +544,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         if self.ensemble.noisy:
             return guard.context.getState(energy=True, groups=0).getKineticEnergy()
         v = velocities_of(guard.context)
-        return 0.5 * float(guard.rows.masses @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
+        return 0.5 * float(masses_of(guard.system) @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
 
     def computeSystemTemperature(self) -> unit.Quantity:
         """2 K/(g k), with g the degrees of freedom that constraints leave; StateDataReporter asks for it.

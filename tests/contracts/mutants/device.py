@@ -30,6 +30,10 @@ MUTANTS = {
         ("self._advance(context, again«→ - 1»)", "device_integrator::a_failure_leaves_the_state_before_the_step"),
         ("yield x, v, f, time + (k «+ 1→+ 0») * every * self", "device_integrator::records_are_the_states_after_steps"),
         ("part.left «!=→is None and» guard.context.getTime(", "kernel_rows::multipliers_are_summed_where_the_rows_are"),
+        (
+            "part if part.program is None «else copy.deepcopy(part)→else part»",
+            "kernel_rows::parts_serve_integrators_of_other_systems",
+        ),
         ("if told[_FAILED]«→ and False»:", "device_integrator::rows_without_solution_are_told_and_taken_back"),
     ],
 }

@@ -2,6 +2,10 @@
 
 MUTANTS = {
     "openmm/integrator/guard.py": [
+        (
+            "            if «self._read_again()→False»:\n",
+            "openmm/integrator/edits::masses_and_lengths_after_reinitialize",
+        ),
         ("if not sites or «integrator.program.on_device→False»:", "device_integrator::virtual_sites_follow"),
         ("()._value if «driven→False» else 0.0", "hold::time_that_is_set_is_no_way_of_moving_targets"),
         (

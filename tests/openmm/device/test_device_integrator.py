@@ -10,7 +10,7 @@ import pytest
 from device_systems import waters
 from openmm_systems import GPUS, LONG, dumbbell, masses_of, residuals, started, state_of
 
-from kcons.constraints import Distance
+from kcons.constraints import Distance, Plane
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import (
     DeviceIntegrator,
@@ -236,6 +236,20 @@ def test_states_of_other_rows_are_refused():
     assert np.abs(np.array(state_of(few)) - before).max() == 0.0
     few.getIntegrator().step(1)
     assert residuals(system, few)[0] < 1e-12
+
+
+def test_constraints_that_are_taken_away_before_reinitialize_hold_no_more():
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(0.001, parts=[Plane(1, [0.0, 0.0, 1.0])], device=True)
+    context = started(system, integrator, x, v)
+    integrator.applyVelocityConstraints()
+    integrator.step(3)
+    system.removeConstraint(0)
+    context.reinitialize()
+    context.setPositions(x)
+    context.setVelocities(v)
+    integrator.applyVelocityConstraints()
+    np.testing.assert_allclose(state_of(context)[1], v * [[1, 1, 1], [1, 1, 0]], atol=1e-12)
 
 
 def test_settings_change_what_is_done():

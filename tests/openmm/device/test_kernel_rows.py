@@ -107,6 +107,23 @@ def test_rows_of_hold_go_over_to_the_device(carried):
     assert copied.degrees_of_freedom(fresh) == 81 - 27 - 6
 
 
+def test_parts_serve_integrators_of_other_systems():
+    (one, x), (other, _) = waters(2), waters(2)
+    other.setParticleMass(0, 100.0)
+    first = ProjectedIntegrator(0.001, parts=[Distance([[0, 3]])], device=True)
+    second = ProjectedIntegrator(0.001, parts=first.parts, device=True)
+    alone = ProjectedIntegrator(0.001, parts=[Distance([[0, 3]])], device=True)
+    v, found = start(one, x), []
+    for integrator, system in ((first, one), (second, other), (alone, one), (first, None)):
+        context = integrator.context if system is None else started(system, integrator, x)
+        context.setPositions(x)
+        context.setVelocities(v + np.sin(np.arange(v.size)).reshape(v.shape))
+        integrator.applyVelocityConstraints()
+        found.append((context, context.getState(velocities=True).getVelocities(asNumpy=True)._value))
+    np.testing.assert_allclose(found[3][1], found[2][1], atol=1e-12)
+    assert np.abs(found[1][1] - found[2][1]).max() > 0.01
+
+
 def test_states_with_energies_of_rows_of_hold_that_move():
     system, x = waters(2)
     length = float(np.linalg.norm(x[0] - x[3]))

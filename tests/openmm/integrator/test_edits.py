@@ -57,6 +57,25 @@ def test_rows_after_reinitialize(preserved):
         integrator.step(1)
 
 
+def test_masses_and_lengths_after_reinitialize():
+    system, integrator = cluster(), ProjectedIntegrator(0.002)
+    length = float(np.linalg.norm(X[0] - X[1]))
+    system.addConstraint(0, 1, length)
+    context = started(system, integrator, X, np.sin(np.arange(X.size)).reshape(X.shape))
+    integrator.step(3)
+    system.setParticleMass(2, 50.0)
+    system.setConstraintParameters(0, 0, 1, 1.002 * length)
+    context.reinitialize(preserveState=True)
+    integrator.applyConstraints()
+    integrator.applyVelocityConstraints()
+    kinetic = context.getState(energy=True).getKineticEnergy()._value
+    assert integrator.kinetic_energy()._value == pytest.approx(kinetic, rel=1e-6)
+    integrator.step(3)
+    integrator.check()
+    x = state_of(context)[0]
+    assert np.linalg.norm(x[0] - x[1]) == pytest.approx(1.002 * length, rel=1e-9)
+
+
 # -- forces change --------------------------------------------------------------------------------------
 
 

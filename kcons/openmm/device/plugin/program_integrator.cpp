@@ -29,7 +29,7 @@ void ProgramIntegrator::initialize(ContextImpl& c) {
     handle.getAs<StepKernel>().begin(c, clusters);
     middleKinetic = -1;
 }
-Plan ProgramIntegrator::planned() const {
+Plan ProgramIntegrator::made() const {
     const System& system = context->getSystem();
     vector<double> masses, lengths;
     vector<int> pairs;
@@ -55,9 +55,10 @@ vector<string> ProgramIntegrator::getKernelNames() { return {StepKernel::Name()}
 StepKernel& ProgramIntegrator::kernel() const {
     if (context == nullptr) throw OpenMMException("This Integrator is not bound to a context!");
     StepKernel& k = handle.getAs<StepKernel>();
-    if (!k.built) k.build(*context, planned());
+    if (!k.built) k.build(*context, made());
     return k;
 }
+bool ProgramIntegrator::planned() const { return context != nullptr && handle.getAs<StepKernel>().built; }
 void ProgramIntegrator::step(int steps) {
     StepKernel& k = kernel();
     fill_n(shared.told, 7, 0);
@@ -254,6 +255,7 @@ void kcons_describe(void* integrator, const char* description, const int* cluste
 }
 Shared* kcons_shared(void* integrator) { return &own(integrator).shared; }
 int kcons_is_bound(void* integrator) { return own(integrator).bound(); }
+int kcons_is_planned(void* integrator) { return own(integrator).planned(); }
 // The values of an array, until the next is read; null where that fails.
 const double* kcons_read(void* integrator, const char* name, int* n) try {
     static thread_local vector<double> values;

@@ -66,6 +66,7 @@ public:
     std::vector<double> read(const std::string& name) const;
     void write(const std::string& name, const std::vector<double>& values);
     bool bound() const { return context != nullptr; }
+    bool planned() const;          // whether the kernel has all that it needs
 protected:
     void initialize(OpenMM::ContextImpl& c) override;
     void cleanup() override;
@@ -79,7 +80,7 @@ protected:
     void deserializeParameters(const OpenMM::SerializationNode& node) override;
 private:
     StepKernel& kernel() const;    // with all that it needs, which is made when it is used first
-    Plan planned() const;
+    Plan made() const;
     std::vector<double> saved() const;         // all that belongs to a state beside x and v
     // `exactly` that of these rows; else arrays of other rows stay as they are.
     void restore(const std::vector<double>& all, bool exactly);
