@@ -28,7 +28,7 @@ from kcons.constraints.arguments import (
     MD_UNITS,
     Kind,
     as_float_array,
-    atom_array,
+    atom_table,
     checked,
     out_of_range,
     plain_target,
@@ -45,6 +45,9 @@ _COMPLEX_STEP = 2.0**-100
 
 #: Rows that loop over more atoms are compiled, where others are taken at once.
 WIDE = 6
+
+#: What each row has an entry of, in all families.
+_BY_ROW = ("atoms", "target", "masses", "whole", "cell_offsets")
 
 #: All families by name.
 FAMILIES: dict[str, type[Constraint]] = {}
@@ -95,7 +98,7 @@ class Constraint:
     #: How many of the parameters, the first ones, are the same in all rows of an object: numbers of atoms and the like.
     alike: int = 0
     #: Atoms a row, where the family fixes it.
-    row_width: ClassVar[int | None] = None
+    row_width: int | None = None
     #: Data held for each row: name -> shape of one row's entry, -1 standing for the width.
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     #: Which of these are lengths, and with which power, where units change.
@@ -148,7 +151,7 @@ class Constraint:
             cls.__init__ = checked(cls.__init__, units=True)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
-        self.atoms: IntArray = read_only(_atom_table(atoms, type(self).__name__, self.row_width))
+        self.atoms: IntArray = read_only(atom_table(atoms, type(self).__name__, self.row_width))
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
         self._keep(**data)
         self._settle()
@@ -346,46 +349,37 @@ class Constraint:
                 f"row {first_row + k}, {self.row_name(k)}: {say(k)}", item=item, atoms=self.atoms[k].tolist()
             )
 
-    def with_masses(self, masses: FloatArray) -> Constraint:
+    def changed(self, **own: Any) -> Self:
+        """Copy with other attributes, of which nothing is checked."""
+        copy = object.__new__(type(self))
+        copy.__dict__.update(self.__dict__ | own)
+        return copy
+
+    def with_masses(self, masses: FloatArray) -> Self:
         """Copy that knows the masses of its atoms, shape (n_rows, width); most families need none."""
         if not self.uses_masses:
             return self
-        copy = self.with_target(self.target)
-        copy.masses = read_only(np.array(masses, dtype=np.float64, order="C"))
-        return copy
+        return self.changed(masses=read_only(np.array(masses, dtype=np.float64, order="C")))
 
     def with_target(self, target: Target) -> Self:
         """Copy of this object held at another target."""
-        copy = object.__new__(type(self))
-        copy.__dict__.update(self.__dict__)
         plain, matters = plain_target(target, f"{self.family}: target", self.held)
-        copy.target = as_target(plain, self.n_rows)
-        if matters:
-            copy.units = MD_UNITS
-        return copy
+        return self.changed(target=as_target(plain, self.n_rows), units=MD_UNITS if matters else self.units)
 
     def select(self, rows: Sequence[int] | IntArray) -> Self:
         """Copy with some of the rows, their targets and their data."""
         rows = np.asarray(rows, dtype=np.int64)
-        copy = self.with_target(None)
-        copy.atoms = read_only(self.atoms[rows])
-        for name in self.per_row:
-            setattr(copy, name, read_only(getattr(self, name)[rows]))
-        if self.masses is not None:
-            copy.masses = read_only(self.masses[rows])
-        copy.whole = None if self.whole is None else self.whole[rows]
-        copy.cell_offsets = None if self.cell_offsets is None else self.cell_offsets[rows]
-        if isinstance(self.target, np.ndarray):
-            copy.target = read_only(self.target[rows])
-        elif self.target is not None:
-            copy.target = _selected(self.target, rows, self.n_rows, self.period)
-        return copy
+        data = {name: getattr(self, name) for name in (*_BY_ROW, *self.per_row)}
+        own: dict[str, Any] = {
+            name: read_only(array[rows]) for name, array in data.items() if isinstance(array, np.ndarray)
+        }
+        if isinstance(self.target, MovingTarget):
+            own["target"] = _selected(self.target, rows, self.n_rows, self.period)
+        return self.changed(**own)
 
     def renumbered(self, new_index: IntArray) -> Self:
         """Copy with atom a replaced by new_index[a]."""
-        copy = self.with_target(self.target)
-        copy.atoms = read_only(np.asarray(new_index, dtype=np.int64)[self.atoms])
-        return copy
+        return self.changed(atoms=read_only(np.asarray(new_index, dtype=np.int64)[self.atoms]))
 
     def row_name(self, row: int) -> str:
         """For example 'Distance(4, 5)'."""
@@ -454,39 +448,6 @@ def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float |
         rate=lambda t: target.rate_at(t, n_rows, period)[rows],
         acceleration=lambda t: target.acceleration_at(t, n_rows, period)[rows],
     )
-
-
-def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
-    table = atom_array(atoms, name)
-    if table.size == 0:
-        return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
-    if not np.issubdtype(table.dtype, np.integer):
-        remedy = "; of a mask give np.flatnonzero(mask)" if table.dtype == bool else ""
-        raise InputError(f"{name}: atom indices must be integers, not {table.dtype}{remedy}", item="atoms")
-    table = np.atleast_2d(table.astype(np.int64))
-    if table.ndim != 2:
-        raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item="atoms")
-    if width is not None and table.shape[1] != width:
-        raise InputError(
-            f"{name}: a row has {width} atom{'s' if width > 1 else ''}, but atoms has shape {np.shape(atoms)}",
-            item="atoms",
-        )
-    if table.min() < 0:
-        row, slot = np.argwhere(table < 0)[0]
-        raise InputError(
-            f"{name}: row {row} has the negative atom index {table[row, slot]}; count atoms from 0",
-            item="atoms",
-            atoms=table[row],
-        )
-    if table.shape[1] > 1:
-        ordered = np.sort(table, axis=1)
-        repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
-        if repeated.any():
-            row = int(np.argmax(repeated))
-            raise InputError(
-                f"{name}: row {row} names an atom twice: {tuple(table[row].tolist())}", item="atoms", atoms=table[row]
-            )
-    return table
 
 
 def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,33 +73,44 @@ class MovingTarget:
             return first_derivative(lambda t: self.rate_at(t, rows), time, self.time_step)
         return second_derivative(lambda t: self.at(t, rows), time, self.time_step, period)
 
-    def contradiction(self, time: float, rows: int, period: float | None = None) -> str:
-        """What a given derivative and differences say at two times soon after `time`, where they differ; or ''."""
-        for name, given, derivative, function, jump in (
+    def check(self, name: str, time: float, rows: int, period: float | None = None) -> None:
+        """Refuse derivatives that are not those of the target soon after `time`: atoms would leave it silently.
+
+        `name` is what messages call the rows that it belongs to.
+        """
+        h, (function, jump) = self.time_step, (self.at, period) if self.rate is None else (self.rate_at, None)
+
+        def rough(t: float) -> bool:
+            coarse, fine = (first_derivative(partial(function, rows=rows), t, step, jump) for step in (h, h / 2))
+            size = np.maximum(np.abs(coarse), np.abs(fine)) + 1e-9 * np.abs(function(t, rows)).max(initial=0.0) / h
+            return bool((np.abs(fine - coarse) > ROUGH * size).any())
+
+        # At two times so far apart that one kink does not count.
+        if self.acceleration is None and rough(time + 5 * h) and rough(time + 15 * h):
+            raise InputError(
+                f"{name}: the target changes within less than the step of its differences, {h:g}; give its rate and "
+                "acceleration, or MovingTarget(..., time_step=...), 1/50 of the time in which it changes",
+                item="time_step",
+            )
+        for what, given, derivative, of, period_of in (
             ("rate", self.rate, self.rate_at, self.at, period),
             ("acceleration", self.acceleration, self.acceleration_at, self.rate_at, None),
         ):
-            if given is not None:
-                own, whole = partial(derivative, rows=rows), partial(function, rows=rows)
-                found = contradiction(own, whole, time, self.time_step, jump)
-                if found is not None:
-                    return (
-                        f"its {name} is {found.given:.6g} at t = {found.time:g}, but differences give {found.found:.6g}"
-                    )
-        return ""
-
-    def unresolved(self, time: float, rows: int, period: float | None = None) -> bool:
-        """Whether what is not given changes too fast for differences with `time_step`, at two times after `time`."""
-        if self.acceleration is not None:
-            return False
-        function, jump = (self.at, period) if self.rate is None else (self.rate_at, None)
-        for later in (5.0, 15.0):  # so far apart that one kink does not count
-            t, h = time + later * self.time_step, self.time_step
-            coarse, fine = (first_derivative(partial(function, rows=rows), t, step, jump) for step in (h, h / 2))
-            size = np.maximum(np.abs(coarse), np.abs(fine)) + 1e-9 * np.abs(function(t, rows)).max(initial=0.0) / h
-            if not (np.abs(fine - coarse) > ROUGH * size).any():
-                return False
-        return True
+            if given is None:
+                continue
+            for t in (time + 1.3 * h, time + 2.7 * h):  # at one alone there may be a kink
+                own, whole = derivative(t, rows), partial(of, rows=rows)
+                coarse, fine = (first_derivative_4(whole, t, step, period_of) for step in (0.1 * h, 0.05 * h))
+                wrong = contradicted(own, coarse, fine, 1e-8 * np.abs(whole(t)) / h)
+                if not wrong.any():
+                    break
+            else:
+                k = int(np.argmax(wrong))
+                raise InputError(
+                    f"{name}: the target contradicts itself: its {what} is {own[k]:.6g} at t = {t:g}, but differences "
+                    f"give {fine[k]:.6g}; correct it, or leave the derivatives out",
+                    item="target",
+                )
 
 
 Target: TypeAlias = Annotated[float | ArrayLike | MovingTarget | TimeFunction | None, HELD]
@@ -141,32 +152,6 @@ def contradicted(
     """
     size = np.maximum(np.abs(given), np.abs(fine)) + rounding
     return np.asarray((np.abs(fine - given) > WRONG * size) & (np.abs(fine - coarse) <= WRONG * size))
-
-
-class Contradiction(NamedTuple):
-    """The number in the array, the time, the derivative that was given there and the one found by differences."""
-
-    number: int
-    time: float
-    given: float
-    found: float
-
-
-def contradiction(
-    derivative: Function, function: Function, time: float, time_step: float, period: float | None = None
-) -> Contradiction | None:
-    """What a given derivative and differences of its function say soon after `time`; None where they agree."""
-    told = None
-    for later in (1.3, 2.7):  # at one alone there may be a kink
-        t, h = time + later * time_step, 0.1 * time_step
-        given = derivative(t)
-        coarse, fine = (first_derivative_4(function, t, step, period) for step in (h, h / 2))
-        wrong = contradicted(given, coarse, fine, 1e-9 * np.abs(function(t)) / h)
-        if not wrong.any():
-            return None
-        k = int(np.argmax(wrong))
-        told = Contradiction(k, t, float(given.flat[k]), float(fine.flat[k]))
-    return told
 
 
 # Weights of f(a + kh) -/+ f(a - kh), k = 1, 2, ...

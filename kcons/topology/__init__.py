@@ -12,7 +12,7 @@
 """
 
 from kcons.topology.holding import Holding
-from kcons.topology.rows_by_name import HeldRows, held_rows
+from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import Snapshot, Topology, bond_angles
 
-__all__ = ["HeldRows", "Holding", "Snapshot", "Topology", "bond_angles", "held_rows"]
+__all__ = ["HeldRows", "Holding", "Snapshot", "Topology", "bond_angles", "rows_of"]

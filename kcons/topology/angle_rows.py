@@ -19,7 +19,7 @@ from kcons.constraints.periodic.one_piece import lined_up, minimum_image, neighb
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross, dot, norm
 from kcons.topology.rigid_groups import body_numbers, inside_bodies
-from kcons.topology.ring_systems import RingSystems, ring_rows, ring_systems
+from kcons.topology.ring_systems import ring_rows, ring_systems
 from kcons.topology.topology import BoolArray, Snapshot, bond_angles
 
 #: Beyond this an angle is held by a linear row, in degrees.
@@ -52,11 +52,16 @@ def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -
         Impropers a-j-b-c of an atom j with its neighbors, and dihedrals of flat rings.
     """
     n = snapshot.topology.n_atoms
-    systems = ring_systems(bonds, n)
-    label = _labels(n, bonds, systems, rigid)
+    of_bond, systems = ring_systems(bonds, n)
+    # The same number for bonds of one ring system or rigid group; -1 for all others.
+    label, first = of_bond.copy(), len(systems)
+    for body in body_numbers(n, rigid):
+        both = body[bonds]
+        together = (label < 0) & (both[:, 0] >= 0) & (both[:, 0] == both[:, 1])
+        label[together] = first + both[together, 0]
     triples, quads = _centers(snapshot, bonds, label)
-    for k, rings in enumerate(systems.rings):
-        inside = bonds[systems.of_bond == k]
+    for k, rings in enumerate(systems):
+        inside = bonds[of_bond == k]
         every = bond_angles(inside, n)
         straight = Angle(every).measure(lined_up(snapshot.positions[every], snapshot.lattice), 0.0) > np.radians(
             STRAIGHT
@@ -71,16 +76,6 @@ def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -
     found[:, [0, 2]] = np.sort(found[:, [0, 2]], axis=1)
     turned = np.concatenate([np.zeros((0, 4), np.int64), *quads])
     return found[np.lexsort((found[:, 2], found[:, 0], found[:, 1]))], turned[np.lexsort(turned.T[[3, 2, 0, 1]])]
-
-
-def _labels(n: int, bonds: IntArray, systems: RingSystems, rigid: Sequence[IntArray]) -> IntArray:
-    """A number for each bond, the same for bonds of one ring system or rigid group; -1 for all others."""
-    label, first = systems.of_bond.copy(), len(systems.rings)
-    for body in body_numbers(n, rigid):
-        both = body[bonds]
-        inside = (label < 0) & (both[:, 0] >= 0) & (both[:, 0] == both[:, 1])
-        label[inside] = first + both[inside, 0]
-    return label
 
 
 def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list[IntArray], list[IntArray]]:

@@ -30,11 +30,10 @@ def rescaled(constraint: C, factor: float) -> C:
         raise UnsupportedError(
             f"{constraint!r} has {what}; it cannot be converted to another unit. Write it in the units of the host"
         )
-    copy = constraint.with_target(None)
+    own = {name: getattr(constraint, name) * factor**power for name, power in constraint.length_powers.items()}
     if constraint.target is not None:
-        copy.target = np.asarray(constraint.target) * factor ** powers.get("length", 0)
-    for name, power in constraint.length_powers.items():
-        setattr(copy, name, read_only(getattr(constraint, name) * factor**power))
+        own["target"] = np.asarray(constraint.target) * factor ** powers.get("length", 0)
+    copy = constraint.changed(**{name: read_only(array) for name, array in own.items()})
     copy._settle()
     return copy
 

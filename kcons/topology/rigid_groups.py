@@ -124,19 +124,15 @@ def find_waters(
     atoms = np.flatnonzero(called[topology.residues])
     number, residue = np.unique(topology.residues[atoms], return_inverse=True)
     symbol = topology.elements[atoms]
-    oxygen, hydrogen = symbol == "O", symbol == "H"
     # Anything else counts as a site if it has no mass; Drude particles have some, and move by themselves.
-    site = ~oxygen & ~hydrogen & (topology.masses[atoms] == 0)
-    count = [
-        np.bincount(residue, weights=mask, minlength=len(number)) for mask in (oxygen, hydrogen, site, symbol != "?")
-    ]
-    whole = (count[0] == 1) & (count[1] == 2) & (count[0] + count[1] + count[2] == count[3])
-    alone = (count[0] == 1) & (count[3] == 1)
-    odd = np.flatnonzero(~whole & ~alone)
+    kind = np.select([symbol == "O", symbol == "H", topology.masses[atoms] == 0], [0, 1, 2], 3)
+    count = np.zeros((len(number), 4), np.int64)
+    np.add.at(count, (residue, kind), 1)
+    whole = (count[:, [0, 1, 3]] == [1, 2, 0]).all(axis=1)
+    odd = np.flatnonzero(~whole & (count != [1, 0, 0, 0]).any(axis=1))
     if len(odd):
         where = atoms[residue == odd[0]]
-        n_oxygen, n_hydrogen, n_site, n_all = (int(of_each[odd[0]]) for of_each in count)
-        others = n_all - n_oxygen - n_hydrogen - n_site
+        n_oxygen, n_hydrogen, _, others = count[odd[0]].tolist()
         besides = f" and {others} with mass besides" if others else ""
         raise InputError(
             f"residue {topology.residue_name(int(number[odd[0]]))} (atoms {where[0]} to {where[-1]}) is called water "
@@ -146,17 +142,12 @@ def find_waters(
             atoms=where.tolist(),
         )
     member = whole[residue]
-    # Atoms of a residue in their order, so that oxygen comes before its hydrogens in the triples.
-    o = atoms[member & oxygen]
-    h = atoms[member & hydrogen]
-    triples = np.zeros((len(o), 3), np.int64)
-    triples[:, 0] = o[np.argsort(residue[member & oxygen], kind="stable")]
-    triples[:, 1:] = h[np.argsort(residue[member & hydrogen], kind="stable")].reshape(-1, 2)
-    rank = np.cumsum(whole) - 1
-    sites = atoms[member & site]
-    parents = triples[rank[residue[member & site]]]
+    held = np.flatnonzero(member & (kind < 2))
+    triples = atoms[held[np.lexsort((kind[held], residue[held]))]].reshape(-1, 3)
+    sites = member & (kind == 2)
+    parents = triples[(np.cumsum(whole) - 1)[residue[sites]]]
     middle = 0.0 if geometry is None else geometry[0] * float(np.cos(np.radians(geometry[1]) / 2))
-    return Waters(triples, _water_sites(snapshot, sites, parents, number[residue[member & site]], model_site, middle))
+    return Waters(triples, _water_sites(snapshot, atoms[sites], parents, number[residue[sites]], model_site, middle))
 
 
 def _water_sites(
@@ -252,16 +243,15 @@ def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]
     return [np.array(group) for _, group in sorted(by_size.items())]
 
 
-def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT) -> list[Constraint]:
+def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint]:
     """Rows that hold every group rigid: distances between bases, and relations for all other atoms.
+
+    Bodies that are linear or planar up to `FLAT` are held exactly so; positions may be off by that much.
 
     Parameters
     ----------
     groups : sequence of ndarray, shape (n_bodies, n_atoms)
         Bodies of one size each.
-    flat : float
-        Extent across a line or a plane, relative to that along it, up to which a body is held as linear or planar.
-        It is then held exactly flat, so that positions may be off by that much.
 
     Raises
     ------
@@ -280,7 +270,7 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT
         r, n = whole_groups(snapshot, atoms), atoms.shape[1]
         center = r.mean(axis=1, keepdims=True)
         _, s, axes = np.linalg.svd(r - center, full_matrices=False)
-        dimension = 1 + (s[:, 1:3] > flat * s[:, :1]).sum(axis=1) if n > 2 else np.ones(len(atoms), np.int64)
+        dimension = 1 + (s[:, 1:3] > FLAT * s[:, :1]).sum(axis=1) if n > 2 else np.ones(len(atoms), np.int64)
         _refuse_coincident(snapshot, atoms, s)
         for d in np.unique(dimension).tolist():
             these = np.flatnonzero(dimension == d)

@@ -8,7 +8,6 @@ are held.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,28 +29,18 @@ _DEPENDENT = 1e-6
 _AS_GOOD = 1 - 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class RingSystems:
-    """Rings that share bonds.
+def ring_systems(bonds: IntArray, n_atoms: int) -> tuple[IntArray, list[list[IntArray]]]:
+    """Rings that share bonds: the shortest ring through each bond, up to `LARGEST` atoms; `bonds` sorted, each once.
 
-    Attributes
-    ----------
+    Returns
+    -------
     of_bond : ndarray of int, shape (n_bonds,)
         The system each bond belongs to, -1 for bonds in no small ring.
-    rings : tuple of tuple of ndarray of int
+    rings : list of list of ndarray of int
         The rings of each system: their atoms, one after the other.
     """
-
-    of_bond: IntArray
-    rings: tuple[tuple[IntArray, ...], ...]
-
-
-def ring_systems(bonds: IntArray, n_atoms: int) -> RingSystems:
-    """The shortest ring through each bond, up to `LARGEST` atoms; `bonds` sorted, each once."""
     of_bond = np.full(len(bonds), -1)
     keep = _without_ends(bonds, n_atoms)
-    if not keep.any():
-        return RingSystems(of_bond, ())
     starts, ends = neighbor_lists(bonds[keep], n_atoms)
     number = {pair: k for k, pair in enumerate(map(tuple, bonds.tolist()))}
     found: dict[tuple[int, ...], IntArray] = {}
@@ -59,20 +48,18 @@ def ring_systems(bonds: IntArray, n_atoms: int) -> RingSystems:
         ring = _shortest_ring(i, j, starts, ends)
         if ring:
             found.setdefault(tuple(sorted(ring)), np.array(ring))
-    if not found:
-        return RingSystems(of_bond, ())
     cycles = list(found.values())
     members = [
         [number[tuple(sorted(p))] for p in zip(c.tolist(), np.roll(c, -1).tolist(), strict=True)] for c in cycles
     ]
-    links = [(b, len(bonds) + k) for k, ring in enumerate(members) for b in ring]
-    label, _ = connected(np.array(links), len(bonds) + len(cycles))
-    used = np.unique(label[len(bonds) :])
-    in_ring = np.isin(np.arange(len(bonds)), np.concatenate(members))
-    of_bond[in_ring] = np.searchsorted(used, label[: len(bonds)][in_ring])
-    system = np.searchsorted(used, label[len(bonds) :])
-    rings = tuple(tuple(c for c, s in zip(cycles, system, strict=True) if s == k) for k in range(len(used)))
-    return RingSystems(of_bond, rings)
+    links = [(len(bonds) + k, b) for k, ring in enumerate(members) for b in ring]
+    label, _ = connected(np.array(links, dtype=np.int64).reshape(-1, 2), len(bonds) + len(cycles))
+    rings: dict[int, list[IntArray]] = {}
+    for cycle, ring in zip(cycles, members, strict=True):
+        rings.setdefault(int(label[ring[0]]), []).append(cycle)
+    for k, system in enumerate(rings):
+        of_bond[label[: len(bonds)] == system] = k
+    return of_bond, list(rings.values())
 
 
 def ring_rows(

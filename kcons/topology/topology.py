@@ -123,25 +123,6 @@ class Topology:
             residues_known=False,
         )
 
-    def subset(self, atoms: IntArray) -> Topology:
-        """Some atoms, renumbered in the order of `atoms`, with the bonds among them."""
-        new = np.full(self.n_atoms, -1, dtype=np.int64)
-        new[atoms] = np.arange(len(atoms))
-        bonds = new[self.bonds]
-        old_residues, residues = np.unique(self.residues[atoms], return_inverse=True)
-        return replace(
-            self,
-            names=self.names[atoms],
-            elements=self.elements[atoms],
-            masses=self.masses[atoms],
-            residues=residues.astype(np.int64),
-            residue_names=self.residue_names[old_residues],
-            residue_ids=self.residue_ids[old_residues],
-            chains=self.chains[old_residues],
-            bonds=sorted_pairs(bonds[(bonds >= 0).all(axis=1)]),
-            charges=None if self.charges is None else self.charges[atoms],
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
@@ -196,16 +177,6 @@ class Snapshot:
             angstrom=angstrom,
             cell=None if self.cell is None else self.cell * factor,
             velocities=None if self.velocities is None else self.velocities * factor,
-        )
-
-    def subset(self, atoms: IntArray) -> Snapshot:
-        """Some atoms only, renumbered."""
-        return replace(
-            self,
-            topology=self.topology.subset(atoms),
-            positions=self.positions[atoms],
-            velocities=None if self.velocities is None else self.velocities[atoms],
-            indices=None if self.indices is None else self.indices[atoms],
         )
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
-from snapshots import WATER, rotations, snapshot
+from snapshots import WATER, held_rows, rotations, snapshot
 
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.topology.rigid_groups import GEOMETRIES, body_rows, find_waters, listed_bodies, residue_bodies
-from kcons.topology.rows_by_name import held_rows
 
 RNG = np.random.default_rng(11)
 SHAPES = {

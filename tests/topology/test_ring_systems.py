@@ -23,8 +23,8 @@ def cycle(*atoms):
 
 def found(bonds, n):
     """Labels of the bonds, and the sizes of the rings of each system."""
-    systems = ring_systems.ring_systems(sorted_pairs(bonds), n)
-    return systems.of_bond.tolist(), [sorted(len(ring) for ring in rings) for rings in systems.rings]
+    of_bond, systems = ring_systems.ring_systems(sorted_pairs(bonds), n)
+    return of_bond.tolist(), [sorted(len(ring) for ring in rings) for rings in systems]
 
 
 def ring(n, height, length=1.4):

@@ -109,13 +109,6 @@ def test_pairs_and_components():
     assert (number.tolist(), count) == ([0, 1, 2, 1, 3], 4)
 
 
-def test_subset_keeps_bonds_inside():
-    part = snapshot(["O", "H", "H"] * 2, np.zeros((6, 3)), [(0, 1), (0, 2), (3, 4)]).topology.subset(
-        np.array([0, 2, 3])
-    )
-    assert part.bonds.tolist() == [[0, 1]]
-
-
 def test_units_and_numbers_of_atoms():
     made = snapshot(["O", "H", "H"], WATER, cell=np.eye(3) * 20, velocities=WATER)
     there = made.in_unit(0.1)

@@ -17,10 +17,11 @@ from kcons.constraints.arguments import (
     atom_array,
     out_of_range,
     positive,
+    refuse_other,
     without_units,
 )
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part, width_of
+from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part
 from kcons.constraints.target import Target
 from kcons.errors import InputError
 
@@ -87,6 +88,7 @@ class Formula(Constraint):
                 f"Formula: parameters is {parameters!r:.60}; give numbers by name, such as {{'k': 2.0}}",
                 item="parameters",
             )
+        refuse_other(formula, str, "formula", "text, such as 'x1**2 + y1**2 - 1'")
         given = dict(parameters or {})
         self.formula, self.names = formula, list(given)
         self.period = period
@@ -98,9 +100,9 @@ class Formula(Constraint):
             taken = name in (*FUNCTIONS, "copysign", "t", "pi") or name.startswith(("_", "vx", "vy", "vz"))
             if not name.isidentifier() or iskeyword(name) or taken or (name[1:].isdigit() and name[0] in "xyz"):
                 raise InputError(f"Formula: {name!r} cannot be the name of a parameter; give another one", item=name)
-        alone = width_of(formula, self.names, self.of_speeds) == 1
+        self.row_width = self.code().width
         table = atom_array(atoms, self.family)
-        super().__init__(table.reshape(-1, 1) if alone and table.ndim < 2 else table, target)
+        super().__init__(table.reshape(-1, 1) if self.row_width == 1 and table.ndim < 2 else table, target)
         columns = []
         for name, value in given.items():
             plain, matters = without_units(value, f"Formula: {name}", ANY)
@@ -122,7 +124,7 @@ class Formula(Constraint):
 
     def code(self) -> Code:
         """What is computed of the formula."""
-        return code_of(self.formula, self.width, tuple(self.names), self.of_speeds)
+        return code_of(self.formula, tuple(self.names), self.of_speeds)
 
     @property
     def row(self) -> Any:  # type: ignore[override]

@@ -106,8 +106,9 @@ def test_files_keep_formulas():
 @pytest.mark.parametrize(
     ("make", "item", "message"),
     [
-        (lambda: Formula("x1 - x2", [[0, 1, 2]]), "atoms", "names 2 atoms a row, and atoms has 3"),
-        (lambda: Formula("x1 - y1", [[0, 1]]), "atoms", "names 1 atoms a row, and atoms has 2"),
+        (lambda: Formula("x1 - x2", [[0, 1, 2]]), "atoms", "a row has 2 atoms, but"),
+        (lambda: Formula("x1 - y1", [[0, 1]]), "atoms", "a row has 1 atom, but"),
+        (lambda: Formula(3.0, 0), "formula", "formula is 3.0; give text"),
         (lambda: Formula("a*x1", [0, 1], 2.0), "parameters", "parameters is 2.0; give numbers by name"),
         (lambda: Formula("a*x1", [0, 1], {"a": [1.0, 2.0, 3.0]}), "a", r"'a' has shape \(3,\).* 2 rows"),
         (lambda: Formula("a*x1", [0, 1], {"a": np.nan}), "a", "parameter .a. is not finite"),

@@ -13,7 +13,7 @@ MUTANTS = {
     ],
     "constraints/functions/expressions.py": [
         (
-            "    what = «undefined_part(tree, _PI)→None»\n",
+            "    undefined = «undefined_part(tree, _PI)→None»\n",
             "test_expressions.py::test_formulas_without_bound_are_refused_at_once",
         ),
         (

@@ -227,7 +227,7 @@ MUTANTS = {
         ),
         ("BOND_LIKE = «1→0».5", "test_images.py::test_a_polymer_that_closes_through_the_boundary"),
     ],
-    "plan/rank.py": [
+    "plan/plan.py": [
         ("«eliminate_last[rows[order]] = left_over→pass»", "test_plan.py::test_dependent_rows_are_eliminated_last"),
     ],
     "motion/certificate.py": [
