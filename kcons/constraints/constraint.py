@@ -37,7 +37,7 @@ from kcons.constraints.arguments import (
 from kcons.constraints.compilation import has_a_file, njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.constraints.vectors import first_true
-from kcons.errors import ConstraintError, InputError, SingularGeometryError
+from kcons.errors import ConstraintError, InputError, SingularGeometryError, UnsupportedError
 
 IntArray = NDArray[np.int64]
 #: A step along which derivatives are imaginary parts: its square vanishes beside 1, and a power of two does not round.
@@ -157,24 +157,26 @@ class Constraint:
         self._settle()
 
     def _keep(self, **data: ArrayLike) -> None:
-        """Store data listed in `per_row`, broadcast to all rows; copies, which users cannot change."""
+        """Store data listed in `per_row`, for all rows; copies, which users cannot change."""
         for name, value in data.items():
-            shape = (self.n_rows, *(self.width if size < 0 else size for size in self.per_row[name]))
-            try:
-                array = np.broadcast_to(as_float_array(value, f"{self.family}: {name}"), shape)
-            except InputError:
-                raise
-            except ValueError:
-                raise InputError(
-                    f"{self.family}: {name} has shape {np.shape(value)}; give {shape[1:] or 'one number'} "
-                    f"for all rows or {shape}",
-                    item=name,
-                ) from None
-            wrong = out_of_range(array)
-            if wrong is not None:
-                row, said = wrong
-                raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
-            setattr(self, name, read_only(np.array(array, order="C")))
+            setattr(self, name, read_only(np.array(self._of_each_row(name, value, self.per_row[name]), order="C")))
+
+    def _of_each_row(self, name: str, value: ArrayLike, entry: tuple[int, ...]) -> FloatArray:
+        """Numbers for all rows or for each, spread over the rows; `entry` is the shape of one row's."""
+        shape = (self.n_rows, *(self.width if size < 0 else size for size in entry))
+        array = as_float_array(value, f"{self.family}: {name}")
+        try:
+            array = np.broadcast_to(array, shape)
+        except ValueError:
+            raise InputError(
+                f"{self.family}: {name} has shape {array.shape}; give {shape[1:] or 'one number'} for all, or {shape}",
+                item=name,
+            ) from None
+        wrong = out_of_range(array)
+        if wrong is not None:
+            row, said = wrong
+            raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
+        return array
 
     def __setstate__(self, own: dict[str, Any]) -> None:
         for value in own.values():
@@ -365,6 +367,29 @@ class Constraint:
         """Copy of this object held at another target."""
         plain, matters = plain_target(target, f"{self.family}: target", self.held)
         return self.changed(target=as_target(plain, self.n_rows), units=MD_UNITS if matters else self.units)
+
+    def rescaled(self, factor: float) -> Self:
+        """The same where every length is a number larger by `factor` (0.1 from angstrom to nm).
+
+        Raises
+        ------
+        UnsupportedError
+            Own functions, velocity rows, targets that move with time: what they mean in another unit is not known.
+        """
+        if factor == 1.0:
+            return self
+        powers = dict(self.held.exponents or {"unknown": 1})
+        if self.moving or not powers.keys() <= {"length", "angle"}:
+            what = "a target that moves" if self.moving else "own functions or velocities"
+            raise UnsupportedError(
+                f"{self!r} has {what}; it cannot be converted to another unit. Write it in the units of the host"
+            )
+        own = {name: getattr(self, name) * factor**power for name, power in self.length_powers.items()}
+        if self.target is not None:
+            own["target"] = np.asarray(self.target) * factor ** powers.get("length", 0)
+        copy = self.changed(**{name: read_only(array) for name, array in own.items()})
+        copy._settle()
+        return copy
 
     def select(self, rows: Sequence[int] | IntArray) -> Self:
         """Copy with some of the rows, their targets and their data."""

@@ -5,6 +5,8 @@ they are singular. So a few atoms, the bases, keep their distances: two for atom
 space. On a line and in a plane every other atom is tied to the bases by x_a = sum w_i x_i (`LinearRelation`), in
 space by three distances: to those of the bases that it sees under the widest angles, or in a large body to three atoms
 nearby, so that no atom takes part in many rows.
+
+Massless sites, such as M of TIP4P and the lone pairs of TIP5P, are placed by three atoms and not held.
 """
 
 from __future__ import annotations
@@ -14,14 +16,14 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, LinearRelation
+from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, SingularGeometryError, did_you_mean
-from kcons.topology.topology import BoolArray, Snapshot, listed, selected_numbers
-from kcons.topology.virtual_sites import VirtualSites, fitted
-from kcons.topology.whole_molecules import whole_groups
+from kcons.topology.topology import BoolArray, Snapshot, listed, selected_numbers, whole_groups
 
 #: Residues that are water, and the molecule when there are no residues.
 WATER = frozenset(
@@ -56,6 +58,66 @@ _NEAR, _ENOUGH = 12, 0.2
 _LINE = 1e-3
 #: Bases are the first atoms that are this close to the best.
 _AS_GOOD = 1 - 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualSites:
+    """Sites at r_0 + a (r_1 - r_0) + b (r_2 - r_0) + c (r_1 - r_0) x (r_2 - r_0).
+
+    They have no mass and no degrees of freedom, so that nothing holds them: they are placed after every move of
+    their parents, and their forces act on the parents.
+
+    Attributes
+    ----------
+    sites : ndarray of int, shape (n,)
+    parents : ndarray of int, shape (n, 3)
+        Atoms 0, 1, 2; for water the oxygen and the hydrogens.
+    coefficients : ndarray, shape (n, 3)
+        a, b, and c in 1/length.
+    """
+
+    sites: IntArray
+    parents: IntArray
+    coefficients: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.sites)
+
+    def _arms(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        origin = x[self.parents[:, 0]]
+        return origin, x[self.parents[:, 1]] - origin, x[self.parents[:, 2]] - origin
+
+    def place(self, positions: ArrayLike) -> FloatArray:
+        """Positions with the sites where they belong, shape (n_atoms, 3); molecules must be whole."""
+        x = np.array(as_float_array(positions, "positions"))
+        origin, u, w = self._arms(x)
+        a, b, c = self.coefficients.T[:, :, None]
+        x[self.sites] = origin + a * u + b * w + c * np.cross(u, w)
+        return x
+
+    def spread_forces(self, positions: ArrayLike, forces: ArrayLike) -> FloatArray:
+        """Forces with those on the sites handed to the parents, shape (n_atoms, 3).
+
+        The work along any motion of the parents, total force and torque stay the same.
+        """
+        x = as_float_array(positions, "positions")
+        f = np.array(as_float_array(forces, "forces"))
+        if f.shape != x.shape:
+            raise InputError(f"forces have shape {f.shape}, positions {x.shape}", item="forces")
+        _, u, w = self._arms(x)
+        a, b, c = self.coefficients.T[:, :, None]
+        acting = f[self.sites].copy()
+        first = a * acting + c * np.cross(w, acting)
+        second = b * acting + c * np.cross(acting, u)
+        f[self.sites] = 0.0
+        np.add.at(f, self.parents[:, 0], acting - first - second)
+        np.add.at(f, self.parents[:, 1], first)
+        np.add.at(f, self.parents[:, 2], second)
+        return f
+
+    def in_unit(self, factor: float) -> VirtualSites:
+        """The same where lengths are given by numbers larger by `factor`."""
+        return VirtualSites(self.sites, self.parents, np.asarray(self.coefficients / np.array([1.0, 1.0, factor])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +235,8 @@ def _water_sites(
             item="positions",
             atoms=parents[flat[0]].tolist(),
         )
-    found = fitted(sites, parents, r[:, 3], r[:, :3]).coefficients
+    frame = np.stack([u, w, np.cross(u, w)], axis=-1)
+    found = np.linalg.solve(frame, to_site[..., None])[..., 0]
     key = np.char.add(np.char.add(topology.residue_names[residue], "/"), topology.names[sites])
     for name in np.unique(key):
         these = key == name
@@ -185,14 +248,13 @@ def _water_sites(
                 item="positions",
                 atoms=sites[these][:1].tolist(),
             )
-        a, b = np.median(found[these, :2], axis=0)
-        a = b = 0.5 * (a + b)
+        a = float(np.median(found[these, :2], axis=0).mean())
         # One lone pair may have the name of the other in some molecules.
         c = float(np.median(np.abs(found[these, 2])))
         in_plane = c * float(np.median(area[these])) < 0.05 * snapshot.angstrom
         if model_site and in_plane:
             measured = float(np.median(np.linalg.norm(0.5 * (u[these] + w[these]), axis=1)))
-            a = b = 0.5 * model_site / (middle or measured / snapshot.angstrom)
+            a = 0.5 * model_site / (middle or measured / snapshot.angstrom)
         found[these, :2] = a
         found[these, 2] = 0.0 if in_plane else np.copysign(c, found[these, 2])
     return VirtualSites(sites, parents, found)

@@ -24,6 +24,7 @@ from kcons.topology.angle_rows import STRAIGHT, angle_rows
 from kcons.topology.guessed_bonds import FAR, guess_bonds, reaches
 from kcons.topology.holding import CONSTRAIN, Holding
 from kcons.topology.rigid_groups import (
+    VirtualSites,
     Waters,
     body_rows,
     find_waters,
@@ -32,7 +33,6 @@ from kcons.topology.rigid_groups import (
     residue_bodies,
 )
 from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
-from kcons.topology.virtual_sites import VirtualSites
 
 #: No bond is that long, in angstrom, whatever its atoms.
 TORN = 10.0

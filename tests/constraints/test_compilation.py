@@ -162,38 +162,6 @@ def test_a_folder_that_is_full_costs_the_cache_and_not_the_run(tmp_path, monkeyp
     assert len(caplog.messages) == 1 and "No space left" in caplog.messages[0]
 
 
-AGAIN = """
-import importlib, sys
-import kcons.constraints.compilation as compilation
-{again}
-import numpy as np
-from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Distance, Formula
-from kcons.errors import ConvergenceError, KconsError
-x = np.eye(2, 3)
-for row in (Distance([[0, 1]]), Formula("(x1 - x2)**2 + (y1 - y2)**2 - 2", [0, 1])):
-    motion = Motion(ConstraintSet(row, x, [1.0, 1.0]), x)
-    after = run(System(motion, lambda q, t: -q), State(x, motion.project_velocities(x, x[::-1])), 0.1, 3)
-    print(abs(row.measure(after.positions[None], 0.0) - row.measure(x[None], 0.0)).max() < 1e-12)
-import kcons.ase, kcons.openmm
-"""
-
-
-@pytest.mark.parametrize(
-    "again",
-    [
-        "importlib.reload(compilation)",
-        "import kcons.openmm, kcons.ase, kcons.thermostats\n"
-        "for name in [n for n in sys.modules if n.partition('.')[0] == 'kcons']: del sys.modules[name]",
-    ],
-    ids=["reload", "purge"],
-)
-def test_a_second_import_in_one_process(again):
-    out, err = ended(started(AGAIN.format(again=again)))
-    assert out.split() == ["True", "True"]
-    assert err.count("kcons compiles the kernels") <= 1
-
-
 def test_processors_that_share_a_folder(tmp_path):
     """Each has its own kernels in it: what one has made is never run by the other."""
     other = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}

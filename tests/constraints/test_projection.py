@@ -155,14 +155,6 @@ def test_complex_matrices(rows: int, columns: int, rank: int) -> None:
         assert not projection.is_solvable(U, b + 1j * (np.eye(rows) - W @ W.conj().T) @ rng.normal(size=rows))
 
 
-def test_an_imaginary_part_alone_decides() -> None:
-    # Rows 1 and i are one row; (1, i) and (1, -i) are two, though their real parts agree.
-    assert projection.rank([[1.0, 1.0], [1j, 1j]]) == 1
-    assert projection.rank([[1.0, 1j], [1.0, -1j]]) == 2
-    np.testing.assert_allclose(projection.pseudo_inverse([[2j]]).matrix, [[-0.5j]], atol=1e-16)
-    assert not projection.is_solvable([[1.0], [1.0]], [1.0, 1.0 + 1e-3j])
-
-
 def test_mechanics_is_real() -> None:
     """Masses, forces and rows of a mechanical system that are complex are refused; nothing is dropped."""
     A, m, f, b = np.array([[1.0, 2.0, 0.5]]), [2.0], np.ones(3), [0.3]

@@ -46,11 +46,6 @@ def test_fixed_atoms_separate_and_their_rows_belong_to_no_cluster() -> None:
     assert (labels[:6] == -1).all() and labels[10] == -1
 
 
-def test_labels_of_no_rows() -> None:
-    assert len(cluster_labels(ConstraintSet([], places(3), np.ones(3)), NONE)) == 0
-    assert list(classify(ConstraintSet([], places(3), np.ones(3)), NONE, np.zeros(3))) == []
-
-
 # -- shapes -----------------------------------------------------------------------------------------
 
 

@@ -174,23 +174,8 @@ def undefined_part(tree: ast.expr, numbers: Mapping[str, float]) -> str | None:
     return None
 
 
-@cache
-def code_of(formula: str, parameters: tuple[str, ...], speeds: bool = False) -> Code:
-    """The code of a formula with parameters of these names; with `speeds`, of one that is linear in velocities.
-
-    Raises
-    ------
-    InputError
-        As `parsed`; a formula without atoms, or one that leaves some out; one that does not change with the positions,
-        or is not linear in the velocities.
-    UnsupportedError
-        There is no folder that it can be written to.
-    """
-    return Code(formula, parameters, speeds)
-
-
 class Code:
-    """What is computed of a formula.
+    """What is computed of a formula with parameters of these names; with `speeds`, of one that is linear in velocities.
 
     Attributes
     ----------
@@ -200,6 +185,14 @@ class Code:
         Atoms a row.
     invariant : bool
         Whether a common shift of all atoms changes nothing.
+
+    Raises
+    ------
+    InputError
+        As `parsed`; a formula without atoms, or one that leaves some out; one that does not change with the positions,
+        or is not linear in the velocities.
+    UnsupportedError
+        There is no folder that it can be written to.
     """
 
     def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool) -> None:
@@ -235,6 +228,10 @@ class Code:
             texts.append(_function("rate", tape, [moves]))
         module = _module("\n\n".join([f"# Written by kcons for {formula!r}.", "from numpy import *\n", *texts]))
         self.row, self.rate = module.row, getattr(module, "rate", None)
+
+
+#: Each once.
+code_of = cache(Code)
 
 
 #: Operations of tapes, for real numbers and, to first order in imaginary parts, complex ones.

@@ -15,7 +15,6 @@ from kcons.constraints.arguments import (
     FloatArray,
     as_float_array,
     atom_array,
-    out_of_range,
     positive,
     refuse_other,
     without_units,
@@ -83,11 +82,7 @@ class Formula(Constraint):
         *,
         period: Annotated[float, ANY, positive] | None = None,
     ) -> None:
-        if not isinstance(parameters, Mapping | None):
-            raise InputError(
-                f"Formula: parameters is {parameters!r:.60}; give numbers by name, such as {{'k': 2.0}}",
-                item="parameters",
-            )
+        refuse_other(parameters, (Mapping, type(None)), "parameters", "numbers by name, such as {'k': 2.0}")
         refuse_other(formula, str, "formula", "text, such as 'x1**2 + y1**2 - 1'")
         given = dict(parameters or {})
         self.formula, self.names = formula, list(given)
@@ -107,17 +102,7 @@ class Formula(Constraint):
         for name, value in given.items():
             plain, matters = without_units(value, f"Formula: {name}", ANY)
             self.units = MD_UNITS if matters else self.units
-            column = as_float_array(plain, f"Formula: {name}")
-            if column.shape not in ((), (1,), (self.n_rows,)):
-                raise InputError(
-                    f"Formula: parameter {name!r} has shape {column.shape}; give one finite number, or one for each of "
-                    f"the {self.n_rows} rows",
-                    item=name,
-                )
-            wrong = out_of_range(column)
-            if wrong is not None:
-                raise InputError(f"Formula: parameter {name!r} is {wrong[1]}", item=name)
-            columns.append(np.broadcast_to(column, (self.n_rows,)))
+            columns.append(self._of_each_row(name, plain, ()))
         self.per_row = {"values": (len(columns),)}  # type: ignore[misc]
         self._keep(values=np.stack(columns, axis=1) if columns else np.zeros((self.n_rows, 0)))
         self.translation_invariant = self.code().invariant

@@ -76,15 +76,15 @@ MUTANTS = {
             "test_images.py::test_a_length_found_and_the_same_one_given",
         ),
     ],
+    "constraints/constraint.py": [
+        ('powers.get("length", «0→1»)', "test_constraint.py::test_the_same_points_fulfil_it"),
+        ('not powers.keys() <= {«→"unknown", »', "test_constraint.py::test_what_has_no_known_units_is_refused"),
+    ],
     "topology/rows_by_name.py": [
         (
             "«_refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))→pass»",
             "test_rows_by_name.py::test_bodies_that_a_missing_cell_tears_are_refused",
         ),
-    ],
-    "topology/other_units.py": [
-        ('powers.get("length", «0→1»)', "test_other_units.py::test_the_same_points_fulfil_it"),
-        ('not powers.keys() <= {«→"unknown", »', "test_other_units.py::test_what_has_no_known_units_is_refused"),
     ],
     "topology/angle_rows.py": [
         (
@@ -99,8 +99,6 @@ MUTANTS = {
             "turning = «(earlier.sum(axis=1) == 1) & ~earlier[:, 0]→earlier.sum(axis=1) > 9»",
             "test_angle_rows.py::test_beside_a_rigid_body_only_what_it_leaves_is_held",
         ),
-    ],
-    "topology/ring_systems.py": [
         ("FLAT_RING = «2→»0.0", "test_ring_systems.py::test_a_ring_is_rigid_by_as_many_rows_as_it_needs"),
         (
             "_independent(rows[«held→:0»], rows[~held])",
