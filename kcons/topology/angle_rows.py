@@ -72,30 +72,29 @@ def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -
         both = body[bonds]
         together = (label < 0) & (both[:, 0] >= 0) & (both[:, 0] == both[:, 1])
         label[together] = first + both[together, 0]
-    triples, quads = _centers(snapshot, bonds, label)
+    triples, quads = ([rows] for rows in _centers(snapshot, bonds, label))
     for k, rings in enumerate(systems):
         inside = bonds[of_bond == k]
         every = bond_angles(inside, n)
-        straight = Angle(every).measure(lined_up(snapshot.positions[every], snapshot.lattice), 0.0) > np.radians(
-            STRAIGHT
-        )
-        bent, impropers = every[~straight], _impropers(snapshot, inside)
-        angles, dihedrals = ring_rows(snapshot, inside, bent, impropers, rings, rigid)
+        angle = Angle(every).measure(lined_up(snapshot.positions[every], snapshot.lattice), 0.0)
+        straight = angle > np.radians(STRAIGHT)
+        impropers = _centers(snapshot, inside, np.full(len(inside), -1))[1]
+        angles, dihedrals = ring_rows(snapshot, inside, every[~straight], impropers, rings, rigid)
         triples += [every[straight], angles]
         quads.append(dihedrals)
-    found = np.concatenate([np.zeros((0, 3), np.int64), *triples])
+    found = np.concatenate(triples)
     found[:, [0, 2]] = np.sort(found[:, [0, 2]], axis=1)
-    turned = np.concatenate([np.zeros((0, 4), np.int64), *quads])
+    turned = np.concatenate(quads)
     return found[np.lexsort((found[:, 2], found[:, 0], found[:, 1]))], turned[np.lexsort(turned.T[[3, 2, 0, 1]])]
 
 
-def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list[IntArray], list[IntArray]]:
+def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[IntArray, IntArray]:
     """Rows at each atom, but for those between bonds with the same label."""
     n = snapshot.topology.n_atoms
     starts, ends = neighbor_lists(bonds, n)
     code = bonds[:, 0] * n + bonds[:, 1]
-    triples: list[IntArray] = []
-    quads: list[IntArray] = []
+    triples: list[IntArray] = [np.zeros((0, 3), np.int64)]
+    quads: list[IntArray] = [np.zeros((0, 4), np.int64)]
     degree = np.diff(starts)
     for d in np.unique(degree[degree > 1]).tolist():
         vertex = np.flatnonzero(degree == d)
@@ -108,7 +107,8 @@ def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list
         rank = np.where(group >= 0, group, len(bonds) + n)
         order = np.lexsort((others, -snapshot.topology.masses[others], rank))
         others, group = (np.take_along_axis(a, order, axis=1) for a in (others, group))
-        e = _directions(snapshot, vertex[:, None], others)
+        e = minimum_image(snapshot.positions[others] - snapshot.positions[vertex[:, None]], snapshot.lattice)
+        e = e / norm(e)[..., None]
         swap = _second(e, group)
         others, group = (np.take_along_axis(a, swap, axis=1) for a in (others, group))
         e = np.take_along_axis(e, swap[..., None], axis=1)
@@ -122,7 +122,7 @@ def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list
             axis = np.argmax(earlier, axis=1)
             row = np.arange(len(vertex))
             quads.append(np.stack([others[:, 0], vertex, others[row, axis], others[:, k]], axis=1)[turning])
-    return triples, quads
+    return np.concatenate(triples), np.concatenate(quads)
 
 
 def _second(e: FloatArray, group: IntArray) -> IntArray:
@@ -164,24 +164,6 @@ def _third(
         triples.append(np.stack([others[:, b], vertex, others[:, k]], axis=1)[own])
     improper = np.stack([others[row, 1 - axis], vertex, others[row, axis], others[:, k]], axis=1)
     quads.append(improper[wanted & flat & ~alone])
-
-
-def _impropers(snapshot: Snapshot, bonds: IntArray) -> IntArray:
-    """Improper dihedrals where three or more of the bonds meet in one plane."""
-    triples: list[IntArray] = []
-    quads: list[IntArray] = [np.zeros((0, 4), np.int64)]
-    starts, ends = neighbor_lists(bonds, snapshot.topology.n_atoms)
-    for vertex in np.flatnonzero(np.diff(starts) > 2)[:, None]:
-        others = ends[starts[vertex[0]] : starts[vertex[0] + 1]][None]
-        e = _directions(snapshot, vertex[:, None], others)
-        for k in range(2, others.shape[1]):
-            _third(vertex, others, e, k, np.ones(1, dtype=bool), triples, quads)
-    return np.concatenate(quads)
-
-
-def _directions(snapshot: Snapshot, vertex: IntArray, others: IntArray) -> FloatArray:
-    u = minimum_image(snapshot.positions[others] - snapshot.positions[vertex], snapshot.lattice)
-    return np.asarray(u / norm(u)[..., None])
 
 
 # -- rings ---------------------------------------------------------------------------------------

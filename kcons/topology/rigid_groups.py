@@ -140,10 +140,6 @@ class Waters:
         sites = VirtualSites(self.sites.sites[seen], self.sites.parents[seen], self.sites.coefficients[seen])
         return Waters(self.triples[held], sites)
 
-    def rows(self, geometry: tuple[float, float] | None, angstrom: float) -> list[Constraint]:
-        """See `water_rows`."""
-        return [water_rows(self.triples, geometry, angstrom)] if len(self.triples) else []
-
 
 def water_rows(triples: IntArray, geometry: tuple[float, float] | None, angstrom: float = 1.0) -> Distance:
     """Three distances a molecule: O-H, O-H, H-H; as they are, or of a given O-H length (angstrom) and angle."""

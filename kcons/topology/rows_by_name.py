@@ -31,6 +31,7 @@ from kcons.topology.rigid_groups import (
     inside_bodies,
     listed_bodies,
     residue_bodies,
+    water_rows,
 )
 from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
 
@@ -154,15 +155,17 @@ def rows_of(snapshot: Snapshot, holding: Holding, numbers: Callable[[Any], IntAr
     groups = residue_bodies(snapshot, holding.residues)
     if selected is not None:
         waters = waters.among(selected)
-        groups = [kept for kept in (g[selected[g].all(axis=1)] for g in groups) if len(kept)]
-    groups = _without_waters(groups, waters.triples)
-    groups += listed_bodies(snapshot, bodies)
+        groups = [g[selected[g].all(axis=1)] for g in groups]
+    # Rigid residues that are rigid water are held as water.
+    groups = [g[~np.isin(g, waters.triples[:, 0]).any(axis=1)] for g in groups]
+    groups = [g for g in groups if len(g)] + listed_bodies(snapshot, bodies)
     _refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))
     bonds = snapshot.topology.bonds
     bonds = bonds[~_closing(bonds, topology.hydrogen)]
     _refuse_torn(snapshot, bonds[inside_bodies(snapshot.topology.n_atoms, bonds, groups)])
     rows = _internal(snapshot, kind, [waters.triples, *groups], selected, holding.angles)
-    rows += waters.rows(geometry, snapshot.angstrom)
+    if len(waters.triples):
+        rows.append(water_rows(waters.triples, geometry, snapshot.angstrom))
     rows += body_rows(snapshot, groups)
     for key, make in holding.own_rows:
         made = make(numbers(key))
@@ -259,14 +262,6 @@ def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray |
     if topology.residues_known:
         loose &= np.bincount(topology.residues, minlength=topology.n_residues)[topology.residues] > 1
     return np.flatnonzero(loose)
-
-
-def _without_waters(groups: list[IntArray], triples: IntArray) -> list[IntArray]:
-    """Rigid residues that are rigid water are held as water."""
-    if not len(triples):
-        return groups
-    oxygens = triples[:, 0]
-    return [kept for kept in (g[~np.isin(g, oxygens).any(axis=1)] for g in groups) if len(kept)]
 
 
 # -- bonds and angles as rows -----------------------------------------------------------------------

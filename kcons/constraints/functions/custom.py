@@ -227,10 +227,8 @@ class Custom(PythonRows):
         size = np.sqrt(_contract(slope, slope))
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
-        found = self._slope(r, along, 1e-3 * length, time)
-        remedy = "correct it, or give the length over which the function varies (length=...)"
+        found, finer = (self._slope(r, along, step * length, time) for step in (1e-3, 0.5e-3))
         if self.gradient_function is None:
-            finer = self._slope(r, along, 0.5e-3 * length, time)
             self.refuse_singular(
                 ~(np.abs(finer - found) <= WRONG * size),
                 first_row,
@@ -240,18 +238,19 @@ class Custom(PythonRows):
                     "Move the atoms, give the length over which it varies (length=...), or its gradient"
                 ),
             )
-        else:
+            return
 
-            def worst(k: int) -> str:
-                other = self._differenced_gradient(r, time)[k]
-                a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - other))), other.shape)
-                return (
-                    f"gradient gives {slope[k, a, i]:.6g} for {'xyz'[i]} of its atom {self.atoms[k, a]}, but "
-                    f"differences of the function give {other[a, i]:.6g}; {remedy}"
-                )
+        def worst(k: int) -> str:
+            other = self._differenced_gradient(r, time)[k]
+            a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - other))), other.shape)
+            return (
+                f"gradient gives {slope[k, a, i]:.6g} for {'xyz'[i]} of its atom {self.atoms[k, a]}, but differences "
+                f"of the function give {other[a, i]:.6g}; correct it, or give the length over which the function "
+                "varies (length=...)"
+            )
 
-            given = _contract(slope, along)
-            self.refuse_input(~(np.abs(given - found) <= WRONG * size), first_row, worst, "gradient")
+        wrong = ~(np.abs(_contract(slope, along) - found) <= WRONG * size)
+        self.refuse_input(wrong, first_row, worst, "gradient")
 
 
 class ImplicitSurface(Custom):
