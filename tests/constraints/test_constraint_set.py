@@ -128,17 +128,6 @@ def test_only_periodic_directions_are_wrapped():
     assert ConstraintSet([Distance([[0, 1]], 3.0)], x, np.ones(2), cell=flat, pbc=[1, 1, 0]).half_width == 5.0
 
 
-def test_lengths_of_half_the_box_are_refused():
-    x = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 3.0, 0.0], [4.6, 3.0, 3.6]])
-    with pytest.raises(InputError, match=r"row 1, Distance\(1, 2\): target 4 is not shorter than half the box \(4\)"):
-        ConstraintSet([Distance([[0, 1], [1, 2]], [1.0, 4.0])], x, np.ones(4), cell=[8.0] * 3)
-    with pytest.raises(
-        InputError, match=r"row 0, Angle\(1, 2, 3\): distance .* of atoms 2 and 3 is not shorter than half the box"
-    ) as e:
-        ConstraintSet([Angle([[1, 2, 3]])], x, np.ones(4), cell=[8.0] * 3)
-    assert e.value.atoms == (2, 3)
-
-
 # -- bad input --------------------------------------------------------------------------------------
 
 

@@ -13,7 +13,6 @@ from snapshots import WATER, held_rows, snapshot
 from kcons.constraints import CenterOfMass
 from kcons.errors import InputError
 from kcons.motion import Motion
-from kcons.topology.topology import bond_angles
 
 # Ethanol, C C O H(O) and five H, and a water.
 ETHANOL = np.array(
@@ -202,11 +201,3 @@ def test_bodies_that_a_missing_cell_tears_are_refused(atom, shift, said, options
     with pytest.raises(InputError, match=said):
         held_rows(replace(made, positions=x), "none", **options)
     held_rows(replace(made, positions=x, cell=np.diag([shift, 40.0, 40.0]), pbc=np.full(3, True)), "none", **options)
-
-
-def test_bond_angles_are_all_of_them():
-    rng = np.random.default_rng(0)
-    bonds = np.array([p for p in combinations(range(12), 2) if rng.random() < 0.3])
-    linked = {tuple(b) for b in bonds.tolist()} | {tuple(b[::-1]) for b in bonds.tolist()}
-    expected = [(i, j, k) for j in range(12) for i in range(12) for k in range(i + 1, 12) if {(i, j), (j, k)} <= linked]
-    assert [tuple(t) for t in bond_angles(bonds, 12).tolist()] == expected

@@ -83,14 +83,6 @@ def test_names_that_come_again_otherwise_are_of_one_residue(names):
     assert residues.tolist() == [0] * len(names) and first.tolist() == [0]
 
 
-def test_molecules_are_named_by_formula():
-    made = snapshot(
-        ["O", "H", "H", "C", "O", "Na"], np.zeros((6, 3)), [(0, 1), (0, 2), (3, 4)]
-    ).topology.with_molecules()
-    assert made.residue_names.tolist() == ["H2O", "CO", "Na"]
-    assert made.residues.tolist() == [0, 0, 0, 1, 1, 2]
-
-
 def test_single_precision_gives_back_the_decimals_of_a_file():
     rng = np.random.default_rng(1)
     for decimals in (3, 4):

@@ -195,7 +195,7 @@ class Code:
         There is no folder that it can be written to.
     """
 
-    def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool) -> None:
+    def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool = False) -> None:
         tree, atoms = parsed(formula, parameters, speeds)
         if not atoms:
             raise InputError(

@@ -155,11 +155,6 @@ def test_smallest_undefined_part():
     assert undefined_part(tree, {"x1": two}) is None
 
 
-def test_time_is_found_out():
-    assert code_of("x1 - t", ()).rate is not None and code_of("x1 - a", ("a",)).rate is None
-    assert not code_of("x1", ()).invariant
-
-
 PROGRAM = """
 import numpy as np
 from kcons import ConstraintSet, Motion

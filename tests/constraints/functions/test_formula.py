@@ -173,12 +173,6 @@ def test_formulas_move_as_the_families_do(formula, family):
     assert formula.translation_invariant and not formula.holonomic and not formula.moving
 
 
-def test_written_to_files_and_read_again():
-    spiral = VelocityFormula("x1*vy1 - y1*vx1 - c*(x1*vx1 + y1*vy1)", [0, 4], {"c": [1.0, 2.0]}, [0.1, 0.2])
-    again = from_dict(spiral.todict())
-    assert isinstance(again, VelocityFormula) and again.todict() == spiral.todict()
-
-
 @pytest.mark.parametrize(
     ("formula", "message", "item"),
     [
