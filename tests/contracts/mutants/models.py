@@ -55,7 +55,7 @@ MUTANTS = {
         ),
     ],
     "constraints/projection.py": [
-        ("rtol)].«conj().→»T)", "constraints/test_projection.py::test_complex_matrices"),
+        ("vt[kept].«conj().→»T)", "constraints/test_projection.py::test_complex_matrices"),
     ],
     "models/multibody.py": [
         (
