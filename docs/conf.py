@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import notebooks
 
 from kcons import __version__
-from kcons.cli.main import parser_of_all
+from kcons.cli.main import parsers
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
@@ -64,7 +64,7 @@ class CommandHelp(Directive):
 
     def run(self) -> list[nodes.Node]:
         found: list[nodes.Node] = []
-        for name, parser in parser_of_all().commands.items():
+        for name, parser in parsers()[1].items():
             section = nodes.section(ids=[nodes.make_id(f"kcons-{name}")])
             section += nodes.title(text=f"kcons {name}")
             section += nodes.literal_block(text=parser.format_help(), language="text")

@@ -71,7 +71,9 @@ def measured(name: str, copies: int, device: str, dtype: torch.dtype, compiled: 
     y = x + 0.02 * torch.as_tensor(np.random.default_rng(0).normal(size=x.shape)).to(batch.device, dtype)
     row = {"part": "speed", "system": name, "copies": copies, "dtype": str(dtype)[6:], "compiled": compiled}
     found = batch.project_positions(y, x)
-    off = max(float(each.residual) for each in batch.select(range(min(copies, 20))).report(found[:20]))
+    off = max(
+        float(each.residual) for each in Batch(motion, min(copies, 20), device=device, dtype=dtype).report(found[:20])
+    )
     with torch.no_grad():
         seconds = [medians(lambda: batch.project_positions(y, x), device)]
         seconds.append(medians(lambda: batch.project_velocities(x, y), device))

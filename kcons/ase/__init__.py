@@ -5,7 +5,7 @@ whole set and solves it as one. Units are ASE's; targets are in angstrom and rad
 the object with ASE, which makes files that contain it readable.
 
 - `topology`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
-- `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
+- `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
 - `pressure`: cells that change, the pressure along a run
 - `calculator`, `named_calculators`: forces along the constraints, for optimizers; calculators by name
 - `logger`: ASE's log, with multipliers and the right temperature

@@ -264,7 +264,12 @@ def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def applied_forces(atoms: Atoms) -> FloatArray:
     """Forces of the calculator and of ASE objects that only add forces; a copy."""
-    forces = np.array(as_float_array(atoms.get_forces(apply_constraint=False), "forces of the calculator"))
+    return with_added(atoms, atoms.get_forces(apply_constraint=False))
+
+
+def with_added(atoms: Atoms, given: Any) -> FloatArray:
+    """Forces of a calculator and of ASE objects that only add forces; a copy."""
+    forces = np.array(as_float_array(given, "forces of the calculator"))
     if forces.shape == (len(atoms), 3):  # otherwise whoever asked complains
         for item in atoms.constraints:
             if isinstance(item, FORCES_ONLY):

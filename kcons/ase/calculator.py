@@ -15,7 +15,7 @@ from kcons.ase.constraints_object import Constraints
 from kcons.ase.respect import VOIGT, refuse_taken_along
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import as_float_array
-from kcons.thermostats.pressure import constraint_virial
+from kcons.thermostats.cells import constraint_virial
 
 #: Residual, in units of what double precision can reach, up to which positions are taken as they are.
 _ON_SURFACE = 4.0

@@ -24,13 +24,13 @@ from kcons.ase.binding import (
     touched_atoms,
     unchanged_on_failure,
 )
-from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions, fulfilled, virial_of
-from kcons.ase.topology import bonds_of, keep_guessed, named_rows, require_atoms, velocities_of
+from kcons.ase.topology import bonds_of, constraints_of, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.certificate import CHECK_EVERY
@@ -133,7 +133,7 @@ class Constraints(FixConstraint):
         return bound
 
     def _bind(self, atoms: Atoms, make: Callable[..., Binding] = shared) -> Binding:
-        given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
+        given = self.constraints if self._repeated is None else _led_across(self.constraints, atoms, *self._repeated)
         _refuse_moving(given)
         bound = make(given, atoms)
         if bound.owner() is None:
@@ -292,7 +292,7 @@ class Constraints(FixConstraint):
         """
         if self._repeated is not None:
             self._bind(atoms)
-        kept = within(self.constraints, np.arange(len(atoms))[ind], len(atoms))
+        kept = _within(self.constraints, np.arange(len(atoms))[ind], len(atoms))
         if not kept:
             raise IndexError("no constraint lies within the slice")
         self.constraints = kept
@@ -312,7 +312,7 @@ class Constraints(FixConstraint):
         times = (m, m, m) if isinstance(m, int | np.integer) else (int(m[0]), int(m[1]), int(m[2]))
         if self._repeated is not None:
             raise UnsupportedError("repeated twice before the first use; repeat once, by the product of the numbers")
-        self.constraints = tiled(self.constraints, times, n)
+        self.constraints = _tiled(self.constraints, times, n)
         self._repeated = (times, int(n))
         self._binding = None
         return self
@@ -422,7 +422,7 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
 
     def delete_atoms(self, indices: Any, natoms: int) -> Constraints | None:
         """Keep the rows whose atoms all stay, renumbered; None if there are none."""
-        kept = within(self.constraints, np.delete(np.arange(natoms), indices), natoms)
+        kept = _within(self.constraints, np.delete(np.arange(natoms), indices), natoms)
         self.constraints, self._binding = kept, None
         return self if kept else None
 
@@ -456,6 +456,60 @@ def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -
                 item="constraints",
             )
     return result
+
+
+def _within(constraints: Sequence[Constraint], atoms: IntArray, n_atoms: int) -> tuple[Constraint, ...]:
+    """Rows all of whose atoms are among `atoms`, of n_atoms, with these renumbered in their order."""
+    new_index = np.full(n_atoms, -1, dtype=np.int64)
+    new_index[atoms] = np.arange(len(atoms))
+    kept = []
+    for item in constraints:
+        inside = np.flatnonzero((new_index[item.atoms] >= 0).all(axis=1))
+        if len(inside):
+            kept.append((item if len(inside) == item.n_rows else item.select(inside)).renumbered(new_index))
+    return tuple(kept)
+
+
+def _tiled(constraints: Sequence[Constraint], times: tuple[int, int, int], n: int) -> tuple[Constraint, ...]:
+    """The rows of all replicas of a cell of `n` atoms; `UnsupportedError` as of `Constraints.repeat`."""
+    copies = times[0] * times[1] * times[2]
+    result = []
+    for item in constraints:
+        if not (item.translation_invariant or item.held_in_place):
+            raise UnsupportedError(
+                f"{item!r} has a place in space and cannot be repeated; remove it with atoms.set_constraint() "
+                "and add one for each replica afterwards"
+            )
+        rows = item.select(np.tile(np.arange(item.n_rows), copies))
+        rows.atoms = rows.atoms + n * np.repeat(np.arange(copies), item.n_rows)[:, None]
+        result.append(rows if item.translation_invariant else rows.with_target(None))
+    return tuple(result)
+
+
+def _led_across(
+    constraints: Sequence[Constraint], atoms: Atoms, times: tuple[int, int, int], n: int
+) -> tuple[Constraint, ...]:
+    """Rows of a repeated cell of `n` atoms, those across its old boundary led to the neighboring replica."""
+    copies = times[0] * times[1] * times[2]
+    if not atoms.pbc.any() or len(atoms) < n * copies:
+        return tuple(constraints)
+    x = atoms.arrays["positions"]
+    cell = atoms.cell.array / np.array(times)[:, None]
+    first = [item.select(np.arange(item.n_rows // copies)) for item in constraints]
+    one = ConstraintSet(first, x[:n], atoms.get_masses()[:n], cell=cell, pbc=atoms.pbc)
+    assert one.lattice is not None
+    result = []
+    for item, bound in zip(constraints, one.constraints, strict=True):
+        if item.relative:
+            replica, base = np.divmod(item.atoms, n)
+            place = np.stack(np.unravel_index(replica, times), axis=-1)
+            apart = one.gather(bound, x[:n]) - x[bound.atoms]
+            cells = np.round((apart - apart[:, :1]) @ one.lattice[1]).astype(np.int64)
+            place = (place + np.tile(cells, (copies, 1, 1))) % np.array(times)
+            item = item.with_target(item.target)
+            item.atoms = np.ravel_multi_index(tuple(np.moveaxis(place, -1, 0)), times) * n + base
+        result.append(item)
+    return tuple(result)
 
 
 def _refuse_moving(given: Iterable[Constraint]) -> None:
@@ -504,7 +558,7 @@ def constrain(
     atoms : ase.Atoms
     constraints : sequence of Constraint, or 'hbonds', 'allbonds', 'hangles', 'allangles'
         Targets left open are taken from the positions. A name stands for ``constraints_of(atoms, name)``, which has
-        options; bonds that had to be guessed are kept in ``atoms.info['bonds']``, with a warning.
+        options.
     project : bool
         Whether to move atoms that are off their explicit targets onto them instead of raising; see
         `Constraints.restore`.
@@ -522,10 +576,7 @@ def constrain(
         Another ASE constraint acts on the same atoms.
     """
     require_atoms(atoms)
-    named = None
-    if isinstance(constraints, str):
-        constraints = named = named_rows(atoms, constraints)
-    held = Constraints(constraints)
+    held = Constraints(constraints_of(atoms, constraints) if isinstance(constraints, str) else constraints)
     with unchanged_on_failure(atoms):
         atoms.set_constraint([*atoms.constraints, held])
         if project:
@@ -535,14 +586,6 @@ def constrain(
         accepted.between_steps = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])
-    if named is not None and named.bonds_guessed:
-        keep_guessed(atoms, named.topology.bonds)
-        warnings.warn(
-            f"{named.bonds_guessed} bonds were guessed from distances and covalent radii; all are now in "
-            "atoms.info['bonds'], and are taken from there from now on",
-            UserWarning,
-            stacklevel=2,
-        )
     return held
 
 

@@ -39,8 +39,8 @@ from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed, require_stepper
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, NoseHooverChain
+from kcons.thermostats.barostats import in_cell
 from kcons.thermostats.monte_carlo import POTENTIAL
-from kcons.thermostats.pressure.constant_pressure import in_cell
 
 #: Steps longer than this are asked about: 20 fs, above which no motion of molecules at room temperature is followed.
 LONGEST = 20.0 * units.fs * (1 + 1e-12)
@@ -73,8 +73,8 @@ class ConstrainedDynamics(MolecularDynamics):
     time : float
         Time at the start, for targets that move.
     state : State, optional
-        Go on from here: what `state` of another run gave, or `State.load` read. Positions, momenta, time and the number
-        of steps are taken from it, `time` is not looked at. Forces are asked of the calculator.
+        Go on from here: what `state` of another run gave, or `kcons.State.load` read. Positions, momenta, time and the
+        number of steps are taken from it, `time` is not looked at. Forces are asked of the calculator.
     check_every : int, optional
         As for `kcons.run`: steps from one certificate of the state to the next.
     trajectory, logfile, loginterval, **kwargs

@@ -14,9 +14,15 @@ from kcons.constraints.arguments import positive, refuse_other
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.thermostats.pressure import BarostatBodies, CellSystem, find_pieces, instantaneous_pressure
-from kcons.thermostats.pressure.measured import Virial, mean_pressure, refuse_virial
-from kcons.thermostats.pressure.pieces import Held
+from kcons.thermostats.cells import (
+    BarostatBodies,
+    CellSystem,
+    Held,
+    Virial,
+    find_pieces,
+    instantaneous_pressure,
+    refuse_virial,
+)
 
 _BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a reporter, which take energies alone"
 
@@ -110,7 +116,7 @@ class PressureReporter:
     @property
     def mean(self) -> float:
         """Of the pressure, in eV/A^3, along the axes that a barostat changes."""
-        return mean_pressure(self.values, self._axes)
+        return float(np.mean([np.diagonal(value)[self._axes] for value in self.values]))
 
     @property
     def _axes(self) -> NDArray[np.bool_]:

@@ -14,8 +14,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.thermostats.pressure.measured import constraint_virial
-from kcons.thermostats.pressure.pieces import rows_open
+from kcons.thermostats.cells import constraint_virial, rows_open
 
 #: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta: what the digits of
 #: most files leave. Farther off they are refused.

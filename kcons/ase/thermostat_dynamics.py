@@ -7,14 +7,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from inspect import signature
-from os import PathLike
 from typing import Any, Literal, NoReturn, cast
 
 import numpy as np
 from ase import Atoms, units
 from ase.calculators.mixing import SumCalculator
 
-from kcons.ase.binding import FORCES_ONLY, unchanged_on_failure
+from kcons.ase.binding import with_added
 from kcons.ase.dynamics import ConstrainedDynamics
 from kcons.ase.pressure import AtomsSystem
 from kcons.ase.topology import kinetic_energy_of, require_atoms
@@ -33,33 +32,15 @@ from kcons.thermostats import (
     Langevin,
     LangevinRespa,
     NoseHooverChain,
-    Tuned,
     thermal_velocities,
-    tune,
 )
+from kcons.thermostats.barostats import Barostat, ConstantPressure, require_barostat
 from kcons.thermostats.freedom import Momentum
-from kcons.thermostats.isokinetic.isokinetic import Convention
-from kcons.thermostats.pressure import Barostat, ConstantPressure, require_barostat
+from kcons.thermostats.isokinetic import Convention
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
-    """What the thermostats share: temperature, barostat, `save` and `restart`.
-
-    Parameters
-    ----------
-    atoms, timestep
-        As for `ConstrainedDynamics`.
-    temperature_K : float, optional
-        None where the thermostat can do without.
-    make : callable
-        Of kT in eV: a stepper that keeps this temperature.
-    restart : path, optional
-        File written by `save`.
-    barostat : Barostat, optional
-        Of `kcons.thermostats`; atoms need a periodic cell.
-    **kwargs
-        As for `ConstrainedDynamics`.
-    """
+    """What the thermostats share: temperature and barostat; `make` gives a stepper that keeps a kT in eV."""
 
     def __init__(
         self,
@@ -68,7 +49,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
         temperature_K: float | None,
         make: Callable[[Any], Stepper],
         *,
-        restart: str | PathLike[str] | None = None,
         barostat: Barostat | None = None,
         **kwargs: Any,
     ) -> None:
@@ -78,10 +58,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
             require_barostat(barostat)
         self.barostat = barostat
         stepper = make(None if temperature_K is None else _thermal(temperature_K))
-        if restart is not None:
-            if "state" in kwargs:
-                raise InputError("give restart or state, not both", item="restart")
-            kwargs["state"] = _read(restart, len(atoms))
         super().__init__(atoms, timestep, stepper, **kwargs)
 
     def set_temperature(self, temperature_K: float) -> None:
@@ -120,14 +96,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
         system = AtomsSystem(self, motion)
         self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
         return system
-
-    def save(self, file: str | PathLike[str]) -> None:
-        """Write the state, all it takes to continue to the last bit with `restart=file` (see `State.save`).
-
-        A trajectory holds positions and momenta only: the isokinetic thermostat continues from it as well, Langevin
-        with another `rng`, a Nose-Hoover chain from rest.
-        """
-        self.state.save(file)
 
     @property
     def thermostat_degrees_of_freedom(self) -> int:
@@ -220,12 +188,12 @@ class ConstrainedLangevin(ThermostattedDynamics):
     Parameters
     ----------
     atoms, timestep, temperature_K, **kwargs
-        As for `ConstrainedDynamics`, and `restart` and `barostat`, see `ThermostattedDynamics`.
+        As for `ConstrainedDynamics`, and `barostat` (of `kcons.thermostats`), for which atoms need a periodic cell.
     friction : float
         In inverse units of ASE's time, for example 0.01/units.fs.
     rng : int, numpy.random.Generator or None
         A seed, or what one is drawn from, which `seed` then tells; None takes it from the operating system. A run
-        continued from a trajectory needs another; with `restart` the noise goes on.
+        continued from a trajectory needs another; with `state` the noise goes on.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
     """
@@ -295,8 +263,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
     Parameters
     ----------
     atoms, timestep, temperature_K, rng, **kwargs
-        As for `ConstrainedLangevin`; forces of the calculator are the gradient of its energy, and `tune` finds a time
-        step.
+        As for `ConstrainedLangevin`; forces of the calculator are the gradient of its energy.
     steps : int or (int, int)
         Time steps of a proposal; with two numbers drawn between them.
     stepper : Stepper, optional
@@ -331,26 +298,6 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
     def counts(self) -> Counts:
         """What became of the proposals."""
         return Counts.of(self._start(self._systems()))
-
-    def tune(self, wanted: float | None = None, proposals: int = 80) -> Tuned:
-        """Find the time step for a wanted share of accepted proposals, and use it from now on.
-
-        The proposals that it takes are no sample, and are not counted; see `kcons.thermostats.tune`.
-
-        Parameters
-        ----------
-        wanted : float, optional
-            Between 0 and 1; by default what costs least for the order of the stepper.
-        proposals : int
-        """
-        system = self._systems()
-        state = self._start(system)
-        sampler = cast(HamiltonianMonteCarlo, self.stepper)
-        with unchanged_on_failure(self.atoms):
-            found = tune(system, state, self.dt, sampler, wanted=wanted, proposals=proposals)
-        self.dt = found.dt
-        self._resume(found.state)
-        return found
 
     def get_conserved_energy(self) -> NoReturn:
         """`UnsupportedError`: nothing is conserved."""
@@ -460,12 +407,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
         def force(x: FloatArray, time: float) -> FloatArray:
             atoms = self.atoms
             atoms.arrays["positions"][...] = x
-            found = np.array(as_float_array(calculator.get_forces(atoms), "forces of the calculator"))
-            if others and found.shape == (len(atoms), 3):
-                for item in atoms.constraints:
-                    if isinstance(item, FORCES_ONLY):
-                        item.adjust_forces(atoms, found)
-            return found
+            found = calculator.get_forces(atoms)
+            return with_added(atoms, found) if others else np.array(as_float_array(found, "forces of the calculator"))
 
         return force
 
@@ -559,15 +502,3 @@ def draw_velocities(
 def _thermal(temperature_K: float) -> float:
     """kT in eV."""
     return units.kB * positive(temperature_K, "temperature_K")
-
-
-def _read(file: str | PathLike[str], n_atoms: int) -> State:
-    try:
-        state = State.load(file)
-    except FileNotFoundError:
-        raise
-    except InputError as error:
-        raise InputError(f"{file} was not written by save: {error}", item="restart") from error
-    if state.positions.shape != (n_atoms, 3):
-        raise InputError(f"{file} holds {len(state.positions)} atoms, not {n_atoms}", item="restart")
-    return state

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from functools import partial
 from typing import Unpack
-from zlib import crc32
 
 import numpy as np
 from ase import Atoms, units
@@ -19,7 +17,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology.guessed_bonds import close_pairs, guess_bonds, reaches
+from kcons.topology.guessed_bonds import close_pairs, guess_bonds
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rigid_groups import water_rows
 from kcons.topology.rows_by_name import HeldRows, rows_of
@@ -35,30 +33,12 @@ from kcons.topology.topology import (
     whole_numbers,
 )
 
-__all__ = [
-    "atoms_of",
-    "bonds_of",
-    "constraints_of",
-    "kinetic_energy_of",
-    "named_rows",
-    "repair_elements",
-    "repartition_hydrogen_mass",
-    "require_atoms",
-    "rigid_water",
-    "snapshot_of",
-    "velocities_of",
-]
-
 #: Where the bonds of an `Atoms` object are kept: pairs of atoms, in ``atoms.info``.
 BONDS = "bonds"
-#: What bonds that were guessed were guessed for, in ``atoms.info``: atoms that are sorted or cut take both along.
-GUESSED = "bonds_guessed_for"
-#: A guessed bond longer than this times the sum of covalent radii is none of these atoms.
-_STALE = 1.6
 #: ASE's unit of time in ps, to the power that velocities need.
 PS = 1000 * units.fs
-#: An O-H length that no water has, in Angstrom.
-_SHORTEST = 0.5
+#: O-H lengths that water has, in Angstrom.
+_SHORTEST, _REACH = 0.5, 1.3
 _ITEM = f"atoms.info[{BONDS!r}]"
 _REMEDY = f"put pairs of atoms into {_ITEM}"
 
@@ -81,11 +61,11 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
     return rows_of(snapshot, Holding(constrain, **options), numbers, _REMEDY)
 
 
-def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None, *, reach: float = 1.3) -> Distance:
+def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None) -> Distance:
     """Hold all water molecules rigid: three distances each.
 
-    A water is an oxygen with two hydrogens within `reach` of it (minimum image), which are near no other oxygen, and
-    without a third; wherever they are in the list of atoms.
+    A water is an oxygen with two hydrogens within 1.3 Angstrom of it (minimum image), which are near no other oxygen,
+    and without a third; wherever they are in the list of atoms.
 
     Parameters
     ----------
@@ -93,8 +73,6 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None,
     geometry : str, (float, float) or None
         A named model, such as 'tip3p' (0.9572 angstrom, 104.52 degrees), or O-H length and H-O-H angle in degrees. None
         holds each molecule as it is.
-    reach : float
-        Longest O-H distance that counts as a bond, in Angstrom.
 
     Raises
     ------
@@ -105,7 +83,7 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None,
     shape = None if geometry is None else Holding("none", water_geometry=geometry).geometry()[0]
     part = np.flatnonzero(np.isin(atoms.numbers, (1, 8)) & np.isfinite(atoms.positions).all(axis=1))
     lattice = lattice_of(atoms.cell.array if atoms.pbc.any() else None, atoms.pbc)
-    pairs, apart = close_pairs(atoms.positions[part], lattice, positive(reach, "reach"))
+    pairs, apart = close_pairs(atoms.positions[part], lattice, _REACH)
     oxygen = atoms.numbers[part] == 8
     mixed = oxygen[pairs].sum(axis=1) == 1
     pairs, apart = pairs[mixed], apart[mixed]
@@ -117,7 +95,7 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None,
     triples = part[np.concatenate([pairs[whole][::2], pairs[whole][1::2, 1:]], axis=1)]
     if len(triples) == 0:
         raise InputError(
-            f"no water found: an oxygen with two hydrogens within {reach:g} Angstrom that are near no other oxygen; "
+            f"no water found: an oxygen with two hydrogens within {_REACH} Angstrom that are near no other oxygen; "
             "hold other molecules with Distance",
             item="atoms",
         )
@@ -129,13 +107,6 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None,
             atoms=triples[:, 0],
         )
     return water_rows(triples, shape)
-
-
-def named_rows(atoms: Atoms, name: str) -> HeldRows:
-    """`constraints_of` without its warning about guessed bonds; the caller says it."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=r"\d+ bonds were guessed")
-        return constraints_of(atoms, name)
 
 
 def require_atoms(atoms: object) -> None:
@@ -182,7 +153,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
         residue_names, ids, chains = np.array([""] * min(n, 1)), np.array(["1"] * min(n, 1)), np.array([""] * min(n, 1))
     if known and "atomtypes" in arrays:
         elements, masses = _repaired(elements, masses, names, residues, residue_names, "masses" in arrays)
-    bonds, guessed = _given_bonds(atoms)
+    bonds = check_pairs(atoms.info.get(BONDS, np.zeros((0, 2), np.int64)), n, _ITEM)
     charges = atoms.get_initial_charges() if "initial_charges" in arrays else None
     topology = Topology(
         names,
@@ -198,12 +169,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     )
     cell = atoms.cell.array.copy() if atoms.pbc.any() else None
     velocities = velocities_of(atoms) * PS if "momenta" in arrays else None
-    made = Snapshot(topology, atoms.positions.copy(), 1.0, cell, atoms.pbc.copy(), velocities, "Atoms object")
-    if guessed:
-        long, radii = reaches(made, topology.bonds)
-        if (long > _STALE * radii).any():
-            return replace(made, topology=replace(topology, bonds=np.zeros((0, 2), np.int64)))
-    return made
+    return Snapshot(topology, atoms.positions.copy(), 1.0, cell, atoms.pbc.copy(), velocities, "Atoms object")
 
 
 def bonds_of(atoms: Atoms) -> IntArray:
@@ -218,28 +184,6 @@ def bonds_of(atoms: Atoms) -> IntArray:
     if len(given) or not atoms.numbers.any():
         return given
     return guess_bonds(snapshot, among=np.isfinite(atoms.positions).all(axis=1))
-
-
-def keep_guessed(atoms: Atoms, bonds: IntArray) -> None:
-    """Keep bonds that were guessed in ``atoms.info``."""
-    atoms.info[BONDS], atoms.info[GUESSED] = bonds, _stamp(atoms, bonds)
-
-
-def _stamp(atoms: Atoms, bonds: IntArray) -> str:
-    return f"{crc32(bonds.astype('<i8').tobytes()):08x} {crc32(atoms.numbers.astype('<i8').tobytes()):08x}"
-
-
-def _given_bonds(atoms: Atoms) -> tuple[IntArray, bool]:
-    """Bonds in ``atoms.info``, and whether they were guessed; none that were guessed for another order of atoms."""
-    given = atoms.info.get(BONDS)
-    if given is None:
-        return np.zeros((0, 2), np.int64), False
-    bonds = check_pairs(given, item=_ITEM)
-    said, stamp = str(atoms.info.get(GUESSED, "")), _stamp(atoms, bonds)
-    guessed = said[:8] == stamp[:8]  # otherwise the bonds are somebody's since
-    if guessed and said != stamp:
-        return np.zeros((0, 2), np.int64), True
-    return check_pairs(bonds, len(atoms), _ITEM), guessed
 
 
 def repair_elements(atoms: Atoms) -> int:

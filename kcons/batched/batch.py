@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,10 +114,8 @@ class Batch:
         self._fixed = self._placed(
             self.atom_starts, lambda each: [each.constraint_set.row_atoms(row)[0] for row in each.plan.pinned_rows[::3]]
         )
-        self._massless = self.masses <= 0
-        self._free = ~self._massless
+        self._free = self.masses > 0
         self._free[self._fixed] = False
-        self._massless[self._fixed] = False
         self._inverse_masses = self._inverse(self.masses)
         self._moving = any(each.constraint_set.moving for each in self._numbers)
         self._is_position = self._joined(lambda each: each.constraint_set.holonomic, torch.bool)
@@ -175,27 +174,6 @@ class Batch:
         self._tree = [self._placed(self.atom_starts, parents)]
         while bool((self._tree[-1] != self._tree[-1][self._tree[-1]]).any()):
             self._tree.append(self._tree[-1][self._tree[-1]])
-
-    def set_cell(self, cells: Tensor) -> None:
-        """Change the periodic cells, as barostats do; which directions are periodic stays as it is.
-
-        Parameters
-        ----------
-        cells : Tensor, shape (n_systems, 3, 3) or (3, 3)
-            Lattice vectors as rows.
-
-        Raises
-        ------
-        InputError
-            Cells of another shape, or for systems without.
-        """
-        whole = torch.as_tensor(cells, dtype=self.dtype, device=self.device)
-        if self._lattice is None or whole.shape not in ((3, 3), (self.n_systems, 3, 3)):
-            wanted = f"(3, 3) or ({self.n_systems}, 3, 3), where Motions have one"
-            raise InputError(f"cells have shape {tuple(whole.shape)}; give {wanted}", item="cells")
-        periodic = self._lattice[:, 1].any(1, keepdim=True)
-        whole = torch.where(periodic.transpose(1, 2), whole.expand(self.n_systems, 3, 3), self._lattice[:, 0])
-        self._lattice = torch.stack([whole, torch.linalg.inv(whole) * periodic], 1)
 
     def _tree_cells(self, x: Tensor) -> Tensor | None:
         """Cells by which atoms of whole rows stand off where they are stored, (n_atoms, 3)."""
@@ -338,14 +316,6 @@ class Batch:
         speeds = self._with_fixed(self._flat(v, "v"), rates)
         return Projection.apply(speeds, here, rates, self.weights(masses), task)[0].reshape(v.shape)
 
-    def project_forces(self, x: Tensor, forces: Tensor) -> Tensor:
-        """What is left of forces on the surface, for optimizers, as `Motion.project_forces`."""
-        here, f = self._flat(x, "x"), self._flat(forces, "forces")
-        pulled = self._inverse_masses[:, None] * f
-        task = self._task(False, 0.0, 0.0)
-        found = Projection.apply(pulled, here, self._still, self._inverse_masses, task)[0] * self.masses[:, None]
-        return torch.where(self._free[:, None], found, self._massless[:, None] * f).reshape(forces.shape)
-
     def multipliers(
         self, x: Tensor, v: Tensor, forces: Tensor, *, time: float = 0.0, masses: Tensor | None = None
     ) -> Tensor:
@@ -409,24 +379,11 @@ class Batch:
         """What each system's engine reports of its positions, and velocities: residuals, rank, kinds of clusters."""
         both = (x, x) if v is None else (x, v)
         here, speed = (self._flat(each, "x or v").detach().cpu().double().numpy() for each in both)
-        found = []
-        for k, motion in enumerate(self.systems):
-            some, before = slice(*self.atom_starts[k : k + 2]), motion.lattice
-            if before is not None and self._lattice is not None:
-                motion.set_cell(self._lattice[k, 0].cpu().double().numpy(), before[1].any(axis=0).tolist())
-            found.append(motion.report(here[some], None if v is None else speed[some], time, condition=False))
-            if before is not None:
-                motion.set_cell(before[0], before[1].any(axis=0).tolist())
-        return found
-
-    def select(self, systems: Sequence[int]) -> Batch:
-        """A batch of some of the systems, in this order, in their cells."""
-        numbers = np.arange(self.n_systems)[list(systems)].tolist()
-        some = [self.systems[k] for k in numbers]
-        made = Batch(some, device=self.device, dtype=self.dtype, compiled=self.compiled, check_every=self.check_every)
-        if self._lattice is not None and made._lattice is not None:
-            made._lattice = self._lattice[numbers]
-        return made
+        parts = [slice(*ends) for ends in pairwise(self.atom_starts)]
+        return [
+            motion.report(here[some], None if v is None else speed[some], time, condition=False)
+            for motion, some in zip(self.systems, parts, strict=True)
+        ]
 
     def __repr__(self) -> str:
         return f"<Batch: {self.n_rows} rows on {self.n_atoms} atoms of {self.n_systems} systems>"

@@ -1,12 +1,14 @@
 """Clusters that look alike, side by side: the equations of their multipliers, by positions, velocities and gradients.
 
-Numbers of a cluster are lists of tensors. Small clusters have a tensor of shape (clusters,) for each number, and their
-elimination is written out (`lanes`); of larger ones a list has one tensor with all, and rows that share nothing are
-eliminated together, by levels (`levels`). What is done with these is written once, for both.
+Vectors of small clusters are lists with a tensor of shape (clusters,) for each number, and their elimination is written
+out (`lanes`); those of larger ones are tensors, and rows that share nothing are eliminated together, by levels
+(`levels`). What is done with these is written once, for both.
 """
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +19,8 @@ from kcons.batched.row_functions import RowFunction
 #: Rows, and atoms in all rows, up to which elimination is written out.
 LANES_ROWS, LANES_PLACES = 6, 24
 
-Vector = list[Any]
+#: A list of tensors, or a tensor.
+Vector = Any
 
 
 class Row(NamedTuple):
@@ -33,11 +36,6 @@ class Row(NamedTuple):
     whole: bool
     period: float
     parameters: int
-
-    @property
-    def places(self) -> tuple[int, ...]:
-        """Atoms of which it takes a place."""
-        return self.atoms[1:] if self.relative else self.atoms
 
 
 class Pattern(NamedTuple):
@@ -59,13 +57,16 @@ class Pattern(NamedTuple):
 class Problem(NamedTuple):
     """What clusters of one pattern are given; the last axis is by cluster, or 1 where all are alike.
 
-    Places of rows and those where directions are taken (`start`), (3 places, n), and how far atoms have come from there
-    where rows of velocities count (`way`), (3 n_atoms, n); inverse masses `w`, what rows are `held` at, parameters `p`.
+    Coordinates of atoms, `x` and `start`, where directions are taken, (3 n_atoms, n); by how much the images that rows
+    mean stand off there, for each atom of a relative row but the first, or None; whether rows of velocities count, by
+    the way from start to x (`flies`); inverse masses `w`, what rows are `held` at, parameters `p`.
     """
 
-    base: Tensor
+    x: Tensor
     start: Tensor
-    way: Tensor | None
+    images: Tensor | None
+    start_images: Tensor | None
+    flies: bool
     w: Tensor
     held: Tensor
     p: Tensor
@@ -74,33 +75,72 @@ class Problem(NamedTuple):
 
     @property
     def at_start(self) -> Problem:
-        return self._replace(base=self.start, way=None, t=self.t_start)
+        return self._replace(x=self.start, images=self.start_images, flies=False, t=self.t_start)
 
 
 class Clusters:
     """Equations of the clusters of one pattern.
 
-    Vectors of rows have shape (rank, n) or (n_rows, n), those of atoms (3 n_atoms, n). `rows_of`, `atoms_of` and
-    `weights` make lists of vectors and of inverse masses, `packed` tensors of lists. `evaluate` gives values and
-    gradients A with atoms moved, `couple` A W B^T of the rows that are solved for, `spread` A^T lambda, `contract` A v,
-    `solved` the rows that are solved for, and `off` value less target.
+    Vectors of rows have shape (rank, n) or (n_rows, n), those of atoms (3 n_atoms, n). `unpacked` makes vectors of
+    tensors, `packed` tensors of vectors, and `take` lists of what a vector has at some numbers. `couple` gives A W B^T
+    of the rows that are solved for, `spread` A^T lambda, `contract` A v.
     """
 
-    rows_of: Any
-    atoms_of: Any
-    weights: Any
+    unpacked: Any
     packed: Any
-    evaluate: Any
+    take: Any
     couple: Any
     solve: Any
     diagonal: Any
     spread: Any
     contract: Any
-    solved: Any
-    off: Any
 
     def __init__(self, pattern: Pattern) -> None:
         self.pattern = pattern
+        #: Rows that are computed at once: the first, and of all their numbers, those of coordinates of their atoms, of
+        #: images, and of parameters.
+        self.kinds: list[tuple[Row, Any, Any, Any, Any]] = []
+        image = parameter = 0
+        for k, row in enumerate(pattern.rows):
+            ends = image + 3 * (len(row.atoms) - 1) * row.relative, parameter + row.parameters
+            coordinates = [3 * atom + c for atom in row.atoms for c in range(3)]
+            self.kinds.append((row, k, coordinates, range(image, ends[0]), range(parameter, ends[1])))
+            image, parameter = ends
+
+    def weights(self, w: Tensor) -> Vector:
+        return self.unpacked(w.repeat_interleave(3, 0))
+
+    def _places(self, kind: tuple[Row, Any, Any, Any, Any], x: Vector, apart: Tensor | None) -> list[Any]:
+        """Coordinates of the atoms of rows; of relative ones how far they are from the first, and `apart` beside it."""
+        row, _, coordinates, images, _ = kind
+        found = self.take(x, coordinates)
+        if row.relative:
+            found = [a - found[k % 3] for k, a in enumerate(found[3:])]
+            found = [0.0, 0.0, 0.0, *(found if apart is None else _added(found, self.take(apart, images)))]
+        return found
+
+    def evaluate(self, of: Problem, u: Vector | None) -> tuple[Any, Any]:
+        """Values less what is held, and gradients, with atoms moved by `u`."""
+        values, slopes = [], []
+        for kind in self.kinds:
+            row, numbers, coordinates, _, parameters = kind
+            flies = of.flies and not row.function.holonomic
+            r = self._places(kind, of.x, of.images)
+            if u is not None:
+                r = _added(r, self._places(kind, u, None))
+            if flies:
+                there = self._places(kind, of.start, of.start_images)
+                r = [0.5 * (a + b) for a, b in zip(r, there, strict=True)]
+                way = _each(operator.sub, self.take(of.x, coordinates), self.take(of.start, coordinates))
+                r += way if u is None else _added(way, self.take(u, coordinates))
+            elif not row.function.holonomic:
+                r += [0.0] * len(coordinates)
+            t = 0.5 * (of.t + of.t_start) if flies else of.t
+            value, slope = row.function(r, self.take(of.p, parameters), t)
+            off = value - of.held[numbers]
+            values.append(off - row.period * torch.round(off / row.period) if row.period else off)
+            slopes.append(slope)
+        return values, slopes
 
     # -- positions ----------------------------------------------------------------------------------
 
@@ -109,20 +149,19 @@ class Clusters:
 
         That is how far they move the atoms, and by how much all rows are off then, infinite where one has turned.
         """
-        weights, known, rank = self.weights(of.w), self.rows_of(lam), self.pattern.rank
+        weights, known, rank = self.weights(of.w), self.unpacked(lam), self.pattern.rank
         there = self.evaluate(of.at_start, None)[1]
         u = _times(weights, self.spread(there, known))
-        value, slope = self.evaluate(of, u)
-        off = self.off(value, self.rows_of(of.held))
+        off, slope = self.evaluate(of, u)
         s = self.couple(slope, there, weights)
-        step = self.solve(s, [-each for each in self.solved(off)])
-        size = self.packed(off, of.base).abs()
-        turned = self.packed([torch.where(d > 0, 0.0, torch.inf) for d in self.diagonal(s)], of.base)
+        step = self.solve(s, _each(operator.neg, off[:rank]))
+        size = self.packed(off, of.x).abs()
+        turned = self.packed(_each(lambda d: torch.where(d > 0, 0.0, torch.inf), self.diagonal(s)), of.x)
         size = size + turned if rank == len(size) else torch.cat([size[:rank] + turned, size[rank:]])
-        return self.packed(_added(known, step), of.base), self.packed(u, of.base), size
+        return self.packed(_added(known, step), of.x), self.packed(u, of.x), size
 
     def newton_adjoint(self, of: Problem, lam: Tensor, pushed: Tensor, bent: Tensor, _: Tensor) -> tuple[Tensor, ...]:
-        """Derivatives at the solution `of.base`, by one solve with the transposed matrix.
+        """Derivatives at the solution `of.x`, by one solve with the transposed matrix.
 
         By positions, by those of the start, by targets and by inverse masses; of derivatives by how far atoms are
         `pushed` and by multipliers (`bent`).
@@ -131,13 +170,13 @@ class Clusters:
         s = self.couple(slope, there, self.weights(of.w))
 
         def of_start(moved: Tensor, wz: Vector, a: Vector) -> Tensor:
-            found = self.evaluate(of.at_start, self.atoms_of(moved))[1]
-            total = _dot(self.solved(self.contract(found, wz)), self.rows_of(lam))
-            if of.way is None:
+            found = self.evaluate(of.at_start, self.unpacked(moved))[1]
+            total = _dot(self.contract(found, wz)[: self.pattern.rank], self.unpacked(lam))
+            if not of.flies:
                 return total
             # The way and the middle of the flight change with where it starts.
-            flown = of._replace(start=of.start + self.moved_places(moved), way=of.way - moved)
-            return total - _dot(self.solved(self.evaluate(flown, None)[0]), a)
+            flown = of._replace(start=of.start + moved)
+            return total - _dot(self.evaluate(flown, None)[0][: self.pattern.rank], a)
 
         return self._adjoint(of, there, slope, s, lam, pushed, bent, of_start)
 
@@ -145,32 +184,25 @@ class Clusters:
         self, of: Problem, there: Any, slope: Any, s: Any, lam: Tensor, pushed: Tensor, bent: Tensor, of_place: Any
     ) -> tuple[Tensor, ...]:
         """Of atoms moved by W B^T lambda, where A and what else depends on `of_place`."""
-        weights, h = self.weights(of.w), self.atoms_of(pushed)
-        b = _added(self.solved(self.contract(there, _times(weights, h))), self.rows_of(bent))
+        weights, h = self.weights(of.w), self.unpacked(pushed)
+        b = _added(self.contract(there, _times(weights, h))[: self.pattern.rank], self.unpacked(bent))
         a = self.solve(s, b, transposed=True)
-        back = [-each for each in self.spread(slope, a)]
+        back = _each(operator.neg, self.spread(slope, a))
         z = _added(h, back)
         wz = _times(weights, z)
         by_place = torch.func.grad(lambda moved: of_place(moved, wz, a))(torch.zeros_like(pushed))
-        force = self.packed(self.spread(there, self.rows_of(lam)), of.base) * self.packed(z, of.base)
+        force = self.packed(self.spread(there, self.unpacked(lam)), of.x) * self.packed(z, of.x)
         by_weight = force.reshape(-1, 3, force.shape[-1]).sum(1)
-        return self.packed(back, of.base), by_place, self.packed(a, of.base), by_weight
-
-    def moved_places(self, moved: Tensor) -> Tensor:
-        """Changes of places where atoms move."""
-        rows = [3 * atom + c for row in self.pattern.rows for atom in row.places for c in range(3)]
-        first = [3 * row.atoms[0] + c for row in self.pattern.rows for _ in row.places for c in range(3)]
-        relative = [[float(row.relative)] for row in self.pattern.rows for _ in row.places for c in range(3)]
-        return moved[rows] - moved.new_tensor(relative) * moved[first]
+        return self.packed(back, of.x), by_place, self.packed(a, of.x), by_weight
 
     # -- velocities ---------------------------------------------------------------------------------
 
     def tangent(self, of: Problem, v: Tensor) -> tuple[Tensor, Tensor]:
         """Multipliers of velocities with A v as it is held, and by how much these change."""
         weights, slope = self.weights(of.w), self.evaluate(of, None)[1]
-        speeds = zip(self.rows_of(of.held), self.contract(slope, self.atoms_of(v)), strict=True)
-        mu = self.solve(self.couple(slope, slope, weights), self.solved([wanted - found for wanted, found in speeds]))
-        return self.packed(mu, of.base), self.packed(_times(weights, self.spread(slope, mu)), of.base)
+        off = _each(operator.sub, self.unpacked(of.held), self.contract(slope, self.unpacked(v)))
+        mu = self.solve(self.couple(slope, slope, weights), off[: self.pattern.rank])
+        return self.packed(mu, of.x), self.packed(_times(weights, self.spread(slope, mu)), of.x)
 
     def tangent_adjoint(self, of: Problem, mu: Tensor, pushed: Tensor, bent: Tensor, v: Tensor) -> tuple[Tensor, ...]:
         """As `newton_adjoint`: by velocities, positions, rates and inverse masses, at the velocities v found."""
@@ -178,9 +210,9 @@ class Clusters:
         s = self.couple(slope, slope, self.weights(of.w))
 
         def of_place(moved: Tensor, wz: Vector, a: Vector) -> Tensor:
-            found = self.evaluate(of, self.atoms_of(moved))[1]
-            speeds = _dot(self.solved(self.contract(found, self.atoms_of(v))), a)
-            return _dot(self.solved(self.contract(found, wz)), self.rows_of(mu)) - speeds
+            found = self.evaluate(of, self.unpacked(moved))[1]
+            speeds = _dot(self.contract(found, self.unpacked(v))[: self.pattern.rank], a)
+            return _dot(self.contract(found, wz)[: self.pattern.rank], self.unpacked(mu)) - speeds
 
         return self._adjoint(of, slope, slope, s, mu, pushed, bent, of_place)
 
@@ -195,22 +227,22 @@ class Clusters:
         s = self.couple(slope, slope, weights)
 
         def speeds(moved: Tensor, time: Tensor) -> Tensor:
-            found = self.contract(self.evaluate(of._replace(t=time), self.atoms_of(moved))[1], self.atoms_of(v))
+            found = self.contract(self.evaluate(of._replace(t=time), self.unpacked(moved))[1], self.unpacked(v))
             return self.packed(found, v) + self.drift(of._replace(t=time), moved)
 
         bend = torch.func.jvp(speeds, (torch.zeros_like(v), of.t), (v, torch.ones_like(of.t)))[1]
-        b = of.held - bend - self.packed(self.contract(slope, self.atoms_of(a)), v)
-        lam = self.packed(self.solve(s, self.solved(self.rows_of(b))), v)
+        b = of.held - bend - self.packed(self.contract(slope, self.unpacked(a)), v)
+        lam = self.packed(self.solve(s, self.unpacked(b)[: self.pattern.rank]), v)
         lam = self._least_norm(slope, s, weights, lam)
-        return lam, self.packed(self.spread(slope, self.rows_of(lam)), v)
+        return lam, self.packed(self.spread(slope, self.unpacked(lam)), v)
 
     def drift(self, of: Problem, moved: Tensor | None = None) -> Tensor:
         """dq/dt of rows with the time in them, where atoms rest."""
         if not any(row.function.timed and row.function.holonomic for row in self.pattern.rows):
-            return of.base.new_zeros(())
-        u = None if moved is None else self.atoms_of(moved)
+            return of.x.new_zeros(())
+        u = None if moved is None else self.unpacked(moved)
         along = (of.t,), (torch.ones_like(of.t),)
-        return torch.func.jvp(lambda t: self.packed(self.evaluate(of._replace(t=t), u)[0], of.base), *along)[1]
+        return torch.func.jvp(lambda t: self.packed(self.evaluate(of._replace(t=t), u)[0], of.x), *along)[1]
 
     def _least_norm(self, slope: Any, s: Any, weights: Vector, lam: Tensor) -> Tensor:
         """Multipliers of all rows with the same force, where the last ones are sums D of those that are solved for."""
@@ -221,20 +253,25 @@ class Clusters:
         for row in range(rank, count):
             unit = lam.new_zeros(count, lam.shape[-1])
             unit[row] = 1.0
-            force = _times(weights, self.spread(slope, self.rows_of(unit)))
-            sums.append(self.packed(self.solve(s, self.solved(self.contract(slope, force))), lam))
+            force = _times(weights, self.spread(slope, self.unpacked(unit)))
+            sums.append(self.packed(self.solve(s, self.contract(slope, force)[: self.pattern.rank]), lam))
         d = torch.stack(sums)
         metric = torch.einsum("krc,lrc->ckl", d, d) + torch.eye(count - rank, dtype=lam.dtype, device=lam.device)
         rest = torch.linalg.solve(metric, (d * lam).sum(1).T.unsqueeze(-1)).squeeze(-1)
         return torch.cat([lam - torch.einsum("krc,ck->rc", d, rest), rest.T])
 
 
+def _each(act: Callable[..., Any], *vectors: Vector) -> Any:
+    """Something done with each number of vectors."""
+    return act(*vectors) if isinstance(vectors[0], Tensor) else [act(*some) for some in zip(*vectors, strict=True)]
+
+
 def _added(one: Vector, other: Vector) -> Vector:
-    return [a + b for a, b in zip(one, other, strict=True)]
+    return _each(operator.add, one, other)
 
 
 def _times(one: Vector, other: Vector) -> Vector:
-    return [a * b for a, b in zip(one, other, strict=True)]
+    return _each(operator.mul, one, other)
 
 
 def _dot(one: Vector, other: Vector) -> Any:

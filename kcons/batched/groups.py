@@ -22,7 +22,7 @@ from kcons.plan.clusters_alike import Alike, alike
 
 
 class Kind(NamedTuple):
-    """Clusters of one pattern in one system: atoms and rows, and by cluster parameters, scales, and cells of places."""
+    """Clusters of one pattern in one system: atoms and rows, and by cluster parameters, scales, and cells of images."""
 
     clusters: Alike
     parameters: FloatArray
@@ -42,12 +42,8 @@ def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
         Rows that cannot be run on tensors; rows that depend on others in clusters where these are not known.
     """
     known = _KNOWN.setdefault(motion, {})
-    if velocity_rows not in known:
-        known[velocity_rows] = _kinds(motion, velocity_rows)
-    return known[velocity_rows]
-
-
-def _kinds(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
+    if velocity_rows in known:
+        return known[velocity_rows]
     held, plan, fixed = motion.constraint_set, motion.plan, set(motion.fixed_atoms.tolist())
     missing = int(((plan.labels >= 0) & ~plan.eliminate_last).sum()) + len(plan.pinned_rows) - motion.rank
     if missing:
@@ -61,10 +57,10 @@ def _kinds(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
     offsets: list[FloatArray] = []
     for item, start in zip(held.constraints, held.starts, strict=False):
         function = None if item.fixes_atoms else row_function(item)
-        table = np.zeros((item.n_rows, 0)) if item.fixes_atoms else item.parameters()
+        table = item.parameters().reshape(item.n_rows, -1)
         whole = np.zeros(item.n_rows, bool) if item.whole is None else item.whole
         cells = np.zeros((*item.atoms.shape, 3)) if item.cell_offsets is None else 1.0 * item.cell_offsets
-        offsets += list((cells - cells[:, :1])[:, 1 if item.relative else 0 :])
+        offsets += list((cells - cells[:, :1])[:, 1 if item.relative else item.width :])
         atoms, parameters = atoms + list(item.atoms), parameters + list(table)
         for k, row in enumerate(item.atoms.tolist()):
             still, last = tuple(a in fixed for a in row), bool(plan.eliminate_last[start + k])
@@ -83,6 +79,7 @@ def _kinds(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
             for t in (parameters, offsets)
         )
         found[pattern] = Kind(clusters, next(numbers), held.scale[clusters.rows], next(numbers))
+    known[velocity_rows] = found
     return found
 
 
@@ -120,21 +117,16 @@ class Group:
         self.p, self.scale, self._offsets = (of_all(lambda kind, *_, k=k: kind[k], like.dtype) for k in (1, 2, 3))
         self.flat = _flat(self.atoms)
         self.moving = [3 * a + c for a in range(pattern.n_atoms) if a not in pattern.fixed for c in range(3)]
-        now: list[int] = []
-        before: list[int] = []
-        first: list[int] = []
-        begin: list[int] = []
-        for row in pattern.rows:
-            now += row.places
-            before += row.atoms[:-1] if row.relative else row.atoms
-            first += row.atoms[:1] * len(row.places)
-            begin += [len(begin)] * len(row.places)
-        #: Coordinates of places, of the first atoms of their rows, and of the atoms before them.
-        self._now, self._first, self._before = (_flat(self.atoms[some]) for some in (now, first, before))
-        self._begin = torch.tensor(begin, device=like.device)
-        marks = [[(row.relative, row.whole)] for row in pattern.rows for _ in row.places]
-        self._relative, self._whole = torch.tensor(marks, device=like.device).unsqueeze(-1).unbind(2)
-        self._any, self._all = (of(row.relative for row in pattern.rows) for of in (any, all))
+        # Of relative rows each atom but the first, and the one before it.
+        some = [row for row in pattern.rows if row.relative]
+        sizes = [len(row.atoms) - 1 for row in some]
+        now = [a for row in some for a in row.atoms[1:]]
+        before = [a for row in some for a in row.atoms[:-1]]
+        first = [row.atoms[0] for row in some for _ in row.atoms[1:]]
+        self._now, self._before, self._first = (_flat(self.atoms[each]) for each in (now, before, first))
+        begins, whole = np.repeat([np.cumsum([0, *sizes])[:-1], [row.whole for row in some]], sizes, axis=1)
+        self._begin = torch.as_tensor(begins, device=like.device)
+        self._whole = torch.as_tensor(whole, device=like.device, dtype=torch.bool)[:, None, None]
         self.worst = torch.zeros(self.rows.shape, dtype=like.dtype, device=like.device)
         self._known: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
 
@@ -149,32 +141,28 @@ class Group:
             self._known[key] = values, some if bool((found == some).all()) else found
         return self._known[key][1]
 
-    def places(self, x: Tensor, lattice: Tensor | None, tree: Tensor | None) -> Tensor:
-        """Places of rows, shape (3 places, n), in the images that they mean.
+    def coordinates(self, x: Tensor, lattice: Tensor | None, tree: Any) -> tuple[Tensor, Tensor | None]:
+        """Of the atoms of clusters, and by how much the images that relative rows mean stand off: see `Problem`.
 
         Parameters
         ----------
         x : Tensor, shape (all atoms, 3)
         lattice : Tensor, shape (n_systems, 2, 3, 3), or None
-        tree : Tensor, shape (all atoms, 3), or None
-            Whole cells by which atoms of whole rows stand off where they are stored.
+        tree : callable
+            Gives whole cells by which atoms of whole rows stand off where they are stored, of the shape of x, or None.
         """
         flat, n = x.reshape(-1), self.atoms.shape[1]
-        here = flat[self._now]
-        if self._all:
-            here = here - flat[self._first]
-        elif self._any:
-            here = here - (self._relative * flat[self._first].reshape(-1, 3, n)).reshape(here.shape)
-        if lattice is None or not self._any:
-            return here
+        if lattice is None or not len(self._begin):
+            return flat[self.flat], None
         cell, inverse = lattice[self.systems].unbind(1)
         step = (flat[self._now] - flat[self._before]).reshape(-1, 3, n)
         sums = -torch.round(torch.einsum("exn,nxy->eyn", step, inverse)).cumsum(0)
         cells = sums - torch.cat([torch.zeros_like(sums[:1]), sums])[self._begin]
-        if tree is not None:
-            apart = (tree.reshape(-1)[self._now] - tree.reshape(-1)[self._first]).reshape(-1, 3, n)
+        if (found := tree(x)) is not None:
+            found = found.reshape(-1)
+            apart = (found[self._now] - found[self._first]).reshape(-1, 3, n)
             cells = torch.where(self._whole, apart + self._offsets, cells)
-        return here + torch.einsum("exn,nxy->eyn", cells * self._relative, cell).reshape(here.shape)
+        return flat[self.flat], torch.einsum("exn,nxy->eyn", cells, cell).reshape(-1, n)
 
     def put(self, into: Tensor, vector: Tensor) -> None:
         """Write a vector of atoms, (3 n_atoms, n), into a tensor of all atoms; those that are fixed keep theirs."""

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcons.batched.clusters import Clusters, Problem, Vector
+from kcons.batched.clusters import Clusters, Vector
 
 Matrix = list[list[Any]]
 
@@ -15,41 +15,15 @@ Matrix = list[list[Any]]
 class Lanes(Clusters):
     """See `Clusters`; gradients are lists of numbers by row, matrices lists of rows, None where two share no atom."""
 
-    def rows_of(self, packed: Tensor) -> Vector:
+    def unpacked(self, packed: Tensor) -> Vector:
         return list(packed.unbind(0))
 
-    atoms_of = rows_of
-
-    def weights(self, w: Tensor) -> Vector:
-        return [each for each in w.unbind(0) for _ in range(3)]
+    def take(self, vector: Vector, numbers: Any) -> list[Any]:
+        return [vector[k] for k in numbers]
 
     def packed(self, vector: Vector, like: Tensor) -> Tensor:
         lane = like[0]
         return torch.stack([each.expand_as(lane) if isinstance(each, Tensor) else lane * 0 + each for each in vector])
-
-    def evaluate(self, of: Problem, u: Vector | None) -> tuple[Vector, Any]:
-        places, start, numbers = of.base.unbind(0), of.start.unbind(0), of.p.unbind(0)
-        values, slopes = [], []
-        k = used = 0
-        for row in self.pattern.rows:
-            flies = of.way is not None and not row.function.holonomic
-            r: list[Any] = [0.0] * 3 if row.relative else []
-            for atom in row.places:
-                for c in range(3):
-                    place = places[k]
-                    if u is not None:
-                        place = place + (u[3 * atom + c] - (u[3 * row.atoms[0] + c] if row.relative else 0.0))
-                    r.append(0.5 * (place + start[k]) if flies else place)
-                    k += 1
-            if not row.function.holonomic:
-                for i in (3 * atom + c for atom in row.atoms for c in range(3)):
-                    r.append(0.0 if of.way is None else of.way[i] if u is None else of.way[i] + u[i])
-            t = 0.5 * (of.t + of.t_start) if flies else of.t
-            mine, used = numbers[used : used + row.parameters], used + row.parameters
-            value, steep = row.function(r, mine, t)
-            values.append(value)
-            slopes.append(steep)
-        return values, slopes
 
     def couple(self, left: Any, right: Any, weights: Vector) -> Matrix:
         rows = self.pattern.rows[: self.pattern.rank]
@@ -104,11 +78,3 @@ class Lanes(Clusters):
             sum(steep[3 * i + c] * v[3 * atom + c] for i, atom in enumerate(row.atoms) for c in range(3))
             for row, steep in zip(self.pattern.rows, slope, strict=True)
         ]
-
-    def solved(self, rows: Vector) -> Vector:
-        return rows[: self.pattern.rank]
-
-    def off(self, value: Vector, targets: Vector) -> Vector:
-        found = [a - b for a, b in zip(value, targets, strict=True)]
-        periods = [row.period for row in self.pattern.rows]
-        return [a - p * torch.round(a / p) if p else a for a, p in zip(found, periods, strict=True)]

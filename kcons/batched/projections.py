@@ -39,13 +39,12 @@ class Task(NamedTuple):
 
     def problem(self, group: Group, x: Tensor, start: Tensor, held: Tensor, w: Tensor) -> Problem:
         """Of the clusters of a group, at positions x with directions of a start, which may be the same tensor."""
-        there = group.places(start, self.lattice, self.tree(start))
-        here = there if x is start else group.places(x, self.lattice, self.tree(x))
+        there = group.coordinates(start, self.lattice, self.tree)
+        here = there if x is start else group.coordinates(x, self.lattice, self.tree)
         flies = self.flies and any(not row.function.holonomic for row in group.pattern.rows)
-        way = (x - start).reshape(-1)[group.flat] if flies else None
         weights = group.lanes(w, group.atoms, w is self.own[0])
         wanted = group.lanes(held, group.rows, held is self.own[1])
-        return Problem(here, there, way, weights, wanted, group.p, self.t, self.t_start)
+        return Problem(here[0], there[0], here[1], there[1], flies, weights, wanted, group.p, self.t, self.t_start)
 
 
 def _solve(group: Group, of: Problem) -> tuple[Tensor, Tensor]:
@@ -53,9 +52,9 @@ def _solve(group: Group, of: Problem) -> tuple[Tensor, Tensor]:
 
     On a processor residuals are looked at in each iteration; on a GPU that would wait for it.
     """
-    eps, watched = torch.finfo(of.base.dtype).eps, of.base.device.type == "cpu"
+    eps, watched = torch.finfo(of.x.dtype).eps, of.x.device.type == "cpu"
     count, before = MAX_ITERATIONS if watched else UNWATCHED, torch.inf
-    following = of.base.new_zeros(group.pattern.rank, of.base.shape[-1])
+    following = of.x.new_zeros(group.pattern.rank, of.x.shape[-1])
     for _ in range(count + 1):
         lam = following
         following, moved, size = group.solver.newton(of, lam)

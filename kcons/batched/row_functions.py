@@ -1,7 +1,6 @@
 """Rows of constraints on tensors: what the declaration of a family does, operation by operation, for many rows at once.
 
-Functions of users are traced: written with NumPy they become such a list too, and functions of torch are called under
-`torch.func.vmap`; both are differentiated by torch.
+Functions of users that are written with NumPy become such a list too, which torch differentiates.
 """
 
 from __future__ import annotations
@@ -50,46 +49,33 @@ def run(tape: Tape, r: Sequence[Any], p: Sequence[Any], t: Any) -> list[Any]:
 class RowFunction(NamedTuple):
     """What rows are computed by, equal for rows that are computed alike.
 
-    `tape` has value and gradient of a declaration, and the value alone of a function of NumPy; `called` is a function
-    of torch, of positions of shape (width, 3) and, where it is `timed`, the time. What is not `holonomic` is a function
-    of the middle of a flight and of the way.
+    The `tape` has value and gradient of a declaration, and the value alone of a user's function. What is not
+    `holonomic` is a function of the middle of a flight and of the way; `timed` is what depends on the time.
     """
 
-    tape: Tape | None
-    called: Callable[..., Any] | None
+    tape: Tape
     width: int
     holonomic: bool
-    timed: bool
+
+    @property
+    def timed(self) -> bool:
+        return any(("t", 0) in operands for _, operands in self.tape.steps)
 
     def __call__(self, r: Sequence[Any], p: Sequence[Any], t: Any) -> tuple[Any, list[Any]]:
         """Value, and 3 width numbers of its gradient, by where the flight ends for velocity rows.
 
         `r` are coordinates x, y, z by atom, and the way behind them for velocity rows; `p` are parameters.
         """
-        if self.tape is not None and len(self.tape.results) > 1:
+        if len(self.tape.results) > 1:
             value, *slope = run(self.tape, r, p, t)
             return value, slope
         like = next(each for each in r if isinstance(each, Tensor))
         r = [each if isinstance(each, Tensor) else torch.full_like(like, each) for each in r]
-        value, pull = torch.func.vjp(lambda *places: self.value(places, p, t), *r)
+        value, pull = torch.func.vjp(lambda *places: run(self.tape, places, p, t)[0], *r)
         slope, n = list(pull(torch.ones_like(value))), 3 * self.width
         if not self.holonomic:
             slope = [0.5 * middle + way for middle, way in zip(slope[:n], slope[n:], strict=True)]
         return value, slope
-
-    def value(self, r: Sequence[Any], p: Sequence[Any], t: Any) -> Any:
-        """Value alone."""
-        if self.tape is not None:
-            return run(self.tape, r, p, t)[0]
-        places = torch.stack(torch.broadcast_tensors(*r), -1)
-        flat = places.reshape(-1, places.shape[-1] // 3, 3)
-        return torch.func.vmap(lambda each: self._of_one(each, t))(flat).reshape(places.shape[:-1])
-
-    def _of_one(self, places: Any, t: Any) -> Any:
-        """The user's function of the places of one row, and the way behind them."""
-        assert self.called is not None
-        found = self.called(places[: self.width], *((t,) if self.timed else ()))
-        return found if self.holonomic else (found * places[self.width :]).sum()
 
 
 def row_function(item: Constraint) -> RowFunction:
@@ -98,34 +84,27 @@ def row_function(item: Constraint) -> RowFunction:
     Raises
     ------
     UnsupportedError
-        A function of Python that is written neither with NumPy's elementary functions nor with torch.
+        A function of Python that is not written with NumPy's elementary functions.
     """
     found = function_of(item)
     if found is not None:
-        tape = found.tape()
-        timed = any(("t", 0) in operands for _, operands in tape.steps)
-        return RowFunction(tape, None, item.width, item.holonomic, timed)
-    function = RowFunction(None, _called(item), item.width, item.holonomic, item.time_dependent)  # type: ignore[attr-defined]
-    n = (3 if item.holonomic else 6) * item.width
+        return RowFunction(found.tape(), item.width, item.holonomic)
+    n, function = 3 * item.width, _of_user(item)
 
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        value = function._of_one(np.array([r[k] for k in range(n)], dtype=object).reshape(-1, 3), t)
+        places = np.array([r[k] for k in range(n if item.holonomic else 2 * n)], dtype=object).reshape(-1, 3)
+        value = function(places[: item.width], *((t,) if item.time_dependent else ()))  # type: ignore[attr-defined]
+        value = value if item.holonomic else (value * places[item.width :]).sum()
         out[0] = value.item() if isinstance(value, np.ndarray) else value
 
     try:
-        return function._replace(tape=record(row), called=None)
+        return RowFunction(record(row), item.width, item.holonomic)
     except UnsupportedError as error:
-        try:
-            function([*torch.arange(1.0, 1.0 + n).sin()], (), torch.zeros(()))
-        except Exception as other:  # whatever the function of a user raises
-            raise UnsupportedError(
-                f"{item!r} cannot be run on tensors: {error}; called with tensors it raises {type(other).__name__}: "
-                f"{other}. Write it with torch or with elementary functions of NumPy, or as a Formula"
-            ) from other
-        return function
+        remedy = "write it with elementary functions of NumPy, or as a Formula"
+        raise UnsupportedError(f"{item!r} cannot be run on tensors: {error}; {remedy}") from error
 
 
-def _called(item: Any) -> Callable[..., Any]:
+def _of_user(item: Any) -> Callable[..., Any]:
     if isinstance(item, ImplicitSurface):
         return lambda r, *t: item.function(r, *t)[0]
     return item.coefficients if isinstance(item, CustomVelocity) else item.function  # type: ignore[no-any-return]

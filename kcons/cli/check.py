@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import io
 import sys
-from collections.abc import Callable
 from contextlib import suppress
-from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kcons.cli.parser import Command, Option
 from kcons.cli.terminal import rendered, say_written, show
@@ -27,13 +26,8 @@ AS_GIVEN = (
 
 
 def _check(chosen: argparse.Namespace) -> int:
-    try:
-        from kcons.mdanalysis.check.constraint_check import check_trajectory
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "MDAnalysis":
-            raise
-        raise InputError("kcons check needs MDAnalysis: python -m pip install 'kcons[mdanalysis]'") from None
     from kcons.mdanalysis.check import report
+    from kcons.mdanalysis.check.constraint_check import check_trajectory
 
     if chosen.out is not None:
         report.results(chosen.out, chosen.trajectory).refuse_others()  # complain before any work
@@ -45,30 +39,27 @@ def _check(chosen: argparse.Namespace) -> int:
         if chosen.forces is None:
             raise InputError("--temperature needs --forces, from which temperatures are found", item="temperature")
         positive(chosen.temperature, "temperature")
+    given = {name: getattr(chosen, name) for name in AS_GIVEN}
     try:
-        result = check_trajectory(
-            chosen.trajectory,
-            chosen.topology,
-            rigid_water=not chosen.no_rigid_water,
-            **{name: getattr(chosen, name) for name in AS_GIVEN},
-        )
+        result = check_trajectory(chosen.trajectory, chosen.topology, rigid_water=not chosen.no_rigid_water, **given)
     except UnreadableError as error:
-        reason = str(error)
-        print(f"kcons: {reason}", file=sys.stderr)
-        say_written(_put(chosen, lambda folder: report.write_failure(chosen.trajectory, reason, folder)))
+        said = str(error)
+        print(f"kcons: {said}", file=sys.stderr)
+        say_written(_put(chosen, {"trajectory": str(chosen.trajectory), "status": "incomplete", "verdict": said}))
         return EXIT["incomplete"]
-    failed = False
+    failed = ""
     if chosen.forces is not None:
         try:
             result.remarks += _temperatures(chosen, result)
         except KconsError as error:  # the check itself is done, and is worth its time
-            failed = True
-            reason = " ".join(str(error).split())
-            result.remarks.append(f"no temperatures of the configurations: {reason}")
-            print(f"kcons: {reason}", file=sys.stderr)
+            failed = " ".join(str(error).split())
+            result.remarks.append(f"no temperatures of the configurations: {failed}")
+            print(f"kcons: {failed}", file=sys.stderr)
     summary, units, rows, verdict = report.page(result)
+    picture = io.BytesIO()
+    report.plot(result, picture)
     text = "\n".join([summary, rendered(units), rendered(rows), result.verdict])
-    written = _put(chosen, lambda folder: report.write(result, folder, text=text))
+    written = _put(chosen, result.to_dict(), picture.getvalue(), text)
     show(summary, units, rows, verdict)
     say_written(written)
     return 2 if failed else EXIT[result.status]
@@ -84,16 +75,19 @@ def _temperatures(chosen: argparse.Namespace, result: CheckResult) -> list[str]:
     return trajectory_temperatures.sentences(found, chosen.temperature)
 
 
-def _put(chosen: argparse.Namespace, write: Callable[[Path], list[Path]]) -> list[Path]:
+def _put(chosen: argparse.Namespace, *contents: Any) -> list[Path]:
     """Write into the folder asked for, or into the first of the usual names that no other trajectory has."""
+    from kcons.mdanalysis.check.report import write
+
     if chosen.out is not None:
-        return write(chosen.out)
-    for number in count(1):
-        folder = Path(f"check-{chosen.trajectory.stem}" + (f"-{number}" if number > 1 else ""))
+        return write(chosen.out, chosen.trajectory, *contents)
+    number, folder = 1, Path(f"check-{chosen.trajectory.stem}")
+    while True:
         if not folder.is_symlink():
             with suppress(OccupiedError):
-                return write(folder)
-    raise AssertionError
+                return write(folder, chosen.trajectory, *contents)
+        number += 1
+        folder = Path(f"check-{chosen.trajectory.stem}-{number}")
 
 
 COMMAND = Command(
@@ -107,22 +101,15 @@ COMMAND = Command(
         Option("--topology", "any topology that MDAnalysis reads", type=Path, required=True),
         Option("--format", "of the trajectory, where its name does not tell: LAMMPSDUMP, ...", metavar="NAME"),
         Option("--topology-format", "of the topology, where its name does not tell", metavar="NAME"),
-        Option(
-            "--constrain", "hbonds (default), allbonds, hangles, allangles or none", default="hbonds", metavar="NAME"
-        ),
+        Option("--constrain", "hbonds (default), allbonds, hangles, allangles, none", default="hbonds", metavar="NAME"),
         Option("--select", "rows within this selection only (MDAnalysis' language)", default="all"),
         Option("--no-rigid-water", "do not expect water to be rigid", action="store_true"),
-        Option(
-            "--targets", "first (frame, default), mean, topology (its coordinates), or a TOML file", default="first"
-        ),
+        Option("--targets", "first (frame, default), mean, topology (coordinates), or a TOML file", default="first"),
         Option("--tolerance", "relative, of the engine (default 1e-4)", type=float, default=1e-4),
         Option("--precision", "step of the coordinates in the file, Å, where not known", type=float),
         Option("--frames", "frames to look at (default all)", metavar="A:B:STEP"),
         Option("--workers", "processes (default 1)", type=int, default=1),
-        Option(
-            "--forces",
-            "also the temperatures of the configurations, by forces as for compare (amber14-all,amber14/tip3p, gfn2)",
-        ),
+        Option("--forces", "also temperatures of the configurations: forces as for compare (amber14-all, gfn2, ...)"),
         Option("--temperature", "with --forces: say whether the temperatures are this one", type=float, metavar="K"),
         Option("--out", "folder for check.json, .png and .txt (default ./check-TRAJECTORY)", type=Path),
     ),

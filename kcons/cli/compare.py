@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from kcons.cli.parser import Command, Option
-from kcons.cli.systems import SYSTEM, check_name, list_everything, molecules, test_system
+from kcons.cli.systems import SYSTEM, check_name, list_everything, molecules, option_of, test_system
 from kcons.cli.terminal import names, numbers, show
 from kcons.errors import InputError
 
 #: Options that say nothing beside expensive and cheap forces.
-NOT_WITH_CHEAP_FORCES = ("size", "forces", "force_field", "add_hydrogens")
+NOT_WITH_CHEAP_FORCES = ("size", "forces", "force_field", "add_hydrogens", "criterion")
 #: Options that results depend on, beside the system, the budget and what is said about molecules.
 SETTINGS = ("size", "quick", "dt")
 #: Steps of a production run that are looked at, in fs.
@@ -66,30 +66,25 @@ def run(chosen: argparse.Namespace) -> int:
 
 def _asks_for_averages(chosen: argparse.Namespace) -> bool:
     """Whether averages are compared, and not trajectories."""
-    from kcons.comparison import methods
+    from kcons.comparison import averages, methods
 
-    target, forces = chosen.target_error, (chosen.slow, chosen.fast)
+    target, two = chosen.target_error, bool(chosen.slow or chosen.fast)
     if chosen.dt is not None and not chosen.dt:
         raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
     if target is not None and not (target > 0 and isfinite(target)):
         raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
-    averages = chosen.criterion == "temperature" or any(forces)
-    if target is not None and averages:
-        other = "--slow and --fast" if any(forces) else "--criterion temperature"
-        raise InputError(f"--target-error is an error of trajectories; leave {other} out", item="criterion")
-    if not averages:
+    if not two and chosen.criterion != "temperature":
         methods.choose(chosen.methods)
         check_name(chosen)
         return False
-    from kcons.comparison.averages import choose_samplers
-
-    choose_samplers(chosen.methods, any(forces))
-    if any(forces):
-        wrong = [name for name in NOT_WITH_CHEAP_FORCES if getattr(chosen, name)]
-        wrong += ["criterion"] if chosen.criterion == "error" else []
-        for name in wrong:
-            option = {"force_field": "--forcefield"}.get(name, f"--{name.replace('_', '-')}")
-            raise InputError(f"{option} does not go with --slow and --fast; leave it out", item=name)
+    if target is not None:
+        other = "--slow and --fast" if two else "--criterion temperature"
+        raise InputError(f"--target-error is an error of trajectories; leave {other} out", item="criterion")
+    averages.choose_samplers(chosen.methods, two)
+    if two:
+        wrong = [name for name in NOT_WITH_CHEAP_FORCES if getattr(chosen, name) not in (None, "temperature")]
+        if wrong:
+            raise InputError(f"{option_of(wrong[0])} does not go with --slow and --fast; leave it out", item=wrong[0])
         for name, other, what in (("slow", "fast", "expensive"), ("fast", "slow", "cheap")):
             if getattr(chosen, name) is None:
                 raise InputError(f"--{other} needs --{name}: give the {what} forces, too", item=name)
@@ -118,10 +113,8 @@ def _trajectories(chosen: argparse.Namespace, options: dict[str, Any]) -> tuple[
         table = measure.table_of([*table.to_dict("records"), *rows], table.attrs)
     production = _production(chosen, system, budget, watcher)
     found = ranking.rank(table, limit=chosen.target_error)
-    code = ""
-    if found is not None and len(found.table):
-        best = found.table.iloc[0]
-        code = methods.code(system, best.method, best.setting, _expression(chosen))
+    best = None if found is None or not len(found.table) else found.table.iloc[0]
+    code = "" if best is None else methods.code(system, best.method, best.setting, _expression(chosen))
     return table, report.text(table, found, code, production)
 
 
@@ -135,10 +128,8 @@ def _averages(chosen: argparse.Namespace, options: dict[str, Any]) -> tuple[Any,
     given: dict[str, Any] = {"cheap": cheap[0] if cheap else None, "steps": chosen.dt}
     table = averages.compare_averages(system, chosen.methods, **given, **options)
     found = ranking.rank(table, "temperature")
-    code = ""
-    if found is not None and len(found.table):
-        best = found.table.iloc[0]
-        code = averages.code(system, best.method, best.setting, best.friction, _expression(chosen))
+    best = None if found is None or not len(found.table) else found.table.iloc[0]
+    code = "" if best is None else averages.code(system, best.method, best.setting, best.friction, _expression(chosen))
     return table, report.text(table, found, code)
 
 
@@ -219,25 +210,12 @@ COMMAND = Command(
             "steppers with several force evaluations a step take longer ones at the same cost",
             type=numbers,
         ),
-        Option(
-            "--methods",
-            "methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
-            type=names,
-        ),
-        Option(
-            "--out",
-            "folder for compare.csv, .png and .txt (default ./compare-SYSTEM, ./compare-FILE, or these with -averages)",
-            type=Path,
-        ),
+        Option("--methods", "comma separated; all; openmm: those of OpenMM (default: the usual ones)", type=names),
+        Option("--out", "folder for compare.csv, .png and .txt (default ./compare-SYSTEM[-averages])", type=Path),
         Option("--quick", "smaller system, half the horizon, a budget of 5 s", action="store_true"),
         Option("--budget", "seconds for each method (default 20)", type=float),
         Option("--resume", "go on from the rows of compare.csv in the folder", action="store_true"),
-        Option(
-            "--target-error",
-            "also find the cheapest method and step that make at most this error, by measurement",
-            type=float,
-            metavar="E",
-        ),
+        Option("--target-error", "find the cheapest method and step that make at most this error", type=float),
         Option(
             "--criterion",
             "what methods are ranked by: error of the trajectory (default); temperature runs thermostats instead, and "
@@ -245,9 +223,7 @@ COMMAND = Command(
             choices=("error", "temperature"),
         ),
         Option("--slow", "of a file: expensive forces, as in --forces, with --fast", metavar="FORCES"),
-        Option(
-            "--fast", "and cheap ones: how long may the step be? (--slow gfn2 --fast amber14-all)", metavar="FORCES"
-        ),
+        Option("--fast", "cheap ones: how long may the step be? (--slow gfn2 --fast amber14-all)", metavar="FORCES"),
     ),
     run,
 )

@@ -14,12 +14,11 @@ from typing import Any
 
 from kcons import __version__
 from kcons.cli.parser import Command, Option
-from kcons.cli.terminal import console, show
+from kcons.cli.terminal import show
 from kcons.errors import EXTRAS
 
 #: Names of distributions that differ from those of the packages.
 DISTRIBUTIONS = {"MDAnalysis": "mdanalysis", "openmm": "OpenMM", "torch_sim": "torch-sim-atomistic"}
-NEEDED = ("numpy", "scipy", "numba", "rich")
 THREADS = ("OMP_NUM_THREADS", "OPENMM_CPU_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -31,21 +30,32 @@ def _doctor(chosen: argparse.Namespace) -> int:
         return 1 if wrong else 0
     for heading, entries in found.items():
         if heading != "wrong":
-            console().print(f"[bold]{heading}[/bold]")
-            show(*(f"  {name:<20} {value}" for name, value in entries.items()))
-    show(*(f"wrong: {sentence}" for sentence in wrong or ()), *([] if wrong else ["nothing is wrong"]))
+            show(heading, *(f"  {name:<20} {value}" for name, value in entries.items()))
+    show(*(f"wrong: {sentence}" for sentence in wrong) if wrong else ["nothing is wrong"])
     return 1 if wrong else 0
 
 
 def examine() -> dict[str, Any]:
     """Sections of names and what was found; under 'wrong' sentences on what has to be mended."""
+    import numba
+
+    from kcons.comparison.machine import processor, simd_width
+
     wrong: list[str] = []
     openmm = find_spec("openmm")
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "kcons": {"version": __version__, "Python": platform.python_version(), "at": str(Path(__file__).parents[1])},
-        "machine": _machine(),
-        "packages": {name: version(name) or "not installed" for name in NEEDED},
-        "extras": {name: version(name) or f"pip install 'kcons[{EXTRAS[name]}]'" for name in EXTRAS},
+        "machine": {
+            "processor": processor(),
+            "system": f"{platform.system()} {platform.machine()}",
+            "SIMD": f"{simd_width()} bits",
+            "cores": f"{os.cpu_count()}, {usable} of them for this process",
+            "threads of Numba": str(numba.get_num_threads()),
+            "set in the shell": ", ".join(f"{n}={os.environ[n]}" for n in THREADS if n in os.environ) or "nothing",
+        },
+        "packages": {name: version(name) or "not installed" for name in ("numpy", "scipy", "numba", "rich")},
+        "extras": {name: version(name) or f"pip install 'kcons[{extra}]'" for name, extra in EXTRAS.items()},
         "OpenMM platforms": _platforms(wrong) if openmm else {},
         "steps on the device": _device() if openmm else {},
         "caches": caches(wrong),
@@ -61,23 +71,6 @@ def version(package: str) -> str | None:
         return metadata.version(DISTRIBUTIONS.get(package, package))
     except metadata.PackageNotFoundError:
         return "of unknown version"
-
-
-def _machine() -> dict[str, str]:
-    """Processor, the width of its registers, and threads."""
-    import numba
-
-    from kcons.comparison.machine import processor, simd_width
-
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "processor": processor(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "SIMD": f"{simd_width()} bits",
-        "cores": f"{os.cpu_count()}, {usable} of them for this process",
-        "threads of Numba": str(numba.get_num_threads()),
-        "set in the shell": ", ".join(f"{n}={os.environ[n]}" for n in THREADS if n in os.environ) or "nothing",
-    }
 
 
 def _platforms(wrong: list[str]) -> dict[str, str]:
@@ -123,14 +116,14 @@ def _device() -> dict[str, str]:
 
 def caches(wrong: list[str]) -> dict[str, str]:
     """Where compiled kernels are kept, and whether they can be."""
-    from kcons.comparison.machine import kernels_cached
-    from kcons.constraints import compilation
+    from kcons.comparison.machine import PACKAGE, kernels_cached
 
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    places = {"$NUMBA_CACHE_DIR": Path(given)} if given else {
-        "beside the package": Path(compilation.__file__).parent / "__pycache__",
+    places = {
+        "beside the package": PACKAGE / "constraints" / "__pycache__",
         "in your home": Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")),
-    }  # fmt: skip
+    }
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        places = {"$NUMBA_CACHE_DIR": Path(given)}
     can = {name: writable(path) for name, path in places.items()}
     if not any(can.values()):
         wrong.append(

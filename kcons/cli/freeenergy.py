@@ -19,26 +19,25 @@ def _free_energy(chosen: argparse.Namespace) -> int:
 
     from kcons.comparison.progress import Watcher
     from kcons.free_energy import Windows, read_input
-    from kcons.free_energy.windows.input_file import executor_at
     from kcons.steppers.files import in_one_piece, text
 
     given = read_input(chosen.input, allow_modules=chosen.allow_module or ())
     if chosen.list:
         return _list(given)
     folder: Path = chosen.out or Path(chosen.input.stem)
-    how = {**given.options, "workers": given.processes if chosen.workers is None else chosen.workers}
+    how = {**given.options, "workers": chosen.workers}
     windows = Windows(given.sampler, folder, given.settings, **how)
     # A folder belongs to settings, and pulls are slower than the way to a window.
     slow = replace(given.settings, pull=given.pull_steps)
     pulls = Windows(given.sampler, folder / "pulls", slow, **how) if given.pulls else None
     watcher = Watcher(shown=True)
-    with windows.taken(), watcher, watcher.piece("windows", 1.0), executor_at(chosen.scheduler) as executor:
+    with windows.taken(), watcher, watcher.piece("windows", 1.0):
 
-        def progress(done: int, total: int, seconds: float) -> None:
+        def progress(done: int, total: int) -> None:
             watcher.advance(done / total)
 
         for each in filter(None, (windows, pulls)):
-            each.executor, each.progress = executor, progress
+            each.progress = progress
         found = windows.run(given.targets)
         if given.improve and not found.failed:
             found = windows.improve(**given.improve)
@@ -79,8 +78,7 @@ COMMAND = Command(
     (
         Option("input", "structure, forces, coordinates and sampling, in TOML", type=Path, metavar="INPUT"),
         Option("--out", "folder of the windows and results (default ./INPUT without its ending)", type=Path),
-        Option("--workers", "processes of this machine (default: of the file, or one a core)", type=int),
-        Option("--scheduler", "address of a Dask scheduler that you trust, such as tcp://host:8786"),
+        Option("--workers", "processes of this machine (default: one a core)", type=int),
         Option(
             "--allow-module",
             "let the input file take a calculator of this Python module, whose code then runs; may be repeated",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import sys
 from collections.abc import Sequence
 
 from kcons import __version__
 from kcons.cli import check, compare, doctor, freeenergy, scan, systems, warmup
-from kcons.cli.parser import Parser
 from kcons.cli.terminal import Terminated, drop_what_follows, ended_in_order, warnings_in_a_line
 from kcons.errors import KconsError, with_extra
 
@@ -52,8 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
-    parser = parser_of_all()
-    chosen = parser.parse_fully(arguments)
+    parser, _ = parsers()
+    chosen = parser.parse_args(arguments)
     if chosen.version:
         print(f"kcons {__version__}")
         return 0
@@ -84,12 +84,11 @@ def _main(arguments: Sequence[str] | None) -> int:
     return status
 
 
-def parser_of_all() -> Parser:
-    """The parser of the command line; `commands` has that of each command."""
-    parser = Parser(prog="kcons", description="Constraints in molecular dynamics.")
+def parsers() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser of the command line, and that of each command by name."""
+    parser = argparse.ArgumentParser(prog="kcons", description="Constraints in molecular dynamics.")
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     commands = parser.add_subparsers(title="commands", dest="command")
     for command in COMMANDS:
         command.add(commands)
-    parser.commands = dict(commands.choices)
-    return parser
+    return parser, commands.choices

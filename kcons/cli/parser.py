@@ -1,12 +1,10 @@
-"""The options of a command as a table, and a parser that says which name may have been meant."""
+"""The options of a command as a table."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
-
-from kcons.errors import did_you_mean
 
 
 class Option:
@@ -41,26 +39,3 @@ class Command(NamedTuple):
                 groups[option.group] = parser.add_argument_group(option.group)
             groups[option.group].add_argument(option.name, **option.how)
         parser.set_defaults(run=self.run, kept=self.kept)
-
-
-class Parser(argparse.ArgumentParser):
-    """An `ArgumentParser` whose complaints name what is nearest; parsers of commands are of this kind, too."""
-
-    #: The parser of each command.
-    commands: dict[str, Parser]
-
-    def parse_fully(self, arguments: Sequence[str] | None = None) -> argparse.Namespace:
-        """As `parse_args`."""
-        chosen, rest = self.parse_known_args(arguments)
-        if rest:
-            of = self.commands.get(chosen.command or "", self)
-            options = [option for action in of._actions for option in action.option_strings]
-            of.error(f"unrecognized arguments: {' '.join(rest)}{did_you_mean(rest[0].partition('=')[0], options)}")
-        return chosen
-
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
-        try:
-            super()._check_value(action, value)
-        except argparse.ArgumentError as error:
-            error.message += did_you_mean(str(value), map(str, action.choices or ()))
-            raise

@@ -126,35 +126,31 @@ def _calculator(name: str, given: str) -> Any:
 
 def _options() -> Iterator[Option]:
     """The table: options of each family are alike."""
+    more = {
+        "distance": "; a second coordinate makes the scan two-dimensional",
+        "difference": ": the distance of the first two less that of the last two",
+    }
+    values: dict[str, Any] = {"nargs": "+", "type": float, "metavar": "VALUE"}
     yield Option("structure", "any file that ASE reads; its last structure", type=Path)
     for family, size in FAMILIES.items():
-        more = {
-            "distance": "; a second coordinate makes the scan two-dimensional",
-            "difference": ": the distance of the first two less that of the last two",
-        }.get(family, "")
         how: dict[str, Any] = {"nargs": size, "type": int, "metavar": "ATOM"}
-        yield Option(f"--{family}", f"{size} atoms{more}", action=_Coordinate, dest="coordinates", **how)
-    how = {"nargs": "+", "type": float, "metavar": "VALUE"}
-    yield Option("--from", "first value, one for each coordinate (dihedrals: -180)", dest="begin", **how)
-    yield Option("--to", "last value, one for each coordinate (dihedrals: 180)", dest="end", **how)
-    said = "steps from the first value to the last, one for each (default 24)"
-    yield Option("--steps", said, nargs="+", type=int, metavar="N")
+        said = f"{size} atoms{more.get(family, '')}"
+        yield Option(f"--{family}", said, action=_Coordinate, dest="coordinates", **how)
+        yield Option(f"--hold-{family}", "held as it is; may be repeated", action="append", **how)
+    yield Option("--from", "first value, one for each coordinate (dihedrals: -180)", dest="begin", **values)
+    yield Option("--to", "last value, one for each coordinate (dihedrals: 180)", dest="end", **values)
+    yield Option("--steps", "from the first value to the last, for each (default 24)", nargs="+", type=int, metavar="N")
     yield Option("--count-from", "number of the first atom (default 0)", type=int, choices=(0, 1), default=0)
     yield Option("--fix", "atoms that stay where they are", nargs="+", type=int, default=(), metavar="ATOM")
-    for family, size in FAMILIES.items():
-        again = "; may be repeated" if size == 2 else ""
-        how = {"nargs": size, "type": int, "metavar": "ATOM"}
-        yield Option(f"--hold-{family}", f"held as it is{again}", action="append", **how)
     said = "bonds (guessed from distances) and angles that are held as they are"
     yield Option("--constrain", said, choices=("hbonds", "allbonds", "hangles", "allangles"))
-    forces = "energy and forces"
     said = (
         "gfn2 (default) or gfn1, by tblite; emt, lj, ...: one of ASE by name; MODULE:NAME: what makes one; "
         "FILE.xml: a System of OpenMM, with what it constrains"
     )
-    yield Option("--calculator", said, default="gfn2", group=forces)
-    said = "such as '{\"charge\": 1}', for what makes it"
-    yield Option("--settings", said, default="{}", metavar="JSON", group=forces)
+    yield Option("--calculator", said, default="gfn2")
+    said = "of the calculator, such as '{\"charge\": 1}'"
+    yield Option("--settings", said, default="{}", metavar="JSON")
     yield Option("--fmax", "largest force left, eV/angstrom (default 0.01)", type=float, default=0.01)
     yield Option("--one-way", "relax each point from the first neighbor only", action="store_true")
     yield Option("--out", "folder for all results (default ./scan-STRUCTURE)", type=Path)

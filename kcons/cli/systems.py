@@ -19,12 +19,7 @@ if TYPE_CHECKING:
 _MOLECULES = "molecules: alanine, dhfr, dhfr-water, villin, and files"
 _FILES = "files"
 SYSTEM = (
-    Option(
-        "system",
-        "one of the built-in test systems, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads",
-        nargs="?",
-        metavar="SYSTEM",
-    ),
+    Option("system", "a built-in test system (--list), or a file: PDB, mmCIF, what MDAnalysis reads", nargs="?"),
     Option("--size", "number of molecules, bonds or particles", type=int),
     Option("--list", "list test systems and methods, and leave", action="store_true"),
     Option(
@@ -61,6 +56,11 @@ SYSTEM = (
 #: Options that are arguments of `from_file`, by the same names, and those of them that `plan` takes.
 GIVEN = ("constrain", "force_field", "add_hydrogens", "platform", "coordinates", "forces", "select")
 HELD = ("constrain", "coordinates", "select")
+
+
+def option_of(name: str) -> str:
+    """The option that an argument is given by."""
+    return "--" + {"force_field": "forcefield"}.get(name, name.replace("_", "-"))
 
 
 def check_name(chosen: argparse.Namespace) -> None:
@@ -136,8 +136,7 @@ def _plan(chosen: argparse.Namespace) -> int:
         print(system.motion.report(system.positions, system.velocities))
         return 0
     for name in (name for name in given if name not in HELD):
-        option = {"force_field": "forcefield"}.get(name, name.replace("_", "-"))
-        raise InputError(f"a plan needs no forces; leave --{option} out", item=name)
+        raise InputError(f"a plan needs no forces; leave {option_of(name)} out", item=name)
     found = test_systems.plan(chosen.system, **given)
     print("\n".join([found.title, *found.notes]))
     if sites := len(found.rows.virtual_sites):

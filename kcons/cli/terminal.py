@@ -35,9 +35,8 @@ def names(text: str) -> list[str]:
 def console() -> Console:
     from rich.console import Console
 
-    found = Console()
-    if not found.is_terminal:  # a file or a pipe has no width to fit into
-        found = Console(width=WIDE)
+    # A file or a pipe has no width to fit into.
+    found = Console(width=None if sys.stdout.isatty() else WIDE)
     found.on_broken_pipe = drop_what_follows  # type: ignore[method-assign]
     return found
 

@@ -82,10 +82,6 @@ class Setting:
         """How many steps of the cheap forces go into one."""
         return max(1, math.ceil(self.step / self.inner - 1e-9))
 
-    @property
-    def groups(self) -> dict[str, int]:
-        return {"slow": 1, "fast": self.inner_steps}
-
 
 @dataclass(frozen=True)
 class Sampler:
@@ -126,24 +122,18 @@ def _langevin(s: Setting) -> Stepper:
     return Langevin(s.thermal_energy, s.friction, s.seed, substeps=1)
 
 
-def _respa(s: Setting) -> Stepper:
+def _respa(s: Setting, **options: Any) -> Stepper:
+    """Where slow kicks are in the middle of a step, states lie halfway between them."""
     if s.inner_steps == 1:
         return _langevin(s)
-    return LangevinRespa(s.thermal_energy, s.friction, s.seed, steps=s.groups, substeps=1)
-
-
-def _halfway(s: Setting) -> Stepper:
-    """Slow kicks are in the middle of a step, so that states lie halfway between them."""
-    if s.inner_steps == 1:
-        return _langevin(s)
-    steps = {"slow": 1, "fast": s.inner_steps + s.inner_steps % 2}  # of an odd number none ends in the middle
-    return LangevinRespa(s.thermal_energy, s.friction, s.seed, steps=steps, slow_kicks="middle", substeps=1)
+    fast = s.inner_steps + (s.inner_steps % 2 if options else 0)  # of an odd number none ends in the middle
+    steps = {"slow": 1, "fast": fast}
+    return LangevinRespa(s.thermal_energy, s.friction, s.seed, steps=steps, substeps=1, **options)
 
 
 def _spheres(s: Setting) -> Stepper:
-    if s.inner_steps == 1:
-        return IsokineticSpheres(s.thermal_energy, s.friction, s.seed, substeps=1)
-    return IsokineticSpheres(s.thermal_energy, s.friction, s.seed, steps=s.groups, substeps=1)
+    options: dict[str, Any] = {} if s.inner_steps == 1 else {"steps": {"slow": 1, "fast": s.inner_steps}}
+    return IsokineticSpheres(s.thermal_energy, s.friction, s.seed, substeps=1, **options)
 
 
 def _monte_carlo(s: Setting) -> Stepper:
@@ -165,7 +155,7 @@ add_sampler(
 )
 add_sampler("hmc", _monte_carlo, "Hamiltonian Monte Carlo, order 4", frictions=False)
 add_sampler("langevin-respa", _respa, "Langevin, several steps", several=True)
-add_sampler("langevin-halfway", _halfway, "the same, read between kicks", several=True)
+add_sampler("langevin-halfway", lambda s: _respa(s, slow_kicks="middle"), "the same, read between kicks", several=True)
 add_sampler("spheres", _spheres, "isokinetic spheres", several=True)
 
 #: Samplers that run unless methods are named, without and with cheap forces.

@@ -360,13 +360,8 @@ class _Log:
         # The first step pays for what an MD engine sets up lazily.
         step = float(np.median(self.seconds[1:] or self.seconds))
         elapsed = run.time / self.system.units.long_time_unit
-        if elapsed <= 0:
-            return {"step_seconds": step}
-        return {
-            "step_seconds": step,
-            "evaluations": self.counted / elapsed,
-            "seconds": step * self.steps / elapsed,
-        }
+        spent = {"evaluations": self.counted / elapsed, "seconds": step * self.steps / elapsed} if elapsed > 0 else {}
+        return {"step_seconds": step, **spent}
 
     def judged(self, run: Run, method: Method, reference: Reference, status: str) -> dict[str, Any]:
         """What a run that made steps says of its method."""
@@ -488,13 +483,11 @@ def _note(row: dict[str, Any], words: str) -> None:
 
 def _uneven(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of methods whose steps cost more than `UNEVEN` times as much at one setting as at another."""
-    found = []
-    for name in dict.fromkeys(row["method"] for row in rows if not row["adaptive"]):
-        mine = [row for row in rows if row["method"] == name and row["rounds"]]
-        costs = [row["step_seconds"] for row in mine]
-        if costs and max(costs) > UNEVEN * min(costs):
-            found += mine
-    return found
+    costs: dict[str, list[float]] = {}
+    timed = [row for row in rows if row["rounds"] and not row["adaptive"]]
+    for row in timed:
+        costs.setdefault(row["method"], []).append(row["step_seconds"])
+    return [row for row in timed if max(costs[row["method"]]) > UNEVEN * min(costs[row["method"]])]
 
 
 def margin(times: Iterable[list[float]]) -> float | None:

@@ -132,16 +132,17 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
     By default the usual ones that can run the test system: of OpenMM alone where its forces are OpenMM's, else all of
     arrays and ASE and the plainest of OpenMM.
     """
+    usual = [method for method in METHODS.values() if method.usual]
     if names is None:
-        usual = [method for method in METHODS.values() if method.usual]
-        if system is None:
-            return usual
-        home = system.openmm is not None and system.openmm.home
-        return [m for m in usual if _at_home(m, home) and (m.engine != "OpenMM" or m.refuses(system) is None)]
+        if system is not None and system.openmm is not None and system.openmm.home:
+            usual = [m for m in usual if m.engine == "OpenMM" and m.refuses(system) is None]
+        elif system is not None:
+            able = [m for m in usual if m.name in guests(system) and m.refuses(system) is None]
+            usual = [m for m in usual if m.engine != "OpenMM" or m in able]
+        return usual
+    groups = {"all": list(METHODS.values())} | {e.lower(): [m for m in usual if m.engine == e] for e in ENGINES}
     picked: dict[str, Method] = {}
     for name in names:
-        groups = {"all": list(METHODS.values())}
-        groups |= {e.lower(): [m for m in METHODS.values() if m.usual and m.engine == e] for e in ENGINES}
         if name in METHODS:
             picked[name] = METHODS[name]
         elif name.lower() in groups:
@@ -157,12 +158,14 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
     return list(picked.values())
 
 
-#: Methods of OpenMM that also run, unless methods are named, with test systems whose forces are not OpenMM's.
-GUESTS = ("openmm-verlet", "openmm-kcons-rattle", "openmm-surface-rattle")
+#: Methods of OpenMM that also run, unless methods are named, with test systems whose forces are not OpenMM's: with
+#: distances, and with surfaces.
+GUESTS = ("openmm-verlet", "openmm-kcons-rattle", "openmm-held-rattle")
 
 
-def _at_home(method: Method, home: bool) -> bool:
-    return method.engine == "OpenMM" if home else method.engine != "OpenMM" or method.name in GUESTS
+def guests(system: TestSystem) -> tuple[str, ...]:
+    """Those of `GUESTS` that run a test system."""
+    return GUESTS[2:] if system.openmm is not None and system.openmm.surfaces else GUESTS[:2]
 
 
 def _step(dt: float) -> str:
@@ -232,35 +235,29 @@ def _code_of_stepper(stepper: str, system: TestSystem) -> str:
     return lines_on_arrays(f"from kcons.steppers import {stepper}", last)
 
 
-def _without_step(stepper: steppers.Stepper, dt: float) -> steppers.Stepper:
-    return stepper
+def _fixed_stepper(stepper: steppers.Stepper, system: TestSystem, dt: float) -> Run:
+    return on_arrays(lambda dt: stepper, system, dt)
 
 
 for _name, _make in STEPPERS.items():
-    _made = _make()
-    _class = type(_made).__name__
+    _stepper = _make()
     add_method(
         _name,
-        partial(on_arrays, partial(_without_step, _made)),
-        title=f"kcons {'RATTLE' if _name == 'rattle' else _class}",
-        force_evaluations=_made.force_evaluations,
-        usual=_name in USUAL,
-        code=partial(_code_of_stepper, _class),
-    )
-for _name, _title, _stepper in (
-    ("projected-verlet", "Verlet", ProjectedEquation(2)),
-    ("projected-rk4", "Runge-Kutta", ProjectedEquation(4)),
-):
-    _run = partial(on_arrays, partial(_without_step, _stepper))
-    add_method(
-        _name,
-        _run,
-        title=f"projected equation, {_title}",
+        partial(_fixed_stepper, _stepper),
+        title=f"kcons {'RATTLE' if _name == 'rattle' else type(_stepper).__name__}",
         force_evaluations=_stepper.force_evaluations,
+        usual=_name in USUAL,
+        code=partial(_code_of_stepper, type(_stepper).__name__),
+    )
+for _name, _title, _order in (("projected-verlet", "Verlet", 2), ("projected-rk4", "Runge-Kutta", 4)):
+    _equation = ProjectedEquation(_order)
+    add_method(
+        _name,
+        partial(_fixed_stepper, _equation),
+        title=f"projected equation, {_title}",
+        force_evaluations=_equation.force_evaluations,
         usual=False,
     )
-
-
 add_method("verlet", _nothing_held, title="baseline: Verlet, nothing held", holds=False)
 
 
@@ -346,14 +343,14 @@ def _kcons_in_ase(system: TestSystem) -> Sequence[Any]:
     return [Constraints(system.constraint_set.constraints)]
 
 
-def _bond_lengths(system: TestSystem) -> Sequence[Any]:
+def _fix_bond_lengths(system: TestSystem) -> Sequence[Any]:
     """FixBondLengths at its own tolerance, angles held by their end distances."""
     from ase.constraints import FixBondLengths
 
     return [*_fixed(system), FixBondLengths(system.bonds)]
 
 
-def _internals(system: TestSystem) -> Sequence[Any]:
+def _fix_internals(system: TestSystem) -> Sequence[Any]:
     """FixInternals at its own tolerance."""
     from ase.constraints import FixInternals
 
@@ -371,7 +368,7 @@ def _fixed(system: TestSystem) -> list[Any]:
 
 
 def _distances_only(system: TestSystem) -> str | None:
-    return None if system.bonds is not None else "it holds distances only"
+    return None if system.bonds is not None else "it holds internal coordinates only"
 
 
 _IN_ASE = """\
@@ -386,31 +383,35 @@ atoms.set_constraint($held)
 VelocityVerlet(atoms, $step * test_system.units.time_unit).run($steps)
 """
 
+
+def _lines_in_ase(imports: str, held: str) -> str:
+    return _IN_ASE.replace("$imports", imports).replace("$held", held)
+
+
 add_method(
     "ase-kcons",
     partial(_in_ase, _kcons_in_ase),
     title="ASE Verlet + kcons",
     engine="ASE",
-    code=_IN_ASE.replace("$imports", "from kcons.ase import Constraints").replace(
-        "$held", "Constraints(test_system.constraint_set.constraints)"
-    ),
+    code=_lines_in_ase("from kcons.ase import Constraints", "Constraints(test_system.constraint_set.constraints)"),
 )
 add_method(
     "ase-bonds",
-    partial(_in_ase, _bond_lengths),
+    partial(_in_ase, _fix_bond_lengths),
     title="ASE Verlet + FixBondLengths",
     engine="ASE",
     refuses=_distances_only,
-    code=_IN_ASE.replace("$imports", "from ase.constraints import FixAtoms, FixBondLengths").replace(
-        "$held", "[FixAtoms(test_system.fixed), FixBondLengths(test_system.bonds)]"
+    code=_lines_in_ase(
+        "from ase.constraints import FixAtoms, FixBondLengths",
+        "[FixAtoms(test_system.fixed), FixBondLengths(test_system.bonds)]",
     ),
 )
 add_method(
     "ase-internals",
-    partial(_in_ase, _internals),
+    partial(_in_ase, _fix_internals),
     title="ASE Verlet + FixInternals",
     engine="ASE",
-    refuses=lambda system: None if system.bonds is not None else "it holds internal coordinates only",
+    refuses=_distances_only,
 )
 add_method(
     "ase-verlet",
@@ -447,7 +448,7 @@ def _engine(system: TestSystem) -> OpenMMEngine:
 
 def only_water(system: TestSystem) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
-    from kcons.openmm.callback_rows.hold import move_constraints
+    from kcons.openmm.callback_rows import move_constraints
 
     engine = _engine(system)
     return not engine.surfaces and not move_constraints(engine.copy())
@@ -457,37 +458,34 @@ def _in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, sy
     """A run of an integrator of OpenMM or of `kcons.openmm`, by its name and what it takes beside the step.
 
     `how`: 'own' constraints of the System; 'held', moved to the solver of kcons (rigid water stays, unless there is
-    nothing else); on 'surfaces'; or 'free' of them.
+    nothing else); or 'free' of them.
     """
     import openmm
 
-    import kcons.openmm as ours
+    from kcons.openmm import ProjectedIntegrator, hold
 
     engine = _engine(system)
     made, x = engine.copy(constraints=how != "free"), system.positions * engine.length
-    own = hasattr(openmm, kind)
+    v, each = system.velocities * engine.speed, 1
+    own = kind != "ProjectedIntegrator"
     if own:
         integrator = getattr(openmm, kind)(*given, dt * engine.time)
         integrator.setConstraintTolerance(tolerance)
         if hasattr(integrator, "setRandomNumberSeed"):
             integrator.setRandomNumberSeed(1)
     else:
-        options: dict[str, Any] = {"tolerance": tolerance}
+        parts = []
         if how == "held":
-            rows: Sequence[Any] = engine.surfaces
-            options["parts"] = [ours.hold(made, rows, x, take="all", keep_water=not only_water(system))]
-        elif how == "surfaces":
-            options |= {"surfaces": engine.surfaces, "system": made}
-        integrator = getattr(ours, kind)(engine.step(dt), *given, **options)
+            parts = [hold(made, engine.surfaces, x, take="all", keep_water=not only_water(system))]
+        integrator = ProjectedIntegrator(engine.step(dt), *given, tolerance=tolerance, parts=parts)
+        each = evaluations(given[0])
     context = engine.context(made, integrator)
     context.setPositions(x)
-    v = system.velocities * engine.speed
     if own:
         # Velocities are those of half a step earlier: then the first position is the one that RATTLE reaches.
         state = context.getState(forces=True, groups=integrator.getIntegrationForceGroups())
         v = v - 0.5 * dt * engine.time * state.getForces(asNumpy=True)._value / system.masses[:, None]
     context.setVelocities(v)
-    each = evaluations(given[0]) if given and isinstance(given[0], str) else 1
     units = {"length": engine.length, "speed": engine.speed}
     return InOpenMM(context, integrator, dt, force_evaluations=each, half_step=own, **units)
 
@@ -510,14 +508,9 @@ integrator.step($steps)
 
 def _lines_in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: str, system: TestSystem) -> str:
     """Lines of Python that do what `_in_openmm` does."""
-    if not kind.startswith(("Projected", "Surface")):
-        lines = f"integrator = openmm.{kind}({', '.join([*map(repr, given), '$ps'])})\n"
-        lines, imported = f"{lines}integrator.setConstraintTolerance({tolerance:g})", "import openmm"
-    elif how == "surfaces":
-        return ""
-    else:
-        taken, imported = ["$ps", *(f'"{word}"' for word in given)], f"from kcons.openmm import {kind}"
-        lines = ""
+    lines, imported = "", "import openmm"
+    if kind == "ProjectedIntegrator":
+        imported, taken = "from kcons.openmm import ProjectedIntegrator", ["$ps", *(f'"{word}"' for word in given)]
         if how == "held":
             imported += ", hold"
             taken.append("parts=[part]")
@@ -525,7 +518,10 @@ def _lines_in_openmm(kind: str, given: tuple[Any, ...], tolerance: float, how: s
 x = test_system.positions * md_engine.length
 part = hold(system, md_engine.surfaces, x, take="all", keep_water={not only_water(system)})  # constraints move to kcons
 """
-        lines += f"integrator = {kind}({', '.join(taken)}, tolerance={tolerance:g})"
+        lines += f"integrator = ProjectedIntegrator({', '.join(taken)}, tolerance={tolerance:g})"
+    else:
+        lines = f"integrator = openmm.{kind}({', '.join([*map(repr, given), '$ps'])})\n"
+        lines += f"integrator.setConstraintTolerance({tolerance:g})"
     return _IN_OPENMM.replace("$imported", imported).replace("$integrator", lines)
 
 
@@ -537,23 +533,21 @@ def _bonds_or_surfaces(system: TestSystem) -> str | None:
     return None if _engine(system).surfaces else _bonds_in_openmm(system)
 
 
-def _surfaces(system: TestSystem) -> str | None:
-    return None if _engine(system).surfaces else "no particle is held on a surface"
-
-
-def in_openmm(
-    name: str, title: str, integrator: str, *given: Any, tolerance: float = TIGHT, how: str = "own", **options: Any
+def _add_in_openmm(
+    name: str, title: str, kind: str, *given: Any, tolerance: float = TIGHT, how: str = "own", usual: bool = True
 ) -> None:
     """Register an integrator as `_in_openmm` takes it."""
-    each = evaluations(given[0]) if given and isinstance(given[0], str) else 1
-    more: dict[str, Any] = {"refuses": _bonds_in_openmm, "force_evaluations": each} | options
+    what = kind, given, tolerance, how
     add_method(
         name,
-        partial(_in_openmm, integrator, given, tolerance, how),
-        title=f"OpenMM {title}",
+        partial(_in_openmm, *what),
+        title=f"OpenMM {title}" if how != "free" else title,
         engine="OpenMM",
-        code=partial(_lines_in_openmm, integrator, given, tolerance, how),
-        **more,
+        force_evaluations=evaluations(given[0]) if kind == "ProjectedIntegrator" else 1,
+        holds=how != "free",
+        usual=usual,
+        refuses=_bonds_or_surfaces if how == "held" else _bonds_in_openmm if how == "own" else lambda system: None,
+        code=partial(_lines_in_openmm, *what) if how != "free" else None,
     )
 
 
@@ -565,32 +559,18 @@ for _name, _title, _own, _given in (
     for _t in TOLERANCES:
         _plain = _t == DEFAULT
         _full, _usual = _name if _plain else f"{_name}-{exponent(_t)}", _plain or _name == "openmm-verlet"
-        in_openmm(_full, f"{_title}, {exponent(_t)}", _own, *_given, tolerance=_t, usual=_usual)
+        _add_in_openmm(_full, f"{_title}, {exponent(_t)}", _own, *_given, tolerance=_t, usual=_usual)
+_ours = "ProjectedIntegrator"
 for _scheme in (*USUAL, "geodesic", "yoshida4", "blanes-moan6a"):
-    _usual = _scheme in USUAL
-    in_openmm(f"openmm-kcons-{_scheme}", f"+ kcons {_scheme}", "ProjectedIntegrator", _scheme, usual=_usual)
+    _add_in_openmm(f"openmm-kcons-{_scheme}", f"+ kcons {_scheme}", _ours, _scheme, usual=_scheme in USUAL)
 for _t in (1e-4, DEFAULT, 1e-6):
     _name, _title = f"openmm-kcons-rattle-{exponent(_t)}", f"+ kcons rattle, {exponent(_t)}"
-    in_openmm(_name, _title, "ProjectedIntegrator", "rattle", tolerance=_t)
+    _add_in_openmm(_name, _title, _ours, "rattle", tolerance=_t)
 for _scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
-    in_openmm(
-        f"openmm-held-{_scheme}",
-        f"+ kcons {_scheme}, own solver",
-        "ProjectedIntegrator",
-        _scheme,
-        how="held",
-        usual=_scheme != "blanes-moan4",
-        refuses=_bonds_or_surfaces,
-    )
-for _scheme in ("rattle", "geodesic", "suzuki4", "blanes-moan6"):
-    _name, _title = f"openmm-surface-{_scheme}", f"+ kcons {_scheme}, surfaces"
-    in_openmm(_name, _title, "SurfaceIntegrator", _scheme, how="surfaces", refuses=_surfaces)
-add_method(
-    "openmm-free",
-    partial(_in_openmm, "VerletIntegrator", (), DEFAULT, "free"),
-    title="baseline: OpenMM Verlet, nothing held",
-    engine="OpenMM",
-    holds=False,
+    _name, _title, _usual = f"openmm-held-{_scheme}", f"+ kcons {_scheme}, own solver", _scheme != "blanes-moan4"
+    _add_in_openmm(_name, _title, _ours, _scheme, how="held", usual=_usual)
+_add_in_openmm(
+    "openmm-free", "baseline: OpenMM Verlet, nothing held", "VerletIntegrator", tolerance=DEFAULT, how="free"
 )
 
 

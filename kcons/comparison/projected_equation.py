@@ -11,7 +11,7 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, UnsupportedError
-from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.steppers.compiled_operations import check_finite
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import explained
 

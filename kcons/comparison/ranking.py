@@ -7,7 +7,7 @@ call from Python, by force evaluations. Costs that differ by less than the scatt
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from kcons.comparison.measure import measure
-from kcons.comparison.methods import METHODS, Method
+from kcons.comparison.methods import METHODS
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.test_systems.potential import NO_FORCES
@@ -98,34 +98,22 @@ def pareto(rows: pd.DataFrame, cost: str, least: float = 0.0) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The cheapest setting of each method that is good enough, cheapest first.
+    """The cheapest setting of each method that is good enough, cheapest first."""
 
-    Attributes
-    ----------
-    table : DataFrame
-        Rows of the comparison with 'place', 'cost' and 'times' (of the first). Methods whose costs differ by less than
-        the scatter share a place.
-    beyond : DataFrame
-        The best row of each method that is not good enough.
-    limit : float
-        The largest error that is good enough.
-    limit_is : str
-        Where it comes from.
-    what, unit : str
-        What methods are judged by.
-    cost : str
-        A key of `COSTS`.
-    scatter : float
-        Costs that differ by this fraction are the same.
-    """
-
+    #: Rows of the comparison with 'place', 'cost' and 'times' (of the first). Methods whose costs differ by less than
+    #: the scatter share a place.
     table: pd.DataFrame
+    #: The best row of each method that is not good enough.
     beyond: pd.DataFrame
+    #: The largest error that is good enough, and where it comes from.
     limit: float
     limit_is: str
+    #: What methods are judged by.
     what: str
     unit: str
+    #: A key of `COSTS`.
     cost: str
+    #: Costs that differ by this fraction are the same.
     scatter: float
 
 
@@ -274,30 +262,30 @@ def find_steps(
         best = min((row[cost] for row in found if (row.get("error") or math.inf) <= target), default=math.inf)
         seconds = promise["seconds"] * system.horizon / system.units.long_time_unit
         if promise[cost] < 1.5 * best and seconds <= budget:
-            method, unit = METHODS[promise["method"]], system.units.time_unit
-
-            def tried(setting: float, method: Method = method, unit: float = unit) -> dict[str, Any]:
-                internal = setting if method.adaptive else setting * unit
-                return measure(system, method, internal, reference, budget, watcher=watcher)
-
-            horizon = None if method.adaptive else system.horizon / unit
-            found += _search(tried, promise["setting"], promise["order"], target, horizon)
+            found += _search(system, promise, target, reference, budget, watcher)
     return found
 
 
 def _search(
-    tried: Callable[[float], dict[str, Any]], setting: float, order: float, target: float, horizon: float | None
+    system: TestSystem,
+    promise: dict[str, Any],
+    target: float,
+    reference: Reference,
+    budget: float,
+    watcher: Watcher | None,
 ) -> list[dict[str, Any]]:
     """Runs of one method at the predicted step and near it, until its longest step that makes the error is known."""
-    found: list[dict[str, Any]] = []
-    good, bad, smallest = 0.0, math.inf, math.inf  # the longest step that reaches the error, the shortest that does not
+    method, found = METHODS[promise["method"]], list[dict[str, Any]]()
+    unit = 1.0 if method.adaptive else system.units.time_unit
+    # The longest step that reaches the error, the shortest that does not.
+    setting, good, bad = promise["setting"] * unit, 0.0, math.inf
     for _ in range(TRIES):
-        if horizon is not None:  # the longest step that divides the horizon and is not longer, shorter than a bad one
-            count = max(1, math.ceil(horizon / setting * (1 - 1e-9)))
-            setting = horizon / (count + (horizon / count >= bad * (1 - 1e-9)))
+        if not method.adaptive:  # the longest step that divides the horizon and is not longer, shorter than a bad one
+            count = max(1, math.ceil(system.horizon / setting * (1 - 1e-9)))
+            setting = system.horizon / (count + (system.horizon / count >= bad * (1 - 1e-9)))
         if not good < setting < bad:
             break
-        found.append(tried(setting))
+        found.append(measure(system, method, setting, reference, budget, watcher=watcher))
         error = found[-1].get("error", math.inf)
         if found[-1]["status"] not in ("ok", "failed"):
             break
@@ -305,10 +293,8 @@ def _search(
             good = setting
             if error >= WASTE * target or error == 0:
                 break
-        elif math.isfinite(bad) and error > 0.9 * smallest:
-            break  # shorter steps do not help: something else than the step decides
         else:
-            bad, smallest = setting, min(error, smallest)
-        ratio = 0.7 if not math.isfinite(error) else (SAFETY * target / error) ** (1 / order)
+            bad = setting
+        ratio = 0.7 if not math.isfinite(error) else (SAFETY * target / error) ** (1 / promise["order"])
         setting *= min(max(ratio, 0.3), 3.0)
     return found

@@ -118,9 +118,11 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
     ranked = found.table if len(found.table) else found.beyond.assign(place="", times=np.nan)
     shown = ranked.head(PLACES)
     tied = found.table.place.duplicated(keep=False)
+    titles = [str(title)[:40] for title in shown.title]
+    width = max(map(len, titles))
     cells = {
         "": [f"{p}{'=' if tie else ''}" for p, tie in zip(shown.place, tied, strict=False)] or [""] * len(shown),
-        "method": [str(title)[:40] for title in shown.title],
+        "method".ljust(width): [title.ljust(width) for title in titles],
         "at": [shown_setting(row, about) for row in shown.itertuples()],
         found.what.split()[0]: [f"{error:.1e}" for error in shown.error],
         "cost": [_spent(cost, found.cost) for cost in shown.cost],
@@ -129,7 +131,7 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
     }
     if found.cost == "evaluations" or "what" in about:
         del cells["timed"]
-    lines = [columns(pd.DataFrame(cells), left=("", "method"))]
+    lines = [pd.DataFrame(cells).to_string(index=False)]
     if len(ranked) > PLACES:
         lines.append(f"... and {len(ranked) - PLACES} more")
     same = f"{100 * found.scatter:.0f} %"
@@ -148,17 +150,6 @@ def _notes(table: pd.DataFrame) -> dict[str, str]:
     """Why methods have no error, by title."""
     bad = table[table.status.isin(["failed", "partial", "not run"])].drop_duplicates("title")
     return dict(zip(bad.title, bad.note, strict=True))
-
-
-def columns(table: pd.DataFrame, left: tuple[str, ...] = ()) -> str:
-    """A table of text, numbers to the right."""
-    widths = {name: max(len(name), *(len(cell) for cell in table[name]), 0) for name in table}
-
-    def line(cells: list[str]) -> str:
-        pairs = zip(widths.items(), cells, strict=True)
-        return "  ".join(c.ljust(w) if name in left else c.rjust(w) for (name, w), c in pairs).rstrip()
-
-    return "\n".join([line(list(widths)), *(line(list(row)) for row in table.itertuples(index=False))])
 
 
 def _spent(cost: float, kind: str) -> str:

@@ -33,18 +33,9 @@ STIFF = 5e-3
 def along(
     trajectory: Path | str, topology: Path | str, forces: str, frames: Sequence[int], **options: Any
 ) -> SplitTemperatures:
-    """Sample frames of a trajectory, each brought onto the constraints first, k_B T in eV.
+    """Temperatures of these frames of a trajectory that MDAnalysis reads, each brought onto the constraints; kT in eV.
 
-    Parameters
-    ----------
-    trajectory, topology : path
-        Any that MDAnalysis reads.
-    forces : str
-        As for `kcons compare FILE --forces`.
-    frames : sequence of int
-        Numbers of the frames.
-    **options
-        What `test_systems.from_file` takes: constrain, select, force_field, platform.
+    `forces` and options (constrain, select, force_field, platform) are those of `test_systems.from_file`.
 
     Raises
     ------

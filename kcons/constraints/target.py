@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import HELD, as_float_array, check_call, has_units, out_of_range, positive, read_only
 from kcons.constraints.arguments import FloatArray as FloatArray
@@ -98,17 +98,12 @@ class MovingTarget:
         ):
             if given is None:
                 continue
-            for t in (time + 1.3 * h, time + 2.7 * h):  # at one alone there may be a kink
-                own, whole = derivative(t, rows), partial(of, rows=rows)
-                coarse, fine = (first_derivative_4(whole, t, step, period_of) for step in (0.1 * h, 0.05 * h))
-                wrong = contradicted(own, coarse, fine, 1e-8 * np.abs(whole(t)) / h)
-                if not wrong.any():
-                    break
-            else:
-                k = int(np.argmax(wrong))
+            own, whole = partial(derivative, rows=rows), partial(of, rows=rows)
+            found = contradiction(own, whole, time, h, period_of)
+            if found is not None:
                 raise InputError(
-                    f"{name}: the target contradicts itself: its {what} is {own[k]:.6g} at t = {t:g}, but differences "
-                    f"give {fine[k]:.6g}; correct it, or leave the derivatives out",
+                    f"{name}: the target contradicts itself: its {what} is {found.given:.6g} at t = {found.time:g}, "
+                    f"but differences give {found.found:.6g}; correct it, or leave the derivatives out",
                     item="target",
                 )
 
@@ -143,15 +138,34 @@ WRONG = 1e-3
 ROUGH = 0.1
 
 
-def contradicted(
-    given: FloatArray | float, coarse: FloatArray, fine: FloatArray, rounding: FloatArray
-) -> NDArray[np.bool_]:
-    """Where a given derivative is not what differences with a step and with half of it agree in.
+class Contradiction(NamedTuple):
+    """The number in the array, the time, the derivative that was given there and the one found by differences."""
 
-    Sizes of `rounding` count as none.
+    number: int
+    time: float
+    given: float
+    found: float
+
+
+def contradiction(
+    derivative: Function, function: Function, time: float, time_step: float, period: float | None = None
+) -> Contradiction | None:
+    """What a given derivative and differences of its function say soon after `time`; None where they agree.
+
+    It is given that differences with a step and with half of it agree in.
     """
-    size = np.maximum(np.abs(given), np.abs(fine)) + rounding
-    return np.asarray((np.abs(fine - given) > WRONG * size) & (np.abs(fine - coarse) <= WRONG * size))
+    told = None
+    for later in (1.3, 2.7):  # at one alone there may be a kink
+        t, h = time + later * time_step, 0.1 * time_step
+        given = derivative(t)
+        coarse, fine = (first_derivative_4(function, t, step, period) for step in (h, h / 2))
+        size = np.maximum(np.abs(given), np.abs(fine)) + 1e-9 * np.abs(function(t)) / h
+        wrong = (np.abs(fine - given) > WRONG * size) & (np.abs(fine - coarse) <= WRONG * size)
+        if not wrong.any():
+            return None
+        k = int(np.argmax(wrong))
+        told = Contradiction(k, t, float(given.flat[k]), float(fine.flat[k]))
+    return told
 
 
 # Weights of f(a + kh) -/+ f(a - kh), k = 1, 2, ...

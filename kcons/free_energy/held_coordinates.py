@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints.arguments import as_array
@@ -153,7 +152,8 @@ class HeldCoordinates:
         self.names = tuple(names)
         self.rows: IntArray = np.array(rows, dtype=np.int64)
         self._source = held
-        everything = _joined_rows(held, self.rows)
+        label = connected_components(held.incidence @ held.incidence.T, directed=False)[1]
+        everything = np.flatnonzero(np.isin(label, label[self.rows]))  # of the clusters of the coordinates
         others = np.setdiff1d(everything, self.rows)
         if not held.holonomic[others].all():
             raise UnsupportedError(
@@ -317,7 +317,7 @@ class HeldCoordinates:
 
     def _refuse(self, dependent: list[int]) -> None:
         if dependent:
-            atoms = [_row(self._source, row).atoms.ravel() for row in self.rows[dependent].tolist()]
+            atoms = [self._source.row_atoms(row) for row in self.rows[dependent].tolist()]
             raise SingularGeometryError(
                 f"{' and '.join(self.names[k] for k in dependent)} depend{'s' if len(dependent) == 1 else ''} on the "
                 "other constraints (Z = 0): nothing is left to move along; take out the constraints that fix it, or "
@@ -384,16 +384,5 @@ def _root(product: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _row(held: ConstraintSet, row: int) -> Constraint:
     """One row of the set."""
-    item = int(np.searchsorted(held.starts, row, side="right")) - 1
-    return held.constraints[item].select([row - int(held.starts[item])])
-
-
-def _joined_rows(held: ConstraintSet, rows: IntArray) -> IntArray:
-    """All rows of the clusters that `rows` belong to, sorted."""
-    incidence = coo_array(held.incidence)
-    n = held.n_rows
-    links = coo_array(
-        (np.ones(incidence.nnz), (incidence.row, n + incidence.col)), shape=(n + held.n_atoms, n + held.n_atoms)
-    )
-    label = connected_components(links, directed=False)[1][:n]
-    return np.flatnonzero(np.isin(label, label[rows])).astype(np.int64)
+    item, k = held.locate(row)
+    return item.select([k])

@@ -41,8 +41,6 @@ class Series:
     isokinetic_degrees_of_freedom : int, optional
         g of an isokinetic run, which gives the velocities (g - 1)/g of their canonical variance; `local_mean_force`
         puts that right. 0 for every other run.
-    seconds : float
-        Processor time that the run took, where it is known.
 
     Attributes
     ----------
@@ -56,27 +54,15 @@ class Series:
     (0, (0, 1))
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        periods: ArrayLike = 0.0,
-        isokinetic_degrees_of_freedom: int = 0,
-        seconds: float = 0.0,
-    ) -> None:
-        self.names, self.seconds = tuple(names), seconds
+    def __init__(self, names: Sequence[str], periods: ArrayLike = 0.0, isokinetic_degrees_of_freedom: int = 0) -> None:
+        self.names = tuple(names)
         self.isokinetic_degrees_of_freedom = isokinetic_degrees_of_freedom
         self.periods: FloatArray = np.broadcast_to(np.asarray(periods, dtype=np.float64), (len(self.names),)).copy()
         self._samples: list[Sample] = []
 
-    def append(self, sample: Sample) -> float:
-        """Add a sample; what moving targets have done since the one before."""
-        done = 0.0
-        if self._samples:
-            before = self._samples[-1]
-            moved = nearest_image(sample.value - before.value, self.periods)
-            done = float((before.multiplier + sample.multiplier) / 2 @ moved)
+    def append(self, sample: Sample) -> None:
+        """Add a sample."""
         self._samples.append(sample)
-        return done
 
     def __len__(self) -> int:
         return len(self._samples)
@@ -89,7 +75,7 @@ class Series:
 
     def __getitem__(self, samples: slice) -> Series:
         """A series of some of the samples."""
-        part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom, self.seconds)
+        part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom)
         part._samples = self._samples[samples]
         return part
 
@@ -124,7 +110,7 @@ class Series:
     def save(self, file: str | PathLike[str]) -> None:
         """Write all of it in NumPy's .npz format; an interrupted write leaves the older file."""
         arrays = {field: getattr(self, field) for field in Sample._fields}
-        for name in ("names", "periods", "isokinetic_degrees_of_freedom", "seconds"):
+        for name in ("names", "periods", "isokinetic_degrees_of_freedom"):
             arrays[name] = np.array(getattr(self, name))
         with in_one_piece(file) as opened:
             np.savez(opened, **arrays)  # type: ignore[arg-type]
@@ -141,8 +127,8 @@ class Series:
         try:
             with open(file, "rb") as opened:
                 data = stored_arrays(opened)
-            g, seconds = int(data["isokinetic_degrees_of_freedom"]), float(data["seconds"])
-            series = cls([str(name) for name in data["names"]], data["periods"], g, seconds)
+            names = [str(name) for name in data["names"]]
+            series = cls(names, data["periods"], int(data["isokinetic_degrees_of_freedom"]))
             shapes = {name: (-1,) if name in _NUMBERS else (-1, len(series.names)) for name in Sample._fields}
             columns = [data[name].reshape(shape) for name, shape in shapes.items()]
             series._samples = [Sample(*row) for row in zip(*columns, strict=True)]
@@ -151,20 +137,6 @@ class Series:
         except Exception as error:  # a damaged archive raises whatever its bytes lead to
             raise InputError(f"{file} holds no series written by Series.save: {error}", item="file") from error
         return series
-
-    def write_xvg(self, file: str | PathLike[str]) -> None:
-        """Write text columns: time, then value and multiplier of each coordinate, ln det Z, and the work.
-
-        MDAnalysis reads it as an auxiliary: ``u.trajectory.add_auxiliary("held", "held.xvg")``.
-        """
-        pairs = np.stack([self.value, self.multiplier], axis=2).reshape(len(self), -1)
-        columns = np.column_stack([self.time, pairs, self.log_det_z, self.work])
-        titles = [title for name in self.names for title in (name, f"multiplier of {name}")] + ["ln det Z", "work"]
-        with in_one_piece(file) as opened:
-            opened.write(b'@ title "held coordinates"\n@ xaxis label "time"\n')
-            for k, title in enumerate(titles):
-                opened.write(f'@ s{k} legend "{title}"\n'.encode())
-            np.savetxt(opened, columns, fmt="%.12g")
 
 
 class Collector:
@@ -196,26 +168,17 @@ class Recorder:
     system : System
         Whose constraints hold the coordinates.
     coordinates : HeldCoordinates
-    series : Series, optional
-        Where to go on; for an isokinetic stepper a new one with its `isokinetic_degrees_of_freedom`, which are not seen
-        from here. Velocities on isokinetic spheres are not thermal.
 
     Attributes
     ----------
     series : Series
+        Of an isokinetic run, set its `isokinetic_degrees_of_freedom`, which are not seen from here. Velocities on
+        isokinetic spheres are not thermal.
     """
 
-    def __init__(self, system: System, coordinates: HeldCoordinates, series: Series | None = None) -> None:
+    def __init__(self, system: System, coordinates: HeldCoordinates) -> None:
         self.system, self.coordinates = system, coordinates
-        series = Series(coordinates.names, coordinates.periods) if series is None else series
-        mine, its = ((s.names, s.periods.tolist()) for s in (coordinates, series))
-        if mine != its:
-            raise InputError(
-                f"the series is of {', '.join(its[0])} with periods {its[1]}, the coordinates are {', '.join(mine[0])} "
-                f"with periods {mine[1]}; go on with a series of the same, or leave it out",
-                item="series",
-            )
-        self._collector = Collector(coordinates, series)
+        self._collector = Collector(coordinates, Series(coordinates.names, coordinates.periods))
 
     def __call__(self, state: State) -> None:
         x, v, forces = self.system.kernel_arrays(state)  # in the cell of the state

@@ -75,7 +75,7 @@ def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray) -> None
                     f"{name} is a torsion over the atoms {', '.join(map(str, four))}, counted from 0, and {said}; give "
                     "the atoms in the order in which they are bonded, unless this is what you mean",
                     UserWarning,
-                    stacklevel=5,
+                    stacklevel=4,
                 )
 
 

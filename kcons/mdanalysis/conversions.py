@@ -47,24 +47,16 @@ class FromMDEngine(NamedTuple):
 
 
 class ToOpenMM(NamedTuple):
-    """What OpenMM needs.
+    """What OpenMM needs."""
 
-    Attributes
-    ----------
-    topology : openmm.app.Topology
-    positions : Quantity
-        On the constraints, molecules whole.
-    velocities : Quantity or None
-    system : openmm.System
-        Distances are among its constraints, virtual sites are set.
-    part : kcons.openmm.CarriedConstraints or None
-        All other rows, for ``ProjectedIntegrator(..., parts=[part])``.
-    """
-
+    #: openmm.app.Topology.
     topology: Any
+    #: On the constraints, molecules whole.
     positions: unit.Quantity
     velocities: unit.Quantity | None
+    #: Distances are among its constraints, virtual sites are set.
     system: openmm.System
+    #: kcons.openmm.CarriedConstraints of all other rows, for ``ProjectedIntegrator(..., parts=[part])``; or None.
     part: Any
 
 
@@ -385,13 +377,12 @@ def _openmm(
         snapshot = replace(snapshot, positions=x)
     topology, positions = openmm_topology(snapshot)
     system = _system(snapshot, topology, sites, force_field, options)
-    lengths: dict[tuple[int, int], float] = {}
-    for item in rows:
-        if isinstance(item, Distance):
-            for (i, j), length in zip(np.sort(item.atoms).tolist(), np.asarray(item.target).tolist(), strict=True):
-                lengths.setdefault((i, j), length)
-    for (i, j), length in lengths.items():
-        system.addConstraint(i, j, length)
+    distances = [item for item in rows if isinstance(item, Distance)]
+    if distances:
+        pairs, lengths = (np.concatenate(part) for part in zip(*((i.atoms, i.target) for i in distances), strict=True))
+        pairs = np.sort(pairs)
+        for k in np.sort(np.unique(pairs, axis=0, return_index=True)[1]).tolist():  # a pair that is held twice, once
+            system.addConstraint(*pairs[k].tolist(), float(lengths[k]))
     others = [item for item in rows if not isinstance(item, Distance)]
     part = hold(system, others, x, periodic=snapshot.cell is not None) if others else None
     speeds = None if snapshot.velocities is None else snapshot.velocities * (unit.nanometer / unit.picosecond)
@@ -403,13 +394,12 @@ def _system(
 ) -> openmm.System:
     import openmm
 
-    described = snapshot.topology
     if force_field:
         return _with_forces(topology, force_field, options)
     if options:
         raise InputError(f"{', '.join(options)} is for a force field; give force_field", item=next(iter(options)))
     system = openmm.System()
-    for mass in described.masses.tolist():
+    for mass in snapshot.topology.masses.tolist():
         system.addParticle(mass)
     if topology.getPeriodicBoxVectors() is not None:
         system.setDefaultPeriodicBoxVectors(*topology.getPeriodicBoxVectors())

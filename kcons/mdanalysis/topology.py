@@ -91,19 +91,20 @@ def selected(universe: Any, words: Any) -> IntArray:
 
 
 def _hint(group: Any, words: str) -> str:
+    """What there is instead of what a selection asks for."""
     tokens = words.replace("(", " ").replace(")", " ").split()
+    asked = dict(zip(tokens, [*tokens[1:], ""], strict=True))
     for keyword, attribute in (
         ("resname", "resnames"),
         ("name", "names"),
         ("segid", "segids"),
         ("element", "elements"),
     ):
-        if keyword in tokens and hasattr(group, attribute):
-            present = [str(v) for v in np.unique(getattr(group, attribute).astype(str))]
-            given = tokens[tokens.index(keyword) + 1] if tokens.index(keyword) + 1 < len(tokens) else ""
-            if given not in present:
+        if keyword in asked and hasattr(group, attribute):
+            present = np.unique(getattr(group, attribute).astype(str)).tolist()
+            if (given := asked[keyword]) not in present:
                 return f": no {keyword} {given}{did_you_mean(given, present)}; there are {listed(present)}"
-    if "resid" in tokens and hasattr(group, "resids"):
+    if "resid" in asked and hasattr(group, "resids"):
         return f"; residues are numbered {group.resids.min()} to {group.resids.max()}"
     return "; names are those of the topology, case counts"
 
@@ -152,7 +153,7 @@ def snapshot_of(universe: Any) -> Snapshot:
 
 def _refuse_alternates(group: Any, topology: Topology) -> None:
     """An atom at two places is two atoms in MDAnalysis, and no molecule."""
-    places = np.char.strip(texts(group, "altLocs", len(group)))
+    places = np.char.strip(_texts(group, "altLocs"))
     if not (places != places[0]).any():
         return
     there: dict[tuple[int, str], int] = {}
@@ -190,38 +191,28 @@ def _require_atoms(universe: Any) -> None:
 
 def topology_of(universe: Any) -> Topology:
     """Names, elements, residues, bonds and masses of a Universe or AtomGroup."""
-    group = universe.atoms
-    whole = group.universe
+    group, whole = universe.atoms, universe.universe
     n = len(group)
-    resindex = group.resindices
-    old, first, residues = np.unique(resindex, return_index=True, return_inverse=True)
-    order = np.argsort(first)  # of their first atoms in the group, which need not be that of the Universe
-    old, residues = old[order], np.argsort(order)[residues]
-    names = texts(group, "names", n) if hasattr(group, "names") else texts(group, "types", n)
-    residue_names = texts(whole.residues[old], "resnames", len(old))
-    known = hasattr(group, "resnames") and bool((np.char.strip(residue_names) != "").any())
+    _, first, residues = np.unique(group.resindices, return_index=True, return_inverse=True)
+    # Residues by their first atoms in the group, which need not be in the order of the Universe.
+    order = np.argsort(first)
+    heads, residues = group[first[order]], np.argsort(order)[residues].astype(np.int64)
+    names = _texts(group, "names" if hasattr(group, "names") else "types")
+    residue_names = _texts(heads, "resnames")
     masses = np.asarray(group.masses, dtype=np.float64) if hasattr(group, "masses") else np.zeros(n)
-    measured = hasattr(group, "masses") and not masses_guessed(whole)
-    elements = texts(group, "elements", n) if hasattr(group, "elements") else np.full(n, "")
-    elements = np.char.capitalize(np.char.strip(elements))
+    measured = hasattr(group, "masses") and not _masses_guessed(whole)
+    elements = np.char.capitalize(np.char.strip(_texts(group, "elements")))
     heavy = elements == "D"
     elements = np.where(heavy, "H", elements)
     lacking = elements == ""
     if lacking.any():
-        found = elements_of(names, residues.astype(np.int64), residue_names, masses if measured else None)
+        found = elements_of(names, residues, residue_names, masses if measured else None)
         elements = np.where(lacking, found, elements)
     if hasattr(group, "masses") and not measured:
         # Masses that somebody set later are theirs.
         mended = guessed_masses(masses, names, np.where(heavy, "D", elements))
         masses = np.where(masses == _first_guess(group), mended, masses)
-    ids = texts(whole.residues[old], "resids", len(old)) if hasattr(whole.residues, "resids") else old.astype(str)
-    chain = next((a for a in ("chainIDs", "segids") if hasattr(group, a)), None)
-    if chain == "chainIDs":
-        first = np.unique(residues, return_index=True)[1]
-        chains = texts(group[first], "chainIDs", len(old))
-    else:
-        chains = texts(whole.residues[old], "segids", len(old)) if chain else np.full(len(old), "")
-    charges = np.asarray(group.charges, dtype=np.float64) if hasattr(group, "charges") else None
+    chains = _texts(heads, "chainIDs" if hasattr(group, "chainIDs") else "segids")
     bonds = _bonds(whole)
     if n != len(whole.atoms) or not np.array_equal(group.indices, np.arange(n)):
         new = np.full(len(whole.atoms), -1, dtype=np.int64)
@@ -232,13 +223,13 @@ def topology_of(universe: Any) -> Topology:
         names=names,
         elements=elements,
         masses=masses,
-        residues=residues.astype(np.int64),
+        residues=residues,
         residue_names=residue_names,
-        residue_ids=ids,
+        residue_ids=_texts(heads, "resids") if hasattr(group, "resids") else group.resindices[first[order]].astype(str),
         chains=np.where(chains == "SYSTEM", "", chains),
         bonds=sorted_pairs(bonds),
-        charges=charges,
-        residues_known=known,
+        charges=np.asarray(group.charges, dtype=np.float64) if hasattr(group, "charges") else None,
+        residues_known=bool((np.char.strip(residue_names) != "").any()),
     )
 
 
@@ -252,33 +243,24 @@ def _cell(step: Any) -> NDArray[np.float64]:
 
 def _bonds(whole: Any) -> IntArray:
     """All bonds of a Universe, without the objects that MDAnalysis makes of them."""
-    attribute = next((a for a in whole._topology.attrs if a.attrname == "bonds"), None)
-    if attribute is None or not len(attribute.values):
-        return np.zeros((0, 2), np.int64)
-    return np.asarray(attribute.values, dtype=np.int64).reshape(-1, 2)
+    values = next((a.values for a in whole._topology.attrs if a.attrname == "bonds"), ())
+    return np.array(values, dtype=np.int64).reshape(-1, 2)
 
 
-def masses_guessed(whole: Any) -> bool:
+def _masses_guessed(whole: Any) -> bool:
     """Whether masses did not come with the topology."""
-    attribute = next((a for a in whole._topology.attrs if a.attrname == "masses"), None)
-    return attribute is None or bool(attribute.is_guessed)
+    return all(a.is_guessed for a in whole._topology.attrs if a.attrname == "masses")
 
 
 def _first_guess(group: Any) -> FloatArray:
     """Masses that MDAnalysis gives by elements or types, whatever the atoms are."""
-    kinds, kind = np.unique(
-        texts(group, "elements" if hasattr(group, "elements") else "types", len(group)), return_inverse=True
-    )
-    table = [tables.masses.get(k, tables.masses.get(k.upper(), 0.0)) for k in kinds.tolist()]
-    return np.asarray(np.array(table)[kind.ravel()], dtype=np.float64)
+    kinds = _texts(group, "elements" if hasattr(group, "elements") else "types").tolist()
+    return np.array([tables.masses.get(k, tables.masses.get(k.upper(), 0.0)) for k in kinds], dtype=np.float64)
 
 
-def texts(holder: Any, name: str, n: int) -> NDArray[np.str_]:
-    """An attribute as text; '' for each of the n where there is none."""
-    if not hasattr(holder, name):
-        return np.full(n, "")
-    values = np.asarray(getattr(holder, name))
-    return values.astype(str) if n else np.zeros(0, dtype="U1")
+def _texts(group: Any, name: str) -> NDArray[np.str_]:
+    """An attribute of the atoms as text; '' where there is none."""
+    return np.asarray(getattr(group, name)).astype(str) if hasattr(group, name) else np.full(len(group), "")
 
 
 def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> None:

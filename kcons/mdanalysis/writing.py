@@ -1,8 +1,7 @@
 """Runs written through MDAnalysis: DCD, XTC, TRR, H5MD, NetCDF and what else it writes.
 
-With velocities where the format has them, and with residuals and multipliers of the constraints: as observables in
-H5MD, and beside other formats in an XVG file that MDAnalysis reads as auxiliary data. Every frame is on disk before the
-next step, so that a run that is stopped keeps all of them.
+With velocities where the format has them, and in H5MD with residuals and multipliers of the constraints. Every frame is
+on disk before the next step, so that a run that is stopped keeps all of them.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import sys
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Self, TextIO
+from typing import Any, Self
 from weakref import WeakSet
 
 import MDAnalysis
@@ -29,8 +28,6 @@ from kcons.steppers import State
 
 #: The largest number in single precision.
 _SINGLE = float(np.finfo(np.float32).max)
-#: Rows up to which an XVG file has a column for each multiplier.
-MOST_COLUMNS = 64
 #: Of XTC: steps from the origin that an integer counts; range of steps from which on some frames are packed wrongly;
 #: atoms up to which there is no packing.
 _MOST, _SAFE, _FLOATS = 2**31 - 3, 2**23, 9
@@ -46,19 +43,13 @@ _H5MD_UNITS = {
 
 @dataclass(frozen=True)
 class RunUnits:
-    """What 1 is in a run, in the units of MDAnalysis.
+    """What 1 is in a run, in the units of MDAnalysis."""
 
-    Attributes
-    ----------
-    length, time, energy : float
-        In angstrom, ps, kJ/mol.
-    name : str
-        For headers.
-    """
-
+    #: In angstrom, ps, kJ/mol.
     length: float = 1.0
     time: float = 1.0
     energy: float = 1.0
+    #: For headers.
     name: str = "Å, ps, kJ/mol"
 
     def __post_init__(self) -> None:
@@ -80,7 +71,7 @@ OPENMM_UNITS = RunUnits(10.0, 1.0, 1.0, "nm, ps, kJ/mol")
 
 
 class TrajectoryWriter:
-    """One trajectory file, and what belongs to its constraints.
+    """One trajectory file.
 
     Parameters
     ----------
@@ -90,8 +81,8 @@ class TrajectoryWriter:
     units : RunUnits
         Of what is written; default Å, ps, kJ/mol.
     motion : Motion, optional
-        The constraints of the run, in its units. Residuals are written, and multipliers where forces are given; both
-        in the units of the run, as `natural_units` says.
+        The constraints of the run, in its units: for the cell of its states. Into H5MD residuals are written, and
+        multipliers where forces are given; both in the units of the run, as `natural_units` says.
     interval : float, optional
         Time between frames in the run's unit; DCD stores this and no times.
     velocities : bool, optional
@@ -104,8 +95,7 @@ class TrajectoryWriter:
     Raises
     ------
     InputError
-        MDAnalysis does not write this format, or not several frames; another writer has the file open; beside it lies a
-        file of another trajectory where that of the constraints would go.
+        MDAnalysis does not write this format, or not several frames; another writer has the file open.
     UnsupportedError
         Velocities or forces are asked of a format without them; H5MD without h5py.
 
@@ -131,8 +121,6 @@ class TrajectoryWriter:
     ) -> None:
         self.path, self.units, self.motion = Path(path), units or RunUnits(), motion
         self.n_frames, self._expects_forces = 0, False
-        self.side_file: Path | None = None
-        self._side: TextIO | None = None
         self._writer: Any = None
         self._format = self.path.suffix[1:].upper()
         n_atoms = whole_number(n_atoms, "n_atoms")
@@ -142,19 +130,13 @@ class TrajectoryWriter:
         if any(other._writer is not None and other.path.resolve() == self.path.resolve() for other in _ALIVE):
             raise InputError(f"{self.path} is open in another TrajectoryWriter; close that first", item="path")
         able = self._format in ("TRR", "H5MD", "NC", "NCDF", "TRZ")
-        for asked, what in ((velocities, "velocities"), (forces, "forces")):
-            if asked and not able:
-                raise UnsupportedError(f"{self._format} has no {what}; write TRR or H5MD")
-        self._side_title = f"# constraints of {self.path.name}, in "
-        if motion is not None and self._format != "H5MD":
-            self._refuse_others()
         kept = {"velocities": able if velocities is None else velocities, "forces": forces}
         self._kept = [name for name, stays in kept.items() if stays]
+        if self._kept and not able:
+            raise UnsupportedError(f"{self._format} has no {self._kept[0]}; write TRR or H5MD")
         self._universe = MDAnalysis.Universe.empty(n_atoms, trajectory=True, **kept)
-        if self._format == "H5MD":
-            options = {**_H5MD_UNITS, **options, **kept}
-        elif self._format in ("NC", "NCDF"):
-            options = {**kept, **options}
+        if self._format in ("H5MD", "NC", "NCDF"):
+            options = {**(_H5MD_UNITS if self._format == "H5MD" else {}), **options, **kept}
         if interval is not None:
             dt = self._universe.trajectory.ts.dt = abs(finite_number(interval, "interval")) * self.units.time
             if self._format == "DCD":
@@ -170,21 +152,6 @@ class TrajectoryWriter:
         except RuntimeError as error:
             raise UnsupportedError(f"{self.path.name}: {error}") from None
         _ALIVE.add(self)
-
-    def _refuse_others(self) -> None:
-        """The file beside the trajectory takes the place of its own older self only."""
-        side = self.path.with_suffix(".xvg")
-        if not side.is_symlink() and not side.exists():
-            return
-        if side.is_file() and not side.is_symlink():
-            with side.open(encoding="utf-8", errors="replace") as file:
-                if file.readline().startswith(self._side_title):
-                    return
-        raise InputError(
-            f"{side} is not of {self.path.name}: residuals are not written over it; move it away, or give the "
-            "trajectory another name",
-            item="path",
-        )
 
     def __call__(self, state: State) -> None:
         """Write a state; for `kcons.steppers.run(..., observers=[writer])`."""
@@ -240,15 +207,11 @@ class TrajectoryWriter:
             setattr(ts, name, arrays.get(name, np.zeros_like(arrays["positions"])) * units[name])
         ts.time, ts.frame, ts.dimensions = time * self.units.time, self.n_frames, box
         ts.data["step"] = self.n_frames if step is None else step
-        if self._format == "H5MD":
-            ts.data.update(extras)
+        ts.data.update(extras)
         with quiet():
             self._writer.write(self._universe.atoms)
-        if self._format == "H5MD":
-            for name in extras:
-                self._writer.h5md_file[f"observables/{name}"].attrs.setdefault("run_units", self.units.name)
-        elif extras:
-            self._write_side(ts.time, extras)
+        for name in extras:
+            self._writer.h5md_file[f"observables/{name}"].attrs.setdefault("run_units", self.units.name)
         self._flush()
         self.n_frames += 1
 
@@ -270,7 +233,7 @@ class TrajectoryWriter:
 
     def _extras(self, arrays: dict[str, FloatArray], time: float) -> dict[str, FloatArray]:
         """What belongs to the constraints, in the units of the run."""
-        if self.motion is None:
+        if self.motion is None or self._format != "H5MD":
             return {}
         held, x = self.motion.constraint_set, arrays["positions"]
         v, f = arrays.get("velocities"), arrays.get("forces")
@@ -283,39 +246,10 @@ class TrajectoryWriter:
                 extras["multipliers"] = np.full(held.n_rows, np.nan)
         return extras
 
-    def _write_side(self, time: float, extras: dict[str, FloatArray]) -> None:
-        assert self.motion is not None
-        sigma, rates = extras["residuals"], extras.get("velocity_residuals")
-        multipliers = extras.get("multipliers", np.zeros(0))
-        if len(multipliers) > MOST_COLUMNS:
-            multipliers = np.zeros(0)
-        if self._side is None:
-            self.side_file = self.path.with_suffix(".xvg")
-            self._side = self.side_file.open("w", encoding="utf-8")
-            name = self.motion.constraint_set.row_name
-            columns = ["largest residual", "rms residual", "largest velocity residual"]
-            columns += [f"multiplier {name(k)}" for k in range(len(multipliers))]
-            self._width = len(columns)
-            print(f"{self._side_title}{self.units.name}; time in ps", file=self._side)
-            for k, column in enumerate(columns):
-                print(f'@ s{k} legend "{column}"', file=self._side)
-        numbers = [
-            float(np.abs(sigma).max(initial=0.0)),
-            float(np.sqrt(np.mean(sigma**2))) if len(sigma) else 0.0,
-            float("nan") if rates is None else float(np.abs(rates).max(initial=0.0)),
-            *multipliers.tolist(),
-        ]
-        # A state whose forces are not known yet has no multipliers; columns stay the same.
-        numbers = (numbers + [float("nan")] * self._width)[: self._width]
-        print(f"{time:.9g}", *(f"{number:.9g}" for number in numbers), file=self._side)
-
     def _flush(self) -> None:
         """Bring everything to the file."""
-        if self._side is not None:
-            self._side.flush()
-        file = getattr(self._writer, "h5md_file", None)
-        if file is not None:
-            file.flush()
+        if self._format == "H5MD":
+            self._writer.h5md_file.flush()
         elif self._format in ("NC", "NCDF"):
             # A file of netCDF4, or of SciPy where that is not installed.
             self._writer.trjfile.sync()
@@ -325,12 +259,10 @@ class TrajectoryWriter:
             library.fflush(None)
 
     def close(self) -> None:
-        """Close the files; more than once does no harm."""
+        """Close the file; more than once does no harm."""
         if self._writer is not None and (self.n_frames or self._format != "H5MD"):
             self._writer.close()
-        if self._side is not None:
-            self._side.close()
-        self._writer = self._side = None
+        self._writer = None
 
     def __enter__(self) -> Self:
         return self
@@ -387,7 +319,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     from kcons.ase.topology import velocities_of
 
     atoms = dynamics.atoms
-    _require_interval(interval)
+    whole_number(interval, "interval")
 
     def box() -> FloatArray | None:
         cell: FloatArray = atoms.cell.array
@@ -402,17 +334,14 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
             found = found or (item.engine(atoms) if hasattr(item, "engine") else None)
         return found if isinstance(found, Motion) else None
 
-    with_forces = {"forces": False, **options}["forces"]
-    writer = TrajectoryWriter(
-        path, len(atoms), **{"units": ASE_UNITS, "motion": engine(), "interval": interval * dynamics.dt, **options}
-    )
+    usual = {"units": ASE_UNITS, "motion": engine(), "interval": interval * dynamics.dt}
+    writer = TrajectoryWriter(path, len(atoms), **{**usual, **options})
+    observed = writer.path.suffix.upper() == ".H5MD"
 
     def report() -> None:
-        if "motion" not in options:
+        if observed and "motion" not in options:
             writer.motion = _followed(writer, engine())
-        forces = None
-        if writer.motion is not None or with_forces:
-            forces = applied_forces(atoms)
+        forces = applied_forces(atoms) if (observed and writer.motion is not None) or options.get("forces") else None
         time, v = float(dynamics.get_time()), velocities_of(atoms)
         writer.write(atoms.positions, v, time=time, cell=box(), forces=forces, step=dynamics.nsteps)
 
@@ -420,15 +349,8 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     return writer
 
 
-def _require_interval(interval: int) -> None:
-    if interval < 1:
-        raise InputError(f"the interval is {interval}; give 1 or more steps", item="interval")
-
-
 def _followed(writer: TrajectoryWriter, now: Motion | None) -> Motion | None:
-    """What is held now. Targets may have changed; columns may not, nor what the file says they are."""
-    if now is writer.motion:
-        return now
+    """What is held now. Targets may have changed; the rows may not, nor what the file says they are."""
     held = [[] if m is None else m.constraint_set.constraints for m in (writer.motion, now)]
     if not all(a and b and a.family == b.family and np.array_equal(a.atoms, b.atoms) for a, b in zip_longest(*held)):
         raise InputError(
@@ -448,14 +370,13 @@ class OpenMMReporter:
     interval : int
         Steps between frames.
     motion : Motion, optional
-        Constraints in OpenMM's units; residuals are written.
+        Constraints in OpenMM's units, whose residuals are written into H5MD.
     **options
         For `TrajectoryWriter`; ``forces=True`` for forces, and multipliers with them.
     """
 
     def __init__(self, path: str | Path, interval: int, *, motion: Motion | None = None, **options: Any) -> None:
-        _require_interval(interval)
-        self.path, self.interval, self.motion = Path(path), int(interval), motion
+        self.path, self.interval, self.motion = Path(path), whole_number(interval, "interval"), motion
         self._options, self._forces = options, bool(options.get("forces"))
         self.writer: TrajectoryWriter | None = None
 

@@ -1,9 +1,8 @@
 """The engine: what constraints do to positions, velocities, accelerations and forces.
 
 - `motion`: `Motion`, the engine itself
-- `solver_sequence`: all solvers of a plan, one after another, and what helps where one of them fails
+- `solver_sequence`: all solvers of a plan, one after another; what helps where one of them fails, and what is said
 - `certificate`: results checked by the constraints as they were given
-- `failures`: what to tell the user where a solve failed
 - `report`: what is held, how well, and condition numbers of clusters
 - `restoring`: positions that are off, brought onto the constraints
 - `minimization`: statics

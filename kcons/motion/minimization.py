@@ -12,7 +12,7 @@ from kcons.constraints.arguments import Positive, as_array, check_call, checked
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.motion.motion import Motion
-from kcons.motion.restoring.descent import Descent, largest
+from kcons.motion.restoring.nearest_point import Descent, largest
 
 
 @dataclass(frozen=True, eq=False)

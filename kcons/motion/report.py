@@ -19,7 +19,7 @@ from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import row_norms
 from kcons.plan.independent_blocks import fixed_atoms
 from kcons.plan.plan import ClusterKind, Plan
-from kcons.solvers.rank_revealing import independent
+from kcons.solvers.rank_revealing import independent, stacks
 
 #: Conversions that a printed report names.
 SHOWN = 4
@@ -170,50 +170,21 @@ def worst_condition(
     float
         NaN where a gradient vanishes, or a cluster is too large for dense algebra and has dependent rows.
     """
-    rows = np.sort(rows)
-    rows = rows[np.argsort(labels[rows], kind="stable")]
     unit = sp.csr_array(jacobian[rows])
     unit.data = unit.data * np.repeat(np.sqrt(inverse_masses), 3)[unit.indices]
     norms = row_norms(unit)
     if not np.all(np.isfinite(norms) & (norms > 0)):
         return float("nan")
     unit.data *= np.repeat(1.0 / norms, np.diff(unit.indptr))
-    first = np.flatnonzero(np.diff(labels[rows], prepend=-1))
-    sizes = np.diff(first, append=len(rows))
-    worst = 1.0
-    for size in np.unique(sizes):
-        starts = first[sizes == size]
-        if size <= (DENSE_DEPENDENT_ROWS if deficiency else DENSE_ROWS):
-            found = _dense(unit, starts, int(size))
-        elif deficiency:
-            return float("nan")
-        else:
-            found = max(_sparse(unit[start : start + size]) for start in starts)
-        worst = max(worst, found)
-    return worst
-
-
-def _dense(unit: sp.csr_array, starts: IntArray, size: int) -> float:
-    """Clusters of `size` rows side by side, in portions that fit into the memory."""
-    worst = 1.0
-    widths = [np.diff(unit.indptr)[starts + k] for k in range(size)]
-    most = int(sum(w.max() for w in widths))
-    portion = max(1, PORTION // (size * most))
-    for begin in range(0, len(starts), portion):
-        some = starts[begin : begin + portion]
-        n = len(some)
-        low, high = unit.indptr[some], unit.indptr[some + size]
-        entry = np.repeat(low - np.concatenate([[0], np.cumsum(high - low)[:-1]]), high - low)
-        entry = entry + np.arange(len(entry))
-        cluster = np.repeat(np.arange(n), high - low)
-        line = np.searchsorted(unit.indptr, entry, side="right") - 1 - some[cluster]
-        # Columns numbered within each cluster; which number is whose does not matter.
-        key = cluster * unit.shape[1] + unit.indices[entry]
-        distinct, place = np.unique(key, return_inverse=True)
-        column = place - np.searchsorted(distinct, np.arange(n) * unit.shape[1])[cluster]
-        dense = np.zeros((n, size, int(column.max()) + 1))
-        np.add.at(dense, (cluster, line, column), unit.data[entry])
-        s = np.linalg.svd(dense, compute_uv=False)
+    number = np.unique(labels[rows], return_inverse=True)[1]
+    sizes = np.bincount(number)
+    dense = (sizes <= (DENSE_DEPENDENT_ROWS if deficiency else DENSE_ROWS))[number]
+    if deficiency and not dense.all():
+        return float("nan")
+    worst = float(np.max([1.0, *(_sparse(unit[number == k]) for k in np.unique(number[~dense]))]))
+    small = unit[dense]
+    for stack in stacks(small, number[dense], PORTION):
+        s = np.linalg.svd(stack.dense(small.data), compute_uv=False)
         smallest = np.min(np.where(independent(s), s, np.inf), axis=1)
         worst = max(worst, float(np.max(s[:, 0] / smallest)))
     return worst

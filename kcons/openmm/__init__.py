@@ -3,7 +3,7 @@
 Swap the integrator of a Simulation, and what the System constrains is held to order 2, 4 or 6, together with
 collective variables, surfaces and the constraint objects of kcons.
 
-- `quantities`, `states`: numbers with units, and what a Context says of its state
+- `quantities`: numbers with units, and what a Context says of its state
 - `topology`: constraints by name
 - `integrator`: the integrators and the programs they run
 - `ensembles`: Langevin, isokinetic, Nosé-Hoover
@@ -16,22 +16,17 @@ collective variables, surfaces and the constraint objects of kcons.
 from kcons.errors import with_extra
 
 try:
-    from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
-    from kcons.openmm.callback_rows.hold import hold, move_constraints
+    from kcons.openmm import ensembles
+    from kcons.openmm.callback_rows import CarriedConstraints, hold, move_constraints
     from kcons.openmm.collective.collective_rows import CollectiveRows
     from kcons.openmm.collective.coordinates import Row
     from kcons.openmm.device.device_integrator import DeviceIntegrator
-    from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
-    from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
-    from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
-    from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-    from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
-    from kcons.openmm.integrator.precision import Precision
+    from kcons.openmm.ensembles import *
+    from kcons.openmm.integrator.guard import worst_length
+    from kcons.openmm.integrator.part import Precision
+    from kcons.openmm.integrator.program import SCHEMES
     from kcons.openmm.integrator.projected import ProjectedIntegrator
-    from kcons.openmm.integrator.schemes import SCHEMES
-    from kcons.openmm.integrator.system_checks import worst_length
-    from kcons.openmm.quantities import masses_of
-    from kcons.openmm.states import positions_of, velocities_of
+    from kcons.openmm.quantities import masses_of, positions_of, velocities_of
     from kcons.openmm.surface_integrator import SurfaceIntegrator
     from kcons.openmm.topology import constraints_of
 except ModuleNotFoundError as error:
@@ -42,13 +37,6 @@ __all__ = [
     "CarriedConstraints",
     "CollectiveRows",
     "DeviceIntegrator",
-    "HamiltonianMonteCarlo",
-    "Isokinetic",
-    "IsokineticSpheres",
-    "Langevin",
-    "LangevinRespa",
-    "NoseHoover",
-    "NoseHooverMiddle",
     "Precision",
     "ProjectedIntegrator",
     "Row",
@@ -61,3 +49,4 @@ __all__ = [
     "velocities_of",
     "worst_length",
 ]
+__all__ += ensembles.__all__

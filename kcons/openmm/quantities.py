@@ -1,4 +1,4 @@
-"""Quantities at the boundary to OpenMM: one way in for numbers, and one for constraints."""
+"""The boundary to OpenMM: one way in for numbers, one for constraints, and what a Context says of its state."""
 
 from __future__ import annotations
 
@@ -23,13 +23,7 @@ GAS_CONSTANT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole /
 
 
 def plain(value: Any, of: unit.Unit, item: str) -> Any:
-    """A Quantity, or nested lists of Quantities, as numbers in a unit; what has no unit is in it already.
-
-    Raises
-    ------
-    InputError
-        It is of another kind.
-    """
+    """A Quantity, or nested lists of them, as numbers in a unit; numbers are in it. `InputError` for another kind."""
     if isinstance(value, list | tuple) and has_units(value):
         return [plain(part, of, item) for part in value]
     if not has_units(value):
@@ -42,14 +36,8 @@ def plain(value: Any, of: unit.Unit, item: str) -> Any:
 
 
 def number(value: Any, of: unit.Unit, item: str) -> float:
-    """The same for one number.
-
-    Raises
-    ------
-    InputError
-        It is of another kind, or no number.
-    """
-    found = plain(value, of, item)
+    """The same for one number; `InputError` too for what is none."""
+    found = value if isinstance(value, float | int) else plain(value, of, item)
     try:
         if isinstance(found, str | bytes):
             raise TypeError
@@ -61,13 +49,7 @@ def number(value: Any, of: unit.Unit, item: str) -> float:
 
 
 def relative_tolerance(value: Any) -> float:
-    """A tolerance of OpenMM's solvers.
-
-    Raises
-    ------
-    InputError
-        It is no number between 0 and 1.
-    """
+    """A tolerance of OpenMM's solvers; `InputError` for what is no number between 0 and 1."""
     found = number(value, unit.dimensionless, "tolerance")
     if not 0 < found < 1:
         raise InputError(f"the tolerance is {value}; give a positive number, such as 1e-10", item="tolerance")
@@ -75,13 +57,7 @@ def relative_tolerance(value: Any) -> float:
 
 
 def kelvins(temperature: unit.Quantity | float) -> float:
-    """A temperature in K, not below zero.
-
-    Raises
-    ------
-    InputError
-        It is none.
-    """
+    """A temperature in K; `InputError` for what is none, or below zero."""
     value = number(temperature, unit.kelvin, "temperature")
     if not 0 <= value < math.inf:
         raise InputError(f"temperature is {temperature}; give a number of K, not below zero", item="temperature")
@@ -89,13 +65,7 @@ def kelvins(temperature: unit.Quantity | float) -> float:
 
 
 def array(values: Any, of: unit.Unit, item: str) -> FloatArray:
-    """The same for an array, as a copy.
-
-    Raises
-    ------
-    InputError
-        They are of another kind, or no numbers.
-    """
+    """The same as `plain` for an array, as a copy; `InputError` too for what is no array of numbers."""
     found = plain(values, of, item)
     try:
         return np.array(found, dtype=np.float64)
@@ -103,14 +73,13 @@ def array(values: Any, of: unit.Unit, item: str) -> FloatArray:
         raise InputError(f"{item} are no array of numbers: {error}", item=item) from None
 
 
-def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
-    """Positions as an array of shape (n, 3), nm.
+def cell_of(vectors: Any) -> FloatArray:
+    """Box vectors, of a State (a Quantity) or of a System (a list of them), nm, shape (3, 3)."""
+    return array(vectors, unit.nanometer, "box")
 
-    Raises
-    ------
-    InputError
-        They are of another kind or shape.
-    """
+
+def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
+    """Positions as an array of shape (n, 3), nm; `InputError` for another shape or kind."""
     x = array(positions, unit.nanometer, "positions")
     if x.shape != (n, 3):
         raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
@@ -162,3 +131,44 @@ def _accepted(item: Any) -> Any:
         if function is not None and not isinstance(function, Unitless):
             setattr(taken, name, Unitless(function, f"{item.family}: {name}", ANY))
     return taken
+
+
+# -- the state of a Context, in nm, ps and kJ/mol ---------------------------------------------------
+
+# A State is in nm and ps whatever else is in use: _value spares the conversion, which takes longer than small Systems.
+
+
+def positions_of(context: openmm.Context) -> FloatArray:
+    return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
+
+
+def velocities_of(context: openmm.Context) -> FloatArray:
+    return np.asarray(context.getState(velocities=True).getVelocities(asNumpy=True)._value)
+
+
+def motion_of(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
+    """Positions and velocities, as they are (not wrapped), shape (n_particles, 3) each."""
+    state = context.getState(positions=True, velocities=True)
+    return np.array(state.getPositions(asNumpy=True)._value), np.array(state.getVelocities(asNumpy=True)._value)
+
+
+def forces_at(context: openmm.Context, groups: int | Iterable[int]) -> FloatArray:
+    """Forces of some force groups, a bit mask or numbers, in kJ/mol/nm, shape (n_particles, 3)."""
+    state = context.getState(forces=True, groups=groups if isinstance(groups, int) else set(groups))
+    return np.array(state.getForces(asNumpy=True)._value)
+
+
+def energy_of(context: openmm.Context, groups: int | Iterable[int]) -> float:
+    """Potential energy of some force groups, a bit mask or numbers, in kJ/mol."""
+    state = context.getState(energy=True, groups=groups if isinstance(groups, int) else set(groups))
+    return float(state.getPotentialEnergy()._value)
+
+
+def box_of(context: openmm.Context) -> Any:
+    """Periodic box vectors in nm, as OpenMM has them."""
+    return context.getState().getPeriodicBoxVectors()._value
+
+
+def width_of(context: openmm.Context) -> float:
+    """Largest coordinate in the periodic box, nm."""
+    return float(np.abs(np.array(box_of(context))).sum(axis=0).max())

@@ -13,11 +13,9 @@ from openmm import unit
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints
-from kcons.openmm.callback_rows.hold import constraints_about, hold
+from kcons.openmm.callback_rows import CarriedConstraints, constraints_about, hold
 from kcons.openmm.integrator.projected import ProjectedIntegrator, picoseconds
-from kcons.openmm.quantities import accepted
-from kcons.openmm.states import positions_of
+from kcons.openmm.quantities import accepted, positions_of
 from kcons.steppers import Splitting
 
 

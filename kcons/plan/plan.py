@@ -13,11 +13,10 @@ from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError
 from kcons.plan.clusters import Shape, classify, cluster_labels
-from kcons.solvers.addressable_solvers import AddressableSolver
-from kcons.solvers.chains.open_chains import Chains
+from kcons.solvers.chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.rank_revealing import independent, rank
+from kcons.solvers.rank_revealing import independent, rank, stacks
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.small_clusters import SmallClusters
@@ -238,7 +237,7 @@ def make_plan(
             lattice = None if whole else constraint_set.lattice
             if isinstance(solver, GeneralClusters):
                 rank = solver.rank(whole_positions, time, moved)
-            elif isinstance(solver, AddressableSolver):
+            elif isinstance(solver, SparseDistances | SparseRows | SingleRows):
                 rank = solver.rank(whole_positions, lattice, time, moved)
             else:
                 rank = rank_of_small(shape, inverse_masses, whole_positions, lattice)
@@ -342,9 +341,8 @@ def mark_dependent_rows(
     found = 0
     for rows in clusters:
         part = jacobian[rows]
-        columns, place = np.unique(part.indices, return_inverse=True)
-        b = np.zeros((len(rows), len(columns)))
-        b[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * root_w[part.indices]
+        (stack,) = stacks(part, np.zeros(len(rows), np.int64))
+        (b,) = stack.dense(part.data * root_w[part.indices])
         size = np.linalg.norm(b, axis=1, keepdims=True)
         triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
         diagonal = np.zeros(len(rows))

@@ -5,13 +5,15 @@ compiled for each of their combinations. Here a solver's functions are compiled 
 else again. They are alike for all of them; `kind` says which minimum image the lattice needs (`kernels.lattices`):
 
 ``_positions(alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers)``
-    solves the SHAKE condition; ``_tangents(alone, x, y, wanted, ...)`` makes y tangent at x. Both return what an
-    `Outcome` holds. An empty `wanted` stands for the targets found at set-up, and for no motion of the surface.
+    solves the SHAKE condition; ``_tangents(alone, y, x, ...)``, with the same arguments, makes y tangent at x, where
+    velocities do not count. Both return what an `Outcome` holds. An empty `wanted` stands for the targets found at
+    set-up, and for no motion of the surface.
 ``_apply(x, factor, tables)``
     adds the last solution times `factor`. A solver that is `alone` has done so with 1 for what it solves, and with
     inv_dt for velocities. Otherwise nothing is written until each of several has found its solution.
 ``_undo(x, tangents, velocities, tables)``
     of solvers that write at once instead: puts back points, or (`tangents` and `velocities` say which) velocities.
+    Multipliers that are asked for they put into `numbers`.
 ``_resolved(x, lattice, kind, tables)``
     whether positions show what was found, where multipliers may be so large that their own rounding does not.
 
@@ -20,9 +22,8 @@ else again. They are alike for all of them; `kind` says which minimum image the 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -36,7 +37,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.kernels.aligned_memory import in_one_array
-from kcons.solvers.kernels.array_views import at_piece, halves, integers, lattice_piece, none_of, table_array, view
+from kcons.solvers.kernels.array_views import at_piece, halves, integers, lattice_piece, table_array, view
 from kcons.solvers.kernels.lattices import NO_LATTICE, lattice_kind
 from kcons.solvers.kernels.two_and_four_wide import load_double, load_index, store_double
 from kcons.solvers.tolerances import MAX_ROUNDS
@@ -45,12 +46,11 @@ NO_NUMBERS = np.zeros(0)
 _NUMBERS, _POINTS, _LATTICE = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 _ALIKE = _NUMBERS, _LATTICE, types.int64, _NUMBERS, _NUMBERS
 _FOUND = types.Tuple((types.boolean, types.float64, types.int64, types.int64))
-_POSITIONS = _FOUND(types.boolean, _POINTS, _POINTS, _POINTS, types.float64, *_ALIKE)
-_TANGENTS = _FOUND(types.boolean, _POINTS, _POINTS, *_ALIKE)
+_SOLVE = _FOUND(types.boolean, _POINTS, _POINTS, _POINTS, types.float64, *_ALIKE)
 _APPLY = types.none(_POINTS, types.float64, _NUMBERS)
 _UNDO = types.none(_POINTS, types.boolean, types.boolean, _NUMBERS)
 _RESOLVED = types.boolean(_POINTS, _LATTICE, types.int64, _NUMBERS)
-_SIGNATURES = _POSITIONS, _TANGENTS, _APPLY, _UNDO, _RESOLVED
+_SIGNATURES = _SOLVE, _SOLVE, _APPLY, _UNDO, _RESOLVED
 #: Words that are kept of a solver: where its functions are (0 for none), then where each array is and how many numbers
 #: it has.
 WORDS = 9
@@ -66,18 +66,7 @@ class Kernels(NamedTuple):
     resolved: Any = None
 
 
-class Addressable(Protocol):
-    """What kernels can call, to be kept as long as they do."""
-
-    kernels: Kernels
-    tables: FloatArray
-    numbers: FloatArray
-
-    def refuse(self) -> None:
-        """Raise what a Python function among the rows has raised while a kernel ran."""
-
-
-class AddressableSolver(ABC):
+class AddressableSolver:
     """Base of the solvers that all kernels can call, each a `ClusterSolver`.
 
     Attributes
@@ -88,13 +77,17 @@ class AddressableSolver(ABC):
     tables : ndarray of float64
         What the kernels know of the rows, in one array.
     numbers : ndarray of float64
-        What functions among the rows get and give; begins as `kcons.solvers.sparse.row_functions` says.
+        What functions among the rows get and give; begins as `kcons.solvers.sparse.row_functions` says. Empty for
+        solvers that put multipliers there.
     """
 
+    name: str
     rows: IntArray
     kernels: Kernels
     tables: FloatArray
-    numbers: FloatArray
+    numbers: FloatArray = NO_NUMBERS
+    #: Arguments that make the same solver again.
+    _made_of: tuple[Any, ...]
     _solution: FloatArray
     #: Whether rows take whole cells off positions.
     _moved = False
@@ -102,10 +95,13 @@ class AddressableSolver(ABC):
     _lattice: FloatArray | None = None
     _cell, _kind = lattice_kind(None)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._made_of  # addresses are of no use elsewhere
+
     @property
-    @abstractmethod
     def pivots(self) -> FloatArray:
-        """Of the last tangents, by row: 0 for rows that depend on others."""
+        """Of the last tangents, by row: 0 for rows that depend on others, where the solver has a cut for these."""
+        return np.ones(len(self.rows))
 
     def refuse(self) -> None:
         """Raise what a Python function among the rows has raised while a kernel ran."""
@@ -119,37 +115,34 @@ class AddressableSolver(ABC):
 
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        x, reference, given, lattice, time, reference_time, velocities, inv_dt, flight, moved = request
-        if moved is not None or self._moved:
-            self._take_off(moved)
-        if lattice is not self._lattice:
-            self._lattice, (self._cell, self._kind) = lattice, lattice_kind(lattice)
-        wanted = NO_NUMBERS if given is None else given[self.rows]
-        self.numbers[:3] = time, reference_time, flight
-        if velocities is None:
-            velocities, inv_dt = x, 0.0
-        found = self.kernels[0](
-            True, x, reference, velocities, inv_dt, wanted, self._cell, self._kind, self.tables, self.numbers
-        )
-        self.refuse()
-        if found[0] and multipliers is not None:
-            multipliers[:] = self._multipliers()
-        return Outcome(*found)
+        return self._solved(0, request, multipliers)
 
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
-        y, x, given, lattice, time, _, _, _, _, moved = request
+        return self._solved(1, request, multipliers)
+
+    def _solved(self, kernel: int, request: Request, multipliers: FloatArray | None) -> Outcome:
+        changed, reference, given, lattice, time, reference_time, velocities, inv_dt, flight, moved = request
         if moved is not None or self._moved:
             self._take_off(moved)
         if lattice is not self._lattice:
             self._lattice, (self._cell, self._kind) = lattice, lattice_kind(lattice)
         wanted = NO_NUMBERS if given is None else given[self.rows]
-        self.numbers[:3] = time, time, 1.0
-        found = self.kernels[1](True, x, y, wanted, self._cell, self._kind, self.tables, self.numbers)
-        self.refuse()
-        if found[0] and multipliers is not None:
-            np.negative(self._multipliers(), out=multipliers)
-        return Outcome(*found)
+        numbers = self.numbers
+        if numbers is not NO_NUMBERS:
+            numbers[:3] = time, time if kernel else reference_time, flight or kernel
+        elif multipliers is not None:
+            numbers = multipliers
+        if velocities is None:
+            velocities, inv_dt = changed, 0.0
+        found = self.kernels[kernel](
+            True, changed, reference, velocities, inv_dt, wanted, self._cell, self._kind, self.tables, numbers
+        )
+        if self.numbers is not NO_NUMBERS:
+            self.refuse()
+            if found[0] and multipliers is not None:
+                np.multiply(self._multipliers(), -1.0 if kernel else 1.0, out=multipliers)
+        return tuple.__new__(Outcome, found)  # as `Outcome(*found)`, in a third of its time
 
     def rank(
         self, x: FloatArray, lattice: FloatArray | None, time: float = 0.0, moved: FloatArray | None = None
@@ -170,8 +163,8 @@ def caller_of(signature: Any) -> Any:
     """What calls, inside kernels, the function of this signature that is at an address, with a tuple of arguments."""
 
     @intrinsic
-    def function(typingctx, address, given):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def function(typingctx, address, given):
+        def codegen(context, builder, sig, args):
             convention = context.call_conv
             kind = convention.get_function_type(signature.return_type, signature.args)
             pointer = builder.inttoptr(args[0], ir.PointerType(kind))
@@ -186,14 +179,14 @@ def caller_of(signature: Any) -> Any:
     return function
 
 
-_call_positions, _call_tangents, _call_apply, _call_undo, _call_resolved = (caller_of(kind) for kind in _SIGNATURES)
+_call_solve, _call_apply, _call_undo, _call_resolved = map(caller_of, (_SOLVE, _APPLY, _UNDO, _RESOLVED))
 
 
 @intrinsic
-def _borrowed(typingctx, address, size):  # type: ignore[no-untyped-def]
+def _borrowed(typingctx, address, size):
     """The array of doubles at an address."""
 
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def codegen(context, builder, sig, args):
         return view(context, builder, _NUMBERS, builder.inttoptr(args[0], ir.PointerType(ir.DoubleType())), args[1])
 
     return _NUMBERS(types.int64, types.int64), codegen
@@ -205,7 +198,7 @@ def _borrowed(typingctx, address, size):  # type: ignore[no-untyped-def]
 _SOLVERS, _PINNED, _PLACES, _KIND, _CELL, MORE = range(6)
 
 
-def words_of(solvers: Sequence[Addressable]) -> IntArray:
+def words_of(solvers: Sequence[AddressableSolver]) -> IntArray:
     """By what kernels know solvers, to be kept as long as it is used."""
     words: list[int] = []
     for solver in solvers:
@@ -217,13 +210,13 @@ def words_of(solvers: Sequence[Addressable]) -> IntArray:
 
 
 def pack_solver_tables(
-    solvers: Sequence[Addressable], pinned: IntArray, places: FloatArray, *more: NDArray[Any]
+    solvers: Sequence[AddressableSolver], pinned: IntArray, places: FloatArray, *more: NDArray[Any]
 ) -> FloatArray:
     """What `packed_positions` and `packed_tangents` need to know.
 
     Parameters
     ----------
-    solvers : sequence of Addressable
+    solvers : sequence of AddressableSolver
         Those that write at once come last, and of these those without `undo`.
     pinned : ndarray of int
         Fixed atoms.
@@ -249,12 +242,12 @@ def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _arrays(words, k):  # type: ignore[no-untyped-def]
+def _arrays(words, k):
     return _borrowed(words[k + 5], words[k + 6]), _borrowed(words[k + 7], words[k + 8])
 
 
 @njit(cache=True, nogil=True)
-def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
+def packed_positions(x, x_ref, v, inv_dt, tables):
     """Bring `x` onto the rows along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
 
     Returns
@@ -267,12 +260,17 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
     pinned, places = at_piece(u, h, _PINNED), at_piece(t, h, _PLACES)
     for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
         store_double(x, 3 * load_index(pinned, k // 3) + k % 3, load_double(places, k))
-    words, lattice, kind, none = table_array(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
+    words, lattice, kind, none = (
+        table_array(h, h, _SOLVERS),
+        lattice_piece(t, h, _CELL),
+        h[h[2 * _KIND]],
+        _borrowed(0, 0),
+    )
     most = 0
     for k in range(0, words.size, WORDS):
         mine, numbers = _arrays(words, k)
         alike = x, x_ref, v, inv_dt, none, lattice, kind, mine, numbers
-        found, _, iterations, _ = _call_positions(words[k], (False, *alike))
+        found, _, iterations, _ = _call_solve(words[k], (False, *alike))
         if not found:
             for j in range(0, k, WORDS):
                 if words[j + 3] != 0:
@@ -290,7 +288,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
                 _call_apply(words[k + 2], (v, inv_dt, mine))
             if words[k + 4] == 0 or again == MAX_ROUNDS or _call_resolved(words[k + 4], (x, lattice, kind, mine)):
                 break
-            found, _, iterations, _ = _call_positions(words[k], (False, *alike))
+            found, _, iterations, _ = _call_solve(words[k], (False, *alike))
             if not found:
                 break
             most = max(most, iterations)
@@ -298,16 +296,21 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True)
-def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
+def packed_tangents(x, v, tables):
     """Project `v` so that no row changes; whether that was possible, `v` otherwise as it was."""
     t, h, u = tables, integers(tables), halves(tables)
     pinned = at_piece(u, h, _PINNED)
     for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
         store_double(v, 3 * load_index(pinned, k // 3) + k % 3, 0.0)
-    words, lattice, kind, none = table_array(h, h, _SOLVERS), lattice_piece(t, h, _CELL), h[h[2 * _KIND]], none_of(t)
+    words, lattice, kind, none = (
+        table_array(h, h, _SOLVERS),
+        lattice_piece(t, h, _CELL),
+        h[h[2 * _KIND]],
+        _borrowed(0, 0),
+    )
     for k in range(0, words.size, WORDS):
         mine, numbers = _arrays(words, k)
-        if not _call_tangents(words[k + 1], (False, x, v, none, lattice, kind, mine, numbers))[0]:
+        if not _call_solve(words[k + 1], (False, v, x, v, 0.0, none, lattice, kind, mine, numbers))[0]:
             for j in range(0, k, WORDS):
                 if words[j + 3] != 0:
                     _call_undo(words[j + 3], (v, True, False, _arrays(words, j)[0]))

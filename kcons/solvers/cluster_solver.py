@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple, Protocol
-
-import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -88,14 +85,3 @@ class ClusterSolver(Protocol):
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """y - M^-1 A^T mu with A y = rates; `multipliers` receive mu."""
         ...
-
-
-def resume(
-    positions: Callable[[Request, FloatArray | None], Outcome], request: Request, multipliers: FloatArray | None
-) -> bool:
-    """Let a solver go on from the positions where it ended, and add to `multipliers`; whether it converged again."""
-    more = None if multipliers is None else np.empty(len(multipliers))
-    again = positions(request, more)
-    if again.converged and multipliers is not None and more is not None:
-        multipliers += more
-    return again.converged

@@ -7,17 +7,17 @@ on each other: singular directions are cut, multipliers come out with least norm
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.solvers.cluster_solver import Outcome, Request
-from kcons.solvers.rank_revealing import independent, least_norm, rank
+from kcons.solvers.rank_revealing import Stack, independent, least_norm, rank, stacks
 from kcons.solvers.tolerances import (
     DENSE_SPEED_TOLERANCE,
     EPS,
@@ -29,52 +29,8 @@ from kcons.solvers.tolerances import (
     ROUNDINGS,
 )
 
-
-@dataclass(frozen=True)
-class _Batch:
-    """Clusters with the same numbers of rows and columns."""
-
-    rows: IntArray  # (n, K) within the subset
-    columns: IntArray  # (n, C) Cartesian columns of the subset
-    entries: IntArray  # where the subset's Jacobian data stand ...
-    places: IntArray  # ... and where they go in the flat (n, K, C) array
-
-    def gradients(self, data: FloatArray) -> FloatArray:
-        """A of each cluster, shape (n, K, C), from the data of the subset's Jacobian."""
-        found = np.zeros((*self.rows.shape, self.columns.shape[1]))
-        found.reshape(-1)[self.places] = data[self.entries]
-        return found
-
-
-@dataclass(frozen=True)
-class _Flight:
-    """Where and when rows of velocities hold, and at what, as `Request` says."""
-
-    subset: ConstraintSet
-    start: FloatArray
-    time: float
-    wanted: FloatArray
-
-    @property
-    def entries(self) -> NDArray[np.bool_]:
-        """Which of the Jacobian's data are those of rows of velocities."""
-        return np.repeat(~self.subset.holonomic, 3 * np.diff(self.subset.incidence.indptr))
-
-    @classmethod
-    def of(cls, request: Request, subset: ConstraintSet, atoms: IntArray, rows: IntArray) -> _Flight | None:
-        """For some atoms and rows; None where rows of velocities do not count."""
-        if not request.flight or request.wanted is None:
-            return None
-        middle = 0.5 * (request.reference_time + request.time)
-        return cls(subset, request.reference[atoms], middle, request.wanted[rows])
-
-    def jacobian(self, end: FloatArray) -> csr_array:
-        return self.subset.jacobian(0.5 * (self.start + end), self.time)
-
-    def slips(self, end: FloatArray) -> FloatArray:
-        """By how much rows of velocities are off at `end`; 0 for the others, as these have 0 for sigma."""
-        found: FloatArray = self.jacobian(end) @ (end - self.start).ravel() - self.wanted
-        return np.where(self.subset.holonomic, 0.0, found)
+#: What is to vanish at given positions, by row, or the numbers of its Jacobian.
+_Measured = Callable[[FloatArray], FloatArray]
 
 
 class GeneralClusters:
@@ -104,55 +60,50 @@ class GeneralClusters:
         self._held = self.subset.holonomic
         #: Whether rows close through the boundary of the cell, so that whole positions alone do not tell their images.
         self.winds = any(item.cell_offsets is not None for item in self.subset.constraints)
-        self._batches = self._make_batches(labels)
-
-    def _make_batches(self, labels: IntArray) -> list[_Batch]:
-        indptr, indices = self.subset.incidence.indptr, self.subset.incidence.indices
-        order = np.argsort(labels, kind="stable")
-        starts = np.flatnonzero(np.diff(labels[order], prepend=-1))
-        members = [np.sort(m) for m in np.split(order, starts[1:])] if len(order) else []
-        groups: dict[tuple[int, int], list[tuple[IntArray, IntArray]]] = {}
-        for rows in members:
-            atoms = np.unique(np.concatenate([indices[indptr[r] : indptr[r + 1]] for r in rows]))
-            groups.setdefault((len(rows), len(atoms)), []).append((rows, atoms.astype(np.int64)))
-        return [self._batch(group) for group in groups.values()]
-
-    def _batch(self, group: list[tuple[IntArray, IntArray]]) -> _Batch:
-        indptr, indices = self.subset.incidence.indptr, self.subset.incidence.indices
-        rows = np.array([r for r, _ in group])
-        atoms = np.array([a for _, a in group])
-        n, k = rows.shape
-        c = 3 * atoms.shape[1]
-        place = np.zeros(self.subset.n_atoms, dtype=np.int64)
-        entries, places = [], []
-        for i in range(n):
-            place[atoms[i]] = np.arange(atoms.shape[1])
-            for j, row in enumerate(rows[i]):
-                slots = np.arange(indptr[row], indptr[row + 1])
-                entries.append((3 * slots[:, None] + np.arange(3)).ravel())
-                local = 3 * place[indices[slots]][:, None] + np.arange(3)
-                places.append(((i * k + j) * c + local).ravel())
-        columns = (3 * atoms[:, :, None] + np.arange(3)).reshape(n, c)
-        return _Batch(rows, columns, np.concatenate(entries), np.concatenate(places))
+        incidence = self.subset.incidence
+        columns = (3 * incidence.indices[:, None] + np.arange(3)).ravel()
+        shape = len(rows), 3 * self.subset.n_atoms
+        pattern = sp.csr_array((np.ones(len(columns)), columns, 3 * incidence.indptr), shape=shape)
+        self._batches = list(stacks(pattern, labels)) if len(rows) else []
 
     # -- pieces ---------------------------------------------------------------------------------
 
-    def _weighted(self, batch: _Batch, data: FloatArray) -> FloatArray:
-        return batch.gradients(data) * self._root_w[batch.columns][:, None, :]
+    def _weighted(self, batch: Stack, data: FloatArray) -> FloatArray:
+        return batch.dense(data) * self._root_w[batch.columns][:, None, :]
 
-    def _rounding(self, batch: _Batch, data: FloatArray, state: FloatArray) -> FloatArray:
+    def _rounding(self, batch: Stack, data: FloatArray, state: FloatArray) -> FloatArray:
         """Relative residual that rounding allows: max(1e-14, 2 eps sum |dq/dx_i| |x_i| / scale), (n, K)."""
         sizes = np.linalg.norm(state.reshape(-1)[batch.columns].reshape(len(batch.rows), -1, 3), axis=2)
-        norms = np.linalg.norm(batch.gradients(data).reshape(*batch.rows.shape, -1, 3), axis=3)
+        norms = np.linalg.norm(batch.dense(data).reshape(*batch.rows.shape, -1, 3), axis=3)
         reach = np.einsum("nka,na->nk", norms, sizes)
         return np.maximum(ROUNDING, 2 * EPS * reach / self._scale[batch.rows])
 
-    def _sigma(self, batch: _Batch, state: FloatArray, time: float, flight: _Flight | None = None) -> FloatArray:
-        return (self.subset.value(state, time) + (0.0 if flight is None else flight.slips(state)))[batch.rows]
+    def _measures(self, request: Request) -> tuple[_Measured, _Measured, bool]:
+        """sigma and the data of the Jacobian by positions, and whether rows of velocities count in them.
 
-    def _data(self, state: FloatArray, time: float, flight: _Flight | None = None) -> FloatArray:
-        data = self.subset.jacobian(state, time).data
-        return data if flight is None else np.where(flight.entries, flight.jacobian(state).data, data)
+        These have 0 for sigma without a flight; at its end they are off by what the way does along them in its middle.
+        """
+        subset, held = self.subset, self._held
+
+        def sigma(state: FloatArray) -> FloatArray:
+            return subset.value(state, request.time)
+
+        def data(state: FloatArray) -> FloatArray:
+            return np.asarray(subset.jacobian(state, request.time).data)
+
+        if held.all() or not request.flight or request.wanted is None:
+            return sigma, data, False
+        start, wanted = request.reference[self.atoms], request.wanted[self.rows]
+        middle = 0.5 * (request.reference_time + request.time)
+        rolls = np.repeat(~held, 3 * np.diff(subset.incidence.indptr))
+
+        def along(state: FloatArray) -> sp.csr_array:
+            return subset.jacobian(0.5 * (start + state), middle)
+
+        def slips(state: FloatArray) -> FloatArray:
+            return np.where(held, sigma(state), along(state) @ (state - start).ravel() - wanted)
+
+        return slips, lambda state: np.where(rolls, along(state).data, data(state)), True
 
     def _place(self, request: Request) -> None:
         self.subset.lattice = request.lattice
@@ -164,15 +115,15 @@ class GeneralClusters:
         """Solve sigma(x_new + M^-1 A(x_ref)^T Lambda, time) = 0 in place; see `Motion.project_positions`."""
         self._place(request)
         state = request.changed[self.atoms]
-        flight = None if self._held.all() else _Flight.of(request, self.subset, self.atoms, self.rows)
+        measures = self._measures(request)
         with np.errstate(all="ignore"):
-            reference = self._data(request.reference[self.atoms], request.reference_time)
+            reference = self.subset.jacobian(request.reference[self.atoms], request.reference_time).data
             total = np.zeros(len(self.rows))
             moves = np.zeros_like(state)
             worst = Outcome(True, 0.0, 0, -1)
             for batch in self._batches:
                 along = self._weighted(batch, reference)
-                outcome = self._newton(batch, state, moves, along, request.time, total, flight)
+                outcome = self._newton(batch, state, moves, along, total, *measures)
                 if not outcome.converged:
                     return outcome
                 worst = _worse(worst, outcome)
@@ -185,16 +136,17 @@ class GeneralClusters:
 
     def _newton(
         self,
-        batch: _Batch,
+        batch: Stack,
         state: FloatArray,
         moves: FloatArray,
         b0: FloatArray,
-        time: float,
         total: FloatArray,
-        flight: _Flight | None,
+        measured: _Measured,
+        gradients: _Measured,
+        rolling: bool,
     ) -> Outcome:
         """Damped Newton along fixed directions, all clusters of a batch side by side, in place."""
-        held = self._held[batch.rows] | (flight is not None)
+        held = self._held[batch.rows] | rolling
         size0 = np.linalg.norm(b0, axis=2)
         bad = held & ~(np.isfinite(size0) & (size0 > 0))
         if bad.any():
@@ -209,13 +161,13 @@ class GeneralClusters:
         root_w = self._root_w[batch.columns]
         flat, flat_moves = state.reshape(-1), moves.reshape(-1)
         along = np.zeros(kept.shape)
-        sigma = self._sigma(batch, state, time, flight) * held
+        sigma = measured(state)[batch.rows] * held
         error = _rms(sigma / scale)
         done = np.zeros(len(batch.rows), dtype=bool)
         polished = np.zeros(len(batch.rows), dtype=bool)
         taken = np.zeros(len(batch.rows))
         for iteration in range(1, MAX_ITERATIONS + 1):
-            data = self._data(state, time, flight)
+            data = gradients(state)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
             rounding = self._rounding(batch, data, state)
@@ -243,7 +195,7 @@ class GeneralClusters:
             factor = np.where(done, 0.0, 1.0)
             for _ in range(MAX_HALVINGS):
                 flat[batch.columns] = here + factor[:, None] * shift
-                trial = self._sigma(batch, state, time, flight) * held
+                trial = measured(state)[batch.rows] * held
                 trial_error = _rms(trial / scale)
                 # Clusters at the rounding error take one more step only if it gains.
                 worse = ~(trial_error < error) & (factor > 0)
@@ -270,7 +222,7 @@ class GeneralClusters:
         rates, y = request.wanted, request.changed
         self._place(request)
         with np.errstate(all="ignore"):
-            data = self._data(request.reference[self.atoms], request.time)
+            data = self.subset.jacobian(request.reference[self.atoms], request.time).data
             local = y[self.atoms]
             flat = local.reshape(-1)
             mu = np.zeros(len(self.rows))
@@ -288,8 +240,7 @@ class GeneralClusters:
                 wanted = np.zeros(size.shape) if rates is None else rates[self.rows[batch.rows]] / size
                 if not free.all():
                     # Atoms of infinite mass move as prescribed; their part of A v is known.
-                    gradient = np.zeros(b.shape)
-                    gradient.reshape(-1)[batch.places] = data[batch.entries]
+                    gradient = batch.dense(data)
                     wanted = wanted - np.einsum("nkc,nc->nk", gradient, np.where(free, 0.0, speeds)) / size
                 scaled = np.where(free, speeds / np.where(free, root_w, 1.0), 0.0)
                 reach = np.maximum(np.linalg.norm(scaled, axis=1), np.linalg.norm(wanted, axis=1))
@@ -319,7 +270,7 @@ class GeneralClusters:
     def rank(self, x: FloatArray, time: float, moved: FloatArray | None = None) -> int:
         """Independent rows at `x`, by singular values; `moved` as in `Request`."""
         self.subset.moved = None if moved is None else moved[self.atoms]
-        data = self._data(x[self.atoms], time)
+        data = self.subset.jacobian(x[self.atoms], time).data
         return sum(rank(self._weighted(batch, data)) for batch in self._batches)
 
 
@@ -329,7 +280,7 @@ def _worse(one: Outcome, other: Outcome) -> Outcome:
     return chosen._replace(iterations=max(one.iterations, other.iterations))
 
 
-def _failed(batch: _Batch, bad: NDArray[np.bool_], iterations: int, residual: FloatArray | None = None) -> Outcome:
+def _failed(batch: Stack, bad: NDArray[np.bool_], iterations: int, residual: FloatArray | None = None) -> Outcome:
     """Outcome that names the worst of the bad rows."""
     size = np.where(bad, np.inf if residual is None else np.nan_to_num(residual, nan=np.inf), -1.0)
     where = np.unravel_index(int(np.argmax(size)), size.shape)

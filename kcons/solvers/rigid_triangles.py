@@ -10,18 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.addressable_solvers import Kernels
-from kcons.solvers.distance_clusters import (
-    SAVED,
-    PackedLanes,
-    SimdClusterSolver,
-    dot,
-    lane_tables,
-    restore_points,
-    worst_row,
-)
-from kcons.solvers.kernels.aligned_memory import copied, in_one_array, room
-from kcons.solvers.kernels.array_views import at_first, halves, integers, none_of, table_array
+from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
+from kcons.solvers.distance_clusters import SAVED, dot, lane_tables, restore_points, worst_row
+from kcons.solvers.kernels.aligned_memory import in_one_array, room
+from kcons.solvers.kernels.array_views import at_first, halves, integers, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -128,12 +120,12 @@ def _report(multipliers, slots, place, sign, m0, m1, m2, sx, sy, sz, tx, ty, tz)
 
 
 @njit(cache=True, fastmath=FASTMATH)
-def project_triangles(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
-    """Project one group of eight triangles after another; `SimdClusterSolver` says what the arguments are."""
+def _project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, tables, multipliers):
+    """Project one group of eight triangles after another; `distance_clusters` says what the arguments are."""
     t, h, u = tables, integers(tables), halves(tables)
     atoms, slots = table_array(u, h, 0), table_array(u, h, 1)
     inv_mass, undo = table_array(t, h, 2), table_array(t, h, _UNDO)
-    move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
+    move, report, driven = tangent is None and inverse_dt != 0.0, multipliers.shape[0] > 0, given.shape[0] > 0
     n_groups, cell = slots.shape[0] // WIDTH, lattice_numbers(lattice)
     # Arrays that are handed on inside the loop would cost reference counting.
     changed, moving, table, room = at_first(points), at_first(velocities), at_first(atoms), at_first(undo)
@@ -211,8 +203,7 @@ def project_triangles(tangent, points, references, velocities, inverse_dt, given
             if ok and not kept:
                 store_triple(errors, 0, not_positive(ps), not_positive(qt), not_positive(us))
                 store_triple(sizes, 0, splat(1.0), splat(1.0), splat(1.0))
-            worst, worst_at = worst_row(errors, sizes, 3)
-            worst_at += group * 3 * WIDTH
+            worst, worst_at = worst_row(errors, sizes, 3, slots, group * WIDTH)
             if not (ok and kept):
                 restore_points(points, atoms, undo, group, 3, kept_points, 0)
                 if move:
@@ -231,13 +222,12 @@ def project_triangles(tangent, points, references, velocities, inverse_dt, given
 def _positions(alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
     """This and the next two as `kcons.solvers.addressable_solvers` says."""
     sides = wanted if wanted.size else table_array(tables, integers(tables), _SIDES)
-    return project_triangles(None, x, x_ref, v, inv_dt, sides, lattice, kind, none_of(tables), tables)
+    return _project(None, x, x_ref, v, inv_dt, sides, lattice, kind, tables, numbers)
 
 
 @njit(cache=True, nogil=True)
-def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):
-    none = none_of(tables)
-    return project_triangles((), y, x, none.reshape(0, 3), 0.0, wanted, lattice, kind, none, tables)
+def _tangents(alone, y, x, v, inv_dt, wanted, lattice, kind, tables, numbers):
+    return _project((), y, x, v, inv_dt, wanted, lattice, kind, tables, numbers)
 
 
 @njit(cache=True, nogil=True)
@@ -247,7 +237,7 @@ def _undo(points, tangents, velocities, tables):
     restore_points(points, table_array(u, h, 0), table_array(tables, h, _UNDO), groups, 3, kept, first)
 
 
-class RigidTriangles(SimdClusterSolver):
+class RigidTriangles(AddressableSolver):
     """Triangles of equal masses held rigid by three distances each.
 
     Parameters
@@ -263,14 +253,11 @@ class RigidTriangles(SimdClusterSolver):
     """
 
     name = "RigidTriangles"
-    _kernel = staticmethod(project_triangles)
+    kernels = Kernels(_positions, _tangents, undo=_undo)
 
     def __init__(self, rows: ArrayLike, atoms: ArrayLike, lengths: ArrayLike, inv_mass: ArrayLike) -> None:
-        super().__init__(rows, lengths, 3)
+        self._made_of = rows, atoms, lengths, inv_mass
+        self.rows = np.array(rows, dtype=np.int64).reshape(-1)
         slots, corners = lane_tables(np.asarray(atoms).reshape(-1, 3), 3)
-        weights = np.array(inv_mass, dtype=np.float64)
-        self.tables = in_one_array((corners, slots, weights, self.lengths, room(6 * len(corners))))
-
-    def packed(self) -> PackedLanes:
-        """A copy for other kernels."""
-        return PackedLanes(Kernels(_positions, _tangents, undo=_undo), copied(self.tables))
+        given = np.array(inv_mass, dtype=np.float64), np.array(lengths, dtype=np.float64).reshape(-1)
+        self.tables = in_one_array((corners, slots, *given, room(6 * len(corners))))

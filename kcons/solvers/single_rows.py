@@ -17,7 +17,7 @@ from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import halves, integers, table_array
-from kcons.solvers.kernels.lattices import OPEN
+from kcons.solvers.kernels.lattices import OPEN, lattice_numbers
 from kcons.solvers.kernels.two_and_four_wide import (
     extract,
     keep_loop_rolled,
@@ -28,8 +28,8 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_double,
 )
 from kcons.solvers.sparse.elimination import FAST
+from kcons.solvers.sparse.mixed_rows import miss, near
 from kcons.solvers.sparse.row_functions import BLOCK, FUNCTION, ROOM, GivenRows, call_row, call_rows
-from kcons.solvers.sparse.row_values import cell_of, miss, near
 from kcons.solvers.tolerances import (
     EPS,
     FLAT,
@@ -89,9 +89,6 @@ class SingleRows(AddressableSolver):
         self.refuse = self._given.refuse  # type: ignore[method-assign]
         self._made_of = constraint_set, rows, inverse_masses
 
-    def __reduce__(self) -> tuple[type[SingleRows], tuple[object, ...]]:
-        return SingleRows, self._made_of  # addresses are of no use elsewhere
-
     @property
     def pivots(self) -> FloatArray:
         pushes: FloatArray = np.add.reduceat(np.abs(self._pushes), 3 * self._links[:-3:3].astype(np.int64))
@@ -99,7 +96,7 @@ class SingleRows(AddressableSolver):
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type: ignore[no-untyped-def]
+def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):
     """Positions of a row's atoms from `room[at]` on, as its function gets them."""
     a, b, c = 0.0, 0.0, 0.0
     before = load_point(x, 3 * load_index(atoms, slot))
@@ -107,8 +104,7 @@ def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type
         keep_loop_rolled()
         here = load_point(x, 3 * load_index(atoms, p))
         if relative:
-            cell, inverse = cell_of(lattice)
-            dx, dy, dz = near(here - before, quad(0.0, 0.0, 0.0, 0.0), cell, inverse, periodic)
+            dx, dy, dz = near(here - before, quad(0.0, 0.0, 0.0, 0.0), lattice_numbers(lattice), periodic)
             a, b, c = a + dx, b + dy, c + dz
             before = here
         else:
@@ -120,7 +116,7 @@ def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _places(x, begin, stop, first, atoms, numbers):  # type: ignore[no-untyped-def]
+def _places(x, begin, stop, first, atoms, numbers):
     """Positions of rows of one atom each, as `rows_at_once` takes them."""
     for i in range(stop - begin):
         g = 3 * load_index(atoms, first + i)
@@ -130,7 +126,7 @@ def _places(x, begin, stop, first, atoms, numbers):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _pushed(begin, stop, first, base, pushes, solution, numbers):  # type: ignore[no-untyped-def]
+def _pushed(begin, stop, first, base, pushes, solution, numbers):
     """The same of where the multipliers have moved them."""
     for i in range(stop - begin):
         lam, p = load_double(solution, begin + i), 3 * (first + i)
@@ -140,7 +136,7 @@ def _pushed(begin, stop, first, base, pushes, solution, numbers):  # type: ignor
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
+def _flat(slope, slot, count, masses, pushes):
     """Whether a gradient has less than `FLAT` of that at the reference along it; `slope` is their product."""
     size = 0.0
     for i in range(count):
@@ -151,7 +147,7 @@ def _flat(slope, slot, count, masses, pushes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
+def _apply(x, factor, tables):
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms = table_array(u, h, 0), table_array(u, h, 1)
@@ -166,9 +162,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _positions(  # type: ignore[no-untyped-def]
-    alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
-):
+def _positions(alone, x, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers):
     """As `kcons.solvers.addressable_solvers` says; steps that gain nothing are halved."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, masses, base = table_array(u, h, 0), table_array(u, h, 1), table_array(t, h, 2), table_array(t, h, 3)
@@ -269,7 +263,7 @@ def _positions(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
+def _tangents(alone, y, x, velocities, inv_dt, wanted, lattice, kind, tables, numbers):
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     links, atoms, masses = table_array(u, h, 0), table_array(u, h, 1), table_array(t, h, 2)

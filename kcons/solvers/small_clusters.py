@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.distance_clusters import SAVED, SimdClusterSolver, dot, lane_tables, restore_points, worst_row
+from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
+from kcons.solvers.distance_clusters import SAVED, dot, lane_tables, restore_points, worst_row
 from kcons.solvers.kernels.aligned_memory import in_one_array, room
 from kcons.solvers.kernels.array_views import at_first, halves, integers, table_array
 from kcons.solvers.kernels.eight_wide import (
@@ -201,19 +202,20 @@ def _judge(error, step, squares, bonds, references, tangent, limit, n):
 
 
 @functools.cache
-def _kernel(n_rows: int) -> Any:
+def _kernel(n_rows: int, tangent: tuple[()] | None) -> Any:
     """The kernel for clusters of `n_rows` rows; the closed-over number unrolls its loops."""
     n, n_square, n_coordinates = n_rows, n_rows * n_rows, 3 * n_rows
     n_shifts = 3 * (n_rows + 1)
 
     @njit(cache=True, fastmath=FASTMATH, error_model="numpy")
-    def project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, multipliers, tables):
-        """Project one group of eight clusters after another; `SimdClusterSolver` says what the arguments are."""
+    def project(alone, points, references, velocities, inverse_dt, wanted, lattice, kind, tables, multipliers):
+        """Project one group of eight clusters after another, as `kcons.solvers.addressable_solvers` says."""
         t, h, u = tables, integers(tables), halves(tables)
         atoms, slots = table_array(u, h, 0), table_array(u, h, 1)
         ends, weights = table_array(h, h, 2), table_array(t, h, 3)
         couplings, undo = table_array(t, h, 4), table_array(t, h, 5)
-        move, report, driven = tangent is None and velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
+        given = table_array(t, h, 6) if tangent is None and not wanted.size else wanted
+        move, report, driven = tangent is None and inverse_dt != 0.0, multipliers.shape[0] > 0, given.shape[0] > 0
         n_local = weights.shape[0]
         # Arrays that are handed on inside the loop would cost reference counting.
         changed, moving, table, room = at_first(points), at_first(velocities), at_first(atoms), at_first(undo)
@@ -226,7 +228,7 @@ def _kernel(n_rows: int) -> Any:
         # Reference bonds s, present bonds r; what is wanted of these, and what errors are compared with.
         s, r, shifts = stack(n_coordinates), stack(n_coordinates), stack(n_shifts)
         matrix, coupling = stack(n_square), stack(n_square)
-        squares, wanted = stack(n), stack(n)
+        squares, goal = stack(n), stack(n)
         error, step, total = stack(n), stack(n), stack(n)
         for k in range(n_square):
             poke(coupling, k, splat(couplings[k]))
@@ -235,7 +237,7 @@ def _kernel(n_rows: int) -> Any:
             at = group * n_local * WIDTH
             size = _begin(
                 changed, origins, table, at, row_ends, goals, firsts, group * WIDTH, cell, kind, tangent, driven,
-                s, r, squares, wanted, total, n,
+                s, r, squares, goal, total, n,
             )  # fmt: skip
             if tangent is not None:
                 size = size * (SPEED_TOLERANCE * SPEED_TOLERANCE)
@@ -253,7 +255,7 @@ def _kernel(n_rows: int) -> Any:
                         ok = ok and all_within(absolute(e), limit)
                     else:
                         a, b, c = _point(s, k)
-                        e = peek(wanted, k) - dot(x, y, z, a, b, c)
+                        e = peek(goal, k) - dot(x, y, z, a, b, c)
                         ok = ok and all_within(e * e, size * peek(squares, k))
                     poke(error, k, e)
                 if ok or iteration == MAX_ITERATIONS:
@@ -277,8 +279,7 @@ def _kernel(n_rows: int) -> Any:
                     if ok and not kept:
                         store(errors, k * WIDTH, not_positive(peek(step, k)))
                         store(sizes, k * WIDTH, splat(1.0))
-                worst, worst_at = worst_row(errors, sizes, n)
-                worst_at += group * n * WIDTH
+                worst, worst_at = worst_row(errors, sizes, n, slots, group * WIDTH)
                 if not (ok and kept):
                     restore_points(points, atoms, undo, group, n_local, kept_points, 0)
                     if move:
@@ -303,7 +304,7 @@ def _couplings(pairs: NDArray[np.int64], inv_mass: NDArray[np.float64]) -> NDArr
     return np.ascontiguousarray((incidence * inv_mass) @ incidence.T).reshape(-1)
 
 
-class SmallClusters(SimdClusterSolver):
+class SmallClusters(AddressableSolver):
     """Clusters of the same connection and masses, up to `LARGEST` distances each.
 
     Parameters
@@ -334,9 +335,10 @@ class SmallClusters(SimdClusterSolver):
         members = np.array(atoms, dtype=np.int64)
         if not 1 <= len(local) <= LARGEST or members.shape[1] > len(local) + 1:
             raise ValueError(f"a small cluster holds 1 to {LARGEST} connected distances")
-        super().__init__(rows, lengths, len(local))
-        self._kernel = _kernel(len(local))
+        self._made_of = rows, atoms, pairs, lengths, inv_mass
+        self.rows = np.array(rows, dtype=np.int64).reshape(-1)
+        self.kernels = Kernels(_kernel(len(local), None), _kernel(len(local), ()))
         weights = np.array(inv_mass, dtype=np.float64)
         slots, points = lane_tables(members, len(local))
         given = points, slots, local.reshape(-1), weights, _couplings(local, weights)
-        self.tables = in_one_array((*given, room(6 * len(points))))
+        self.tables = in_one_array((*given, room(6 * len(points)), np.array(lengths, dtype=np.float64).reshape(-1)))

@@ -1,6 +1,6 @@
 """The interpreter of time steps on arrays: programs run in compiled calls, and in Python where no kernel can.
 
-The kernel (`stages.compiled_operations`) makes as many operations as it knows in one call: kicks, flights, great
+The kernel (`compiled_operations`) makes as many operations as it knows in one call: kicks, flights, great
 circles, projections. It comes back for the forces, for operations that have a method of their name here, and for rows
 that it cannot solve: those that move, are too many or of kinds that kernels do not know are solved by the engine, as
 are those that need more means.
@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 from functools import cache
 from typing import Any
+from weakref import ref
 
 import numpy as np
 from numpy import empty, ndarray
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError
-from kcons.steppers.program import Program, Row
-from kcons.steppers.stages.compiled_operations import (
+from kcons.steppers.compiled_operations import (
     ENGINE,
     FAR,
     ITERATIONS,
@@ -30,6 +30,8 @@ from kcons.steppers.stages.compiled_operations import (
     kernel,
     tangents,
 )
+from kcons.steppers.operations import Operation
+from kcons.steppers.program import Program, Row
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Listed, explained, stays
 
@@ -48,6 +50,16 @@ class Interpreted(Listed):
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` where the stepper may not be used."""
         raise NotImplementedError
+
+    def program(self, system: System | None) -> Program:
+        """A step as the interpreter goes through it; without a System, of forces of positions and time only."""
+        raise NotImplementedError
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        return self.program(system).operations
+
+    def parts(self, system: System | None = None) -> tuple[Operation, ...]:
+        return self.program(system).parts
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         """Steps that are about to be made from a state, as many as can be made at once.
@@ -138,16 +150,6 @@ class Interpreter:
         moves, and as many as it takes if the system becomes far from the origin.
     numbers : ndarray, optional
         Those of the functions that the program calls, and of a thermostat.
-
-    Attributes
-    ----------
-    x, v : ndarray, shape (n_atoms, 3)
-        Where forces were evaluated last; where `here` is not 0, positions are in another array. Near the origin.
-    forces : ndarray, shape (n_groups n_atoms, 3)
-        Those that were evaluated last.
-    numbers : ndarray
-    number : int
-        Of the step that is made.
     """
 
     __slots__ = (
@@ -155,6 +157,8 @@ class Interpreter:
         *("known", "forces", "low", "push", "spare", "room", "numbers", "time", "left_over", "then", "left_over_then"),
         "unchanging",
     )
+    # x, v, forces: where forces were evaluated last (near the origin; where `here` is not 0, positions are in another
+    # array), and these, shape (n_groups n_atoms, 3). number: of the step that is made.
 
     #: Whether forces are those of the System's function, all at once.
     simple = True
@@ -444,10 +448,19 @@ class Interpreter:
 
     def end(self, here: int) -> State:
         """The state, with remainders from here on if it is far from the origin by now."""
-        x = self.x if self.shift is not None or self.x.flags.writeable else self.x.copy()
-        when, arrays = (self.then, self.left_over_then), (x, self.v, self.applied(here))
-        more = self.shift, self.low, bool(self.room[FAR]), self.variables()
-        return self.system.ended(self.start, self.number, when, arrays, *more)
+        system, start, x, remainder = self.system, self.start, self.x, None
+        if self.shift is not None:
+            x = self.x + self.shift
+            remainder = self.x - (x - self.shift)
+        else:
+            if not x.flags.writeable:
+                x = x.copy()
+            if self.room[FAR]:
+                remainder = np.zeros_like(x) if self.low is None else self.low.copy()
+        time, v = self.then, self.v
+        last = time, self.applied(here), self.number, remainder, self.left_over_then, self.variables(), start.barostat
+        after = system.last = State(x, v, *last, (ref(system), x, v, time))
+        return after
 
     def applied(self, here: int) -> FloatArray | None:
         """The forces at the end, None where a drift came last."""

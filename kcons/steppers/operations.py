@@ -27,7 +27,7 @@ class Operation:
     fraction : float
         The share of the step that it is over; 0 where it takes no time.
     group : str
-        Whose forces it takes, where they come in groups (`kcons.thermostats.multistep`); empty for all.
+        Whose forces it takes, where they come in groups (`kcons.thermostats.ForceGroups`); empty for all.
     """
 
     verb: ClassVar[str]
@@ -63,7 +63,7 @@ class Settle(Timed):
 
 @dataclass(frozen=True)
 class Turn(Timed):
-    """The isokinetic kick: v turns towards M_par^+ f and keeps its length (`kcons.thermostats.isokinetic.kick`)."""
+    """The isokinetic kick: v turns towards M_par^+ f and keeps its length (`kcons.thermostats.isokinetic`)."""
 
     verb, meaning = "turn", "change velocities by forces at constant kinetic energy"
     group: str = ""  # type: ignore[misc]

@@ -16,9 +16,8 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import address_of
-from kcons.steppers.operations import Fly, Kick, Operation
-from kcons.steppers.stages import compiled_operations as kernel
-from kcons.steppers.stages.compiled_operations import (
+from kcons.steppers import compiled_operations as kernel
+from kcons.steppers.compiled_operations import (
     ADDRESS,
     CALL,
     COUNT,
@@ -29,48 +28,27 @@ from kcons.steppers.stages.compiled_operations import (
     ROOM,
     WIDTH,
 )
+from kcons.steppers.operations import Fly, Kick, Operation
 
 #: Operations that show positions to a force function, after which they are not written to again.
 SHOWN = ("evaluate", "settle")
 
 
 class Row(NamedTuple):
-    """What is done at once.
+    """What is done at once."""
 
-    Attributes
-    ----------
-    name : str
-        The interpreter's method.
-    verb : int
-        What the kernel does.
-    here, there : int
-        Which array has the positions before and after it.
-    length, kick : float
-        Of the flight, and of the kick before it, as fractions of the step.
-    group : int
-        Whose forces.
-    begin, end : float
-        The fractions of the step at which time is before and after it.
-    number : int
-        How many of the same name are before it in the step.
-    operation : Operation or None
-        What it is made of; None for the end of the step.
-    function : compiled function or None
-        What is called.
-    """
-
-    name: str
-    verb: int
-    here: int
-    there: int
-    length: float
-    kick: float
-    group: int
-    begin: float
-    end: float
-    number: int = 0
-    operation: Operation | None = None
-    function: Any = None
+    name: str  # the interpreter's method
+    verb: int  # what the kernel does
+    here: int  # which array has the positions before it
+    there: int  # and after it
+    length: float  # of the flight, as a fraction of the step
+    kick: float  # of the kick before it, likewise
+    group: int  # whose forces
+    begin: float  # the fractions of the step at which time is before it
+    end: float  # and after it
+    number: int = 0  # how many of the same name are before it in the step
+    operation: Operation | None = None  # what it is made of; None for the end of the step
+    function: Any = None  # the compiled function that is called
 
 
 class Program:
@@ -83,16 +61,8 @@ class Program:
         What the kernel calls for these verbs; those that it does not know and that are not here are left to Python.
     groups : sequence of str
         Names of the groups of forces, in the order in which the interpreter has them.
-
-    Attributes
-    ----------
-    rows : list of Row
-    ends : list of float
-        Of these.
-    shown, flies : list of bool
-        Whether they evaluate forces at positions that no force function has seen, and whether flights follow.
-    pairs : bool
-        Whether what rounding takes is kept: there are several flights, or great circles.
+    parts : sequence of Operation, optional
+        What is run: the operations, with what the program does between them.
     """
 
     def __init__(
@@ -100,11 +70,16 @@ class Program:
         operations: Sequence[Operation],
         functions: Mapping[str, Any] | None = None,
         groups: Sequence[str] = ("",),
+        parts: Sequence[Operation] | None = None,
     ) -> None:
-        self.rows = list(_rows(operations, functions or {}, {name: k for k, name in enumerate(groups)}))
+        self.operations = tuple(operations)
+        self.parts = self.operations if parts is None else tuple(parts)
+        self.rows = list(_rows(self.parts, functions or {}, {name: k for k, name in enumerate(groups)}))
         flights = [row.operation for row in self.rows if isinstance(row.operation, Fly)]
+        #: Whether what rounding takes is kept: there are several flights, or great circles.
         self.pairs = len(flights) > 1 or any(flight.exact for flight in flights)
         self.ends = [row.end for row in self.rows]
+        #: Whether rows evaluate forces at positions that no force function has seen, and whether flights follow.
         self.shown = [row.name == "evaluate" and row.here == 1 for row in self.rows]
         self.flies = ["fly" in [later.name for later in self.rows[k:]] for k in range(len(self.rows))]
         self._numbers: FloatArray | None = None

@@ -61,6 +61,9 @@ class ReversibilityCheck(Listed):
             raise UnsupportedError(f"{self.stepper!r} does not say what its step consists of")
         return self.stepper.operations(system)
 
+    def parts(self, system: System | None = None) -> tuple[Operation, ...]:
+        return self.stepper.parts(system) if isinstance(self.stepper, Listed) else self.operations(system)
+
     def check(self, system: System) -> None:
         self.stepper.check(system)
 

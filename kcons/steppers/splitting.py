@@ -13,9 +13,12 @@ from collections.abc import Callable, Sequence
 from kcons.constraints.arguments import Count, checked
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers.interpreter import Interpreted, Interpreter
-from kcons.steppers.operations import Operation, mirrored, splitting
+from kcons.steppers.operations import mirrored, splitting
 from kcons.steppers.program import Program
 from kcons.steppers.state import State, System
+
+__all__ = ["BlanesMoan4", "BlanesMoan6", "BlanesMoan6a", "Composition", "Geodesic", "KahanLi6", "Rattle"]
+__all__ += ["RungeKuttaNystrom", "Splitting", "Suzuki4", "Yoshida4"]
 
 _P = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 #: Suzuki's fractal, order 4.
@@ -97,7 +100,6 @@ class Splitting(Interpreted):
             )
         self.kick_first = len(self.kicks) > len(self.drifts)
         self._by_form: dict[tuple[bool, bool, bool], Program] = {}
-        self._known: tuple[System, bool, Program] | None = None
 
     @property
     def force_evaluations(self) -> int:
@@ -106,27 +108,17 @@ class Splitting(Interpreted):
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
 
-    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        exact, settled, damped = self._form(system)
-        flight = (1.0,) if exact else self.flight
-        return splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled, damped=damped)
-
-    def _form(self, system: System | None) -> tuple[bool, bool, bool]:
-        """Whether drifts fly along great circles, kicks are solved for, and friction acts."""
-        if system is None:
-            return False, False, False
-        exact = self.exact_flight and system.great_circles is not None
-        return exact, system.velocity_dependent, system.friction > 0
-
-    def _program(self, system: System) -> Program:
-        """The operations as the interpreter goes through them."""
-        known = self._known
-        if known is None or known[0] is not system or known[1] is not system.velocity_dependent:
-            form = self._form(system)
-            if form not in self._by_form:
-                self._by_form[form] = Program(self.operations(system))
-            self._known = known = system, system.velocity_dependent, self._by_form[form]
-        return known[2]
+    def program(self, system: System | None) -> Program:
+        exact = settled = damped = False
+        if system is not None:
+            exact = self.exact_flight and system.great_circles is not None
+            settled, damped = system.velocity_dependent, system.friction > 0
+        form = exact, settled, damped
+        if form not in self._by_form:
+            flight = (1.0,) if exact else self.flight
+            listed = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled, damped=damped)
+            self._by_form[form] = Program(listed)
+        return self._by_form[form]
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` where the stepper may not be used: here, nowhere."""
@@ -134,7 +126,7 @@ class Splitting(Interpreted):
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         if (state is not system.last or state.forces is None) and (self.kick_first or system.velocity_dependent):
             state = system.with_forces(state)
-        return Interpreter(system, state, dt, self._program(system), steps)
+        return Interpreter(system, state, dt, self.program(system), steps)
 
 
 class Rattle(Splitting):

@@ -31,9 +31,9 @@ from kcons.constraints.vectors import extent
 from kcons.errors import CertificateError, InputError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
+from kcons.steppers.compiled_operations import beyond, check_finite
 from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
-from kcons.steppers.stages.compiled_operations import beyond, check_finite
-from kcons.steppers.stages.packed_system import PackedSystem, spheres_of, tables_without_rows
+from kcons.steppers.packed_system import PackedSystem, spheres_of, tables_without_rows
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -535,33 +535,6 @@ class System:
             return x, None
         shift = x[self.anchor]
         return (x - shift) + state.remainder, shift
-
-    def ended(
-        self,
-        start: State,
-        number: int,
-        when: tuple[float, float],
-        arrays: tuple[FloatArray, FloatArray, FloatArray | None],
-        shift: FloatArray | None = None,
-        low: FloatArray | None = None,
-        far: bool = False,
-        thermostat: FloatArray | None = None,
-    ) -> State:
-        """The state that steps from `start` end in, with what rounding takes from its positions where they are far.
-
-        `when` is the time, and what its rounding leaves over; `arrays` are positions less `shift`, velocities, forces.
-        `low` is what rounding has taken from the positions, where these are whole; `far` whether that counts by now.
-        """
-        (x, v, forces), (time, left_over) = arrays, when
-        positions, remainder = x, None
-        if shift is not None:
-            positions = x + shift
-            remainder = x - (positions - shift)
-        elif far:
-            remainder = np.zeros_like(x) if low is None else low.copy()
-        origin, more = (ref(self), positions, v, time), (thermostat, start.barostat)
-        state = self.last = State(positions, v, time, forces, number, remainder, left_over, *more, origin)
-        return state
 
     def is_far(self, x: FloatArray) -> bool:
         """Whether what is held is so far from the origin that the rounding of its positions would show."""

@@ -63,14 +63,12 @@ def require_stepper(stepper: Any, item: str = "stepper") -> None:
 class DropsSystemCaches:
     """Base of those that remember what they found for a System: copies and other processes find it anew."""
 
-    #: What the last step ended in, by which a state that goes on is known; in a copy it may be that of another System.
+    #: What is known of a System; what the last step ended in, by which a state that goes on is known.
+    _known: Any = None
     _left: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
-        found = {n for n, v in vars(self).items() if isinstance(v, tuple) and v and isinstance(v[0], System)} | {
-            "_left"
-        }
-        return {name: None if name in found else value for name, value in vars(self).items()}
+        return {name: None if name in ("_known", "_left") else value for name, value in vars(self).items()}
 
 
 class Listed(DropsSystemCaches):
@@ -87,9 +85,13 @@ class Listed(DropsSystemCaches):
         """
         raise NotImplementedError
 
+    def parts(self, system: System | None = None) -> tuple[Operation, ...]:
+        """What is run: the operations, with what is done between them."""
+        return self.operations(system)
+
     def listing(self, system: System | None = None) -> str:
-        """A step in words, a line for each operation, with fractions of the step; `system` as for `operations`."""
-        return "\n".join([f"a step of {self!r}", *(f"  {operation}" for operation in self.operations(system))])
+        """What is run in words, a line for each operation, with fractions of the step; `system` as for `operations`."""
+        return "\n".join([f"a step of {self!r}", *(f"  {operation}" for operation in self.parts(system))])
 
 
 def stays(state: State, dt: float) -> State | None:

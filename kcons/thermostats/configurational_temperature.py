@@ -33,25 +33,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import (
-    Rng,
-    as_array,
-    generator_of,
-    positive,
-    refuse_other,
-)
+from kcons.constraints.arguments import Rng, as_array, as_float_array, generator_of, positive, refuse_other
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
+from kcons.constraints.periodic.one_piece import spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import System
-from kcons.steppers.stages.compiled_operations import check_finite
+from kcons.steppers.compiled_operations import check_finite
 from kcons.thermostats.correlated_series import MIN_SAMPLES, Estimate, few, spread
-from kcons.thermostats.freedom import UNCHANGED, bodies, row_changes
-from kcons.thermostats.isokinetic.isokinetic import constrained_acceleration
-from kcons.thermostats.thermal_velocities import thermal_velocities
+from kcons.thermostats.force_groups import ForceGroups
+from kcons.thermostats.freedom import UNCHANGED, Bodies, bodies, refuse_driven, row_changes, thermal_velocities
+from kcons.thermostats.isokinetic import constrained_acceleration
 
 #: Standard errors by which the mean curvature must differ from 0 for a ratio to have an error.
 _CERTAIN = 3.0
@@ -75,8 +69,8 @@ def temperature(squares: FloatArray, curvatures: FloatArray) -> tuple[Estimate, 
     return Estimate(found, error), few(n, independent)
 
 
-#: Typical move for a difference, as a share of the distance to the next atom.
-MOVE = 1e-3
+#: Typical moves for differences, as a share of the distance to the next atom; the second for `slow_share`.
+MOVE, REACH = 1e-3, 0.03
 #: Moment of inertia about an axis, relative to the largest, below which there is no turn.
 THIN = 1e-9
 #: Share of its thermal energy below which a cluster has no motion of its own.
@@ -119,78 +113,47 @@ class SplitTemperatures:
     left_out: tuple[str, ...]
 
 
-class Clusters:
-    """What constraints tie together, and which of it may shift and turn as a whole.
-
-    Attributes
-    ----------
-    label : ndarray of int, shape (n_atoms,)
-        Cluster of each atom; -1 for atoms that are fixed.
-    count : int
-    mass : ndarray, shape (count,)
-    shifts, turns : ndarray of bool, shape (count,)
-        Whether a cluster may shift in every direction, and turn about every axis, without a change of any row.
-    """
+class Clusters(Bodies):
+    """What constraints tie together, free atoms by themselves, and which of it may shift and turn as a whole."""
 
     def __init__(self, motion: Motion, positions: FloatArray, moving: NDArray[np.bool_]) -> None:
         held = motion.constraint_set
-        self._motion, self._held = motion, held
-        self._masses = np.where(moving, held.masses, 0.0)
-        self.label: IntArray = bodies(motion, moving)
-        self.count = int(self.label.max(initial=-1)) + 1
-        self._moving = np.flatnonzero(moving)
-        self._of = self.label[self._moving]
-        self.mass: FloatArray = self.add_up(self._masses)
+        label, masses = bodies(motion, moving), np.where(moving, held.masses, 0.0)
+        mass = np.asarray(np.bincount(label + 1, masses)[1:], dtype=np.float64)
         rows, touched = held.incidence.nonzero()
         rows, touched = rows[moving[touched]], touched[moving[touched]]
-        first = touched[np.searchsorted(rows, rows)]
-        self._tree = spanning_tree(np.stack([first, touched], axis=1).astype(np.int64), len(moving))
-        self.shifts, self.turns = self._open(positions)
-
-    def add_up(self, values: FloatArray) -> FloatArray:
-        """Sums over the atoms of each cluster, shape (count,) or (count, 3)."""
-        if values.ndim == 1:
-            return np.asarray(np.bincount(self._of, values[self._moving], self.count), dtype=np.float64)
-        return np.stack([self.add_up(np.ascontiguousarray(column)) for column in values.T], axis=1)
-
-    def spread(self, values: FloatArray) -> FloatArray:
-        """Values of the clusters given to their atoms, 0 for fixed ones; shape (n_atoms, 3)."""
-        out = np.zeros((len(self.label), *values.shape[1:]))
-        out[self._moving] = values[self._of]
-        return out
+        pairs = np.stack([touched[np.searchsorted(rows, rows)], touched], axis=1).astype(np.int64)
+        super().__init__(label, np.where(moving, masses / mass[label], 0.0), mass, spanning_tree(pairs, len(moving)))
+        self._held, self._masses = held, masses
+        #: Whether a cluster has several atoms, shape (n_bodies,); may shift in every direction, and turn about every
+        #: axis, without a change of any row.
+        self.several = np.bincount(label + 1)[1:] > 1
+        self.shifts, self.turns = self._open(motion, positions)
 
     def arms(self, x: FloatArray) -> FloatArray:
         """Places relative to the centers of mass, shape (n_atoms, 3), in pieces put together across the box."""
-        y = self._whole(x)
-        centers = self.add_up(self._masses[:, None] * y) / self.mass[:, None]
-        return np.where((self.label >= 0)[:, None], y - self.spread(centers), 0.0)
-
-    def _whole(self, x: FloatArray) -> FloatArray:
-        return make_whole(x, *self._tree, self._held.lattice)
+        y = self.whole(x, self._held.lattice)
+        return np.where((self.label >= 0)[:, None], y - self.spread(self.centers(y)), 0.0)
 
     def unit_turns(self, arms: FloatArray) -> FloatArray:
-        """Turns g of unit energy as columns, shape (count, 3, 3): g g^T is the (pseudo-)inverse tensor of inertia.
+        """Turns g of unit energy as columns, shape (n_bodies, 3, 3): g g^T is the (pseudo-)inverse tensor of inertia.
 
         0 about axes without inertia, and for clusters that do not turn.
         """
-        products = np.empty((self.count, 3, 3))
-        for a in range(3):
-            for b in range(a + 1):
-                products[:, a, b] = products[:, b, a] = self.add_up(self._masses * arms[:, a] * arms[:, b])
+        products = self.sums((self._masses[:, None, None] * arms[:, :, None] * arms[:, None]).reshape(-1, 9))
+        products = products.reshape(-1, 3, 3)
         tensor = np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3) - products
         moments, axes = np.linalg.eigh(tensor)
         has = (moments > THIN * moments[:, -1:]) & self.turns[:, None]
         return np.asarray(axes * np.where(has, 1.0 / np.sqrt(np.where(has, moments, 1.0)), 0.0)[:, None, :])
 
-    def _open(self, positions: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _open(self, motion: Motion, positions: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """By the change of each row, here and at two places nearby, where nothing cancels by symmetry."""
-        every, several = np.ones(self.count, dtype=bool), np.bincount(self._of, minlength=self.count) > 1
-        held = self._held
+        held, shifts, turns = self._held, np.ones(len(self), dtype=bool), self.several.copy()
         if not held.n_rows:
-            return every, several
-        shifts, turns = every.copy(), several.copy()
+            return shifts, turns
         rows, touched = held.incidence.nonzero()
-        whole = self._whole(positions)
+        whole = self.whole(positions, held.lattice)
         size = min(extent(whole) or 1.0, float(held.scale.min()))
         inside = (self.label >= 0)[:, None]
 
@@ -200,7 +163,7 @@ class Clusters:
             moves = [np.where(inside, axis, 0.0) for axis in np.eye(3)]
             return np.stack([m.ravel() for m in (*moves, *(np.cross(axis, p) / reach for axis in np.eye(3)))], axis=1)
 
-        for change in row_changes(self._motion, whole, fields, 0.0, size):
+        for change in row_changes(motion, whole, fields, 0.0, size):
             kept: NDArray[np.bool_] = np.asarray(np.abs(change) <= UNCHANGED)  # not NaN: a surface that ends there
             for may, some in ((shifts, kept[:, :3]), (turns, kept[:, 3:])):
                 hit = self.label[touched[~np.asarray(some.all(axis=1))[rows]]]
@@ -242,10 +205,9 @@ class TemperatureSplit:
         displacement: float | None = None,
     ) -> None:
         refuse_other(system, System, "system", "a kcons.steppers.System")
-        if system.motion.plan.driven or system.velocity_dependent:
-            raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")
-        if not system.motion.constraint_set.holonomic.all():
-            raise UnsupportedError("configurations have a temperature where rows hold positions, not velocities only")
+        refuse_driven(system, "and configurations have no temperature")
+        if system.velocity_dependent:
+            raise UnsupportedError("configurations have a temperature where forces know no velocities")
         if displacement is not None:
             positive(displacement, "displacement")
         self._system, self._displacement = system, displacement
@@ -336,7 +298,7 @@ class TemperatureSplit:
         #: Axes about which each cluster turns, and clusters with motions besides shifts and turns.
         self._axes: IntArray = turns.any(axis=1).sum(axis=1)
         rest = system.masses[:, None] * self._rest_of(x, arms, turns) ** 2
-        self._rest: NDArray[np.bool_] = clusters.add_up(rest.sum(axis=1)) > RIGID
+        self._rest: NDArray[np.bool_] = clusters.sums(rest.sum(axis=1)) > RIGID
         self._flight = flight
 
     def _forces(self, x: FloatArray) -> FloatArray:
@@ -346,22 +308,22 @@ class TemperatureSplit:
         """Thermal velocities of unit energy, less shifts and turns."""
         clusters, masses = self._clusters, self._system.masses[:, None]
         v = thermal_velocities(self._system, x, 1.0, self._rng)
-        pace = clusters.add_up(masses * v) / clusters.mass[:, None] * clusters.shifts[:, None]
-        spins = np.einsum("cik,cjk,cj->ci", turns, turns, clusters.add_up(masses * np.cross(arms, v)))
+        pace = clusters.centers(v) * clusters.shifts[:, None]
+        spins = np.einsum("cik,cjk,cj->ci", turns, turns, clusters.sums(masses * np.cross(arms, v)))
         return np.asarray(v - clusters.spread(pace) - np.cross(clusters.spread(spins), arms))
 
     def _squares(self, x: FloatArray, f: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:
         """Squares of the slopes by shifts, by turns, and of all, of each cluster; shape (3, clusters)."""
         clusters = self._clusters
         sizes = np.sqrt((f * f).sum(axis=1))
-        force = _unbalanced(clusters.add_up(f), clusters.add_up(sizes))
+        force = _unbalanced(clusters.sums(f), clusters.sums(sizes))
         reach = np.sqrt((arms * arms).sum(axis=1))
-        torque = _unbalanced(clusters.add_up(np.cross(arms, f)), clusters.add_up(reach * sizes))
+        torque = _unbalanced(clusters.sums(np.cross(arms, f)), clusters.sums(reach * sizes))
         shift = np.where(clusters.shifts, (force * force).sum(axis=1) / clusters.mass, 0.0)
         turn = (np.einsum("cik,ci->ck", turns, torque) ** 2).sum(axis=1)
         whole = np.zeros_like(shift)
         if self._rest.any():
-            whole = clusters.add_up((f * constrained_acceleration(self._system, x, f, 0.0)).sum(axis=1))
+            whole = clusters.sums((f * constrained_acceleration(self._system, x, f, 0.0)).sum(axis=1))
         return np.stack([shift, turn, whole])
 
     def _curvatures(self, x: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:
@@ -371,13 +333,13 @@ class TemperatureSplit:
         serves all three, so that it cancels in what is left.
         """
         clusters, h = self._clusters, self._flight
-        signs = self._rng.choice((-1.0, 1.0), size=(2, clusters.count, 3))
+        signs = self._rng.choice((-1.0, 1.0), size=(2, len(clusters), 3))
         pushed = clusters.spread(signs[0] * (clusters.shifts / np.sqrt(clusters.mass))[:, None])
         spin = clusters.spread(np.einsum("cik,ck->ci", turns, signs[1]))
         v = pushed
         if self._rest.any():
             v = self._rest_of(x, arms, turns) + pushed + np.cross(spin, arms)
-        found = np.zeros((3, clusters.count))
+        found = np.zeros((3, len(clusters)))
         for way in (h, -h):
             if clusters.shifts.any():
                 found[0] -= self._slopes(x + way * pushed, pushed) / (2 * way)
@@ -392,19 +354,18 @@ class TemperatureSplit:
 
     def _slopes(self, x: FloatArray, v: FloatArray) -> FloatArray:
         """What the forces of each cluster do at x along v."""
-        return self._clusters.add_up((self._forces(x) * v).sum(axis=1))
+        return self._clusters.sums((self._forces(x) * v).sum(axis=1))
 
     def _left_out(self) -> list[str]:
         clusters = self._clusters
-        several = np.bincount(clusters.label[clusters.label >= 0], minlength=clusters.count) > 1
         notes = []
         tied = int((~clusters.shifts).sum())
         if tied:
             notes.append(f"{tied} clusters are tied to a place in space and do not shift: they count as internal")
-        bound = int((clusters.shifts & several & ~clusters.turns).sum())
+        bound = int((clusters.shifts & clusters.several & ~clusters.turns).sum())
         if bound:
             notes.append(f"{bound} clusters are tied to a direction in space and do not turn: they count as internal")
-        if not several.any():
+        if not clusters.several.any():
             notes.append("single atoms only: nothing turns")
         fixed = int((clusters.label < 0).sum())
         if fixed:
@@ -466,3 +427,64 @@ def spacing(x: FloatArray) -> float:
     if not len(near):
         raise InputError("there is one atom only, and no length to go by; give a displacement", item="displacement")
     return float(np.median(near))
+
+
+def slow_share(
+    system: System, frames: ArrayLike, group: str = "slow", *, rng: Rng = 0, displacement: float | None = None
+) -> float:
+    """Share of the stiffness that one group of forces carries along the constraints, root mean square.
+
+    With the second derivatives H of an energy along the constraints in the metric of the masses, the square root of
+    <tr H_slow^2>/<tr H^2>: fast motions count most, and no signs cancel. Heating of fast motions grows with this share;
+    of two splittings the one with the smaller share allows longer steps.
+
+    Parameters
+    ----------
+    system : System
+        Its forces are `ForceGroups`.
+    frames : array_like, shape (n_frames, n_atoms, 3)
+        Configurations on the constraints: ten of a short run for large systems, more for small ones.
+    group : str
+        The slow forces.
+    rng : int, numpy.random.Generator or None
+        Of the random moves, one a frame, which costs two evaluations of every group.
+    displacement : float, optional
+        Typical move of an atom for differences of forces; 0.03 of the distance to the next atom by default, as in a
+        small step, so that jumps of forces at a cutoff count little.
+
+    Raises
+    ------
+    UnsupportedError
+        Targets move, rows hold velocities, or forces come in no groups.
+    InputError
+        No such group; frames off the constraints; forces that do not change with the positions; all atoms fixed.
+    """
+    refuse_other(system, System, "system", "a kcons.steppers.System")
+    refuse_driven(system, "whose stiffness slow_share does not know; leave them out")
+    force = system.force
+    if not isinstance(force, ForceGroups):
+        raise UnsupportedError("the System has no groups of forces; make it with System(motion, ForceGroups({...}))")
+    if group not in force.groups:
+        raise InputError(f"there is no group {group!r} of forces; there are {', '.join(force.groups)}", item="group")
+    x = as_float_array(frames, "frames")
+    if x.ndim != 3 or not len(x):
+        raise InputError(f"frames have shape {x.shape}; give (n_frames, n_atoms, 3)", item="frames")
+    generator = generator_of(rng)
+    slow, whole, flight = 0.0, 0.0, 0.0
+    for number, frame in enumerate(x):
+        here = configuration(system, frame)
+        flight = flight or flight_of(system, here, displacement, REACH)
+        v = thermal_velocities(system, here, 1.0, generator)
+        changes = np.zeros((2, *here.shape))
+        for way in (flight, -flight):
+            there, _ = system.flown(here, v, way)
+            for name in force.groups:
+                f = system.accepted(force.of(name, there, 0.0), number, True)
+                check_finite(f, "force", number)
+                pace = math.copysign(1.0, way) * constrained_acceleration(system, there, f, 0.0)
+                changes += np.array([name == group, True])[:, None, None] * pace
+        squares = [system.motion.project_velocities(here, c) ** 2 * system.masses[:, None] for c in changes]
+        slow, whole = slow + float(squares[0].sum()), whole + float(squares[1].sum())
+    if not whole > 0:
+        raise InputError("the forces do not change with the positions: nothing is stiff", item="forces")
+    return math.sqrt(slow / whole)

@@ -72,20 +72,6 @@ class Spread(NamedTuple):
     independent: float
 
 
-class _Processes(NamedTuple):
-    """What is tried: p shapes with r ratios each, at level 1.
-
-    Axes, shape (p, k, cosines), along which the cosines are independent; weights 1/S along these, shape (p, r, k); the
-    variance of the mean or the slope, shape (p, r); ln of how likely each is but for the level, shape (p, r), -inf
-    where a spectrum would be negative.
-    """
-
-    axes: FloatArray
-    weights: FloatArray
-    own: FloatArray
-    prior: FloatArray
-
-
 def _cosines(values: FloatArray) -> FloatArray:
     """The orthonormal cosine transform (DCT-II) along the first axis."""
     from scipy.fft import dct  # slow to import
@@ -94,8 +80,13 @@ def _cosines(values: FloatArray) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def _processes(cosines: int, degree: int) -> _Processes:
-    """All that are tried, for the mean (degree 0) or the slope (1) of as many values as cosines."""
+def _processes(cosines: int, degree: int) -> tuple[FloatArray, ...]:
+    """All that are tried, for the mean (degree 0) or the slope (1) of as many values as cosines, at level 1.
+
+    Axes, shape (p, k, cosines), along which the cosines are independent; weights 1/S along these, shape (p, r, k); the
+    variance of the mean or the slope, shape (p, r); ln of how likely each is but for the level, shape (p, r), -inf
+    where a spectrum would be negative. Of p shapes with r ratios each.
+    """
     k, t = np.arange(cosines), np.arange(cosines, dtype=np.float64)
     design = _cosines(np.vander(t - t.mean(), degree + 1))
     inside = np.linalg.qr(design, mode="complete")[0][:, degree + 1 :]
@@ -120,7 +111,7 @@ def _processes(cosines: int, degree: int) -> _Processes:
             prior -= 0.5 * np.log(spectrum).sum(axis=1)
             own = rule @ rule + np.expm1(_LOG_R) * (rule @ covariance @ rule)
             found.append((axes.T @ inside.T, 1.0 / spectrum, own, np.where(allowed, prior, -np.inf)))
-    return _Processes(*(np.array(part) for part in zip(*found, strict=True)))
+    return tuple(np.array(part) for part in zip(*found, strict=True))
 
 
 def _error(values: FloatArray, degree: int) -> tuple[float, int]:
@@ -136,12 +127,12 @@ def _error(values: FloatArray, degree: int) -> tuple[float, int]:
             break
         found = found[: len(found) // 2]
     count = len(found)
-    tried = _processes(count, degree)
-    along = (tried.axes @ found) ** 2
-    level = np.maximum((tried.weights @ along[..., None])[..., 0] / along.shape[1], np.finfo(float).tiny)
-    likely = tried.prior - 0.5 * along.shape[1] * np.log(level)
+    axes, weights, own, prior = _processes(count, degree)
+    along = (axes @ found) ** 2
+    level = np.maximum((weights @ along[..., None])[..., 0] / along.shape[1], np.finfo(float).tiny)
+    likely = prior - 0.5 * along.shape[1] * np.log(level)
     likely = np.exp(likely - likely.max())
-    error = float((likely * np.sqrt(level * np.maximum(tried.own, 0.0))).sum() / likely.sum())
+    error = float((likely * np.sqrt(level * np.maximum(own, 0.0))).sum() / likely.sum())
     return error * (count / len(values)) ** (0.5 + degree), count
 
 

@@ -1,4 +1,4 @@
-"""Which degrees of freedom a thermostat acts on: rank of the rows, conserved momenta, what rows tie together."""
+"""Degrees of freedom a thermostat acts on: rank, conserved momenta, what rows tie together; thermal velocities."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import checked
+from kcons.constraints.arguments import Rng, as_array, checked, generator_of, positive
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import BoolArray
+from kcons.constraints.periodic.one_piece import BoolArray, follow_parents
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent, row_norms
 from kcons.errors import InputError, NonFiniteError, OverdeterminedError, UnsupportedError
@@ -24,6 +24,40 @@ from kcons.steppers import State, System
 NEARBY = 1e-3
 #: Change of a row, relative to its gradient, that is taken for rounding.
 UNCHANGED = 1e-9
+
+
+@dataclass(eq=False)
+class Bodies:
+    """What moves as one."""
+
+    label: IntArray  # the body of each atom; -1 for atoms of none
+    weight: FloatArray  # share of each atom in the mass of its body
+    mass: FloatArray  # of each body
+    tree: tuple[IntArray, IntArray]  # atoms and the parents next to which they are, for bodies cut by faces of the cell
+
+    def __len__(self) -> int:
+        return len(self.mass)
+
+    def whole(self, x: FloatArray, lattice: FloatArray | None) -> FloatArray:
+        """Positions with each body in one piece."""
+        y = x.copy()
+        if lattice is not None:
+            follow_parents(y, *self.tree, lattice)
+        return y
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Of an array over atoms, shape (n_atoms,) or (n_atoms, k), for each body."""
+        if values.ndim == 1:
+            return np.asarray(np.bincount(self.label + 1, values, len(self) + 1)[1:], dtype=np.float64)
+        return np.stack([self.sums(column) for column in values.T], axis=1)
+
+    def centers(self, y: FloatArray) -> FloatArray:
+        """Centers of mass of positions in one piece (or their velocities), shape (n_bodies, 3)."""
+        return self.sums(self.weight[:, None] * y)
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """Values of the bodies given to their atoms, 0 for those of none, shape (n_atoms, k)."""
+        return np.where((self.label >= 0)[:, None], values[self.label], 0.0)
 
 
 def bodies(motion: Motion, moving: BoolArray) -> IntArray:
@@ -306,12 +340,50 @@ def momentum_share(masses: FloatArray, velocities: FloatArray, directions: Float
     return float(momentum @ momentum / (masses.sum() * twice))
 
 
-def drift_velocity(velocities: FloatArray, masses: FloatArray, directions: FloatArray) -> FloatArray:
-    """Velocity of the center of mass along `directions`, shape (3,); `UnsupportedError` where there are none."""
-    if not len(directions):
-        raise UnsupportedError(_HELD)
-    mean = masses @ velocities / masses.sum()
-    return np.asarray(directions.T @ (directions @ mean))
+def thermal_velocities(
+    system: System,
+    positions: ArrayLike,
+    thermal_energy: float,
+    rng: Rng,
+    *,
+    time: float = 0.0,
+    zero_momentum: bool = False,
+) -> FloatArray:
+    """Velocities of the canonical distribution on the surface A v = c, shape (n_atoms, 3).
+
+    Maxwell-Boltzmann velocities, projected by M_par^+ M: their covariance is k_B T M_par^+, that of momenta which
+    know of the constraints. Where targets move, the slowest velocities that follow them are added.
+
+    Parameters
+    ----------
+    system : System
+    positions : array_like, shape (n_atoms, 3)
+        On the constraints.
+    thermal_energy : float
+        k_B T.
+    rng : int, numpy.random.Generator or None
+    time : float
+        For targets that move.
+    zero_momentum : bool
+        Take total momentum out, in the directions in which no row knows a place in space.
+
+    Raises
+    ------
+    UnsupportedError
+        `zero_momentum` with rows that hold atoms in space in every direction.
+    """
+    positive(thermal_energy, "thermal_energy")
+    generator = generator_of(rng)
+    motion = system.motion
+    x = as_array(positions, (system.n_atoms, 3), "positions")
+    drive = motion.project_velocities(x, np.zeros_like(x), time=time)
+    noise = generator.standard_normal(x.shape) * np.sqrt(thermal_energy * system.inverse_masses)
+    if zero_momentum:
+        directions = open_directions(motion, x, time)
+        if not len(directions):
+            raise UnsupportedError(_HELD)
+        noise -= directions.T @ (directions @ (system.masses @ noise / system.masses.sum()))
+    return motion.project_velocities(x, drive + noise, time=time)
 
 
 # -- bodies apart -----------------------------------------------------------------------------------
@@ -379,6 +451,12 @@ def refuse_dissipation(system: System, why: str) -> None:
             "a System with friction has no temperature: what it takes out, a thermostat would put back elsewhere; "
             "leave it out of the System, and give the rate to Langevin, which brings noise with it"
         )
+
+
+def refuse_driven(system: System, why: str) -> None:
+    """Raise `UnsupportedError` for targets that move and rows that hold velocities; `why` says what they cannot do."""
+    if system.motion.plan.driven:
+        raise UnsupportedError(f"targets move with time, or rows hold velocities, {why}")
 
 
 def carried(state: State, size: int, name: str, *, marked: bool = False) -> bool:

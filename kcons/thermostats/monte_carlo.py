@@ -31,8 +31,8 @@ from kcons.errors import (
 )
 from kcons.steppers import Rattle, ReversibilityCheck, State, Stepper, System
 from kcons.steppers.stepper import DropsSystemCaches, require_stepper, stays
-from kcons.thermostats.freedom import carried, refuse_dissipation
-from kcons.thermostats.langevin import noise_generator
+from kcons.thermostats.freedom import carried, refuse_dissipation, refuse_driven
+from kcons.thermostats.noise import noise_generator
 
 #: What `State.thermostat` holds, in this order; the last is what became of the last proposal, 0 before the first.
 POTENTIAL, ACCEPTED, ENERGY, IRREVERSIBLE, UNSOLVED, NOT_FINITE, CHANGE, SUM, SQUARES, LAST = range(10)
@@ -82,15 +82,20 @@ class Counts:
     @classmethod
     def of(cls, state: State) -> Counts:
         """Those of a state; all 0 before the first proposal."""
-        carried(state, SIZE, "HamiltonianMonteCarlo")
-        held = np.zeros(SIZE) if state.thermostat is None else state.thermostat
-        accepted, energy, irreversible, unsolved, not_finite = (
-            round(float(n)) for n in held[ACCEPTED : NOT_FINITE + 1]
-        )
-        told = accepted + energy
+        held = variables_of(state)
+        told = held[ACCEPTED] + held[ENERGY]
         change = float(held[CHANGE]) if held[LAST] else math.nan
-        square = float(held[SQUARES]) / told if told else math.nan
+        square = float(held[SQUARES] / told) if told else math.nan
+        accepted, energy, irreversible, unsolved, not_finite = held[ACCEPTED : NOT_FINITE + 1].astype(int).tolist()
         return cls(accepted, energy, irreversible, unsolved, not_finite, change, square)
+
+
+def variables_of(state: State) -> FloatArray:
+    """A copy of the variables that a state carries, those of a run that begins where it carries none."""
+    if carried(state, SIZE, "HamiltonianMonteCarlo"):
+        assert state.thermostat is not None
+        return state.thermostat.copy()
+    return np.array([math.nan, *[0.0] * (SIZE - 1)])
 
 
 class ReversedSteps(ReversibilityCheck):
@@ -103,39 +108,32 @@ class ReversedSteps(ReversibilityCheck):
 
     def __init__(self, system: System, stepper: Stepper, tolerance: float) -> None:
         super().__init__(stepper, tolerance)
-        self.force_evaluations = stepper.force_evaluations
         self.system = system
         force = None if system.force is None else self._force
         #: The same system, which remembers.
         self.watched = System(system.motion, force, potential=system.potential, far=system.far)
         self._known: list[tuple[FloatArray, FloatArray]] = []
-        self._near = 0.0
-        self._back = False
+        #: How near a place of the way back is to one that is known; negative on the way there.
+        self._near = -1.0
 
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`, and see that the step back ends at `state`; errors as of `ReversibilityCheck`."""
-        state = replace(state, origin=None)  # forces of the system are those of the watched one
-        self._known = [] if state.forces is None else [(state.positions, state.forces)]
-        self._back = False
+        state, x = replace(state, origin=None), state.positions  # forces of the system are those of the watched one
+        self._known, self._near = [] if state.forces is None else [(x, state.forces)], -1.0
         after = self.stepper.step(self.watched, state, dt)
-        x = state.positions
         self._near = self.tolerance * extent(x) + 8 * float(np.spacing(np.abs(x).max(initial=0.0)))
-        self._back = True
-        try:
-            self.take_back(self.watched, state, after, dt, lambda: [forces for _, forces in self._known])
-        finally:
-            self._back = False
+        self.take_back(self.watched, state, after, dt, lambda: [forces for _, forces in self._known])
         return after
 
     def _force(self, x: FloatArray, time: float) -> ArrayLike:
-        if self._back:
+        if self._near >= 0:
             for place, forces in reversed(self._known):
                 if float(np.abs(x - place).max(initial=0.0)) <= self._near:
                     return forces
         force = self.system.force
         assert force is not None
         forces = self.system.accepted(force(x, time), 0, True)
-        if not self._back:
+        if self._near < 0:
             self._known.append((x.copy(), forces))
         return forces
 
@@ -230,11 +228,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
     def check(self, system: System) -> None:
         """Raise where there is no such density: for forces without a potential, rows that move or hold velocities."""
         refuse_dissipation(system, "energy to accept or reject by")
-        if system.motion.plan.driven:
-            raise UnsupportedError(
-                "rows that move with time, or hold velocities, leave no stationary density to sample: hold positions "
-                "that rest, or use Langevin"
-            )
+        refuse_driven(system, "which leaves no stationary density: hold positions that rest, or use Langevin")
         if system.force is not None and system.potential is None:
             raise InputError(
                 "this System has no potential; pass potential=..., by which proposals are accepted", item="potential"
@@ -258,8 +252,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
             return still
         if dt < 0:
             raise InputError(f"the time step is {system.shown_time(dt)}; noise cannot be taken back", item="dt")
-        held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
-        held = np.array([math.nan, *[0.0] * (SIZE - 1)]) if held is None else held.copy()
+        held = variables_of(state)
         # Positions without forces may be new ones, and what a state carries, or a file, that of other forces or places.
         goes_on = self._left is not None and all(map(is_, self._left, (state.thermostat, state.positions)))
         strange = not goes_on and (state.origin is None or state.origin[0] is None)
@@ -359,16 +352,6 @@ class Tuned:
     state: State
 
 
-def best_acceptance(order: int) -> float:
-    """The share of accepted proposals that costs least, p/(p + 1) for order p.
-
-    For many degrees of freedom dH is normal, its deviation s is proportional to dt^p and its mean s^2/2, and
-    erfc(s/sqrt(8)) of the proposals are accepted. dt erfc(s/sqrt(8)) is largest for 0.651 at order 2, 0.796 at order 4
-    and 0.856 at order 6.
-    """
-    return order / (order + 1)
-
-
 @checked
 def tune(
     system: System,
@@ -393,7 +376,9 @@ def tune(
     sampler : HamiltonianMonteCarlo
         Its number of steps stays, so that trajectories become longer or shorter with the step.
     wanted : float, optional
-        Between 0 and 1; by default what costs least for the order of the stepper, see `best_acceptance`.
+        Between 0 and 1; by default p/(p + 1) for order p, which costs least: for many degrees of freedom dH is normal,
+        its deviation s is proportional to dt^p and its mean s^2/2, and dt erfc(s/sqrt(8)) is largest where 0.651 of the
+        proposals are accepted at order 2, 0.796 at order 4, 0.856 at order 6.
     proposals : int
         20 or more.
 
@@ -409,9 +394,8 @@ def tune(
     Dual averaging: Hoffman and Gelman, J. Mach. Learn. Res. 15, 1593 (2014), Algorithm 5.
     """
     sampler.check(system)
-    known = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
-    held = np.zeros(SIZE) if known is None else known
-    wanted = best_acceptance(sampler.order) if wanted is None else wanted
+    held = variables_of(state)
+    wanted = sampler.order / (sampler.order + 1) if wanted is None else wanted
     begin = log = math.log(dt)
     missing = mean = 0.0
     chances: list[float] = []
@@ -429,9 +413,8 @@ def tune(
         raise ConvergenceError(
             f"no proposal succeeded with time steps down to {system.shown_time(math.exp(log))}; is the start sound?"
         )
-    potential, held = held[POTENTIAL], np.zeros(SIZE)
-    held[POTENTIAL] = potential
-    return Tuned(math.exp(mean), acceptance, replace(state, thermostat=held))
+    begun = np.array([held[POTENTIAL], *[0.0] * (SIZE - 1)])
+    return Tuned(math.exp(mean), acceptance, replace(state, thermostat=begun))
 
 
 def exchange(
@@ -509,12 +492,5 @@ def _moved(there: State, here: State, scale: float) -> State:
     assert there.thermostat is not None and here.thermostat is not None
     held = here.thermostat.copy()
     held[POTENTIAL] = there.thermostat[POTENTIAL]
-    return replace(
-        here,
-        positions=there.positions,
-        velocities=scale * there.velocities,
-        forces=there.forces,
-        remainder=there.remainder,
-        thermostat=held,
-        origin=there.origin,
-    )
+    clock = {name: getattr(here, name) for name in ("time", "time_remainder", "step", "barostat")}
+    return replace(there, velocities=scale * there.velocities, thermostat=held, **clock)

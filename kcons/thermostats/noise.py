@@ -1,4 +1,4 @@
-"""Normal numbers within kernels: those that NumPy draws from its Philox generator, to the last bit.
+"""Random numbers of a seed and a step; normal ones within kernels, those of NumPy's Philox generator to the last bit.
 
 A stretch of the generator's stream belongs to each step and to each part of it, so that noise is a function of the seed
 and of the number of the step; kernels draw it without coming back to Python.
@@ -26,6 +26,12 @@ _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _W0, _W1 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
 _ZERO, _ONE, _EIGHT, _NINE, _ELEVEN = (np.uint64(k) for k in (0, 1, 8, 9, 11))
 _LAYER, _FRACTION = np.uint64(0xFF), np.uint64(0x000FFFFFFFFFFFFF)
+
+
+def noise_generator(key: tuple[int, int], number: int, part: int = 0) -> np.random.Generator:
+    """A generator of numbers that are a function of a key, the number of a step and its part."""
+    counter = np.array([0, 0, number, part], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter))
 
 
 @intrinsic

@@ -11,14 +11,14 @@ import numpy as np
 from kcons.constraints.arguments import Count, Positive, checked
 from kcons.constraints.compilation import njit
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError
 from kcons.solvers.kernels.array_views import flat
 from kcons.steppers import Rattle, State, System
+from kcons.steppers.compiled_operations import check_finite, square_sum
 from kcons.steppers.interpreter import Interpreted, Interpreter
-from kcons.steppers.operations import Chain, Operation
+from kcons.steppers.operations import Chain
 from kcons.steppers.program import Program, Row
 from kcons.steppers.splitting import SUZUKI_4
-from kcons.steppers.stages.compiled_operations import check_finite
 from kcons.thermostats.freedom import (
     AT_REST,
     LOOK_AT,
@@ -29,10 +29,10 @@ from kcons.thermostats.freedom import (
     momentum_share,
     open_directions,
     refuse_dissipation,
+    refuse_driven,
     warn_of_bodies_apart,
     warn_of_conserved_momenta,
 )
-from kcons.thermostats.langevin import kinetic
 
 #: Fractions of its time in which the chain moves on at fixed velocities, of order 4.
 FRACTIONS = SUZUKI_4
@@ -92,22 +92,18 @@ class NoseHooverChain(Interpreted):
     ) -> None:
         self.thermal_energy, self.period, self.length = thermal_energy, period, length
         self.momentum: Momentum = momentum
-        self._operations = HALF, *Rattle().operations(), HALF
-        self._program = Program(self._operations, {"chain": _chain})
+        self._program = Program((HALF, *Rattle().operations(), HALF), {"chain": _chain})
 
     def __repr__(self) -> str:
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
 
-    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        return self._operations
+    def program(self, system: System | None) -> Program:
+        return self._program
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for rows whose targets demand velocities, velocity-dependent forces, or friction."""
         refuse_dissipation(system, "place in this scheme; use Langevin")
-        if system.motion.plan.driven:
-            raise UnsupportedError(
-                "targets move, or rows hold velocities, and scaled velocities would not follow them; use Langevin"
-            )
+        refuse_driven(system, "and scaled velocities would not follow them; use Langevin")
 
     def start(self, system: System, state: State) -> State:
         """The state with its forces, and a chain at rest if it carries none, or one of other degrees of freedom."""
@@ -204,7 +200,7 @@ def _chain(x, v, forces, time, numbers, tables):  # type: ignore[no-untyped-def]
     q = SIZE + parts
     end = q + 3 * n + 1
     u, masses = flat(v), numbers[end:]
-    twice = 2.0 * kinetic(u, masses)
+    twice = square_sum(u, masses)
     scale = _advance(numbers[q + n : end], numbers[q : q + n], twice, numbers[KT], time, numbers[SIZE:q])
     if not math.isfinite(scale):
         return 1

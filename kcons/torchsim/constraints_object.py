@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -37,18 +38,17 @@ class Constraints(SystemConstraint):
         super().__init__(system_idx)
         self.motions = tuple(motions)
         #: Tensors that the engine was made for, with their versions, the engine, and its atoms.
-        self._made: tuple[list[tuple[torch.Tensor, int]], Batch, torch.Tensor | None] | None = None
+        self._made: tuple[list[tuple[torch.Tensor, int]], Batch, torch.Tensor] | None = None
 
-    def batch(self, state: SimState) -> tuple[Batch, torch.Tensor | None]:
-        """The engine for all systems of a state, and its atoms, None if these are all of the state."""
+    def batch(self, state: SimState) -> tuple[Batch, torch.Tensor]:
+        """The engine for all systems of a state that have rows, and the numbers of their atoms."""
         # TorchSim sets another system_idx where it reorders systems; masses and cells can be edited in a run.
         seen = [(each, each._version) for each in (self.system_idx, state.masses, state.cell)]
         if self._made is None or any(a is not b or n != m for (a, n), (b, m) in zip(self._made[0], seen, strict=True)):
             self.check_fits(state)
             motions = [self.motions[k] for k in torch.argsort(self.system_idx).tolist()]
-            part = torch.isin(state.system_idx, self.system_idx)
-            batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=1)
-            self._made = seen, batch, None if bool(part.all()) else part.nonzero().ravel()
+            batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=sys.maxsize)
+            self._made = seen, batch, torch.isin(state.system_idx, self.system_idx).nonzero().ravel()
         return self._made[1:]
 
     def check_fits(self, state: SimState) -> None:
@@ -66,18 +66,21 @@ class Constraints(SystemConstraint):
                 )
 
     def move(self, state: SimState, new: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction."""
+        """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction.
+
+        Failures are kept until `check` looks for them.
+        """
         batch, atoms = self.batch(state)
-        if atoms is None:
-            return batch.solve_positions(new, state.positions)[:2]
         positions, push, _ = batch.solve_positions(new[atoms], state.positions[atoms])
         return new.index_copy(0, atoms, positions), torch.zeros_like(new).index_copy(0, atoms, push)
+
+    def check(self, state: SimState) -> None:
+        """Raise `ConvergenceError` where rows were not met since the last look, which waits for the device."""
+        self.batch(state)[0].check()
 
     def tangent(self, state: SimState, velocities: torch.Tensor) -> torch.Tensor:
         """The part of velocities that stays on the constraints."""
         batch, atoms = self.batch(state)
-        if atoms is None:
-            return batch.project_velocities(state.positions, velocities)
         return velocities.index_copy(0, atoms, batch.project_velocities(state.positions[atoms], velocities[atoms]))
 
     def get_removed_dof(self, state: SimState) -> torch.Tensor:
@@ -90,6 +93,7 @@ class Constraints(SystemConstraint):
         if isinstance(state, MDState):
             raise UnsupportedError(_OWN)
         new_positions.copy_(self.move(state, new_positions)[0])
+        self.check(state)
 
     def adjust_momenta(self, state: SimState, momenta: torch.Tensor) -> None:
         """Refuse integrators of TorchSim, before they move positions."""

@@ -71,12 +71,13 @@ class NoseHooverState(MDState):
         return NoseHooverChain(self.chain_positions, self.chain_momenta.clone(), masses, self.tau, kinetic, freedom)
 
 
-def _start(state: SimState, model: ModelInterface, kT: Any, at_rest: bool) -> MDState:
+def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = True, **_: Any) -> MDState:
     """A state with forces, on the constraints, its momenta projected, or drawn if it has none."""
     held = constraints_of(state)
     held.check_fits(state)
     start = copy.copy(state)
     start.positions = held.move(state, state.positions)[0]
+    held.check(state)
     away = (start.positions - state.positions).abs().amax(1)
     if bool(away.max() > FAR):
         atom = int(away.argmax())
@@ -165,31 +166,20 @@ def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
 
 
 def _evaluate(state: MDState, model: ModelInterface) -> None:
+    """Forces at the end of a step, at positions that are on the constraints: looked at here, once a step."""
+    constraints_of(state).check(state)
     output = model(state)
     state.energy, state.forces = output["energy"], output["forces"]
     state.store_model_extras(output)
 
 
-def _nve_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any) -> MDState:
-    return _start(state, model, kT, at_rest=True)
-
-
-def _rattle(state: State, model: ModelInterface, dt: Any) -> State:
+def _rattle(state: State, model: ModelInterface, *, dt: Any, **_: Any) -> State:
     held, dt = constraints_of(state), _each(state, dt, atoms=True)
     _kick(state, held, dt / 2)
     _drift(state, held, dt)
     _evaluate(state, model)
     _kick(state, held, dt / 2)
     return state
-
-
-@_whole
-def _nve_step(state: State, model: ModelInterface, *, dt: Any, **_: Any) -> State:
-    return _rattle(state, model, dt)
-
-
-def _langevin_init(state: SimState, model: ModelInterface, *, kT: Any, **_: Any) -> MDState:
-    return _start(state, model, kT, at_rest=False)
 
 
 @_whole
@@ -211,7 +201,7 @@ def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, g
 def _nose_hoover_init(
     state: SimState, model: ModelInterface, *, kT: Any, dt: Any, tau: Any = None, chain_length: int = 3
 ) -> NoseHooverState:
-    made = _start(state, model, kT, at_rest=True)
+    made = _start(state, model, kT=kT)
     rest = torch.zeros((state.n_systems, chain_length), dtype=state.dtype, device=state.device)
     period = _each(state, PERIODS * dt if tau is None else tau)
     chain = {"chain_positions": rest, "chain_momenta": rest.clone(), "tau": period, "target_kT": _each(state, kT)}
@@ -226,15 +216,15 @@ def _nose_hoover_step(state: NoseHooverState, model: ModelInterface, *, dt: Any,
         momenta, chain = half_step(state.momenta, state.chain, state.target_kT, state.system_idx)
         state.momenta, state.chain_positions, state.chain_momenta = momenta, chain.positions, chain.momenta
         if first:
-            state = _rattle(state, model, dt)
+            state = _rattle(state, model, dt=dt)
     return state
 
 
 #: Constant energy by RATTLE. Momenta are drawn without that of the center of mass.
-nve = Integrator(_nve_init, _nve_step)
+nve = Integrator(_start, _whole(_rattle))
 #: Langevin dynamics by geodesic BAOAB, with ``gamma`` as in TorchSim. Momenta are those before the kick, which have the
 #: right temperature.
-langevin = Integrator(_langevin_init, _langevin_step)
+langevin = Integrator(functools.partial(_start, at_rest=False), _langevin_step)
 #: Nosé-Hoover chains around RATTLE; ``tau`` and ``chain_length`` in ``init_kwargs``, as in TorchSim.
 nose_hoover = Integrator(_nose_hoover_init, _nose_hoover_step)
 

@@ -124,8 +124,7 @@ def hold(
 def report(state: SimState) -> list[Report]:
     """What the engine of each held system reports: residuals of positions, and of momenta where there are any, rank."""
     batch, atoms = constraints_of(state).batch(state)
-    part = slice(None) if atoms is None else atoms
-    return batch.report(state.positions[part], state.velocities[part] if isinstance(state, MDState) else None)
+    return batch.report(state.positions[atoms], state.velocities[atoms] if isinstance(state, MDState) else None)
 
 
 def _fixed_atoms(state: SimState) -> Any:

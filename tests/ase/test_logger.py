@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import io
-from typing import ClassVar
 
 import numpy as np
 import pytest
 from ase import Atoms, units
 from ase.build import molecule
-from ase.calculators.calculator import Calculator
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
 from ase.constraints import FixAtoms, FixBondLengths
 from ase.md.logger import MDLogger
 from ase.md.verlet import VelocityVerlet
-from ase_systems import Free
+from ase_systems import Field, Free
 
 from kcons.ase import (
     ConstrainedDynamics,
@@ -46,25 +44,10 @@ def columns(log: io.StringIO) -> np.ndarray:
     return np.array([line.split() for line in log.getvalue().splitlines()[1:]], dtype=float)
 
 
-class Wells(Calculator):
-    """Each atom in a harmonic well of its own."""
-
-    implemented_properties: ClassVar = ["energy", "forces"]
-
-    def __init__(self, stiffness: float, places: np.ndarray) -> None:
-        super().__init__()
-        self.stiffness, self.places = stiffness, places
-
-    def calculate(self, atoms=None, properties=None, system_changes=()):
-        d = atoms.positions - self.places
-        self.results = {"energy": 0.5 * self.stiffness * np.sum(d * d), "forces": -self.stiffness * d}
-
-
 def oscillators(step: float) -> Atoms:
     """Fifty argon atoms whose frequency times the step is 1: at its ends BAOAB has 1 - 1/4 of the temperature."""
-    atoms = Atoms("Ar50", positions=4.0 * np.arange(150.0).reshape(50, 3))
-    mass = float(atoms.get_masses()[0])
-    atoms.calc = Wells(mass / step**2, atoms.positions.copy())
+    atoms = Atoms("Ar50")
+    atoms.calc = Field(float(atoms.get_masses()[0]) / step**2)
     return atoms
 
 

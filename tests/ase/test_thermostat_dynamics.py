@@ -11,7 +11,7 @@ from ase.build import molecule
 from ase.calculators.calculator import Calculator, all_changes
 from ase.constraints import ExternalForce, FixAtoms
 from ase.io import read
-from ase_systems import equal, state
+from ase_systems import Field, equal, state
 
 from kcons.ase import (
     ConstrainedLangevin,
@@ -71,26 +71,6 @@ class Pairs(Calculator):
         self.results = {"energy": 0.05 * float((x * x).sum()), "forces": -0.1 * x + turning}
 
 
-class Wells(Calculator):
-    """Each atom in a well of its own strength, drawn to one side; counts its calls, and gives up after `bad`."""
-
-    implemented_properties = ("energy", "forces")
-
-    def __init__(self, bad=math.inf):
-        super().__init__()
-        self.bad, self.calls = bad, 0
-
-    def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):
-        super().calculate(atoms, properties, system_changes)
-        self.calls += 1
-        if self.calls > self.bad:
-            raise ZeroDivisionError("mine")
-        x, k = atoms.positions, np.linspace(0.2, 0.6, len(atoms))[:, None]
-        forces = -k * x
-        forces[-1, 0] += 0.3
-        self.results = {"energy": float((k * x * x / 2).sum() - 0.3 * x[-1, 0]), "forces": forces}
-
-
 def waters(n=3, calc=None, temperature=300.0, momenta=True, zero_momentum=False) -> Atoms:
     atoms = Atoms()
     for k in range(n):
@@ -122,13 +102,8 @@ def sampler(atoms, timestep=4 * FS, temperature_K=400.0, **options):
     return made("monte carlo", atoms, timestep, temperature_K=temperature_K, **{"keep": 0.4, **options})
 
 
-def wells(bad=math.inf) -> Atoms:
-    atoms, other = molecule("H2O"), molecule("H2O")
-    other.translate([2.5, 1.0, 0.3])
-    atoms += other
-    atoms.calc = Wells(bad)
-    constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
-    return atoms
+def gives_up(forces):
+    raise ZeroDivisionError("mine")
 
 
 THREE = pytest.mark.parametrize("kind", ["isokinetic", "langevin", "nose-hoover"])
@@ -227,12 +202,12 @@ def test_a_saved_run_goes_on_to_the_last_bit(kind, at, tmp_path):
     atoms.positions += at
     moving = made(kind, atoms)
     moving.run(15)
-    moving.save(tmp_path / "restart.npz")
+    moving.state.save(tmp_path / "state.npz")
     given, time = moving.state.copied(), moving.get_time()
     moving.run(15)
-    for options in ({"restart": tmp_path / "restart.npz"}, {"state": given}):
+    for start in (State.load(tmp_path / "state.npz"), given):
         again = waters(momenta=False)
-        resumed = made(kind, again, **options)
+        resumed = made(kind, again, state=start)
         assert resumed.nsteps == 15 and resumed.get_time() == time
         resumed.run(15)
         assert equal(state(atoms), state(again))
@@ -242,20 +217,19 @@ def test_a_saved_run_goes_on_to_the_last_bit(kind, at, tmp_path):
 
 
 @THREE
-def test_a_restart_asks_the_calculator_for_forces(kind, tmp_path):
+def test_a_restart_asks_the_calculator_for_forces(kind):
     """Those of a file may be of another calculator: the run goes on as one from positions and velocities alone."""
     moving = made(kind, waters())
     moving.run(3)
-    moving.save(tmp_path / "restart.npz")
     saved = moving.state
     assert saved.forces is not None
     bare = State(saved.positions, saved.velocities, saved.time, step=saved.step, thermostat=saved.thermostat)
     ends = []
-    for given in ({"restart": tmp_path / "restart.npz"}, {"state": saved}, {"state": bare}):
+    for given in (saved, bare):
         atoms = waters(calc=Pairs(), momenta=False)
-        made(kind, atoms, **given, **({} if kind == "langevin" else {"momentum": "free"})).run(2)
+        made(kind, atoms, state=given, **({} if kind == "langevin" else {"momentum": "free"})).run(2)
         ends.append(state(atoms))
-    assert equal(ends[0], ends[2]) and equal(ends[1], ends[2])
+    assert equal(*ends)
 
 
 def test_isokinetic_goes_on_from_a_trajectory(tmp_path):
@@ -270,22 +244,13 @@ def test_isokinetic_goes_on_from_a_trajectory(tmp_path):
     assert equal(state(atoms), state(again))
 
 
-def test_files_that_hold_no_restart(tmp_path):
+def test_states_of_others():
     atoms = waters()
-    before = state(atoms)
-    (tmp_path / "other.npz").write_bytes(b"nothing")
-    np.savez(tmp_path / "third.npz", a=np.zeros(3))
-    for name in ("other.npz", "third.npz"):
-        with pytest.raises(InputError, match="was not written by save"):
-            made("langevin", atoms, restart=tmp_path / name)
-    with pytest.raises(FileNotFoundError):
-        made("langevin", atoms, restart=tmp_path / "none.npz")
-    made("langevin", atoms).save(tmp_path / "nine.npz")
-    with pytest.raises(InputError, match="holds 9 atoms, not 6"):
-        made("langevin", waters(2), restart=tmp_path / "nine.npz")
-    made("nose-hoover", atoms).save(tmp_path / "chain.npz")
+    before, nine, chain = state(atoms), made("langevin", waters()).state, made("nose-hoover", waters()).state
+    with pytest.raises(InputError, match="positions"):
+        made("langevin", waters(2), state=nine)
     with pytest.raises(InputError, match="variables of another thermostat"):
-        made("isokinetic", atoms, restart=tmp_path / "chain.npz")
+        made("isokinetic", atoms, state=chain)
     assert equal(before, state(atoms))
 
 
@@ -387,16 +352,14 @@ def test_forces_that_are_not_numbers(kind, bad):
 
 
 def test_an_error_of_the_calculator_leaves_the_last_good_atoms():
-    atoms = wells(bad=20)
+    atoms = waters(2, Field(0.4, bad=20, how=gives_up))
     dyn = sampler(atoms, steps=3)
     with pytest.raises(ZeroDivisionError, match="mine") as caught:
         for _ in range(20):
             before = state(atoms)
             dyn.run(1)
     assert equal(state(atoms), before) and caught.value.step == dyn.nsteps + 1
-    with pytest.raises(ZeroDivisionError):
-        sampler(wells(bad=0)).tune()
-    atoms = wells()
+    atoms = waters(2, Field(0.4))
     dyn = sampler(atoms)
     atoms.calc.calculate = lambda *a, **k: atoms.calc.results.update(energy=math.nan, forces=np.zeros((6, 3)))
     with pytest.raises(NonFiniteError, match="potential energy is nan"):
@@ -408,10 +371,10 @@ def test_an_error_of_the_calculator_leaves_the_last_good_atoms():
 
 @pytest.mark.parametrize(("stepper", "step"), [(None, 5), (BlanesMoan4(), 13)], ids=repr)
 def test_monte_carlo_is_what_arrays_give(stepper, step):
-    atoms = wells()
+    atoms = waters(2, Field(0.4))
     dyn = sampler(atoms, stepper=stepper, timestep=step * FS)
     x = atoms.positions.copy()
-    alone = Atoms(atoms.symbols, x, calculator=Wells())
+    alone = Atoms(atoms.symbols, x, calculator=Field(0.4))
 
     def asked(question):
         def answer(x, t):
@@ -423,22 +386,12 @@ def test_monte_carlo_is_what_arrays_give(stepper, step):
     motion = Motion(dyn.motion.constraint_set, x)
     system = System(motion, asked(alone.get_forces), potential=asked(alone.get_potential_energy))
     core = HamiltonianMonteCarlo(units.kB * 400, (2, 5), 7, stepper=stepper, keep=0.4)
-    there = run(system, State(x, np.zeros_like(x)), step * FS, 12, stepper=core)
+    there = run(system, State(x, atoms.get_velocities()), step * FS, 12, stepper=core)
     dyn.run(12)
     np.testing.assert_allclose(atoms.positions, there.positions, atol=1e-9)
     np.testing.assert_allclose(atoms.get_velocities(), there.velocities, atol=1e-9)
     assert 0 < dyn.counts.accepted <= 12 == dyn.counts.proposals
     assert dyn.get_time() == pytest.approx(there.time)
-
-
-def test_a_step_is_found():
-    dyn = sampler(wells(), timestep=1 * FS, steps=5, keep=0.0)
-    found = dyn.tune(wanted=0.8, proposals=40)
-    assert dyn.dt == found.dt > 2 * FS and dyn.counts.proposals == 0
-    dyn.run(40)
-    assert dyn.counts.acceptance > 0.55
-    with pytest.raises(InputError, match="wanted is 2"):
-        dyn.tune(wanted=2)
 
 
 # -- several time steps -----------------------------------------------------------------------------

@@ -99,13 +99,6 @@ def test_nothing_that_can_be_read_is_incomplete_too(folder, capsys):
     assert [path.name for path in out.iterdir()] == ["check.json"]
 
 
-def test_the_help_says_what_the_exit_status_means(capsys):
-    with pytest.raises(SystemExit):
-        main(["check", "--help"])
-    text = " ".join(capsys.readouterr().out.split())
-    assert "Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete" in text
-
-
 def test_formats_by_option(folder, tmp_path, capsys):
     for name in ("good.trr", "t.gro"):
         (tmp_path / name.partition(".")[0]).write_bytes((folder / name).read_bytes())
@@ -159,16 +152,6 @@ def test_the_check_of_another_trajectory_is_not_overwritten(folder, tmp_path, mo
     said = capsys.readouterr().err
     assert "check-run has a check of another file" in said and "a/run.xtc); give another folder (--out)" in said
     assert (tmp_path / "check-run" / "check.json").read_bytes() == before
-
-
-def test_what_is_no_check_is_not_overwritten(folder, tmp_path, capsys):
-    for name in report.FILES:
-        other = tmp_path / name / name
-        other.parent.mkdir()
-        other.write_text("precious")
-        assert command(folder, "good.xtc", "--out", str(other.parent)) == 2
-        assert "give another folder (--out)" in capsys.readouterr().err
-        assert list(other.parent.iterdir()) == [other] and other.read_text() == "precious"
 
 
 def test_the_usual_folder_is_no_link(folder, tmp_path, monkeypatch, capsys):

@@ -20,11 +20,6 @@ def said(line, where="", **variables):
     return done.returncode, done.stdout, done.stderr
 
 
-def test_in_a_c_locale():
-    status, out, errors = said("compare --list", **C_LOCALE)
-    assert (status, errors) == (0, b"") and "test systems" in out.decode("ascii")
-
-
 def test_into_a_pipe_that_nobody_reads():
     said("plan chain --size 3")  # what has to be compiled is compiled now: that is announced on the stream of errors
     status, out, errors = said("plan chain --size 3", "| head -1", PYTHONUNBUFFERED="1")

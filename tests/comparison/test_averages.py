@@ -219,21 +219,8 @@ def test_a_run_needs_a_length_or_a_budget():
 
 def test_the_command_writes_the_same_files_and_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    words = [
-        "compare",
-        "chain",
-        "--size",
-        "4",
-        "--criterion",
-        "temperature",
-        "--methods",
-        "langevin,isokinetic",
-        "--dt",
-        "10",
-        "--budget",
-        "0.6",
-    ]
-    assert main.main(words) == 0
+    words = "compare chain --size 4 --criterion temperature --methods langevin,isokinetic --dt 10 --budget 0.6"
+    assert main.main(words.split()) == 0
     printed = capsys.readouterr().out
     assert "temperature of the configurations" in printed.splitlines()[0] and len(printed.splitlines()) <= 30
     folder = tmp_path / "compare-chain-averages"
@@ -251,12 +238,12 @@ def test_the_command_writes_the_same_files_and_goes_on(tmp_path, monkeypatch, ca
         return stopped(*args, keep=once, **options)
 
     monkeypatch.setattr("kcons.comparison.averages.compare_averages", cut)
-    assert main.main(words) == 130
+    assert main.main(words.split()) == 130
     assert "--resume goes on" in capsys.readouterr().err
-    assert main.main([*words, "--resume"]) == 130
+    assert main.main(f"{words} --resume".split()) == 130
     assert ran == [None, ["langevin", "langevin"]]
     assert list(read_csv(folder / "compare.csv").method) == ["langevin", "langevin", "isokinetic"]
-    assert main.main([*words, "--resume", "--budget", "2"]) == 2
+    assert main.main(f"{words} --resume --budget 2".split()) == 2
 
 
 def test_expensive_and_cheap_forces_of_a_file(tmp_path, monkeypatch, capsys):

@@ -13,7 +13,7 @@ from host_systems import quietly, read_universe
 from openmm import app, unit
 
 from kcons.cli import main
-from kcons.comparison import compare, read_csv, test_systems
+from kcons.comparison import compare, test_systems
 from kcons.comparison.test_systems import files
 from kcons.constraints import LinearRelation
 from kcons.errors import InputError, UnsupportedError
@@ -194,13 +194,6 @@ def test_hydrogens_boxes_sites_and_cut_molecules(bare, tmp_path):
     assert sorted(caught.value.atoms) == [0, 1]
 
 
-def test_options_of_molecules_are_refused_elsewhere():
-    with pytest.raises(InputError, match="chain takes no options, not constrain"):
-        test_systems.build("chain", constrain="hbonds")
-    with pytest.raises(InputError, match="cannot be built at size 2"):
-        test_systems.build("alanine", 2)
-
-
 def test_openmm_is_needed(monkeypatch):
     monkeypatch.setattr(files, "find_spec", lambda name: None)
     with pytest.raises(UnsupportedError, match="pip install openmm"):
@@ -284,15 +277,6 @@ def test_forces_that_do_not_fit(file, options, words, ethanol):
         quietly(from_file, ethanol if file == "ethanol" else VILLIN, **options)
     with pytest.raises(UnsupportedError, match="holds distances only"):
         files._openmm_engine(None, [LinearRelation(0, [1, 2], [0.5, 0.5])], files.FORCE_FIELD, "Reference")
-
-
-def test_compare_runs_on_a_file(ethanol, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = "--forces emt --constrain allbonds --methods rattle --quick --budget 1 --dt 4"
-    assert main.main(["compare", str(ethanol), *words.split()]) == 0
-    assert "kcons: 8 bonds were guessed" in capsys.readouterr().err
-    about = read_csv(tmp_path / "compare-ethanol.xyz" / "compare.csv").attrs
-    assert "9 atoms, allbonds: 8 Distance" in about["title"]
 
 
 def test_virtual_sites_have_a_plan_and_no_system(tmp_path):

@@ -181,11 +181,6 @@ def test_what_a_method_raises_is_a_result(registry):
     assert (unable["status"], unable["note"]) == ("not run", "no such constraints here; use Rattle")
 
 
-def test_bad_input():
-    with pytest.raises(InputError, match="budget is 0; give a positive number"):
-        compare(chain(), ["rattle"], budget=0)
-
-
 def test_a_set_up_of_openmm_beyond_the_budget_is_refused_from_then_on():
     rotor = test_systems.build("rotor").shortened(4)
     rotor.openmm._waited = 50.0

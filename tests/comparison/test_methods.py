@@ -208,8 +208,7 @@ def test_forces_masses_and_distances_are_those_of_the_system(in_openmm):
 
 def test_same_errors_as_on_arrays(in_openmm):
     system = replace(in_openmm, time_steps=in_openmm.time_steps[1:3])
-    surfaces = bool(system.openmm.surfaces)
-    own = ("openmm-surface-rattle",) if surfaces else ("openmm-verlet-1e-12", "openmm-kcons-rattle")
+    own = () if system.openmm.surfaces else ("openmm-verlet-1e-12", "openmm-kcons-rattle")
     table, (core, *others) = errors(system, "rattle", *own, "openmm-held-rattle")
     for other in others:
         assert other == pytest.approx(core, rel=1e-6)
@@ -226,7 +225,7 @@ def test_same_errors_as_on_arrays(in_openmm):
         ("rotor", "blanes-moan6", "openmm-kcons-blanes-moan6"),
         ("alanine", "blanes-moan4", "openmm-kcons-blanes-moan4"),
         ("dumbbells", "suzuki4", "openmm-kcons-suzuki4"),
-        ("sphere-pendulum", "blanes-moan6", "openmm-surface-blanes-moan6"),
+        ("sphere-pendulum", "blanes-moan6", "openmm-held-blanes-moan6"),
     ],
 )
 def test_higher_orders_are_the_same_scheme(name, ours, theirs):
@@ -289,7 +288,6 @@ def test_which_methods_run():
     assert {m.engine for m in at_home} == {"OpenMM"}
     names = [m.name for m in at_home]
     assert "openmm-verlet-1e-12" in names and "openmm-held-rattle" in names
-    assert not any("surface" in name for name in names)
     assert names == [m.name for m in choose(["openmm"], built("alanine", 1))]
     guests = {
         name: [m.name for m in choose(None, built(name, 2 if name == "sphere" else None)) if m.engine == "OpenMM"]
@@ -297,7 +295,7 @@ def test_which_methods_run():
     }
     assert guests == {
         "rotor": ["openmm-verlet", "openmm-kcons-rattle"],
-        "sphere": ["openmm-surface-rattle"],
+        "sphere": ["openmm-held-rattle"],
         "butane": [],
     }
 
@@ -306,7 +304,6 @@ def test_which_methods_run():
     ("method", "system", "reason"),
     [
         ("openmm-verlet", "sphere", "a System holds distances only"),
-        ("openmm-surface-rattle", "rotor", "no particle is held on a surface"),
         ("openmm-verlet", "butane", "no OpenMM System"),
         ("ase-bonds", "sphere", "ASE has no constraint that holds an atom on a sphere"),
     ],

@@ -90,13 +90,6 @@ def test_an_error_that_is_asked_for():
     assert not len(none.table) and none.beyond.iloc[0].method == "blanes"
 
 
-def test_evaluations_decide_where_forces_take_no_time():
-    found = rank(made(*ROWS, force_seconds=1e-8))
-    assert found.cost == "evaluations"
-    assert list(found.table.method) == ["blanes", "rattle", "peer"]
-    assert list(found.table.place) == [1, 2, 2]
-
-
 def test_what_cannot_be_ranked():
     assert rank(made(row("rattle", 2.0, math.nan, 1.0, status="failed"))) is None
     below = rank(made(row("rattle", 2.0, 1e-15, 1.0), row("peer", 2.0, 1e-16, 2.0)))

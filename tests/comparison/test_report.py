@@ -10,7 +10,7 @@ import pytest
 
 from kcons.comparison import compare, figure, rank, read_csv, test_systems, text, write_csv
 from kcons.comparison.progress import duration
-from kcons.comparison.report import CURVES, chosen_curves, columns, sentence
+from kcons.comparison.report import CURVES, chosen_curves, sentence
 from kcons.errors import InputError
 
 
@@ -96,7 +96,6 @@ def test_a_figure_of_nothing_says_so():
     assert "no method reached the horizon" in [t.get_text() for t in figure(nothing).axes[0].texts]
 
 
-def test_columns_and_durations():
-    assert columns(pd.DataFrame({"a": ["x", "yyy"], "b": ["1", "10"]}), left=("a",)) == "a     b\nx     1\nyyy  10"
+def test_durations():
     given = (2.5e-9, 1.25e-5, 0.0125, 3.0, 700.0, 8000.0)
     assert [duration(s) for s in given] == ["2.50 ns", "12.5 µs", "12.5 ms", "3.00 s", "12 min", "2.2 h"]

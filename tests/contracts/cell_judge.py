@@ -15,7 +15,7 @@ from ase.calculators.calculator import Calculator, all_changes
 from ase.md.verlet import VelocityVerlet
 from cell_molecules import half_width
 from cell_oracle import EPS, Array, NoSolution, advance, stepper_of
-from cell_worlds import World, world, wrapping
+from cell_worlds import World, row_length, world, wrapping
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain
@@ -33,8 +33,6 @@ FAR_JUMP = 3.0
 ANOTHER = "another solution"
 #: Steppers of runs that nothing bounds.
 WILD = (Rattle(), Rattle(), Geodesic(), Suzuki4(), BlanesMoan4(), KahanLi6(), BlanesMoan6())
-#: Said where a held dihedral becomes straight.
-UNDEFINED = "where a dihedral angle is undefined"
 #: Said of lengths to be found that could as well close through the boundary.
 TO_GIVE = "Give the target of this row"
 ABOUT_HALF = re.compile(r"half\b.{0,30}\b(box|cell)|minimum image|ambiguous|image", re.IGNORECASE)
@@ -159,25 +157,12 @@ class Judge:
             self.say(operation, "refused", "impossible")
         elif ABOUT_HALF.search(str(error)):
             self.say(operation, "refused" if link > 1 else "unfounded", f"half the cell, link {link:.2f}: {words}")
-        elif not solvable or (UNDEFINED in str(error) and self._straight(error)):
+        elif not solvable:
             self.say(operation, "refused", words)
         elif 1 < link < FAR_JUMP:
             self.say(operation, "silent", f"wrong remedy, link {link:.2f}: {words}")
         else:
             self.say(operation, "refused" if link >= FAR_JUMP else "unfounded", words)
-
-    def _straight(self, error: Exception) -> bool:
-        """Whether smaller steps stop at the same time, so that a held dihedral really ends the motion."""
-        w, step = self.w, getattr(error, "step", None)
-        if step is None or self.motion is None:
-            return False
-        anchors = w.stored(w.anchors)
-        system = System(self.motion, lambda x, t: -w.springs * (x - anchors))
-        try:
-            run(system, State(self.x.copy(), w.v.copy()), w.dt / 8, 8 * (step + 2), stepper=stepper_of(w.stepper))
-        except KconsError as again:
-            return UNDEFINED in str(again) and abs(getattr(again, "step", 0) / 8 - step) < 2
-        return False
 
     def attempt(
         self,
@@ -208,6 +193,10 @@ class Judge:
             self.say(operation, "silent", "arguments were changed")
             return None
         return result
+
+    def accepts(self, operation: str, call: Callable[[], Any], given: list[Array], link: float, *more: bool) -> bool:
+        """Whether a call that has no result ends well."""
+        return bool(self.attempt(operation, lambda: [call()], given, link, *more))
 
     def may_refuse(self, link: float, cell: Array | None = None) -> bool:
         """Whether the oracle's last ways to the rows are such as the engine need not go, and smaller steps help.
@@ -284,13 +273,9 @@ class Judge:
             links, solvable = max(links, w.nearness(exact, every=True)), True
         except NoSolution:
             solvable = False
-        found = self.attempt(
-            label + "project_positions",
-            lambda: motion.project_positions(new, here, time=t, reference_time=0.0),
-            [new, here],
-            links,
-            solvable and not self.may_refuse(links),
-        )
+        project = lambda: motion.project_positions(new, here, time=t, reference_time=0.0)  # noqa: E731
+        may = solvable and not self.may_refuse(links)
+        found = self.attempt(label + "project_positions", project, [new, here], links, may)
         if found is not None and solvable and rng.random() < 0.3:
             self.in_place(label, moved, images, here, t, links)
         if found is not None and not solvable:
@@ -300,62 +285,45 @@ class Judge:
             self.place(label + "project_positions", placed, exact, allowed, moved, w.x, t, _top(new, here))
         link = w.nearness(w.x)
         v, f = rng.normal(size=w.x.shape), rng.normal(size=w.x.shape)
-        for name, call, exact_of, given in (
-            (
-                "project_velocities",
-                lambda: motion.project_velocities(here, v),
-                lambda x: rows.velocities(x, v, 0.0),
-                [here, v],
-            ),
-            (
-                "acceleration",
-                lambda: motion.acceleration(here, w.v, f),
-                lambda x: rows.acceleration(x, rows.velocities(x, w.v, 0.0), f, 0.0),
-                [here, w.v, f],
-            ),
-            (
-                "constraint_force",
-                lambda: motion.constraint_force(here, w.v, f),
-                lambda x: rows.force(x, rows.velocities(x, w.v, 0.0), f, 0.0),
-                [here, w.v, f],
-            ),
-        ):
-            found = self.attempt(label + name, call, given, link)
-            if found is None:
-                continue
-            exact, allowed = self.spread(exact_of, w.x, stored=stored)
-            if w.impossible:
-                allowed = -1.0  # no result is right
-            self.compare(label + name, found, exact, allowed)
+        begun = {
+            "project_velocities": ((here, v), lambda x: rows.velocities(x, v, 0.0)),
+            "acceleration": ((here, w.v, f), lambda x: rows.acceleration(x, rows.velocities(x, w.v, 0.0), f, 0.0)),
+            "constraint_force": ((here, w.v, f), lambda x: rows.force(x, rows.velocities(x, w.v, 0.0), f, 0.0)),
+        }
+        for name, (given, exact_of) in begun.items():
+            found = self.attempt(label + name, lambda n=name, g=given: getattr(motion, n)(*g), list(given), link)
+            if found is not None:
+                exact, allowed = self.spread(exact_of, w.x, stored=stored)
+                # Of what is impossible no result is right.
+                self.compare(label + name, found, exact, -1.0 if w.impossible else allowed)
 
     def in_place(self, label: str, moved: Array, images: Array, here: Array, t: float, link: float) -> None:
         """The same into the array itself, with the velocities that belong to it."""
-        w, rows, rng = self.w, self.rows, self.rng
-        new, v, dt = w.stored(moved, images), rng.normal(size=w.x.shape), 0.1
-        expected = v.copy()
-        work = [new.copy(), v.copy()]
-        name = label + "project_positions in place"
+        w, rows = self.w, self.rows
+        new, v, dt, name = (
+            w.stored(moved, images),
+            self.rng.normal(size=w.x.shape),
+            0.1,
+            label + "project_positions in place",
+        )
+        y, u, top = new.copy(), v.copy(), _top(new, here)
         try:
-            self.motion.project_positions(
-                work[0], here, time=t, reference_time=0.0, velocities=work[1], dt=dt, out=work[0]
-            )
+            self.motion.project_positions(y, here, time=t, reference_time=0.0, velocities=u, dt=dt, out=y)
         except Exception as error:
             self.refusal(name, error, link)
-            if work[0].tobytes() != new.tobytes() or work[1].tobytes() != expected.tobytes():
+            if y.tobytes() != new.tobytes() or u.tobytes() != v.tobytes():
                 self.say(name, "silent", "arguments were changed")
             return
-        both, allowed = self.spread(lambda a, b: np.stack(rows.solve(a, b, t)), moved, w.x, stored=_top(new, here))
-        placed = work[0] - images @ w.cell
-        if float(np.abs(placed - both[0]).max()) > allowed and self.other(
-            placed, both[0], moved, w.x, t, _top(new, here)
-        ):
+        (exact, push), allowed = self.spread(lambda a, b: np.stack(rows.solve(a, b, t)), moved, w.x, stored=top)
+        placed = y - images @ w.cell
+        if float(np.abs(placed - exact).max()) > allowed and self.other(placed, exact, moved, w.x, t, top):
             start = moved.copy()
             rows.pin(start, t)
             self.say(name, "right", ANOTHER)
-            self.compare(name, work[1], v + (placed - start) / dt, (allowed + 64 * EPS * _top(new)) / dt)
-            return
-        self.compare(name, placed, both[0], allowed)
-        self.compare(name, work[1], v + both[1] / dt, allowed / dt)
+            self.compare(name, u, v + (placed - start) / dt, (allowed + 64 * EPS * _top(new)) / dt)
+        else:
+            self.compare(name, placed, exact, allowed)
+            self.compare(name, u, v + push / dt, allowed / dt)
 
     def values(self) -> None:
         """sigma as the set that was given evaluates it, off the rows too."""
@@ -368,19 +336,12 @@ class Judge:
                 atoms = item.arguments["atoms"]
                 expected += (moved[atoms] - rows.places[np.searchsorted(rows.pinned, atoms)]).ravel().tolist()
             elif item.family:
-                for row in item.arguments.get("pairs_as_rows") or item.rows:
-                    if id(row) in at:
-                        expected.append(float(at[id(row)]))
-                    else:
-                        (i, j) = row.vectors[0]
-                        expected.append(float(np.linalg.norm(moved[i] - moved[j])) - row.target)
+                for row in item.rows:
+                    known = at.get(id(row))
+                    expected.append(row_length(row, moved, w.cell) - row.target if known is None else float(known))
         here = w.stored(moved, self.elsewhere(0.5))
-        found = self.attempt(
-            "value",
-            lambda: self.held.value(here),
-            [here],
-            max(w.nearness(moved, every=True), w.nearness(w.x, every=True)),
-        )
+        link = max(w.nearness(moved, every=True), w.nearness(w.x, every=True))
+        found = self.attempt("value", lambda: self.held.value(here), [here], link)
         if found is not None:
             self.compare("value", found, np.array(expected), 200 * EPS * _top(here, w.x) * _slope(rows, moved))
 
@@ -415,13 +376,9 @@ class Judge:
         anchors = [w.stored(w.anchors)]
         system = System(self.motion, lambda x, t: -w.springs * (x - anchors[0]))
         state = State(self.x.copy(), w.v.copy())
-        parts = (
-            [5] * (w.steps // 5)
-            if w.drifting
-            else [w.steps]
-            if rng.random() < 0.6 or not self.periodic
-            else [w.steps, 1]
-        )
+        parts = [5] * (w.steps // 5)
+        if not w.drifting:
+            parts = [w.steps] if rng.random() < 0.6 or not self.periodic else [w.steps, 1]
         winds = any(np.any(r.images) for r in rows.rows if r.images)
         pair = Pair(self)
         done, largest, name = 0, _top(self.x), f"run {w.stepper}"
@@ -442,16 +399,8 @@ class Judge:
                 solvable = True
             except NoSolution:
                 solvable = False
-            before = (state.positions, state.velocities)
-            here = state
-            state = self.attempt(
-                name,
-                lambda s=here, n=steps: run(system, s, w.dt, n, stepper=stepper),
-                list(before),
-                link,
-                solvable,
-                doubtful,
-            )
+            go = lambda s=state, n=steps: run(system, s, w.dt, n, stepper=stepper)  # noqa: E731
+            state = self.attempt(name, go, [state.positions, state.velocities], link, solvable, doubtful)
             if state is None:
                 return
             if not solvable:
@@ -461,11 +410,13 @@ class Judge:
             rounding = 64 * EPS * self.dependent[2] * largest
             room = ROOM * max(done, 1)
             (x, v), (off_x, off_v) = (pair.x, pair.v), pair.apart()
-            speed = float(np.abs(v).max())
-            fine = self.compare(name, state.positions - images @ cell, x, room * off_x + rounding) and self.compare(
-                name, state.velocities, v, room * off_v + 64 * EPS * self.dependent[2] * speed
-            )
-            if not (fine and self.on_rows(name, state.positions - images @ cell, x, done * w.dt, largest)):
+            slow = 64 * EPS * self.dependent[2] * float(np.abs(v).max())
+            placed = state.positions - images @ cell
+            if not (
+                self.compare(name, placed, x, room * off_x + rounding)
+                and self.compare(name, state.velocities, v, room * off_v + slow)
+                and self.on_rows(name, placed, x, done * w.dt, largest)
+            ):
                 return
         if not np.array_equal(cell, w.cell):
             self._use_cell(w.cell, w.x, w.images)
@@ -524,18 +475,16 @@ class Judge:
         return moving or self.w.links(self.w.x)[0] > 0
 
     def _use_cell(self, cell: Array, whole: Array, images: Array) -> bool:
-        def change() -> bool:
-            positions = self.w.stored(whole, images, cell) if self._loose() else None
-            self.motion.set_cell(cell, self.w.pbc, positions)
+        positions = self.w.stored(whole, images, cell) if self._loose() else None
+        change = lambda: self.motion.set_cell(cell, self.w.pbc, positions)  # noqa: E731
+        if accepted := self.accepts("set_cell", change, [], self._cell_link(cell, whole)):
             self.rows.set_cell(cell)
-            return True
-
-        return bool(self.attempt("set_cell", change, [], self._cell_link(cell, whole)))
+        return accepted
 
     def _cell_link(self, cell: Array, x: Array | None = None) -> float:
         """Rows are sorted once: a distance that becomes longer than half the cell may be refused as well."""
         w = self.w
-        rows = (r for i in w.items for r in (i.arguments.get("pairs_as_rows") or i.rows))
+        rows = (r for i in w.items for r in i.rows)
         lengths = [r.target for r in rows if r.kind == "norm" and not r.amplitude]
         half, before = half_width(cell, w.pbc), half_width(w.cell, w.pbc)
         grown = any(before > a >= half for a in lengths)
@@ -556,21 +505,14 @@ class Judge:
         link = w.nearness(w.x, cell)
         # Rows among atoms that nothing ties need the positions.
         positions = w.stored(cell=cell) if too_small or self._loose() or rng.random() < 0.5 else None
-        given = [] if positions is None else [positions]
         if rng.random() < 0.3 and link < 1:
             # Barostats may as well tell the set.
-            def tell() -> bool:
-                self.held.with_cell(cell, w.pbc)
-                return True
-
-            accepted = self.attempt("with_cell", tell, [], self._cell_link(cell))
+            tell = lambda: self.held.with_cell(cell, w.pbc)  # noqa: E731
+            accepted = self.accepts("with_cell", tell, [], self._cell_link(cell))
         else:
-
-            def change() -> bool:
-                self.motion.set_cell(cell, w.pbc, positions)
-                return True
-
-            accepted = self.attempt("set_cell", change, given, self._cell_link(cell))
+            change = lambda: self.motion.set_cell(cell, w.pbc, positions)  # noqa: E731
+            given = [] if positions is None else [positions]
+            accepted = self.accepts("set_cell", change, given, self._cell_link(cell))
         label = "after set_cell, "
         if accepted:
             self.rows.set_cell(cell)
@@ -586,21 +528,19 @@ class Judge:
         w, rng = self.w, self.rng
         images = w.images
         calculator = Springs(w.springs, w.stored(w.anchors))
-        atoms = Atoms("H" * len(w.x), positions=self.x, calculator=calculator)
-        atoms.set_cell(w.cell)
-        atoms.pbc = w.pbc & self.periodic
-        atoms.set_masses(w.masses)
-        atoms.set_velocities(w.v)
+        pbc = w.pbc & self.periodic
+        atoms = Atoms(
+            "H" * len(w.x), self.x, cell=w.cell, pbc=pbc, masses=w.masses, velocities=w.v, calculator=calculator
+        )
         steps = 1 if w.placed.any() else int(rng.integers(1, 3))
         link, pair = w.nearness(w.x), Pair(self)
         dynamics = (VelocityVerlet if rng.random() < 0.6 else ConstrainedDynamics)(atoms, w.dt)
         name = f"ASE {type(dynamics).__name__}"
 
-        def go(number: int) -> bool:
+        def go(number: int) -> None:
             if number == 0:
                 constrain(atoms, w.constraints())
             dynamics.run(1)
-            return True
 
         for number in range(steps):
             solvable = True
@@ -616,16 +556,17 @@ class Judge:
                 atoms.wrap()
                 images = np.round(np.linalg.solve(w.cell.T, (atoms.positions - whole).T).T).astype(int)
                 calculator.anchors = w.anchors + images @ w.cell
-            if not self.attempt(name, lambda n=number: go(n), [], link, solvable) or not solvable:
+            if not self.accepts(name, lambda n=number: go(n), [], link, solvable) or not solvable:
                 return
             largest = _top(atoms.positions, self.x)
             (x, v), (off_x, off_v) = (pair.x, pair.v), pair.apart()
             rounding = 64 * EPS * self.dependent[2] * largest
             room = ROOM * (number + 1)
-            if not self.compare(name, atoms.positions - images @ w.cell, x, room * off_x + rounding):
-                return
             # ASE takes velocities from differences of positions.
-            if not self.compare(name, atoms.get_velocities(), v, room * off_v + rounding / w.dt):
+            if not (
+                self.compare(name, atoms.positions - images @ w.cell, x, room * off_x + rounding)
+                and self.compare(name, atoms.get_velocities(), v, room * off_v + rounding / w.dt)
+            ):
                 return
 
 
@@ -647,8 +588,8 @@ class Pair:
             self.twin = advance(self.w.rows, stepper, *self.twin, t, self.w.dt, self.pull)
 
     def apart(self) -> tuple[float, float]:
-        one, other = (self.x, self.v), self.twin
-        return float(np.abs(one[0] - other[0]).max()), float(np.abs(one[1] - other[1]).max())
+        x, v = self.twin
+        return float(np.abs(self.x - x).max()), float(np.abs(self.v - v).max())
 
 
 class Springs(Calculator):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from cell_oracle import Array, Row
@@ -16,12 +16,18 @@ class Unsuitable(Exception):
 
 @dataclass
 class Item:
-    """Rows in the package's words, and the same for the oracle (none where rows in other words stand for them)."""
+    """Rows in the package's words, and the same for the oracle.
+
+    Not `held` are those for which it has rows in other words, and no `family` have these.
+    """
 
     family: str
-    arguments: dict
     rows: list[Row]
+    #: Atoms of the rows that depend on images.
+    listed: list[list[int]] = field(default_factory=list)
+    arguments: dict = field(default_factory=dict)
     how: str = "open"  # 'open' | 'given' | 'moving'
+    held: bool = True
 
 
 class Builder:
@@ -47,15 +53,15 @@ class Builder:
     def add(self, family: str, rows: list[Row], listed: list[list[int]], movable: bool = True, **arguments) -> Item:
         chance = self.rng.random()
         how = "moving" if movable and chance < 0.15 else "given" if chance < 0.4 else "open"
-        item = Item(family, {"listed": listed, **arguments}, rows, how)
+        item = Item(family, rows, listed, arguments, how)
         self.items.append(item)
         return item
 
     def distances(self, pairs: list[tuple[int, int]], movable: bool = True, held: bool = True) -> Item:
         """Distance rows; `held` False if the oracle holds the same in other words."""
         rows = [Row("norm", [{i: 1.0, j: -1.0}], [(0, 0, 0)]) for i, j in pairs]
-        item = self.add("Distance", rows if held else [], [list(p) for p in pairs], movable, pairs=pairs)
-        item.arguments["pairs_as_rows"] = rows
+        item = self.add("Distance", rows, [list(p) for p in pairs], movable, pairs=pairs)
+        item.held = held
         return item
 
     def angles(self, triples: list[list[int]], images: list | None = None) -> None:
@@ -70,25 +76,19 @@ class Builder:
         self.add("Dihedral", rows, quads, quads=quads)
 
     def relation(self, atom: int, bases: list[int], weights: Array, held: bool = True) -> None:
-        rows = relation_rows(atom, bases, weights)
+        rows = [
+            Row("linear", coefficients={atom: axis, **{b: -w * axis for b, w in zip(bases, weights, strict=True)}})
+            for axis in np.eye(3)
+        ]
         if held:
             self.add("LinearRelation", rows, [[atom, *bases]], atoms=[atom], bases=[bases], weights=[list(weights)])
         else:
-            self.items.append(Item("", {"listed": []}, rows))
+            self.items.append(Item("", rows))
 
     def combination(self, atoms: list[int], coefficients: Array, place: bool = False) -> None:
         rows = [Row("linear", coefficients={a: c for a, c in zip(atoms, coefficients, strict=True)})]
         arguments = {"place": True} if place else {}
         self.add("LinearCombination", rows, [atoms], atoms=atoms, coefficients=coefficients, **arguments)
-
-
-def relation_rows(atom: int, bases: list[int], weights: Array) -> list[Row]:
-    rows = []
-    for axis in np.eye(3):
-        rows.append(
-            Row("linear", coefficients={atom: axis, **{b: -w * axis for b, w in zip(bases, weights, strict=True)}})
-        )
-    return rows
 
 
 def _unit(rng: np.random.Generator) -> Array:
@@ -179,7 +179,7 @@ def _between(b: Builder, a: list[int], x: Array, bases: list[int]) -> None:
     """Distances of the bases, and the other atoms as combinations of them: what the oracle holds."""
     b.flat = True
     rows = [Row("norm", [{a[i]: 1.0, a[j]: -1.0}], [(0, 0, 0)]) for i, j in itertools.combinations(bases, 2)]
-    b.items.append(Item("", {"listed": []}, rows))
+    b.items.append(Item("", rows))
     arms = (x[bases[1:]] - x[bases[0]]).T
     for k in range(len(a)):
         if k not in bases:
@@ -364,8 +364,7 @@ def winding(b: Builder) -> list[int]:
     b.distances(list(itertools.pairwise(a)))
     image = tuple(int(k == axis) * -1 for k in range(3))
     rows = [Row("norm", [{a[-1]: 1.0, a[0]: -1.0}], [image])]
-    item = b.add("Distance", rows, [[a[-1], a[0]]], pairs=[(a[-1], a[0])])
-    item.arguments["pairs_as_rows"] = rows
+    b.add("Distance", rows, [[a[-1], a[0]]], pairs=[(a[-1], a[0])])
     if rng.random() < 0.4:
         # Around the atom at the seam: from the last atom's image over the first to the second.
         vectors = [{a[-1]: 1.0, a[0]: -1.0}, {a[1]: 1.0, a[0]: -1.0}]

@@ -2,16 +2,15 @@
 
 Nothing here comes from the package but the fractions of a step, and nothing knows of minimum images: positions are
 those of whole molecules, and a row that leads through the boundary says by which lattice vectors. Every row is a
-function of a few vectors that are linear in the positions; values, gradients and second derivatives along a motion are
-taken from there by the product rule. Projections are least squares on the singular vectors of B = A M^-1/2, so that
-rows may depend on each other; fixed atoms have infinite mass.
+function of a few vectors that are linear in the positions. Projections are least squares on the singular vectors of
+B = A M^-1/2, so that rows may depend on each other; fixed atoms have infinite mass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ RANK = 1e-8
 #: A correction longer than this, in units of the molecules' bonds, is no solution near the start.
 FAR = 20.0
 #: Which vectors a kind of row is made of, and whether it turns through a full circle.
-VECTORS = {"norm": 1, "angle": 2, "dihedral": 3, "linear": 0, "gyration": 0}
+VECTORS = {"norm": 1, "angle": 2, "dihedral": 3, "linear": 0, "gyration": 1}
 
 
 class NoSolution(Exception):
@@ -53,13 +52,8 @@ class Row:
 
     def renumbered(self, new: Array) -> Row:
         """The same row where atom a is called new[a]."""
-        return Row(
-            self.kind,
-            [{int(new[a]): w for a, w in v.items()} for v in self.vectors],
-            list(self.images),
-            {int(new[a]): c for a, c in self.coefficients.items()},
-            self.place,
-        )
+        vectors = [{int(new[a]): w for a, w in v.items()} for v in self.vectors]
+        return replace(self, vectors=vectors, coefficients={int(new[a]): c for a, c in self.coefficients.items()})
 
 
 def wave(amplitude: Array, omega: Array, phase: Array, time: float, derivative: int = 0) -> Array:
@@ -83,26 +77,23 @@ class Dense:
         self.weights = 1.0 / masses
         self.weights[pinned] = 0.0
         self.root = np.sqrt(np.repeat(self.weights, 3))
+        #: By kind: weights of atoms in vectors, places, coefficients, images.
         self.blocks = {}
         for kind, count in VECTORS.items():
             mine = [r for r in self.rows if r.kind == kind]
-            if not mine:
-                continue
-            table = np.zeros((max(count, 1), len(mine), self.n))
+            table, extra = np.zeros((count, len(mine), self.n)), np.zeros((count, len(mine), 3))
+            linear, images = np.zeros((len(mine), self.n, 3)), np.zeros((count, len(mine), 3))
             for k, row in enumerate(mine):
                 for slot, vector in enumerate(row.vectors):
-                    for atom, weight in vector.items():
-                        table[slot, k, atom] = weight
-            extra = np.zeros((max(count, 1), len(mine), 3))
-            for k, row in enumerate(mine):
+                    table[slot, k, list(vector)] = list(vector.values())
+                if row.images:
+                    images[:, k] = row.images
                 if row.place is not None:
                     extra[0, k] -= row.place
-            linear = np.zeros((len(mine), self.n, 3))
-            for k, row in enumerate(mine):
                 for atom, c in row.coefficients.items():
                     linear[k, atom] = c
-            images = np.array([r.images or [(0, 0, 0)] * max(count, 1) for r in mine], dtype=float)
-            self.blocks[kind] = (table, extra, linear, images)
+            if mine:
+                self.blocks[kind] = (table, extra, linear, images)
         self.set_cell(cell)
         self.waving = np.array([[r.amplitude, r.omega, r.phase] for r in self.rows]).reshape(-1, 3).T
         self.targets = np.array([r.target for r in self.rows])
@@ -130,41 +121,38 @@ class Dense:
 
     def set_cell(self, cell: Array) -> None:
         """Lattice vectors as rows; rows through the boundary follow."""
-        self.shifts = {k: np.moveaxis(images @ cell, 1, 0) for k, (_, _, _, images) in self.blocks.items()}
+        self.shifts = {kind: extra + images @ cell for kind, (_, extra, _, images) in self.blocks.items()}
 
     # -- rows -----------------------------------------------------------------------------------
-
-    def _vectors(self, kind: str, x: Array, moving: bool = False) -> Array:
-        table, extra, _, _ = self.blocks[kind]
-        return table @ x if moving else table @ x + extra + self.shifts[kind]
 
     def measure(self, x: Array) -> Array:
         """q of every row."""
         return np.concatenate([self._measure(kind, x) for kind in self.blocks] or [np.zeros(0)])
 
     def _measure(self, kind: str, x: Array) -> Array:
+        table, _, linear, _ = self.blocks[kind]
         if kind == "linear":
-            return np.einsum("kai,ai->k", self.blocks[kind][2], x)
+            return np.einsum("kai,ai->k", linear, x)
         if kind == "gyration":
-            return np.sqrt(self._spread(x, x)[0])
-        d = self._vectors(kind, x)
+            return np.sqrt(self._spread(x)[0])
+        d = table @ x + self.shifts[kind]
         if kind == "norm":
-            return np.linalg.norm(d[0], axis=1)
-        s, c = _angle(*d)[:2] if kind == "angle" else _dihedral(*d)[:2]
+            return _length(d[0])
+        s, c = (_angle if kind == "angle" else _dihedral)(*d)[:2]
         return np.arctan2(s, c)
 
-    def _spread(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Sum of w (x - c) . (y - c'), and x - c, with the centers c and c' of x and y.
+    def _spread(self, x: Array) -> tuple[Array, Array]:
+        """Sum of w |x - c|^2, and x - c, with the center c of x.
 
         What rounds is c, by eps |c|, and with it all of x - c, so that they are taken about their own center again:
         heavy atoms lie next to c, at a distance that may be eps |c| times 1e13 and less.
         """
         w = self.blocks["gyration"][0][0]
-        about = [np.broadcast_to(z, (len(w), *z.shape)) for z in (x, y)]
+        about = np.broadcast_to(x, (len(w), *x.shape))
         for _ in range(2):
-            about = [z - np.einsum("ka,kai->ki", w, z)[:, None] for z in about]
-        extent = np.abs(np.where(w[..., None] != 0, about[0], 0.0)).max(axis=(1, 2), keepdims=True)
-        return np.einsum("ka,kai,kai->k", w, *about), about[0] + self.slip * extent
+            about = about - np.einsum("ka,kai->ki", w, about)[:, None]
+        extent = np.abs(np.where(w[..., None] != 0, about.real, 0.0)).max(axis=(1, 2), keepdims=True)
+        return np.einsum("ka,kai,kai->k", w, about, about), about + self.slip * extent
 
     def value(self, x: Array, t: float) -> Array:
         """sigma of every row, dihedrals to the nearest turn."""
@@ -181,34 +169,19 @@ class Dense:
         if kind == "linear":
             return linear
         if kind == "gyration":
-            square, about = self._spread(x, x)
+            square, about = self._spread(x)
             return table[0][:, :, None] * about / np.sqrt(square)[:, None, None]
-        d = self._vectors(kind, x)
+        d = table @ x + self.shifts[kind]
         if kind == "norm":
-            slopes = d / np.linalg.norm(d, axis=2, keepdims=True)
+            slopes = d / _length(d)[..., None]
         else:
             s, c, ds, dc = (_angle if kind == "angle" else _dihedral)(*d)
             slopes = (c[:, None] * ds - s[:, None] * dc) / (s * s + c * c)[:, None]
         return np.einsum("ska,ski->kai", table, slopes)
 
     def curvature(self, x: Array, v: Array) -> Array:
-        """The second derivative of q along x + s v."""
-        return np.concatenate([self._curvature(kind, x, v) for kind in self.blocks] or [np.zeros(0)])
-
-    def _curvature(self, kind: str, x: Array, v: Array) -> Array:
-        if kind == "linear":
-            return np.zeros(len(self.blocks[kind][2]))
-        if kind == "gyration":
-            q = np.sqrt(self._spread(x, x)[0])
-            return (self._spread(v, v)[0] - (self._spread(x, v)[0] / q) ** 2) / q
-        d, u = self._vectors(kind, x), self._vectors(kind, v, moving=True)
-        if kind == "norm":
-            q = np.linalg.norm(d[0], axis=1)
-            return (_dot(u[0], u[0]) - (_dot(d[0], u[0]) / q) ** 2) / q
-        s, c = _angle_along(d, u) if kind == "angle" else _dihedral_along(d, u)
-        square = s[0] ** 2 + c[0] ** 2
-        rate = (c[0] * s[1] - s[0] * c[1]) / square
-        return (c[0] * s[2] - s[0] * c[2]) / square - rate * 2 * (c[0] * c[1] + s[0] * s[1]) / square
+        """The second derivative of q along x + s v: a step of the gradient into the complex plane, without rounding."""
+        return self.jacobian(x + 1e-30j * v).imag @ v.ravel() / 1e-30
 
     # -- mechanics ------------------------------------------------------------------------------
 
@@ -221,6 +194,14 @@ class Dense:
         rank = int(np.sum(s > RANK * s.max(initial=0.0)))
         return vh[:rank], a, float(s[0] / s[rank - 1]) if rank else 1.0
 
+    def _nearest(self, a: Array, basis: Array, wanted: Array) -> tuple[Array, Array]:
+        """The least change, in the mass metric and along a basis, with `a` times it as wanted; and in the basis."""
+        spread = (basis * self.root).T
+        size = np.linalg.norm(a, axis=1)
+        size[size == 0] = 1.0
+        inside = np.linalg.lstsq((a @ spread) / size[:, None], wanted / size, rcond=1e-10)[0]
+        return (spread @ inside).reshape(-1, 3), inside
+
     def pin(self, x: Array, t: float, derivative: int = 0) -> None:
         """Put fixed atoms where they are, or give them their velocity or acceleration, in place."""
         moved = wave(*self.waves, t, derivative)
@@ -231,19 +212,16 @@ class Dense:
         y = x_new.copy()
         self.pin(y, t)
         basis = self.basis(x_ref)[0]
-        spread = (basis * self.root).T
-        unknown = np.zeros(len(basis))
+        spread, unknown = (basis * self.root).T, np.zeros(len(basis))
         z, last = y, np.inf
         for _ in range(30):
             a, miss = self.jacobian(z), self.value(z, t)
             if not (np.all(np.isfinite(a)) and np.all(np.isfinite(miss))):
                 break
-            size = np.linalg.norm(a, axis=1)
-            size[size == 0] = 1.0
-            step = np.linalg.lstsq((a @ spread) / size[:, None], -miss / size, rcond=1e-10)[0]
-            unknown += step
+            step, inside = self._nearest(a, basis, -miss)
+            unknown += inside
             z = y + (spread @ unknown).reshape(-1, 3)
-            length = float(np.abs(spread @ step).max(initial=0.0))
+            length = float(np.abs(step).max(initial=0.0))
             if float(np.abs(z - y).max()) > FAR:
                 break
             if length <= 1e-15 * np.abs(z).max() or (length >= last and length <= 1e-12 * np.abs(z).max()):
@@ -257,14 +235,10 @@ class Dense:
     def _change(self, x: Array, y: Array, wanted: Array) -> Array:
         """From y to the nearest, in the mass metric, with A y = wanted; fixed atoms stay."""
         basis, a, _ = self.basis(x)
-        spread = (basis * self.root).T
-        size = np.linalg.norm(a, axis=1)
-        size[size == 0] = 1.0
         change = np.zeros(y.shape)
         for _ in range(2):
             # Once more: the first is as precise as its largest part, which may be that of other molecules.
-            miss = (wanted - a @ (y + change).ravel()) / size
-            change += (spread @ np.linalg.lstsq((a @ spread) / size[:, None], miss, rcond=1e-10)[0]).reshape(-1, 3)
+            change += self._nearest(a, basis, wanted - a @ (y + change).ravel())[0]
         return change
 
     def velocities(self, x: Array, v: Array, t: float) -> Array:
@@ -306,14 +280,8 @@ class Dense:
             wanted = a @ (z - start).ravel() - self.value(z, t)
             if not (np.all(np.isfinite(a)) and np.all(np.isfinite(wanted))):
                 break
-            basis = self.basis(z)[0]
-            spread = (basis * self.root).T
-            size = np.linalg.norm(a, axis=1)
-            size[size == 0] = 1.0
-            push = np.linalg.lstsq((a @ spread) / size[:, None], wanted / size, rcond=1e-10)[0]
-            following = start + (spread @ push).reshape(-1, 3)
-            length = float(np.abs(following - z).max())
-            z = following
+            following = start + self._nearest(a, self.basis(z)[0], wanted)[0]
+            length, z = float(np.abs(following - z).max()), following
             if length <= 2e-15 * np.abs(z).max() or (length >= last and length <= 1e-12 * np.abs(z).max()):
                 return z
             last = length
@@ -326,50 +294,30 @@ class Dense:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return np.einsum("ki,ki->k", a, b)
+    return np.einsum("...i,...i", a, b)
+
+
+def _length(a: Array) -> Array:
+    """Analytic, as a step into the complex plane needs it."""
+    return np.sqrt(_dot(a, a))
 
 
 def _angle(u: Array, w: Array) -> tuple[Array, Array, Array, Array]:
     """|u x w|, u . w, and their gradients with respect to u and w."""
     n = np.cross(u, w)
-    s = np.linalg.norm(n, axis=1)
+    s = _length(n)
     return s, _dot(u, w), np.stack([np.cross(w, n), np.cross(n, u)]) / s[:, None], np.stack([w, u])
 
 
 def _dihedral(p: Array, q: Array, r: Array) -> tuple[Array, Array, Array, Array]:
     """|q| p . (q x r), (p x q) . (q x r), and their gradients with respect to p, q and r."""
-    g = np.linalg.norm(q, axis=1)
-    qr = np.cross(q, r)
+    g, qr = _length(q), np.cross(q, r)
     triple = _dot(p, qr)
     pq_, qr_, pr_, qq = _dot(p, q)[:, None], _dot(q, r)[:, None], _dot(p, r)[:, None], _dot(q, q)[:, None]
     ds = np.stack([qr, np.cross(r, p), np.cross(p, q)]) * g[:, None]
     ds[1] += triple[:, None] * q / g[:, None]
     dc = np.stack([qr_ * q - qq * r, qr_ * p + pq_ * r - 2 * pr_ * q, pq_ * q - qq * p])
     return g * triple, (pq_ * qr_ - pr_ * qq)[:, 0], ds, dc
-
-
-def _angle_along(d: Array, v: Array) -> tuple[list[Array], list[Array]]:
-    (u, w), (du, dw) = d, v
-    n, n1, n2 = np.cross(u, w), np.cross(du, w) + np.cross(u, dw), 2 * np.cross(du, dw)
-    s = np.linalg.norm(n, axis=1)
-    s1 = _dot(n, n1) / s
-    return [s, s1, (_dot(n1, n1) + _dot(n, n2) - s1**2) / s], [_dot(u, w), _dot(du, w) + _dot(u, dw), 2 * _dot(du, dw)]
-
-
-def _dihedral_along(d: Array, v: Array) -> tuple[list[Array], list[Array]]:
-    (p, q, r), (dp, dq, dr) = d, v
-    g = np.linalg.norm(q, axis=1)
-    g1 = _dot(q, dq) / g
-    g2 = (_dot(dq, dq) - g1**2) / g
-    m = [np.cross(q, r), np.cross(dq, r) + np.cross(q, dr), 2 * np.cross(dq, dr)]
-    n = [np.cross(p, q), np.cross(dp, q) + np.cross(p, dq), 2 * np.cross(dp, dq)]
-    t = [_dot(p, m[0]), _dot(dp, m[0]) + _dot(p, m[1]), 2 * _dot(dp, m[1]) + _dot(p, m[2])]
-    c = [
-        _dot(n[0], m[0]),
-        _dot(n[1], m[0]) + _dot(n[0], m[1]),
-        _dot(n[2], m[0]) + 2 * _dot(n[1], m[1]) + _dot(n[0], m[2]),
-    ]
-    return [g * t[0], g1 * t[0] + g * t[1], g2 * t[0] + 2 * g1 * t[1] + g * t[2]], c
 
 
 # -- motion -------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from cell_molecules import KINDS, Builder, Item, Unsuitable, half_width, random_cell
@@ -95,7 +95,7 @@ class World:
         """Which atoms distances tie together, as a forest of parents, and the longest vector that this needs."""
         tied, parent = 0.0, list(range(len(x)))
         bonds = [(r, *r.vectors[0]) for i in self.items for r in _tying(i)]
-        for length, i, j in sorted((_length(r, x, cell), i, j) for r, i, j in bonds):
+        for length, i, j in sorted((row_length(r, x, cell), i, j) for r, i, j in bonds):
             a, b = _root(parent, i), _root(parent, j)
             if a != b:
                 parent[a] = b
@@ -103,7 +103,7 @@ class World:
         for item in self.items:
             for row in item.rows:
                 if row.images and np.any(row.images):
-                    tied = max(tied, _length(row, x, cell))
+                    tied = max(tied, row_length(row, x, cell))
         return parent, tied
 
     def nearness(self, x: Array, cell: Array | None = None, every: bool = False) -> float:
@@ -115,7 +115,7 @@ class World:
     def features(self) -> list[str]:
         """What is special about this case."""
         half = half_width(self.cell, self.pbc)
-        lengths = [r.target for i in self.items for r in i.arguments.get("pairs_as_rows", [])]
+        lengths = [r.target for i in self.items if i.family == "Distance" for r in i.rows]
         longest = max(lengths, default=0.0)
         angles = self.cell @ self.cell.T
         found = {
@@ -140,17 +140,15 @@ def _loose_pairs(item: Item, every: bool) -> Iterator[tuple[int, int]]:
     """Pairs of atoms of rows that depend on differences of positions, but for distances."""
     if item.family in ("FixedAtoms", "Sphere", "Plane", "CenterOfMass", "Distance") or "place" in item.arguments:
         return
-    for atoms in item.arguments["listed"]:
+    for atoms in item.listed:
         yield from itertools.combinations(atoms, 2) if every else itertools.pairwise(atoms)
 
 
 def _tying(item: Item) -> list[Row]:
-    if item.family != "Distance":
-        return []
-    return [r for r in item.arguments["pairs_as_rows"] if not np.any(r.images)]
+    return [r for r in item.rows if not np.any(r.images)] if item.family == "Distance" else []
 
 
-def _length(row: Row, x: Array, cell: Array) -> float:
+def row_length(row: Row, x: Array, cell: Array) -> float:
     d = sum(w * x[a] for a, w in row.vectors[0].items())
     return float(np.linalg.norm(d + (np.array(row.images[0]) @ cell if row.images else 0.0)))
 
@@ -163,7 +161,7 @@ def _root(parent: list[int], i: int) -> int:
 
 def _constraint(item: Item, world: World) -> families.Constraint:
     """The package's object of an item."""
-    arguments = {k: v for k, v in item.arguments.items() if k not in ("listed", "pairs_as_rows", "place")}
+    arguments = {k: v for k, v in item.arguments.items() if k != "place"}
     make = getattr(families, item.family)
     moved = world.images @ world.cell
     if item.family == "FixedAtoms":
@@ -173,7 +171,7 @@ def _constraint(item: Item, world: World) -> families.Constraint:
         if item.how == "moving":
             return make(atoms, _moving(places, waves))
         return make(atoms, None if item.how == "open" else places)
-    rows = item.arguments.get("pairs_as_rows") or item.rows
+    rows = item.rows
     values = np.array([r.target for r in rows])
     if item.family == "Sphere":
         arguments["center"] = arguments["center"] + moved[arguments["atoms"][0]]
@@ -254,7 +252,7 @@ def _finished(b: Builder) -> World:
         cell = random_cell(rng)
         if rng.random() < 0.4:
             pbc = rng.permutation([True, bool(rng.random() < 0.5), False])
-    rows = Dense([r for i in items for r in i.rows], masses, cell, pinned, x[pinned], waves)
+    rows = Dense([r for i in items if i.held for r in i.rows], masses, cell, pinned, x[pinned], waves)
     w = World(b.kinds, x, x, masses, np.zeros((n, 3), int), cell, pbc, items, rows, placed, b.impossible, drifting,
               b.flat, x, x, "Rattle", 0.01, 1)  # fmt: skip
     _scale_cell(w, rng, b.cell is not None)
@@ -295,13 +293,11 @@ def _finished(b: Builder) -> World:
 
 def _renumbered(item: Item, new: Array) -> Item:
     changed = dict(item.arguments)
-    for name in ("listed", "pairs", "triples", "quads", "atoms", "bases", "group_a", "group_b", "groups"):
+    for name in ("pairs", "triples", "quads", "atoms", "bases", "group_a", "group_b", "groups"):
         if name in changed:
             changed[name] = _mapped(changed[name], new)
     rows = [r.renumbered(new) for r in item.rows]
-    if "pairs_as_rows" in changed:
-        changed["pairs_as_rows"] = rows if item.rows else [r.renumbered(new) for r in changed["pairs_as_rows"]]
-    return Item(item.family, changed, rows, item.how)
+    return replace(item, rows=rows, listed=_mapped(item.listed, new), arguments=changed)
 
 
 def _mapped(table, new: Array):
@@ -388,10 +384,8 @@ def _set_targets(w: World, rng: np.random.Generator) -> None:
     for k, row in enumerate(rows.rows):
         row.target = float(q[k])
     for item in w.items:
-        known = {id(r) for r in rows.rows}
-        for row in item.arguments.get("pairs_as_rows", []):
-            if id(row) not in known:
-                row.target = _length(row, w.x, w.cell)
+        for row in () if item.held else item.rows:
+            row.target = row_length(row, w.x, w.cell)
         if item.how == "moving":
             for row in item.rows:
                 row.amplitude = float(rng.uniform(-0.08, 0.08))

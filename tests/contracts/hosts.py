@@ -1,4 +1,4 @@
-"""The same mechanics in the three hosts: NumPy arrays, ASE atoms, an OpenMM System..
+"""The same mechanics in the three hosts: NumPy arrays, ASE atoms, an OpenMM System.
 
 Eight atoms in a trap that is not harmonic, held by any constraints. The units of each host are consistent (nm, ps and
 dalton; angstrom, atomic mass unit and ASE's time), so that positions at the same number of steps agree.
@@ -18,11 +18,12 @@ from ase.calculators.calculator import Calculator
 from constraint_cases import CASES, MASSES, N_ATOMS, scattered
 
 from kcons.ase import ConstrainedDynamics
+from kcons.comparison import runs
 from kcons.constraints import Constraint, projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator, hold
-from kcons.steppers import Rattle, State, Stepper, Suzuki4, System, run
+from kcons.steppers import Rattle, State, Stepper, Suzuki4, System
 
 STIFF = np.array([1.0, 1.3, 0.7]) * np.linspace(2.0, 6.0, N_ATOMS)[:, None]
 BUMP = 0.4
@@ -70,63 +71,37 @@ def problem(name: str) -> Problem:
     return Problem(name)
 
 
-class Run:
-    """A run of one host: `step(n)`, `phase()`, and `save()`, which gives what goes on as another run."""
-
-    def step(self, n: int) -> None:
-        raise NotImplementedError
-
-    def phase(self) -> Phase:
-        raise NotImplementedError
+class OnArrays(runs.OnArrays):
+    def __init__(self, p: Problem, dt: float, scheme: str, state: State | None = None) -> None:
+        system = System(p.motion, force)
+        self.given = p, dt, scheme
+        super().__init__(system, system.initial_state(p.x, p.v) if state is None else state, STEPPERS[scheme], dt)
 
     def back(self, n: int) -> None:
         """Go back n steps."""
-        raise NotImplementedError
+        self.dt = -self.dt
+        self.advance(n)
+        self.dt = -self.dt
 
     def save(self) -> Callable[[], Run]:
-        raise NotImplementedError
-
-
-class InArrays(Run):
-    def __init__(self, p: Problem, dt: float, scheme: str, state: State | None = None) -> None:
-        self.given = p, dt, scheme
-        self.dt, self.stepper = dt, STEPPERS[scheme]
-        self.system = System(p.motion, force)
-        self.state = self.system.initial_state(p.x, p.v) if state is None else state
-
-    def step(self, n: int) -> None:
-        self.state = run(self.system, self.state, self.dt, n, stepper=self.stepper)
-
-    def back(self, n: int) -> None:
-        self.state = run(self.system, self.state, -self.dt, n, stepper=self.stepper)
-
-    def phase(self) -> Phase:
-        return self.state.positions, self.state.velocities
-
-    def save(self) -> Callable[[], Run]:
+        """What goes on as another run."""
         kept = pickle.dumps(self.state)
-        return lambda: InArrays(*self.given, pickle.loads(kept))
+        return lambda: OnArrays(*self.given, pickle.loads(kept))
 
 
-class InAse(Run):
+class InAse(runs.InAse):
     def __init__(self, p: Problem, dt: float, scheme: str, state: State | None = None) -> None:
         self.given = p, dt, scheme
-        self.dt = dt
-        self.atoms = Atoms(f"H{N_ATOMS}", positions=p.x, calculator=_Trap())
-        self.atoms.set_masses(MASSES)
-        self.atoms.set_velocities(p.v)
+        atoms = Atoms(f"H{N_ATOMS}", p.x, masses=MASSES, velocities=p.v, calculator=_Trap())
         more = {} if state is None else {"state": state}
-        self.dynamics = ConstrainedDynamics(self.atoms, dt, STEPPERS[scheme], constraints=p.rows, **more)
-
-    def step(self, n: int) -> None:
-        self.dynamics.run(n)
+        super().__init__(atoms, ConstrainedDynamics(atoms, dt, STEPPERS[scheme], constraints=p.rows, **more), dt)
 
     def back(self, n: int) -> None:
         self.dynamics.set_timestep(-self.dt)
-        self.dynamics.run(n)
+        self.advance(n)
         self.dynamics.set_timestep(self.dt)
 
-    def phase(self) -> Phase:
+    def observe(self) -> Phase:
         return self.atoms.get_positions(), self.dynamics.state.velocities  # ASE has no momenta of fixed atoms
 
     def save(self) -> Callable[[], Run]:
@@ -134,7 +109,7 @@ class InAse(Run):
         return lambda: InAse(*self.given, pickle.loads(kept))
 
 
-class InOpenMM(Run):
+class InOpenMM(runs.InOpenMM):
     def __init__(self, p: Problem, dt: float, scheme: str, checkpoint: bytes | None = None) -> None:
         self.given = p, dt, scheme
         system = openmm.System()
@@ -145,33 +120,24 @@ class InOpenMM(Run):
             system.addParticle(mass)
             trap.addParticle(k, STIFF[k].tolist())
         system.addForce(trap)
-        self.part = hold(system, p.rows, p.x)
-        self.integrator = ProjectedIntegrator(dt, scheme, parts=[self.part])
-        self.context = openmm.Context(system, self.integrator, openmm.Platform.getPlatformByName("Reference"))
-        self.context.setPositions(p.x)
-        self.context.setVelocities(p.v)
+        integrator = ProjectedIntegrator(dt, scheme, parts=[hold(system, p.rows, p.x)])
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+        context.setPositions(p.x)
+        context.setVelocities(p.v)
         if checkpoint is not None:
-            self.integrator.step(0)
-            self.context.loadCheckpoint(checkpoint)
-
-    def step(self, n: int) -> None:
-        self.integrator.step(n)
+            integrator.step(0)
+            context.loadCheckpoint(checkpoint)
+        super().__init__(context, integrator, dt)
 
     def back(self, n: int) -> None:
-        self.context.setVelocities(-self.phase()[1])
-        self.integrator.step(n)
-        self.context.setVelocities(-self.phase()[1])
-
-    def phase(self) -> Phase:
-        state = self.context.getState(positions=True, velocities=True)
-        return (
-            np.array(state.getPositions(asNumpy=True)._value),
-            np.array(state.getVelocities(asNumpy=True)._value),
-        )
+        self.context.setVelocities(-self.observe()[1])
+        self.advance(n)
+        self.context.setVelocities(-self.observe()[1])
 
     def save(self) -> Callable[[], Run]:
         kept = self.context.createCheckpoint()
         return lambda: InOpenMM(*self.given, kept)
 
 
-HOSTS: dict[str, Callable[[Problem, float, str], Run]] = {"arrays": InArrays, "ASE": InAse, "OpenMM": InOpenMM}
+Run = OnArrays | InAse | InOpenMM
+HOSTS: dict[str, Callable[[Problem, float, str], Run]] = {"arrays": OnArrays, "ASE": InAse, "OpenMM": InOpenMM}

@@ -14,7 +14,7 @@ from kcons.comparison import test_systems
 from kcons.comparison.test_systems.minimal import COARSER, FINEST
 from kcons.constraints import projection
 from kcons.errors import InputError
-from tests.contracts.test_reference_orders import EPS, sensitivities
+from tests.contracts.test_reference_cases import EPS, sensitivities
 from tests.reference import cases
 
 

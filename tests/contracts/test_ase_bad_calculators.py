@@ -1,4 +1,4 @@
-"""A calculator that fails under ASE's own classes: typed error, no array changed by a hook, trajectories readable."""
+"""A calculator that fails: typed error, no array changed by a hook or a step, trajectories readable."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from ase.md.nvtberendsen import NVTBerendsen
 from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, TEMPERATURE, Field, equal, off, random, state, water
 
-from kcons.ase import constrain
+from kcons.ase import ConstrainedDynamics, constrain
 from kcons.constraints import Distance
-from kcons.errors import InputError
+from kcons.errors import InputError, NonFiniteError
+from kcons.steppers import BlanesMoan6a, Geodesic, KahanLi6, Rattle, ReversibilityCheck
 
-DYNAMICS = {
+OF_ASE = {
     "VelocityVerlet": lambda a: VelocityVerlet(a, FS),
     "Langevin": lambda a: Langevin(a, FS, temperature_K=TEMPERATURE, friction=0.01 / FS, fixcm=False, rng=random()),
     "Bussi": lambda a: Bussi(a, FS, TEMPERATURE, 50 * FS, rng=random()),
     "Andersen": lambda a: Andersen(a, FS, TEMPERATURE, 0.1, fixcm=False, rng=random()),
     "NVTBerendsen": lambda a: NVTBerendsen(a, FS, TEMPERATURE, 50 * FS, fixcm=False),
+}
+OURS = {
+    repr(stepper): lambda a, stepper=stepper: ConstrainedDynamics(a, FS, stepper)
+    for stepper in (Rattle(), Geodesic(), KahanLi6(), BlanesMoan6a(), ReversibilityCheck(Rattle()))
 }
 
 
@@ -37,20 +42,25 @@ def no_result(forces):
     raise RuntimeError("no convergence")
 
 
+#: What a calculator does, and the error under ASE's own classes and under ours.
 FAILURES = {
-    "nan": (no_numbers, InputError, "atom 1 is not finite"),
-    "shape": (lambda f: f[:2], ValueError, "shape"),  # ASE's arithmetic, before any hook
-    "raises": (no_result, RuntimeError, "no convergence"),
+    "nan": (no_numbers, InputError, "atom 1 is not finite", NonFiniteError, "non-finite force at step 4 on atom 1"),
+    "inf": (lambda f: f + np.inf, InputError, "not finite", NonFiniteError, "non-finite force at step 4"),
+    # ASE's arithmetic, before any hook.
+    "shape": (lambda f: f[:2], ValueError, "shape", InputError, r"shape \(2, 3\) at step 4"),
+    "raises": (no_result, RuntimeError, "no convergence", RuntimeError, "no convergence"),
 }
 
 
 @pytest.mark.parametrize("case", FAILURES)
-@pytest.mark.parametrize("name", DYNAMICS)
+@pytest.mark.parametrize("name", [*OF_ASE, *OURS])
 def test_dynamics(name, case, tmp_path):
-    how, error, message = FAILURES[case]
+    how, *said = FAILURES[case]
+    error, message = said[2:] if name in OURS else said[:2]
+    make = (OF_ASE | OURS)[name]
     atoms, held = water(Field(how=how))
     good, _ = water()
-    dyn, peer = DYNAMICS[name](atoms), DYNAMICS[name](good)
+    dyn, peer = make(atoms), make(good)
     peer.run(3)
 
     def spoil():
@@ -63,13 +73,34 @@ def test_dynamics(name, case, tmp_path):
         with pytest.raises(error, match=message) as caught:
             dyn.run(20)
     assert dyn.nsteps == 3
-    if case == "nan":
-        assert "calculator" in str(caught.value)
-    assert np.isfinite(atoms.positions).all() and np.isfinite(atoms.get_momenta()).all()
-    assert off(atoms, held) <= 1e-14
     frames = read(tmp_path / "md.traj", index=":")
     assert len(frames) == 4
     assert equal(state(frames[-1]), state(good))
+    if name in OF_ASE:
+        assert case != "nan" or "calculator" in str(caught.value)
+        assert np.isfinite(atoms.positions).all() and np.isfinite(atoms.get_momenta()).all()
+        assert off(atoms, held) <= 1e-14
+        return
+    assert caught.value.step == 4
+    assert case != "raises" or any("in step 4" in note for note in caught.value.__notes__)
+    assert equal(state(atoms), state(good))
+    # With a calculator that works, the run goes on as if nothing had happened.
+    atoms.calc = Field()
+    dyn.observers.clear()
+    dyn.run(2)
+    peer.run(2)
+    assert equal(state(atoms), state(good))
+
+
+def test_bad_forces_for_an_observer():
+    # This one does not end with the forces at the last positions, which are computed for observers only.
+    atoms, _ = water(Field(how=no_numbers))
+    dyn = ConstrainedDynamics(atoms, FS, stepper := BlanesMoan6a())
+    dyn.attach(atoms.get_potential_energy, interval=2)
+    dyn.run(1)
+    atoms.calc.bad = atoms.calc.calls + stepper.force_evaluations
+    with pytest.raises(NonFiniteError, match="at step 2"):
+        dyn.run(1)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -1,4 +1,4 @@
-"""Saddle searches, vibrations and phonons on the constraints."""
+"""Saddle searches and vibrations on the constraints."""
 
 from __future__ import annotations
 
@@ -12,13 +12,8 @@ from ase.constraints import FixAtoms
 from ase.mep import NEB, DimerControl, MinModeAtoms, MinModeTranslate
 from ase.optimize import BFGS
 from ase.optimize.optimize import Dynamics
-from ase.phonons import Phonons
 from ase.vibrations import Vibrations
-from ase_systems import (
-    classes_in,
-    ethanol,
-    off,
-)
+from ase_systems import classes_in, off
 
 from kcons.ase import ConstrainedCalculator, Constraints, constrain
 from kcons.constraints import Angle, Distance, FixedAtoms
@@ -155,21 +150,3 @@ def test_vibrations_see_the_constrained_hessian(tmp_path, monkeypatch):
     found = np.sort(np.abs(vibrations.get_energies()))
     assert found[-1] == pytest.approx(frequency, rel=1e-3)
     assert found[-2] < 0.05 * frequency  # all the rest: translation, rotation and held directions
-
-
-def test_phonon_force_constants_are_those_of_the_constrained_motions(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    atoms, held = ethanol()
-    atoms.set_cell([8, 8, 8])
-    atoms.pbc = True
-    BFGS(atoms, logfile=None).run(fmax=1e-4, steps=500)
-    rows = held.engine(atoms).constraint_set.jacobian(atoms.positions).toarray()
-    forbidden = rows / np.repeat(atoms.get_masses(), 3)
-    atoms.set_constraint()
-    phonons = Phonons(atoms, ConstrainedCalculator(EMT(), held), supercell=(1, 1, 1), delta=0.002)
-    phonons.run()
-    phonons.read(symmetrize=0, acoustic=False)
-    constants = phonons.get_force_constant().reshape(27, 27)
-    size = np.abs(constants).max()
-    assert np.abs(constants - constants.T).max() <= 1e-3 * size
-    assert np.abs(constants @ forbidden.T).max() <= 1e-3 * size  # nothing resists what the rows forbid

@@ -1,4 +1,4 @@
-"""ConstrainedDynamics with every stepper: as on arrays, restarts, reversal, far away, bad calculators."""
+"""ConstrainedDynamics with every stepper: as on arrays, restarts, reversal."""
 
 from __future__ import annotations
 
@@ -9,29 +9,15 @@ from ase.build import molecule
 from ase.io import read
 from ase.md.velocitydistribution import thermalize_momenta
 from ase_systems import FS, Field, equal, off, random, state, water
+from stepper_systems import SYMMETRIC
 
 from kcons import ConstraintSet, Motion, System, run
 from kcons.ase import ConstrainedDynamics, constrain, rigid_water
 from kcons.constraints import Distance
 from kcons.constraints.target import MovingTarget
-from kcons.errors import InputError, KconsError, NonFiniteError
-from kcons.steppers import (
-    BlanesMoan4,
-    BlanesMoan6,
-    BlanesMoan6a,
-    Geodesic,
-    KahanLi6,
-    Rattle,
-    ReversibilityCheck,
-    State,
-    Suzuki4,
-    Yoshida4,
-)
+from kcons.errors import InputError
+from kcons.steppers import BlanesMoan6a, Geodesic, KahanLi6, Rattle, ReversibilityCheck, State
 
-SYMMETRIC = [
-    Rattle(), Geodesic(), Suzuki4(), Yoshida4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a(),
-    ReversibilityCheck(Rattle()),
-]  # fmt: skip
 #: Of each kind one: what it does on arrays it does in ASE, as the first test shows of all.
 KINDS = [Rattle(), Geodesic(), KahanLi6(), BlanesMoan6a(), ReversibilityCheck(Rattle())]
 every = pytest.mark.parametrize("stepper", KINDS, ids=repr)
@@ -62,7 +48,7 @@ def rotating() -> tuple[Atoms, list]:
 
 @pytest.mark.parametrize(
     ("case", "stepper"),
-    [(case, stepper) for case in (rotating, driven) for stepper in SYMMETRIC],
+    [(case, stepper) for case in (rotating, driven) for stepper in (*SYMMETRIC, ReversibilityCheck(Rattle()))],
     ids=lambda value: getattr(value, "__name__", repr(value)),
 )
 def test_every_stepper_does_in_ase_what_it_does_on_arrays(case, stepper):
@@ -138,69 +124,3 @@ def test_steps_of_zero_changed_on_the_fly_and_taken_back(stepper):
     assert all(np.abs(a - b).max() <= 1e-12 for a, b in zip(before, state(atoms), strict=True))
     assert dyn.get_time() == pytest.approx(0, abs=1e-13)
     assert off(atoms, held) <= 1e-14
-
-
-# -- calculators that fail --------------------------------------------------------------------------
-
-
-def no_numbers(forces):
-    forces[1, 2] = np.nan
-    return forces
-
-
-def no_result(forces):
-    raise RuntimeError("no convergence")
-
-
-FAILURES = {
-    "nan": (no_numbers, NonFiniteError, "non-finite force at step 4 on atom 1"),
-    "inf": (lambda f: f + np.inf, NonFiniteError, "non-finite force at step 4"),
-    "shape": (lambda f: f[:2], InputError, r"shape \(2, 3\) at step 4"),
-    "raises": (no_result, RuntimeError, "no convergence"),
-}
-
-
-@pytest.mark.parametrize("case", FAILURES)
-@every
-def test_bad_calculator_at_a_step(stepper, case, tmp_path):
-    how, error, message = FAILURES[case]
-    good, _ = water()
-    undisturbed = ConstrainedDynamics(good, FS, stepper)
-    undisturbed.run(3)
-    path = tmp_path / "md.traj"
-    atoms, _ = water(Field(how=how))
-    with ConstrainedDynamics(atoms, FS, stepper, trajectory=str(path)) as dyn:
-
-        def spoil():
-            if dyn.nsteps == 3:
-                atoms.calc.bad = 0
-
-        dyn.attach(spoil)
-        with pytest.raises(error, match=message) as caught:
-            dyn.run(20)
-        assert dyn.nsteps == 3
-    assert caught.value.step == 4
-    assert case == "raises" or isinstance(caught.value, KconsError)
-    if case == "raises":
-        assert any("in step 4" in note for note in caught.value.__notes__)
-    assert equal(state(atoms), state(good))
-    frames = read(path, index=":")
-    assert len(frames) == 4
-    assert equal(state(frames[-1]), state(good))
-    # With a calculator that works, the run goes on as if nothing had happened.
-    atoms.calc = Field()
-    dyn.observers.clear()
-    dyn.run(2)
-    undisturbed.run(2)
-    assert equal(state(atoms), state(good))
-
-
-def test_bad_forces_for_an_observer():
-    # This one does not end with the forces at the last positions, which are computed for observers only.
-    atoms, _ = water(Field(how=no_numbers))
-    dyn = ConstrainedDynamics(atoms, FS, stepper := BlanesMoan6a())
-    dyn.attach(atoms.get_potential_energy, interval=2)
-    dyn.run(1)
-    atoms.calc.bad = atoms.calc.calls + stepper.force_evaluations
-    with pytest.raises(NonFiniteError, match="at step 2"):
-        dyn.run(1)

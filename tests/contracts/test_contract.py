@@ -24,8 +24,8 @@ ROUNDING = 2e-11
 @cache
 def after(host: str, name: str, scheme: str, steps: int) -> Phase:
     made: Run = HOSTS[host](problem(name), TIME / steps, scheme)
-    made.step(steps)
-    return made.phase()
+    made.advance(steps)
+    return made.observe()
 
 
 @cache
@@ -91,9 +91,9 @@ BACK = [
 def test_runs_go_back(host: str, name: str, scheme: str) -> None:
     p = problem(name)
     made = HOSTS[host](p, TIME / COARSE, scheme)
-    made.step(COARSE)
+    made.advance(COARSE)
     made.back(COARSE)
-    x, v = made.phase()
+    x, v = made.observe()
     assert np.abs(x - p.x).max() <= ROUNDING and np.abs(v - p.v).max() <= 10 * ROUNDING
 
 
@@ -101,12 +101,12 @@ def test_runs_go_back(host: str, name: str, scheme: str) -> None:
 @every_family
 def test_a_restart_is_the_same_to_the_last_bit(host: str, name: str) -> None:
     whole = HOSTS[host](problem(name), TIME / COARSE, "rattle")
-    whole.step(5)
+    whole.advance(5)
     resume = whole.save()
-    whole.step(7)
+    whole.advance(7)
     part = resume()
-    part.step(7)
-    for a, b in zip(whole.phase(), part.phase(), strict=True):
+    part.advance(7)
+    for a, b in zip(whole.observe(), part.observe(), strict=True):
         assert np.array_equal(a, b)
 
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from isokinetic_systems import water_and_more
-from thermostat_systems import dumbbells, swirling, system, waves
+from thermostat_systems import dumbbells, swirling, system, water_and_more, waves
 
 from kcons.constraints import Plane, Sphere
 from kcons.errors import NonFiniteError

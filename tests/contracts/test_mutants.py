@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import functools
 import os
 import re
 import shutil
@@ -37,48 +35,7 @@ def copied(folder: Path) -> Path:
     shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "examples" / "studies", folder / "examples" / "studies")
     shutil.copy(ROOT / "pyproject.toml", folder)
-    # Kernels of a tree in which functions that they took in were changed since.
-    for path in (folder / "kcons" / "solvers").glob("*.py"):
-        forget_kernels(folder / "kcons", f"solvers/{path.name}")
     return folder
-
-
-@functools.cache
-def imported(file: Path) -> set[str]:
-    """Modules that a file imports, `kcons.a.b` as it stands or as part of another name."""
-    names = set()
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-    return names
-
-
-def modules(package: Path) -> dict[str, Path]:
-    """Files of a package by the names of their modules."""
-    return {
-        ".".join(("kcons", *path.relative_to(package).with_suffix("").parts)): path for path in package.rglob("*.py")
-    }
-
-
-def users(package: Path, file: str) -> list[Path]:
-    """The file, and all that import it, themselves or through others."""
-    paths = modules(package)
-    needs = {name: imported(path) for name, path in paths.items()}
-    found = {".".join(("kcons", *Path(file).with_suffix("").parts))}
-    while more := {name for name, used in needs.items() if name not in found and used & found}:
-        found |= more
-    return [paths[name] for name in found]
-
-
-def forget_kernels(package: Path, file: str) -> None:
-    """Kernels are kept by the text of their own module, also those that took in functions of others."""
-    changed = (package / file).stat().st_mtime
-    for path in users(package, file):
-        for kept in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb?"):
-            if kept.stat().st_mtime < changed:
-                kept.unlink()
 
 
 def run(folder: Path, tests: str) -> subprocess.CompletedProcess[str]:
@@ -126,20 +83,8 @@ def test_the_mutant_is_killed(mutant, tmp_path):
     text = target.read_text()
     assert text.count(old) == 1
     target.write_text(text.replace(old, new))
-    forget_kernels(folder / "kcons", file)
     for test in tests.split():
         result = run(folder, test)
         assert result.returncode == FAILED, f"{test} does not fail:\n{result.stdout[-3000:]}"
         # What does not run at all shows nothing about the test.
         assert not re.search(r"TypingError|LoweringError|NameError|SyntaxError", result.stdout), result.stdout[-3000:]
-
-
-def test_modules_that_took_in_a_function_are_found():
-    names = {str(path.relative_to(PACKAGE)) for path in users(PACKAGE, "solvers/kernels/two_and_four_wide.py")}
-    assert {
-        "solvers/kernels/two_and_four_wide.py",
-        "solvers/sparse/distances.py",
-        "solvers/distance_clusters.py",
-        "motion/motion.py",
-    } <= names
-    assert "errors.py" not in names

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from openmm import app, unit
+from openmm import app
 from openmm_systems import (
     DATA,
     PLATFORMS,
     alanine,
-    dumbbell,
     forces_at,
     masses_of,
     residuals,
@@ -22,19 +21,15 @@ from openmm_systems import (
 
 from kcons.constraints import Distance, projection
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm import SCHEMES, ProjectedIntegrator
 
 TIME = 0.048  # ps
-#: Order, and time steps in fs that divide the time, where the leading term rules and rounding does not.
+#: Order, and time steps in fs that divide the time, where the leading term rules and rounding does not. Other schemes
+#: are the same program with other fractions, those of arrays.
 ORDERS = {
     "rattle": (2, (1.0, 0.5, 0.25)),
-    "geodesic": (2, (1.0, 0.5, 0.25)),
     "suzuki4": (4, (2.0, 1.0, 0.5)),
-    "yoshida4": (4, (1.0, 0.5, 0.25)),
-    "kahan-li6": (6, (2.0, 1.5, 1.0)),
     "blanes-moan4": (4, (1.5, 1.0, 0.75)),
-    "blanes-moan6": (6, (3.0, 2.4, 2.0)),
     "blanes-moan6a": (6, (3.0, 2.4, 2.0)),
 }
 
@@ -98,11 +93,11 @@ def test_constraints_of_water(scheme, platform):
 # -- back in time -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("scheme", "dt"), [*((scheme, 2e-3) for scheme in SCHEMES), ("rattle", 0.5e-3)])
-def test_reversible(scheme, dt):
+@pytest.mark.parametrize("scheme", ORDERS)
+def test_reversible(scheme):
     """20 steps there and back. OpenMM takes no negative steps; velocities are turned round instead."""
     system, x, v = alanine()
-    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14)
+    integrator = ProjectedIntegrator(2e-3, scheme, tolerance=1e-14)
     context = started(system, integrator, x, v)
     integrator.step(1)
     x, v = state_of(context)
@@ -146,28 +141,6 @@ def test_projector_against_the_dense_oracle():
     integrator.applyVelocityConstraints(context)
     found = state_of(context)[1][atoms].ravel()
     assert np.abs(found - exact).max() <= 1e-12 * np.abs(exact).max()
-
-
-def test_one_force_evaluation_a_step():
-    """Counted by a force that is a Python function."""
-    calls = []
-
-    def bond(state):
-        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-        calls.append(1)
-        return 50.0 * float(np.sum(x**2)), -100.0 * np.asarray(x)
-
-    for scheme in SCHEMES:
-        system, x, v = dumbbell()
-        system.removeForce(0)
-        system.addForce(openmm.PythonForce(bond))
-        integrator = ProjectedIntegrator(1e-3, scheme)
-        context = started(system, integrator, x, v)
-        integrator.step(2)
-        calls.clear()
-        integrator.step(10)
-        assert len(calls) == 10 * SCHEMES[scheme]().force_evaluations, scheme
-        del context
 
 
 @pytest.mark.slow

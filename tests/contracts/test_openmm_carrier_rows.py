@@ -7,28 +7,32 @@ import openmm
 import pytest
 from carried_systems import context_of, free, pull, start, state_of
 
-from kcons.constraints import (
-    Distance,
-)
+from kcons.constraints import Distance
 from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.callback_rows.hold import hold
+from kcons.openmm.callback_rows import hold
 
 # -- periodic boxes -------------------------------------------------------------------------------
 
 
-def test_rows_across_the_boundary_take_minimum_images():
+def pair(x, cutoff=1.0):
+    """Two particles in a cube of 2 nm, their distance held."""
     system = free([12.0, 12.0])
     nonbonded = openmm.NonbondedForce()
     nonbonded.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    nonbonded.setCutoffDistance(cutoff)
     for _ in range(2):
         nonbonded.addParticle(0, 0.1, 0)
     system.addForce(nonbonded)
-    x = np.array([[0.1, 0, 0], [1.9, 0, 0]])
     part = hold(system, Distance([[0, 1]]), x)
-    assert part.motion.constraint_set.target() == pytest.approx([0.2], abs=1e-15)
     context = context_of(system, ProjectedIntegrator(0.01, parts=[part]))
     start(context, part, x)
+    return context, part
+
+
+def test_rows_across_the_boundary_take_minimum_images():
+    context, part = pair(np.array([[0.1, 0, 0], [1.9, 0, 0]]))
+    assert part.motion.constraint_set.target() == pytest.approx([0.2], abs=1e-15)
     context.getIntegrator().step(50)
     part.check(context)
     # The box of the context counts, also where it changes.
@@ -38,22 +42,11 @@ def test_rows_across_the_boundary_take_minimum_images():
 
 
 def test_a_box_too_small_stops_the_step():
-    system = free([12.0, 12.0])
-    nonbonded = openmm.NonbondedForce()
-    nonbonded.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
-    nonbonded.setCutoffDistance(0.2)
-    for _ in range(2):
-        nonbonded.addParticle(0, 0.1, 0)
-    system.addForce(nonbonded)
-    x = np.array([[0.1, 0, 0], [0.5, 0, 0]])
-    part = hold(system, Distance([[0, 1]]), x)
-    integrator = ProjectedIntegrator(0.01, parts=[part])
-    context = context_of(system, integrator)
-    start(context, part, x)
+    context, _ = pair(np.array([[0.1, 0, 0], [0.5, 0, 0]]), cutoff=0.2)
     context.setPeriodicBoxVectors([0.7, 0, 0], [0, 2, 0], [0, 0, 2])
     before = state_of(context)
     with pytest.raises(InputError, match="half the box"):
-        integrator.step(1)
+        context.getIntegrator().step(1)
     assert all(np.array_equal(a, b) for a, b in zip(before, state_of(context), strict=True))
 
 

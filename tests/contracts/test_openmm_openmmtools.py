@@ -1,4 +1,6 @@
-"""openmmtools: its ContextCache, MCMC moves, thermodynamic states and replica exchange run with kcons' integrators.
+"""openmmtools: its ContextCache, MCMC moves and thermodynamic states run with kcons' integrators.
+
+Replica exchange is a tutorial.
 
 openmmtools compares integrators by copies of them whose variables it sets to 0, copies variables by their numbers from
 one to another, and asks for `getTemperature` to see whether there is a thermostat.
@@ -27,12 +29,11 @@ from kcons.openmm import (
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     openmmtools = pytest.importorskip("openmmtools", reason="openmmtools is not installed")
-    from openmmtools import cache, mcmc, multistate, states
+    from openmmtools import cache, mcmc, states
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
     pytest.mark.filterwarnings("ignore:the forces exert no torque"),
-    pytest.mark.filterwarnings("ignore:Warning. The openmmtools.multistate API is experimental"),
 ]
 
 BATHS = {
@@ -125,20 +126,3 @@ def test_a_move_with_a_row_that_is_held():
         move.apply(state, place, context_cache=contexts)
     y = place.positions / unit.nanometer
     assert abs(np.linalg.norm(y[0] - y[3]) - np.linalg.norm(x[0] - x[3])) < 1e-9
-
-
-@pytest.mark.parametrize("name", ["Langevin", "constant energy"])
-def test_replica_exchange(name, tmp_path):
-    system, x = trapped()
-    kelvins = (300, 320, 345)
-    moves = [mcmc.IntegratorMove(MAKERS[name](kelvin), n_steps=5, reassign_velocities=True) for kelvin in kelvins]
-    here = [states.ThermodynamicState(system, temperature=kelvin * unit.kelvin) for kelvin in kelvins]
-    sampler = multistate.ReplicaExchangeSampler(mcmc_moves=moves, number_of_iterations=3)
-    sampler.energy_context_cache, sampler.sampler_context_cache = reference_cache(), reference_cache()
-    reporter = multistate.MultiStateReporter(str(tmp_path / "replicas.nc"), checkpoint_interval=1)
-    box = system.getDefaultPeriodicBoxVectors()
-    sampler.create(here, [states.SamplerState(x * unit.nanometer, box_vectors=box)], storage=reporter)
-    sampler.run()
-    assert sampler.iteration == 3
-    assert len(sampler.sampler_context_cache) == 1
-    reporter.close()

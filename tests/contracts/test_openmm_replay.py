@@ -13,8 +13,7 @@ from openmm import unit
 from openmm_ensembles import ENSEMBLES
 from openmm_systems import GPUS, PLATFORMS, context_of, masses_of, rows_of, started, state_of, total_energy
 
-from kcons.openmm import Langevin, ProjectedIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm import SCHEMES, Langevin, ProjectedIntegrator
 
 GAS = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 T = 300.0

@@ -25,7 +25,7 @@ from virtual_site_systems import prepared
 from kcons.errors import UnsupportedError
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
-from kcons.openmm.integrator.system_checks import parts_of_steps
+from kcons.openmm.integrator.guard import parts_of_steps
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 

@@ -7,7 +7,7 @@ import numpy as np
 from hard_cases import truths
 from hard_cases.case import Outcome, case, outcome
 from hard_cases.motions import OMEGA, Seen, energy_off, every, flat_body, move, tumble
-from hard_cases.problem import Array, Problem
+from hard_cases.problem import Array, Problem, bends
 from hard_cases.programs import Frame, Program, together
 
 TRIANGLE = [(0, 1), (0, 2), (1, 2)]
@@ -39,7 +39,7 @@ def duplicate_rows(program: Program, quick: bool) -> Outcome:
 @case("H03", "Tetrahedron by 6, bipyramid by 10, octahedron by 15", "10 x the error of RATTLE; residual 1e-10; 6 dof")
 def braced_bodies(program: Program, quick: bool) -> Outcome:
     shapes = {
-        "tetrahedron": np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]),
+        "tetrahedron": _TETRAHEDRON,
         "bipyramid": _BIPYRAMID,
         "octahedron": np.vstack([np.eye(3), -np.eye(3)]),
     }
@@ -47,16 +47,17 @@ def braced_bodies(program: Program, quick: bool) -> Outcome:
     for name, shape in shapes.items():
         n = len(shape)
         result = tumble(program, shape, np.arange(1.0, n + 1), every(n), quick=quick)
-        found += [(f"{name}: {check.name}", check.value, check.limit) for check in result.checks]
+        found += [check._replace(name=f"{name}: {check.name}") for check in result.checks]
     return outcome(*found)
 
 
+_TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 _BIPYRAMID = np.array([[1.0, 0, 0], [-0.5, 0.87, 0], [-0.5, -0.87, 0], [0, 0, 1.1], [0, 0, -1.1]])
 
 
 @case("X01", "Methane by all 10 distances", "as H03")
 def methane(program: Program, quick: bool) -> Outcome:
-    corners = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 1.09 / np.sqrt(3)
+    corners = _TETRAHEDRON * 1.09 / np.sqrt(3)
     return tumble(program, np.vstack([np.zeros(3), corners]), np.array([12.0, 1, 1, 1, 1]), every(5), quick=quick)
 
 
@@ -80,7 +81,7 @@ _DIAMOND = np.array([[0, 0, 0], [2.7, 0, 0], [1.35, 2.338, 0], [1.35, -2.338, 0]
 
 @case("X04", "Martini diamond by all 6 distances", "right, or refused as singular", "warn-or-raise")
 def braced_diamond(program: Program, quick: bool) -> Outcome:
-    return flat_body(program, _DIAMOND, np.full(4, 45.0), every(4), quick)
+    return flat_body(program, quick, _DIAMOND, np.full(4, 45.0), every(4))
 
 
 # -- straight and nearly straight ---------------------------------------------------------------------
@@ -94,7 +95,7 @@ def braced_diamond(program: Program, quick: bool) -> Outcome:
 )
 def collinear(program: Program, quick: bool) -> Outcome:
     x = truths.rotated([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]])
-    masses = np.array([16.0, 12.0, 16.0])
+    masses = CO2_MASSES
     axis = (x[2] - x[0]) / np.linalg.norm(x[2] - x[0])
     omega = np.cross(axis, OMEGA)
     dt, steps = 0.005, program.length(quick, 100, 2000)
@@ -138,20 +139,21 @@ def two_bonds(program: Program, quick: bool) -> Outcome:
     return move(program, problem, 0.005, program.length(quick, 100, 1000))
 
 
-def _bent_triatomic(degrees: float) -> Array:
+CO2_MASSES = np.array([16.0, 12.0, 16.0])
+
+
+def _bent_triatomic(degrees: float, omega: list[float]) -> tuple[Array, Array]:
+    """Places, and velocities of a turn about an axis across its own."""
     bend = np.radians(degrees)
-    return truths.rotated([[1, 0, 0], [0, 0, 0], [np.cos(bend), np.sin(bend), 0]])
+    x = truths.rotated([[1, 0, 0], [0, 0, 0], [np.cos(bend), np.sin(bend), 0]])
+    return x, truths.spinning(x, CO2_MASSES, np.cross((x[0] - x[2]) / np.linalg.norm(x[0] - x[2]), omega))
 
 
 @case("H06", "Triatomic at 179.9 degrees by 3 distances", "residual 1e-11, energy 1e-8 over 1e4 steps")
 def nearly_collinear(program: Program, quick: bool) -> Outcome:
-    x = _bent_triatomic(179.9)
-    masses = np.array([16.0, 12.0, 16.0])
-    axis = (x[0] - x[2]) / np.linalg.norm(x[0] - x[2])
-    v = truths.spinning(x, masses, np.cross(axis, [0.3, -0.5, 0.9]))
+    x, v = _bent_triatomic(179.9, [0.3, -0.5, 0.9])
     steps = program.length(quick, 500, 10_000)
-    problem = Problem(x, masses, TRIANGLE, velocities=v)
-    seen = Seen(problem)
+    seen = Seen(problem := Problem(x, CO2_MASSES, TRIANGLE, velocities=v))
     program.run(problem, 1e-3, steps, seen)
     return outcome(
         ("energy", energy_off(seen.energies), 1e-8), ("residual", seen.residual, 1e-11), remark=f"{steps} steps"
@@ -164,22 +166,15 @@ def angle_towards_180(program: Program, quick: bool) -> Outcome:
 
 
 def _held_angle(program: Program, degrees: float, steps: int, energy_limit: float) -> Outcome:
-    x = _bent_triatomic(degrees)
-    masses = np.array([16.0, 12.0, 16.0])
-    axis = (x[0] - x[2]) / np.linalg.norm(x[0] - x[2])
-    v = truths.spinning(x, masses, np.cross(axis, [0.03, -0.05, 0.09]))
-    problem = Problem(x, masses, [(0, 1), (1, 2)], triples=[(0, 1, 2)], velocities=v)
-    opened = [0.0]
+    x, v = _bent_triatomic(degrees, [0.03, -0.05, 0.09])
+    problem = Problem(x, CO2_MASSES, [(0, 1), (1, 2)], triples=[(0, 1, 2)], velocities=v)
+    opened, energies = [0.0], []
 
     def watch(frame: Frame) -> None:
-        angle = np.arctan2(
-            np.linalg.norm(np.cross(frame.x[0] - frame.x[1], frame.x[2] - frame.x[1])),
-            (frame.x[0] - frame.x[1]) @ (frame.x[2] - frame.x[1]),
-        )
-        opened.append(abs(np.degrees(angle) - degrees))
+        opened.append(abs(np.degrees(bends(frame.x, problem.triples)[0]) - degrees))
+        energies.append(frame.energy)
 
-    energies: list[float] = []
-    program.run(problem, 1e-3, steps, together(watch, lambda frame: energies.append(frame.energy)))
+    program.run(problem, 1e-3, steps, watch)
     off = energy_off(energies)
     return outcome(
         ("angle off by (degrees)", np.max(opened), 1e-9), ("energy", off, energy_limit), remark=f"{steps} steps"
@@ -202,5 +197,5 @@ def angles(program: Program, quick: bool) -> Outcome:
     steps = program.length(quick, 100, 2000)
     for degrees in (165.0, 170.0, 175.0, 179.0, 179.99):
         result = _held_angle(program, degrees, steps, 1e-9)
-        found += [(f"at {degrees:g}: {check.name}", check.value, check.limit) for check in result.checks]
+        found += [check._replace(name=f"at {degrees:g}: {check.name}") for check in result.checks]
     return outcome(*found, remark=f"{steps} steps each")

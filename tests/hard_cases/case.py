@@ -10,8 +10,8 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
 
 from hard_cases.programs import PROGRAMS, CannotExpressError, Program, quiet
 from kcons.errors import KconsError
@@ -39,8 +39,7 @@ _NAMES = {
 }
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """A measured number and what it may be at most."""
 
     name: str
@@ -124,30 +123,28 @@ def judge(case: Case, found: Outcome | BaseException, warned: str = "", program:
     """
     if isinstance(found, BaseException):
         words = " ".join(str(found).split())
-        if isinstance(found, CannotExpressError):
-            return Cell("cannot express", False, str(found))
-        if isinstance(found, ImportError):
-            return Cell("cannot express", False, f"not installed: {words}")
+        if isinstance(found, CannotExpressError | ImportError):
+            missing = "" if isinstance(found, CannotExpressError) else "not installed: "
+            return Cell("cannot express", False, missing + words)
         if program in OURS and not isinstance(found, KconsError):
             return Cell("crash/NaN", False, f"untyped {type(found).__name__}: {words}")
         met = case.kind != "bound"
         nan = not met and type(found).__name__ == "OpenMMException" and "NaN" in words
         return Cell("crash/NaN" if nan else "refused", met, f"{type(found).__name__}: {words}")
-    checks = [{**asdict(check), "passed": check.passed} for check in found.checks]
+    checks = [{**check._asdict(), "passed": check.passed} for check in found.checks]
     notes = "; ".join(part for part in (found.remark, f"warned: {warned}" if warned else "") if part)
     tail = f"; {notes}" if notes else ""
     broken = next((check for check in found.checks if not math.isfinite(check.value)), None)
     if broken:
         return Cell("crash/NaN", False, f"{broken.name} is {broken.value}{tail}", checks)
     failed = next((check for check in found.checks if not check.passed), None)
+    if failed and warned and case.kind != "raise":
+        return Cell("refused", case.kind == "warn-or-raise", f"warned: {warned}; {failed}", checks)
     if failed:
-        if warned and case.kind != "raise":
-            return Cell("refused", case.kind == "warn-or-raise", f"warned: {warned}; {failed}", checks)
         return Cell("silently wrong", False, f"{failed}{tail}", checks)
     if not found.checks:
-        if warned and case.kind != "bound":
-            return Cell("refused", True, notes)
-        return Cell("silently wrong", False, f"accepted without a word{tail}", checks)
+        told = warned and case.kind != "bound"
+        return Cell("refused", True, notes) if told else Cell("silently wrong", False, f"accepted without a word{tail}")
     worst = max(found.checks, key=lambda check: check.value / check.limit if check.limit > 0 else 0.0)
     return Cell("right", True, f"{worst}{tail}", checks)
 

@@ -13,6 +13,8 @@ from hard_cases.case import Outcome, case, outcome
 from hard_cases.problem import Array
 from hard_cases.programs import Program
 from hard_cases.steps import each_refused
+from kcons.models.flows import LinearFlow
+from kcons.models.growth import Hypercycle, solve
 
 NONE = "no growth models and no linear flows"
 #: g_0 - g_eq of the start (0.6, 0.1, 0.1, 0.1, 0.1) of figure 11.
@@ -34,15 +36,8 @@ def _excess(log_x: Array, total: float = 1.0) -> float:
     return float(np.sum(x_eq * (u * np.exp(u) - np.expm1(u))))
 
 
-@case(
-    "H33",
-    "Hypercycle near equilibrium, to t = 900",
-    "g - g_eq by its law, to 1 % of 3e-14",
-    md_engines=NONE,
-)
+@case("H33", "Hypercycle near equilibrium, to t = 900", "g - g_eq by its law, to 1 % of 3e-14", md_engines=NONE)
 def near_equilibrium(program: Program, quick: bool) -> Outcome:
-    from kcons.models.growth import Hypercycle, solve
-
     times = [300.0, 600.0, 900.0]
     found = solve(Hypercycle().with_entropy_production(TAU), (0.0, 900.0), START, t_eval=times)
     checks = [
@@ -60,8 +55,6 @@ def near_equilibrium(program: Program, quick: bool) -> Outcome:
     md_engines=NONE,
 )
 def wrong_budget(program: Program, quick: bool) -> Outcome:
-    from kcons.models.growth import Hypercycle, solve
-
     def run(factor: float) -> float:
         system = Hypercycle().with_entropy_production(TAU, factor * EXCESS)
         return float(solve(system, (0.0, 10.0), START).t[-1])
@@ -69,15 +62,8 @@ def wrong_budget(program: Program, quick: bool) -> Outcome:
     return each_refused({f"{f:g} of the budget": lambda f=f: run(f) for f in (1.1, 1.5, 0.9)})  # type: ignore[misc]
 
 
-@case(
-    "H35",
-    "Near-extinction: ln x down to -2.6e4, and back",
-    "ln x as with 20 digits, to 1e-6",
-    md_engines=NONE,
-)
+@case("H35", "Near-extinction: ln x down to -2.6e4, and back", "ln x as with 20 digits, to 1e-6", md_engines=NONE)
 def near_extinction(program: Program, quick: bool) -> Outcome:
-    from kcons.models.growth import Hypercycle, solve
-
     known = {
         4.0: [-0.42732377304907165, -2543.817392006705, -2761.201209194897, -2688.0424044343267, -1.0562781665592944],
         4.5: [-0.5026804706385988, -24091.61134399064, -26150.293535903424, -25454.723078009978, -0.9286342229800977],
@@ -102,8 +88,6 @@ def near_extinction(program: Program, quick: bool) -> Outcome:
     md_engines=NONE,
 )
 def at_equilibrium(program: Program, quick: bool) -> Outcome:
-    from kcons.models.growth import Hypercycle, solve
-
     x_eq = _equilibrium()
     found = solve(Hypercycle().with_entropy_production(TAU), (0.0, 10.0), x_eq)
     return outcome(("moved by", np.abs(found.y[:, -1] - x_eq).max(), 1e-12))
@@ -111,8 +95,6 @@ def at_equilibrium(program: Program, quick: bool) -> Outcome:
 
 @case("H37", "Populations that sum to 2", "x at t = 10 as found with 45 digits, to 1e-7", md_engines=NONE)
 def sum_of_two(program: Program, quick: bool) -> Outcome:
-    from kcons.models.growth import Hypercycle, solve
-
     known = np.array(
         [0.23903300228620136, 0.3961302107295643, 0.6148242353159383, 0.4702890991184972, 0.2797234525497988]
     )
@@ -123,8 +105,6 @@ def sum_of_two(program: Program, quick: bool) -> Outcome:
 
 @case("H38", "Critical damping, 1 +- 1e-9 of it; Jordan block of 3", "closed forms to 1e-12", md_engines=NONE)
 def defective(program: Program, quick: bool) -> Outcome:
-    from kcons.models.flows import LinearFlow
-
     w, start = 2.0, np.array([1.0, 0.5])
     checks: list[tuple[str, float, float]] = []
     for zeta in (1.0, 1 + 1e-9, 1 - 1e-9):

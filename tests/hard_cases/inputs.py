@@ -132,7 +132,7 @@ def single_precision(program: Program, quick: bool) -> Outcome:
         problem = Problem(x.astype(kind), masses.astype(kind), TRIANGLE, velocities=v.astype(kind))
         # Velocities that fit to rounding, so that nothing else differs.
         fitting = problem.but(velocities=problem.tangent(v.astype(np.float64)).astype(np.float32).astype(kind))
-        ends.append(program.run(_Raw(**vars(fitting)), 0.01, 100, project=True))
+        ends.append(program.run(fitting.of_kind(_Raw), 0.01, 100, project=True))
     apart = max(np.abs(ends[0].x - ends[1].x).max(), np.abs(ends[0].v - ends[1].v).max())
     double = all(a.dtype == np.float64 for end in ends for a in (end.x, end.v))
     return outcome(("difference", apart, 1e-12), ("results in another precision", float(not double), 0))
@@ -217,7 +217,7 @@ def late_force(program: Program, quick: bool) -> Outcome:
         end = program.run(problem, 0.01, 100)
     else:
         base = moving_chain(4)
-        end = program.run(Late(**vars(base)), 0.01, 100)
+        end = program.run(base.of_kind(Late), 0.01, 100)
     return outcome(("residual", base_residual(end.x), 1e-10))
 
 

@@ -74,7 +74,7 @@ def move(program: Program, problem: Problem, dt: float, steps: int) -> Outcome:
     )
 
 
-def flat_body(program: Program, shape: Array, masses: Array, pairs: Pairs, quick: bool) -> Outcome:
+def flat_body(program: Program, quick: bool, shape: Array, masses: Array, pairs: Pairs) -> Outcome:
     """Tumbling against Euler's equations; then forces that would buckle it."""
     tumbled = tumble(program, shape, masses, pairs, quick=quick)
     x = truths.rotated(shape)
@@ -91,7 +91,7 @@ def flat_body(program: Program, shape: Array, masses: Array, pairs: Pairs, quick
     steps = program.length(quick, 100, 2000)
     program.run(problem, 0.01, steps, together(seen, watch))
     return outcome(
-        *[(check.name, check.value, check.limit) for check in tumbled.checks],
+        *tumbled.checks,
         ("buckled by", np.max(buckled), 1e-8),
         ("residual under a push", seen.residual, 1e-10),
         remark=f"{tumbled.remark}; {steps} steps under forces out of the plane",

@@ -6,8 +6,9 @@ that all programs compute with the same numbers.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -80,6 +81,10 @@ class Problem:
         """A copy with other attributes."""
         return replace(self, **changes)
 
+    def of_kind(self, kind: type[Problem]) -> Problem:
+        """The same as a `kind`."""
+        return kind(**{item.name: getattr(self, item.name) for item in fields(self)})
+
     def rows(self) -> list[Constraint]:
         """The constraints of kcons."""
         found: list[Constraint] = [FixedAtoms(list(self.fixed))] if len(self.fixed) else []
@@ -138,19 +143,19 @@ class Problem:
         moving = np.setdiff1d(np.arange(self.n_atoms), np.asarray(self.fixed, dtype=int))
         return 0.5 * float(np.sum(self.m[moving, None] * v[moving] ** 2))
 
+    @functools.cached_property
     def oracle(self) -> ConstraintSet:
         """The rows for the dense theory of `kcons.constraints.projection`; none of the solvers knows of it."""
         return ConstraintSet(self.rows(), self.x, self.m)
 
     def tangent(self, v: ArrayLike) -> Array:
         """Velocities projected in the mass metric, densely."""
-        return projection.project_velocities(self.oracle().jacobian(self.x).toarray(), self.m, np.asarray(v))
+        return projection.project_velocities(self.oracle.jacobian(self.x).toarray(), self.m, np.asarray(v))
 
     def acceleration(self, x: Array, v: Array) -> Array:
         """Accelerations of the dense theory (notes, eq. 105)."""
-        held = self.oracle()
-        rows = held.jacobian(x).toarray()
-        return projection.acceleration(rows, self.m, self.forces(x), held.acceleration_target(x, v))
+        rows = self.oracle.jacobian(x).toarray()
+        return projection.acceleration(rows, self.m, self.forces(x), self.oracle.acceleration_target(x, v))
 
 
 def distances(x: Array, pairs: Pairs, cell: ArrayLike | None = None) -> Array:

@@ -333,13 +333,14 @@ class PlainOpenMM(Program):
             periodic = openmm.CustomBondForce("0")
             periodic.setUsesPeriodicBoundaryConditions(True)
             system.addForce(periodic)
-        if problem.push is not None:
-            force = openmm.CustomExternalForce("-(fx*x+fy*y+fz*z)")
-            _add_particles(force, ("fx", "fy", "fz"), np.asarray(problem.push, dtype=float))
-            system.addForce(force)
-        if problem.tether:
-            force = openmm.CustomExternalForce(f"{0.5 * problem.tether!r}*((x-a)^2+(y-b)^2+(z-c)^2)")
-            _add_particles(force, ("a", "b", "c"), problem._anchors)
+        if problem.push is not None or problem.tether:
+            spring = f"{0.5 * problem.tether!r}*((x-a)^2+(y-b)^2+(z-c)^2)"
+            force = openmm.CustomExternalForce(f"-(fx*x+fy*y+fz*z)+{spring}")
+            for name in ("fx", "fy", "fz", "a", "b", "c"):
+                force.addPerParticleParameter(name)
+            push = np.zeros_like(problem.x) if problem.push is None else np.asarray(problem.push, dtype=float)
+            for k, row in enumerate(np.hstack([push, problem._anchors])):
+                force.addParticle(k, row.tolist())
             system.addForce(force)
         if problem.springs:
             bonds = openmm.HarmonicBondForce()
@@ -446,13 +447,6 @@ class KconsInOpenMM(PlainOpenMM):
         context = self.context(system, integrator)
         context.setPositions(problem.x)
         return int(integrator.degrees_of_freedom(context))
-
-
-def _add_particles(force: Any, names: tuple[str, ...], values: Array) -> None:
-    for name in names:
-        force.addPerParticleParameter(name)
-    for k, row in enumerate(values):
-        force.addParticle(k, [float(a) for a in row])
 
 
 PROGRAMS: dict[str, type[Program]] = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from hard_cases import truths
@@ -23,8 +25,8 @@ def ring(n: int, radius: float = 1.0) -> Array:
 def planar_rings(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
     for n in (4, 6):
-        result = flat_body(program, ring(n), np.ones(n), every(n), quick)
-        found += [(f"{n}-ring: {check.name}", check.value, check.limit) for check in result.checks]
+        result = flat_body(program, quick, ring(n), np.ones(n), every(n))
+        found += [check._replace(name=f"{n}-ring: {check.name}") for check in result.checks]
     return outcome(*found)
 
 
@@ -43,48 +45,25 @@ def hexagon_9(program: Program, quick: bool) -> Outcome:
     return _flexible(program, ring(6), SIDES + PARA, quick, "a mechanism, flat at the start")
 
 
-@case("X11", "Planar hexagon by 12 distances (sides and meta)", SINGULAR, "warn-or-raise")
-def hexagon_12(program: Program, quick: bool) -> Outcome:
-    return flat_body(program, ring(6), np.full(6, 12.0), SIDES + META, quick)
-
-
-@case("X12", "Planar hexagon by all 15 distances", SINGULAR, "warn-or-raise")
-def hexagon_15(program: Program, quick: bool) -> Outcome:
-    return flat_body(program, ring(6), np.full(6, 12.0), every(6), quick)
-
-
-@case("X13", "Square by all 6 distances", SINGULAR, "warn-or-raise")
-def square(program: Program, quick: bool) -> Outcome:
-    return flat_body(program, ring(4), np.full(4, 12.0), every(4), quick)
-
-
-@case("X14", "Planar formate by all 6 distances", SINGULAR, "warn-or-raise")
-def formate(program: Program, quick: bool) -> Outcome:
-    bend = np.radians(65.0)
-    shape = np.array(
-        [
-            [0, 0, 0],
-            [1.25 * np.sin(bend), -1.25 * np.cos(bend), 0],
-            [-1.25 * np.sin(bend), -1.25 * np.cos(bend), 0],
-            [0, 1.1, 0],
-        ]
-    )
-    return flat_body(program, shape, np.array([12.0, 16.0, 16.0, 1.0]), every(4), quick)
-
-
-@case("X15", "Benzene by all 66 distances", SINGULAR, "warn-or-raise")
-def benzene(program: Program, quick: bool) -> Outcome:
-    masses = np.array([12.0] * 6 + [1.0] * 6)
-    return flat_body(program, np.vstack([ring(6, 1.39), ring(6, 2.48)]), masses, every(12), quick)
+_WIDE, _HIGH = 1.25 * np.sin(np.radians(65.0)), 1.25 * np.cos(np.radians(65.0))
+BENZENE, BENZENE_MASSES = np.vstack([ring(6, 1.39), ring(6, 2.48)]), np.array([12.0] * 6 + [1.0] * 6)
+FORMATE = np.array([[0, 0, 0], [_WIDE, -_HIGH, 0], [-_WIDE, -_HIGH, 0], [0, 1.1, 0]])
+for number, title, shape, masses, pairs in (
+    ("X11", "Planar hexagon by 12 distances (sides and meta)", ring(6), np.full(6, 12.0), SIDES + META),
+    ("X12", "Planar hexagon by all 15 distances", ring(6), np.full(6, 12.0), every(6)),
+    ("X13", "Square by all 6 distances", ring(4), np.full(4, 12.0), every(4)),
+    ("X14", "Planar formate by all 6 distances", FORMATE, np.array([12.0, 16.0, 16.0, 1.0]), every(4)),
+    ("X15", "Benzene by all 66 distances", BENZENE, BENZENE_MASSES, every(12)),
+):
+    case(number, title, SINGULAR, "warn-or-raise")(partial(flat_body, shape=shape, masses=masses, pairs=pairs))
 
 
 @case("X16", "Benzene by its 12 bonds", "10 x the error of RATTLE; residual 1e-10")
 def benzene_bonds(program: Program, quick: bool) -> Outcome:
-    masses = np.array([12.0] * 6 + [1.0] * 6)
-    x = truths.rotated(np.vstack([ring(6, 1.39), ring(6, 2.48)]))
+    x = truths.rotated(BENZENE)
     pairs = [*SIDES, *[(k, k + 6) for k in range(6)]]
     v = 0.2 * np.random.default_rng(2).standard_normal((12, 3))
-    return move(program, Problem(x, masses, pairs, velocities=v), 0.005, program.length(quick, 100, 400))
+    return move(program, Problem(x, BENZENE_MASSES, pairs, velocities=v), 0.005, program.length(quick, 100, 400))
 
 
 def sheet(columns: int, lines: int, bond: float = 1.42) -> tuple[Array, list[tuple[int, int]]]:

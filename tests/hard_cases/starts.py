@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from hard_cases import truths
@@ -22,7 +24,7 @@ def _first(program: Program, problem: Problem, steps: int = 0) -> tuple[Frame, F
 
 def _tangent_checks(problem: Problem, first: Frame) -> list[tuple[str, float, float]]:
     """Velocities against the dense projection at the positions found; kinetic energy against its formula."""
-    held, m = problem.oracle(), problem.m
+    held, m = problem.oracle, problem.m
     rows = held.jacobian(first.x).toarray()
     jv = rows @ problem.v.ravel()
     loss = 0.5 * jv @ np.linalg.pinv(rows / np.repeat(m, 3) @ rows.T, rcond=1e-12) @ jv
@@ -63,7 +65,7 @@ def first_residual(problem: Problem, *frames: Frame) -> float:
     return float("nan") if np.any(np.isnan(found)) else max(found)
 
 
-def _scaled(program: Program, factor: float) -> Outcome:
+def _scaled(program: Program, quick: bool, factor: float) -> Outcome:
     """A molecule of bonds and 1-3 distances, every coordinate scaled, brought back and run."""
     shape = truths.rotated(zigzag(8) + np.random.default_rng(3).uniform(-0.1, 0.1, (8, 3)))
     masses = np.array([12.0, 12, 14, 16, 12, 12, 1, 1])
@@ -80,20 +82,13 @@ def _scaled(program: Program, factor: float) -> Outcome:
     )
 
 
-def _register_scaled() -> None:
-    for number, factor, words in (
-        ("X30", 1.2, "20 % off"),
-        ("X31", 2.0, "a factor 2 off"),
-        ("X32", 0.5, "a factor 0.5 off"),
-    ):
-
-        def run(program: Program, quick: bool, factor: float = factor) -> Outcome:
-            return _scaled(program, factor)
-
-        case(number, f"Start {words}, chain by bonds and 1-3 distances", "residual 1e-10 and a quiet run")(run)
-
-
-_register_scaled()
+for number, factor, words in (
+    ("X30", 1.2, "20 % off"),
+    ("X31", 2.0, "a factor 2 off"),
+    ("X32", 0.5, "a factor 0.5 off"),
+):
+    title = f"Start {words} off, chain by bonds and 1-3 distances"
+    case(number, title, "residual 1e-10 and a quiet run")(partial(_scaled, factor=factor))
 
 
 @case("X33", "Start 20 % off, and nobody asks to mend it", "refused, or mended without heating", "warn-or-raise")
@@ -129,7 +124,7 @@ def bad_velocities_unasked(program: Program, quick: bool) -> Outcome:
     rng = np.random.default_rng(1)
     problem = Problem(x, rng.uniform(1, 16, 6), bonds(6), velocities=rng.standard_normal((6, 3)))
     end = program.run(problem, 1e-4, 1)
-    held = problem.oracle()
+    held = problem.oracle
     rate = np.abs(held.jacobian(end.x).toarray() @ end.v.ravel()).max()
     return outcome(("|J v| after a step", rate, 1e-10))
 

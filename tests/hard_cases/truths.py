@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
@@ -14,27 +10,6 @@ from scipy.special import ellipj, ellipk
 from hard_cases.problem import Array, Numbers, Problem
 from kcons.comparison.test_systems.rotor import flight
 from kcons.constraints import projection
-
-_KNOWN: dict[tuple[Any, ...], Array] = {}
-
-
-def _remembered(function: Callable[..., Array]) -> Callable[..., Array]:
-    """Compute a truth once for all programs."""
-
-    @wraps(function)
-    def call(*arguments: Any) -> Array:
-        key = (function.__name__, *(_key(a) for a in arguments))
-        if key not in _KNOWN:
-            _KNOWN[key] = function(*arguments)
-        return _KNOWN[key]
-
-    return call
-
-
-def _key(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tobytes()
-    return repr([getattr(value, name) for name in value.__dataclass_fields__]) if isinstance(value, Problem) else value
 
 
 def cross_matrix(w: ArrayLike) -> Array:
@@ -54,13 +29,11 @@ def spinning(x: Array, masses: Array, omega: Numbers, drift: ArrayLike = (0, 0, 
     return np.asarray(np.cross(omega, x - masses @ x / masses.sum()) + np.asarray(drift, dtype=float))
 
 
-@_remembered
 def rigid_flight(x: Array, masses: Array, omega: Array, time: float) -> Array:
     """Positions of a free rigid body after `time`, by Euler's equations; its center rests."""
     return flight(x, spinning(x, masses, omega), masses, time).positions
 
 
-@_remembered
 def rigid_rattle(x: Array, masses: Array, omega: Array, dt: float, steps: int) -> Array:
     """What RATTLE must give for that body, whatever rows hold it: the map of Moser and Veselov.
 
@@ -105,7 +78,6 @@ def linear_flight(x: Array, v: Array, masses: Array, time: float) -> Array:
     return np.asarray(center + drift * time + d * np.cos(omega * time) + u / omega * np.sin(omega * time))
 
 
-@_remembered
 def true_motion(problem: Problem, time: float) -> Array:
     """Positions after `time` by the accelerations of the dense theory, integrated to 1e-11 (small problems)."""
     n = 3 * problem.n_atoms
@@ -119,10 +91,9 @@ def true_motion(problem: Problem, time: float) -> Array:
     return np.asarray(end.y[:n, -1].reshape(-1, 3))
 
 
-@_remembered
 def dense_rattle(problem: Problem, dt: float, steps: int) -> Array:
     """RATTLE written down literally, with dense pseudo-inverses: what error the scheme itself has."""
-    held, m = problem.oracle(), problem.m
+    held, m = problem.oracle, problem.m
     x, v = problem.x, problem.v
     for _ in range(steps):
         rows = held.jacobian(x).toarray()

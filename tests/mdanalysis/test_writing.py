@@ -55,30 +55,6 @@ def system():
     return made, made.initial_state(x, motion.project_velocities(x, v)), motion
 
 
-@pytest.mark.parametrize("what", ["another trajectory's", "an engine's", "a link"])
-def test_residuals_of_another_trajectory_are_not_overwritten(tmp_path, what):
-    """run.trr and run.xtc would both have run.xvg; so would what GROMACS writes."""
-    _, _, motion = system()
-    side = tmp_path / "run.xvg"
-    x = files.whole(files.water(N, 1))[0]
-    if what == "another trajectory's":
-        with TrajectoryWriter(tmp_path / "run.trr", 3 * N, motion=motion) as writer:
-            writer.write(x)
-        # Its own older self it may replace.
-        with TrajectoryWriter(tmp_path / "run.trr", 3 * N, motion=motion) as writer:
-            writer.write(x)
-    elif what == "an engine's":
-        side.write_text("# This file was created by an engine\n")
-    else:
-        side.symlink_to(tmp_path / "elsewhere")
-    before = side.read_bytes() if side.exists() else None
-    with pytest.raises(InputError, match=r"run\.xvg is not of run\.xtc.*another name") as error:
-        TrajectoryWriter(tmp_path / "run.xtc", 3 * N, motion=motion)
-    assert error.value.item == "path" and not (tmp_path / "run.xtc").exists()
-    assert (side.read_bytes() if side.exists() else None) == before and not (tmp_path / "elsewhere").exists()
-    TrajectoryWriter(tmp_path / "run.xtc", 3 * N).close()
-
-
 @pytest.mark.parametrize("ending", ["dcd", "xtc", "trr", "nc", "scipy.nc", "h5md"])
 def test_core_runs(tmp_path, ending, monkeypatch):
     if ending == "scipy.nc":  # written by SciPy where netCDF4 is not installed
@@ -126,7 +102,6 @@ def test_observables_of_h5md(tmp_path):
     states = []
     with TrajectoryWriter(path, 3 * N, motion=motion, forces=True) as writer:
         run(made, state, 0.002, 10, observers=[writer, states.append], every=5)
-    assert writer.side_file is None
     last = files.loaded(path, N).trajectory[-1]
     s = states[-1]
     expected = motion.multipliers(s.positions, s.velocities, s.forces, s.time)
@@ -135,24 +110,6 @@ def test_observables_of_h5md(tmp_path):
     assert np.abs(last.data["residuals"]).max() < 1e-12
     with h5py.File(path) as file:
         assert file["observables/multipliers"].attrs["run_units"] == "Å, ps, kJ/mol"
-
-
-def test_side_file_is_auxiliary_data(tmp_path):
-    made, state, motion = system()
-    path = tmp_path / "r.dcd"
-    with TrajectoryWriter(path, 3 * N, motion=motion, interval=0.01) as writer:
-        after = run(made, state, 0.002, 20, observers=[writer], every=5)
-    assert writer.side_file == tmp_path / "r.xvg"
-    universe = files.loaded(path, N)
-    universe.trajectory.add_auxiliary({"constraints": 0}, str(writer.side_file))
-    assert universe.trajectory.n_frames == 5
-    aux = mda.auxiliary.XVG.XVGReader(str(writer.side_file))
-    rows = np.array([step._data.copy() for step in aux])
-    np.testing.assert_allclose(rows[:, 0], [0, 0.01, 0.02, 0.03, 0.04], atol=1e-9)
-    assert rows.shape[1] == 4 + 3 * N and np.nanmax(rows[:, 1]) < 1e-12
-    expected = motion.multipliers(after.positions, after.velocities, after.forces, after.time)
-    np.testing.assert_allclose(rows[-1, 4:], expected, rtol=1e-6, atol=1e-6)
-    assert "multiplier #0 Distance(0, 1)" in writer.side_file.read_text()
 
 
 KILLED = """
@@ -179,7 +136,6 @@ def test_a_run_that_is_killed_keeps_its_frames(tmp_path):
     for ending in endings:
         check = files.checked(tmp_path / f"k{ending}.{ending}", N, tolerance=0.0, rank=False)
         assert check.status == "kept" and check.broken is None and len(check.frames) == 5, (ending, check.broken)
-    assert len((tmp_path / "kdcd.xvg").read_text().split("\n")) > 5
 
 
 def test_ase_dynamics(tmp_path):
@@ -191,7 +147,7 @@ def test_ase_dynamics(tmp_path):
         atoms.set_constraint([Constraints(rows), ase.constraints.Hookean(0, 3, k=5.0, rt=1.0)])
         atoms.calc = TIP3P(rc=4.5)
         dynamics = (ConstrainedDynamics if ours else VelocityVerlet)(atoms, 1.0 * ase.units.fs)
-        path = tmp_path / f"a{ours}.trr"
+        path = tmp_path / f"a{ours}.h5md"
         with write_ase(dynamics, path, interval=4, forces=True) as writer:
             dynamics.run(8)
         assert writer.n_frames == 3 and writer.motion is not None
@@ -203,10 +159,9 @@ def test_ase_dynamics(tmp_path):
         applied, per_mole = applied_forces(atoms), ase.units.kJ / ase.units.mol
         assert np.abs(applied - atoms.get_forces(apply_constraint=False)).max() > 1.0
         np.testing.assert_allclose(last.forces, applied / per_mole, rtol=1e-5, atol=1e-4)
-        multipliers = np.loadtxt(tmp_path / f"a{ours}.xvg", comments=("#", "@"))[-1, 4:]
         motion = atoms.constraints[0].engine(atoms)
         expected = motion.multipliers(atoms.positions, atoms.get_velocities(), applied, dynamics.get_time())
-        np.testing.assert_allclose(multipliers, expected, rtol=1e-7)
+        np.testing.assert_allclose(last.data["multipliers"], expected, rtol=1e-6)
     assert pytest.approx(1 / (1000 * ase.units.fs), rel=1e-8) == ASE_UNITS.time
 
 
@@ -229,7 +184,7 @@ def test_openmm_simulations(tmp_path):
     simulation.context.setVelocitiesToTemperature(300, 1)
     masses = np.tile([15.999, 1.008, 1.008], 2)
     motion = Motion(ConstraintSet(Distance(files.pairs(2), files.targets(2) / 10), x, masses), x)
-    path = tmp_path / "o.trr"
+    path = tmp_path / "o.h5md"
     reporter = OpenMMReporter(path, 5, motion=motion)
     simulation.reporters.append(reporter)
     simulation.step(20)
@@ -241,8 +196,7 @@ def test_openmm_simulations(tmp_path):
     np.testing.assert_allclose(last.positions / 10, state.getPositions(asNumpy=True)._value, atol=1e-6)
     speeds = state.getVelocities(asNumpy=True).value_in_unit(unit.angstrom / unit.picosecond)
     np.testing.assert_allclose(last.velocities, speeds, rtol=1e-5, atol=1e-5)
-    residuals = np.loadtxt(tmp_path / "o.xvg", comments=("#", "@"))[:, 1]
-    assert residuals.max() < 1e-8 and len(residuals) == 4
+    assert np.abs(last.data["residuals"]).max() < 1e-8
 
 
 @pytest.mark.parametrize("ending", ["xtc", "h5md"])
@@ -286,24 +240,26 @@ def test_constraints_that_change_in_a_run(tmp_path, ours):
     atoms.calc = EMT()
     constrain(atoms, Distance([[0, 1]]))
     dynamics = (ConstrainedDynamics if ours else VelocityVerlet)(atoms, 0.1)
-    with write_ase(dynamics, tmp_path / "a.dcd") as writer:
+    with write_ase(dynamics, tmp_path / "a.h5md") as writer:
         dynamics.run(1)
         # The same row at another length: the file goes on, with residuals from the new one.
         atoms.set_constraint()
         constrain(atoms, Distance([[0, 1]], [1.6]), project=True)
         dynamics.run(1)
-        residuals = np.loadtxt(tmp_path / "a.xvg", comments=("#", "@"))[:, 1]
-        assert np.abs(residuals).max() < 1e-10 and abs(atoms.get_distance(0, 1) - 1.6) < 1e-10
+        assert abs(atoms.get_distance(0, 1) - 1.6) < 1e-10
         # Another row is no longer what the columns say.
         written = writer.n_frames
         atoms.set_constraint()
         constrain(atoms, Distance([[1, 2]]))
-        with pytest.raises(InputError, match=r"no longer those that a\.dcd was begun with; write a new file"):
+        with pytest.raises(InputError, match=r"no longer those that a\.h5md was begun with; write a new file"):
             dynamics.run(1)
         assert writer.n_frames == written
         atoms.set_constraint()
         with pytest.raises(InputError, match="no longer those"):
             dynamics.run(1)
+    with h5py.File(tmp_path / "a.h5md") as file:
+        residuals = file["observables/residuals/value"][:]
+    assert len(residuals) == written and np.abs(residuals).max() < 1e-10
 
 
 def test_cells_that_boxes_of_mdanalysis_are_not(tmp_path):

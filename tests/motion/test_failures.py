@@ -7,51 +7,10 @@ import pytest
 
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import ConvergenceError, InputError, SingularGeometryError
+from kcons.errors import ConvergenceError, SingularGeometryError
 from kcons.motion import Motion
-from kcons.motion.failures import Failures
+from kcons.motion.solver_sequence import Failures
 from kcons.solvers.cluster_solver import Outcome, Request
-
-WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
-BOND = Motion(ConstraintSet(held.Distance([0, 1]), WATER, np.ones(3)), WATER)
-SOLVER = BOND.plan.solvers[0]
-
-
-def failures(motion: Motion = BOND, numbers: np.ndarray | None = None) -> Failures:
-    return Failures(motion.constraint_set, motion.plan, numbers)
-
-
-@pytest.mark.parametrize("numbers", [None, np.array([70, 80, 90])])
-def test_errors_name_row_array_and_atoms(numbers: np.ndarray | None) -> None:
-    told = failures(numbers=numbers)
-    names = (0, 1) if numbers is None else (70, 80)
-    error = told.positions(Request(WATER, WATER), Outcome(False, 0.25, 7, 0), SOLVER)
-    assert isinstance(error, ConvergenceError)
-    assert (error.row, error.atoms, error.cluster, error.residual, error.iterations) == (0, names, 0, 0.25, 7)
-    assert f"#0 Distance({names[0]}, {names[1]})" in str(error) and "restore_positions" in str(error)
-    nameless = told.positions(Request(WATER, WATER), Outcome(False, 0.25, 7, -1), SOLVER)
-    assert isinstance(nameless, ConvergenceError) and nameless.row == -1
-    assert told.not_finite(x_new=WATER) is None
-    broken = WATER.copy()
-    broken[2] = np.nan  # no row touches it
-    assert told.not_finite(x_new=broken) is None
-    broken[1, 0] = np.inf
-    error = told.not_finite(x_new=WATER, x_ref=broken)
-    assert isinstance(error, InputError) and error.item == "x_ref" and error.atoms == names[1:]
-    assert str(error).startswith(f"x_ref of atom {names[1]} is not finite")
-
-
-def test_coincident_atoms_come_before_all_else() -> None:
-    told, same, outcome = failures(), np.zeros((3, 3)), Outcome(False, np.inf, 0, 0)
-    for error in (
-        told.unusable(0, x_new=WATER, x_ref=same),
-        told.tangents(same, WATER, outcome, SOLVER, "velocity"),
-        told.undefined(0, velocity=WATER, position=same),
-        told.start(WATER, same, 0, np.inf, 0, 0.0),
-    ):
-        assert isinstance(error, SingularGeometryError)
-        assert error.rows == (0,) and error.atoms == (0, 1) and "move them apart" in str(error)
-    assert told.unusable(0, x_new=same, x_ref=WATER) is None
 
 
 def test_curvature_that_is_undefined() -> None:
@@ -79,7 +38,8 @@ def folded(degrees: float) -> np.ndarray:
 def test_a_dihedral_that_becomes_straight_is_named(numbers, before, after, named) -> None:
     x = folded(before)
     motion, request = chain(x), Request(folded(after), x)
-    error = failures(motion, numbers).positions(request, Outcome(False, 0.25, 7, 0), motion.plan.solvers[0])
+    told = Failures(motion.constraint_set, motion.plan, numbers)
+    error = told.positions(request, Outcome(False, 0.25, 7, 0), motion.plan.solvers[0])
     assert isinstance(error, ConvergenceError) and "smaller time step" in str(error)
     names = "1, 2, 3" if numbers is None else "11, 12, 13"
     assert (f"Atoms {names} of row #3 Dihedral" in str(error)) == named

@@ -54,12 +54,17 @@ def snippets(language):
 
 
 def python_pages():
-    """The Python snippets of one page continue each other."""
+    """The Python snippets of one page continue each other; the site, in `.ci/run`, runs tutorials as notebooks."""
     pages = {}
     for parameter in snippets("python"):
         page, code = parameter.values
         pages.setdefault(page, []).append(code)
-    return [pytest.param("\n".join(codes), id=name_of(page)) for page, codes in pages.items()]
+    return [
+        pytest.param(
+            "\n".join(codes), id=name_of(page), marks=pytest.mark.validation if page.parent.name == "tutorials" else ()
+        )
+        for page, codes in pages.items()
+    ]
 
 
 @pytest.mark.parametrize("code", python_pages())

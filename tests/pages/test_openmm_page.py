@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm import SCHEMES, ProjectedIntegrator
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = (DOCS / "openmm.md").read_text(encoding="utf-8")

@@ -57,7 +57,7 @@ def test_modules_among_the_public_names_have_their_place():
 
 
 def test_each_command_has_its_help():
-    commands = main.parser_of_all().commands
+    commands = main.parsers()[1]
     assert {"compare", "plan", "check", "scan", "freeenergy", "warmup"} <= set(commands)
     for name, parser in commands.items():
         assert f"usage: kcons {name}" in parser.format_help()

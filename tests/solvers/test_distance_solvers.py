@@ -5,8 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from kcons.solvers.chains.open_chains import Chains
-from kcons.solvers.chains.strips import SHORT
+from kcons.solvers.chains import SHORT, Chains
 from kcons.solvers.distance_clusters import resolved
 from kcons.solvers.kernels.lattices import NO_LATTICE, OPEN
 from kcons.solvers.rigid_triangles import PAIRS, RigidTriangles

@@ -10,7 +10,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError
 from kcons.motion import Motion
 from kcons.solvers.addressable_solvers import packed_positions, packed_tangents, set_lattice
-from kcons.steppers.stages.packed_system import packed_rows
+from kcons.steppers.packed_system import packed_rows
 
 TRIANGLE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])
 

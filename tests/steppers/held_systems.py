@@ -16,9 +16,7 @@ from kcons.constraints import (
     Plane,
     Sphere,
 )
-from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, Geodesic, KahanLi6, Rattle, Suzuki4
 
-STEPPERS = [Rattle(), Geodesic(4), Suzuki4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()]
 PAIRS = [[0, 1], [0, 2], [1, 2]]
 SHAPE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])
 

@@ -11,16 +11,13 @@ from stepper_systems import SYMMETRIC, gravity, slope, system_of
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge, LinearVelocity, MovingTarget, Sphere
 from kcons.errors import InputError
 from kcons.steppers import (
-    BlanesMoan4,
     BlanesMoan6,
     BlanesMoan6a,
     Geodesic,
     KahanLi6,
     Rattle,
     State,
-    Suzuki4,
     System,
-    Yoshida4,
     run,
 )
 
@@ -53,11 +50,7 @@ def solution(moving: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["at rest", "moving"])
-@pytest.mark.parametrize(
-    "stepper",
-    [Rattle(), Geodesic(2), Yoshida4(), Suzuki4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()],
-    ids=repr,
-)
+@pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
 def test_every_stepper_keeps_its_order(stepper, moving: bool) -> None:
     system, start = pendulum(moving=moving)
     counts = {2: (8, 32), 4: (4, 8), 6: (2, 4)}[stepper.order]

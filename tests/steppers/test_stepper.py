@@ -1,4 +1,4 @@
-"""What every stepper does: what it states, purity, errors, time steps, invariance; runs; steps taken back."""
+"""What every stepper does: purity, errors, time steps, invariance; runs and what is recorded; steps taken back."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from stepper_systems import (
 from kcons.constraints import Angle, Distance
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
 from kcons.steppers import (
+    BlanesMoan4,
     Geodesic,
     Rattle,
     ReversibilityCheck,
@@ -29,18 +30,6 @@ from kcons.steppers import (
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, IsokineticSpheres, Langevin
 
 REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
-
-DECLARED = {
-    # order, reversible, symplectic, force evaluations
-    "Rattle()": (2, True, True, 1),
-    "Geodesic(substeps=4)": (2, True, True, 1),
-    "Yoshida4()": (4, True, True, 3),
-    "Suzuki4()": (4, True, True, 5),
-    "KahanLi6()": (6, True, True, 9),
-    "BlanesMoan4()": (4, True, True, 6),
-    "BlanesMoan6()": (6, True, True, 11),
-    "BlanesMoan6a()": (6, True, True, 14),
-}
 
 
 def copies(state: State) -> list[np.ndarray | None]:
@@ -67,13 +56,7 @@ def springs(x: np.ndarray, t: float) -> np.ndarray:
     return -np.sum(d * (1 - 0.5 / (1 + np.sum(d**2, axis=-1, keepdims=True))), axis=1)
 
 
-# -- what each states -------------------------------------------------------------------------------
-
-
-@REVERSIBLE
-def test_what_it_states(stepper) -> None:
-    declared = stepper.order, stepper.reversible, stepper.symplectic, stepper.force_evaluations
-    assert declared == DECLARED[repr(stepper)]
+# -- forces -----------------------------------------------------------------------------------------
 
 
 @REVERSIBLE
@@ -252,3 +235,72 @@ def test_check_works_far_from_the_origin_and_at_rest() -> None:
     run(system, state, 0.05, 20, stepper=ReversibilityCheck(Geodesic(2)))
     system, state = rotor(omega=0.0)
     run(system, state, 0.05, 3, stepper=ReversibilityCheck(Rattle()))
+
+
+def test_observers_see_start_and_every_kth_step() -> None:
+    system, state = rotor()
+    seen: list[int] = []
+    run(system, state, 0.01, 10, observers=[lambda s: seen.append(s.step)], every=4)
+    assert seen == [0, 4, 8]
+
+
+IMPOSSIBLE = [{"time": np.nan}, {"time": -np.inf}, {"time": 1j}, {"time": "a"}, {"time_remainder": np.nan}]
+IMPOSSIBLE += [{"step": step} for step in (-3, 2.5, True, None)]
+
+
+@pytest.mark.parametrize("impossible", IMPOSSIBLE, ids=str)
+@pytest.mark.parametrize("stepper", [None, BlanesMoan4(), Langevin(1.0, 1.0, rng=1)], ids=str)
+def test_states_made_by_hand_with_impossible_numbers(stepper, impossible) -> None:
+    """In a run, which shows them to nobody, and in a step by itself."""
+    system, state = rotor()
+    wrong, seen = State(state.positions, state.velocities, **impossible), []
+    (item,) = impossible
+    with pytest.raises(InputError, match=f"^{item} is .*; give a") as caught:
+        run(system, wrong, 0.1, 2, stepper=stepper, observers=[seen.append])
+    assert caught.value.item == item and not seen
+    with pytest.raises(InputError, match=f"^{item} is"):
+        run(system, wrong, 0.1, 0, stepper=stepper)
+    with pytest.raises(InputError, match=f"^{item} is"):
+        (stepper or Rattle()).step(system, wrong, 0.1)
+
+
+# -- trajectories -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stepper", [None, BlanesMoan4()], ids=repr)
+def test_frames_are_states_of_the_run(stepper):
+    system, state = rotor()
+    seen: list = []
+    found = run(system, state, 0.01, 10, stepper=stepper, observers=[seen.append], every=2, record=4)
+    assert [frame.step for frame in found.frames] == [0, 4, 8]
+    np.testing.assert_array_equal(found.times, [seen[k].time for k in (0, 2, 4)])
+    np.testing.assert_array_equal(found.positions, [seen[k].positions for k in (0, 2, 4)])
+    np.testing.assert_array_equal(found.velocities, [seen[k].velocities for k in (0, 2, 4)])
+    assert found.positions.shape == (3, *state.positions.shape)
+    alone = run(system, state, 0.01, 10, stepper=stepper)
+    assert found.last.step == 10
+    np.testing.assert_array_equal(found.last.positions, alone.positions)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
+def test_frames_of_a_run_that_stops_are_kept(error):
+    system, state = rotor()
+
+    def forces(x, t):
+        if t > 0.065:
+            raise error
+        return np.zeros_like(x)
+
+    with pytest.raises(error) as raised:
+        run(System(system.motion, forces), state, 0.01, 10, record=2)
+    assert [frame.step for frame in raised.value.trajectory.frames] == [0, 2, 4, 6]
+
+
+def test_what_raises_at_the_first_state_has_a_trajectory_too() -> None:
+    def refuses(state: State) -> None:
+        raise KeyError("first")
+
+    system, state = rotor()
+    with pytest.raises(KeyError) as raised:
+        run(system, state, 0.01, 3, observers=[refuses], record=1)
+    assert raised.value.trajectory.frames == []

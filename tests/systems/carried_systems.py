@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import openmm
-from openmm import app, unit
+from openmm import app
+from openmm_systems import DATA, context_of, state_of
 
 from kcons.constraints import Dihedral, Distance
 from kcons.openmm import ProjectedIntegrator, hold
 
-NM, PS = unit.nanometer, unit.picosecond
-
-
-PEPTIDE_FILE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
+PEPTIDE_FILE = DATA / "alanine-dipeptide-implicit.pdb"
 PEPTIDE = app.PDBFile(str(PEPTIDE_FILE))
 PSI = [[6, 8, 14, 16]]
-
-
-def context_of(system, integrator, platform="Reference"):
-    properties = {"Threads": "1"} if platform == "CPU" else {}
-    return openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
-
-
-def state_of(context):
-    state = context.getState(positions=True, velocities=True)
-    return (
-        state.getPositions(asNumpy=True).value_in_unit(NM).copy(),
-        state.getVelocities(asNumpy=True).value_in_unit(NM / PS).copy(),
-    )
 
 
 def started(context, x, v=None):

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import openmm
 from openmm import app, unit
-from openmm_systems import PROPERTIES
+from openmm_systems import DATA, started
 
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.collective import CollectiveRows
+from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
-DATA = Path(__file__).parents[1] / "data"
 #: A bent chain with a branch: no three atoms in a line.
 CHAIN = np.array(
     [[0.0, 0, 0], [0.14, 0.03, 0], [0.2, 0.15, 0.02], [0.1, 0.22, 0.1], [0.0, 0.2, 0.2], [0.08, 0.3, 0.25]]
@@ -50,19 +47,6 @@ def chain_system():
         system.addParticle(mass)
     system.addForce(springs())
     return system
-
-
-def context_of(system, integrator, positions, velocities=None, platform="Reference"):
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatform(platform), PROPERTIES.get(platform, {}))
-    context.setPositions(positions)
-    if velocities is not None:
-        context.setVelocities(velocities)
-    return context
-
-
-def state_of(context):
-    state = context.getState(positions=True, velocities=True)
-    return np.array(state.getPositions(asNumpy=True)._value), np.array(state.getVelocities(asNumpy=True)._value)
 
 
 def energy_of(context, integrator):
@@ -147,7 +131,7 @@ def held_chain(rows, scheme="rattle", dt=0.002, platform="Reference", constraine
     part = CollectiveRows(system, rows, positions=CHAIN, **options)
     integrator = ProjectedIntegrator(dt, scheme, parts=[part], tolerance=1e-13)
     v = some_velocities() if velocities is None else velocities
-    context = context_of(system, integrator, CHAIN, v, platform)
+    context = started(system, integrator, CHAIN, v, platform)
     part.restore(context)
     return context, integrator, part
 
@@ -159,7 +143,7 @@ def dipeptide(constraints=app.AllBonds, platform="Reference", scheme="rattle", d
     positions = np.array(pdb.positions.value_in_unit(unit.nanometer))
     part = CollectiveRows(system, [dihedral(*PHI), dihedral(*PSI)], positions=positions)
     integrator = ProjectedIntegrator(dt, scheme, parts=[part], tolerance=1e-14)
-    context = context_of(system, integrator, positions, platform=platform)
+    context = started(system, integrator, positions, platform=platform)
     context.applyConstraints(1e-14)
     context.setVelocitiesToTemperature(300, 1)
     part.restore(context)

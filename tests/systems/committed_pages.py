@@ -1,4 +1,4 @@
-"""Examples as commands, and where committed results are."""
+"""Examples as commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pathlib import Path
 from unittest.mock import patch
 
 ROOT = Path(__file__).parents[2]
-FOLDER = ROOT / "docs" / "results"
 
 
 def said(script: Path, *arguments: str) -> str:

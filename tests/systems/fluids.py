@@ -21,8 +21,6 @@ from kcons.steppers import System
 DENSITY, THERMAL_ENERGY, CUTOFF = 0.5, 1.5, 2.5
 #: Bond of a dumbbell and size of its sites.
 BOND, SITE = 0.7, 0.9
-#: Edge of a box of 8 triatomic molecules, and their shape.
-TRIATOMIC_EDGE, TRIATOMIC_SHAPE = 3.9, np.array([[0, 0, 0], [0.6, 0, 0], [-0.2, 0.4 * math.sqrt(2), 0]])
 #: Edge of a box of 27 waters (0.9 g/cm3) and largest cutoff in Å, and temperature in K.
 WATER_EDGE, WATER_CUTOFF, WATER_TEMPERATURE = 9.65, 9.0, 400.0
 #: Charges are in units in which two of them have the energy q q'/r in eV.

@@ -19,7 +19,7 @@ SWITCH = 0.7
 
 
 class LennardJones:
-    """Forces, energies and curvatures of a periodic fluid in a cubic box.
+    """Forces and energies of a periodic fluid in a cubic box.
 
     u(r) = S(r) [4 eps ((sigma/r)^12 - (sigma/r)^6) + q q' (1/r + r^2/(2 c^3) - 3/(2 c))], mixed by Lorentz and
     Berthelot: charges with a conducting reaction field beyond the cutoff c. S falls from 1 to 0 with two continuous
@@ -54,12 +54,10 @@ class LennardJones:
                 item="cutoff",
             )
         self.box, self.cutoff = float(box), float(cutoff)
-        table = [np.broadcast_to(np.asarray(a, dtype=np.float64), n) for a in (epsilon, sigma, charges, masses)]
-        #: eps^(1/2), sigma/2, q and m of each atom.
-        self.sites: FloatArray = np.ascontiguousarray(
-            np.stack([np.sqrt(table[0]), 0.5 * table[1], table[2], table[3]], axis=1)
-        )
-        self.masses: FloatArray = table[3].copy()
+        well, size, charge, mass = (np.broadcast_to(np.asarray(a, float), n) for a in (epsilon, sigma, charges, masses))
+        #: eps^(1/2), sigma/2 and q of each atom.
+        self.sites: FloatArray = np.ascontiguousarray(np.stack([np.sqrt(well), 0.5 * size, charge], axis=1))
+        self.masses: FloatArray = mass.copy()
         self.first = np.append(np.flatnonzero(np.diff(self.molecule, prepend=-1)), n)
 
     def force(self, x: FloatArray, time: float = 0.0) -> FloatArray:
@@ -75,11 +73,6 @@ class LennardJones:
         f = np.zeros_like(x)
         return float(_evaluate(x, self.molecule, self.sites, self.box, self.cutoff, f)), f
 
-    def split_sample(self, x: FloatArray) -> tuple[float, float, float, float]:
-        """|grad U|^2 and laplacian of U in the shifts of whole molecules, and both in their turns (per radian)."""
-        found = _rigid(x, self.molecule, self.first, self.sites, self.box, self.cutoff)
-        return (float(found[0]), float(found[1]), float(found[2]), float(found[3]))
-
     def metropolis(
         self,
         x: ArrayLike,
@@ -94,16 +87,17 @@ class LennardJones:
 
         Moves are at most `shift` along each axis and `turn` about a random one; energies are recorded each `every`.
         """
-        y = np.array(x, dtype=np.float64)
-        energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)
-        common = self.first, self.sites, self.box, np.array([self.cutoff]), thermal_energy, every, rng
-        accepted = _metropolis(y, *common, (shift, turn), energies)
-        return energies, y, accepted / (every * len(energies) * (len(self.first) - 1))
+        y, rng, n = np.array(x, dtype=np.float64), np.random.default_rng(seed), len(self.first) - 1
+        energies = np.empty(sweeps // every)
+        draws, axes = (draw((len(energies), every * n, k)) for draw, k in ((rng.random, 6), (rng.standard_normal, 3)))
+        molecules = self.first, self.sites, self.box, self.cutoff
+        accepted = _metropolis(y, *molecules, thermal_energy, draws, axes, (shift, turn), energies)
+        return energies, y, accepted / (every * len(energies) * n)
 
 
 @njit(cache=True, nogil=True)
-def _pair(r2, a, b, cutoff, end):  # type: ignore[no-untyped-def]
-    """u, u'/r and u'' of two sites, switched off at `end`."""
+def _pair(r2, a, b, cutoff):  # type: ignore[no-untyped-def]
+    """u and u'/r of two sites."""
     r = np.sqrt(r2)
     s = a[1] + b[1]
     q = a[2] * b[2]
@@ -112,109 +106,42 @@ def _pair(r2, a, b, cutoff, end):  # type: ignore[no-untyped-def]
     field = 1.0 / cutoff**3
     u = e * (c - 1.0) + q * (1.0 / r + 0.5 * field * r2 - 1.5 / cutoff)
     d = -e * (12.0 * c - 6.0) / r + q * (field * r - 1.0 / r2)
-    dd = e * (156.0 * c - 42.0) / r2 + q * (2.0 / (r2 * r) + field)
-    begin = SWITCH * end
+    begin = SWITCH * cutoff
     if r > begin:
-        w = 1.0 / (end - begin)
+        w = 1.0 / (cutoff - begin)
         t = (r - begin) * w
         k = 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t))
         dk = -30.0 * t * t * (1.0 - t) * (1.0 - t) * w
-        ddk = -60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) * w * w
-        dd = dd * k + 2.0 * d * dk + u * ddk
         d = d * k + u * dk
         u = u * k
-    return u, d / r, dd
-
-
-@njit(cache=True, nogil=True)
-def _line(x, i, j, box, inverse):  # type: ignore[no-untyped-def]
-    """From j to i, to the nearest image, and the square of its length."""
-    dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-    dx -= box * np.rint(dx * inverse)
-    dy -= box * np.rint(dy * inverse)
-    dz -= box * np.rint(dz * inverse)
-    return dx, dy, dz, dx * dx + dy * dy + dz * dz
-
-
-@njit(cache=True, nogil=True)
-def _push(f, i, j, fx, fy, fz):  # type: ignore[no-untyped-def]
-    f[i, 0] -= fx
-    f[i, 1] -= fy
-    f[i, 2] -= fz
-    f[j, 0] += fx
-    f[j, 1] += fy
-    f[j, 2] += fz
+    return u, d / r
 
 
 @njit(cache=True, nogil=True)
 def _evaluate(x, molecule, sites, box, cutoff, f):  # type: ignore[no-untyped-def]
     total, cut2, inverse = 0.0, cutoff * cutoff, 1.0 / box
-    n = x.shape[0]
+    n, d = x.shape[0], np.empty(3)
     for i in range(n):
         for j in range(i + 1, n):
             if molecule[j] == molecule[i]:
                 continue
-            dx, dy, dz, r2 = _line(x, i, j, box, inverse)
+            r2 = 0.0
+            for c in range(3):
+                d[c] = x[i, c] - x[j, c]
+                d[c] -= box * np.rint(d[c] * inverse)
+                r2 += d[c] * d[c]
             if r2 < cut2:
-                u, slope, _ = _pair(r2, sites[i], sites[j], cutoff, cutoff)
+                u, slope = _pair(r2, sites[i], sites[j], cutoff)
                 total += u
-                _push(f, i, j, slope * dx, slope * dy, slope * dz)
+                for c in range(3):
+                    f[i, c] -= slope * d[c]
+                    f[j, c] += slope * d[c]
     return total
 
 
 @njit(cache=True, nogil=True)
-def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-def]
-    """Squares of forces, laplacian over shifts, squares of torques, laplacian over turns; summed over molecules.
-
-    A turn about the axis e moves a site at p from the center by e x p, and bends its path by e x (e x p). Summed over
-    three axes, the first gives |e x p|^2 -> |p x d|^2 along the line d of a pair and 2 p^2 in all, the second -2 p.
-    """
-    n, cut2, inverse = x.shape[0], cutoff * cutoff, 1.0 / box
-    f, p = np.zeros_like(x), np.empty_like(x)
-    for k in range(len(first) - 1):
-        for c in range(3):
-            mass = center = 0.0
-            for i in range(first[k], first[k + 1]):
-                mass += sites[i, 3]
-                center += sites[i, 3] * x[i, c]
-            for i in range(first[k], first[k + 1]):
-                p[i, c] = x[i, c] - center / mass
-    shifts = turns = 0.0
-    for i in range(n):
-        for j in range(i + 1, n):
-            if molecule[j] == molecule[i]:
-                continue
-            dx, dy, dz, r2 = _line(x, i, j, box, inverse)
-            if r2 < cut2:
-                _, slope, bend = _pair(r2, sites[i], sites[j], cutoff, cutoff)
-                _push(f, i, j, slope * dx, slope * dy, slope * dz)
-                shifts += 2.0 * (bend + 2.0 * slope)
-                for k in (i, j):
-                    p2 = p[k, 0] ** 2 + p[k, 1] ** 2 + p[k, 2] ** 2
-                    along = p[k, 0] * dx + p[k, 1] * dy + p[k, 2] * dz
-                    across = p2 - along * along / r2  # |p x d|^2 / d^2
-                    turns += (bend - slope) * across + slope * 2.0 * p2
-    squares = torques = 0.0
-    for k in range(len(first) - 1):
-        fx = fy = fz = tx = ty = tz = 0.0
-        for i in range(first[k], first[k + 1]):
-            fx += f[i, 0]
-            fy += f[i, 1]
-            fz += f[i, 2]
-            tx += p[i, 1] * f[i, 2] - p[i, 2] * f[i, 1]
-            ty += p[i, 2] * f[i, 0] - p[i, 0] * f[i, 2]
-            tz += p[i, 0] * f[i, 1] - p[i, 1] * f[i, 0]
-            # grad U = -f, bent by -2 p
-            turns += 2.0 * (f[i, 0] * p[i, 0] + f[i, 1] * p[i, 1] + f[i, 2] * p[i, 2])
-        squares += fx * fx + fy * fy + fz * fz
-        torques += tx * tx + ty * ty + tz * tz
-    return squares, shifts, torques, turns
-
-
-@njit(cache=True, nogil=True)
-def _one(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
+def _one(y, a, b, x, sites, box, cutoff):  # type: ignore[no-untyped-def]
     """Energy of atoms a..b at y with all others at x."""
-    cutoff = reach[0]
     total, cut2, inverse = 0.0, cutoff * cutoff, 1.0 / box
     for i in range(a, b):
         for j in range(x.shape[0]):
@@ -226,43 +153,46 @@ def _one(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
                 d -= box * np.rint(d * inverse)
                 r2 += d * d
             if r2 < cut2:
-                total += _pair(r2, sites[i], sites[j], cutoff, cutoff)[0]
+                total += _pair(r2, sites[i], sites[j], cutoff)[0]
     return total
 
 
 @njit(cache=True, nogil=True)
-def _proposed(y, moves, rng):  # type: ignore[no-untyped-def]
-    """A molecule at places y, turned about its center and moved, in place; shape (n, 3)."""
-    center = np.zeros(3)
-    for i in range(len(y)):
-        center += y[i] / len(y)
-    axis = rng.normal(0.0, 1.0, 3)
-    axis /= np.sqrt((axis * axis).sum())
-    angle = moves[1] * (2.0 * rng.random() - 1.0)
+def _propose(y, draw, axis, moves):  # type: ignore[no-untyped-def]
+    """Turn a molecule at places y, shape (n, 3), about its center and move it, in place."""
+    size = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+    angle = moves[1] * (2.0 * draw[0] - 1.0)
     sine, cosine = np.sin(angle), np.cos(angle)
-    move = moves[0] * (2.0 * rng.random(3) - 1.0)
+    center, p = np.zeros(3), np.empty(3)
     for i in range(len(y)):
-        p = y[i] - center
-        y[i] = center + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
+        for c in range(3):
+            center[c] += y[i, c] / len(y)
+    for i in range(len(y)):
+        along = 0.0
+        for c in range(3):
+            p[c] = y[i, c] - center[c]
+            along += p[c] * axis[c] / size**2
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            across = (axis[d] * p[e] - axis[e] * p[d]) / size
+            turned = cosine * p[c] + sine * across + (1.0 - cosine) * along * axis[c]
+            y[i, c] = center[c] + moves[0] * (2.0 * draw[1 + c] - 1.0) + turned
 
 
-# That of near molecules is written out beside it: what takes a function as an argument is compiled by every process.
 @njit(cache=True, nogil=True)
-def _metropolis(x, first, sites, box, cutoff, kt, every, rng, moves, energies):  # type: ignore[no-untyped-def]
-    molecules = len(first) - 1
-    energy = 0.0
+def _metropolis(x, first, sites, box, cutoff, kt, draws, axes, moves, energies):  # type: ignore[no-untyped-def]
+    molecules, accepted, energy = len(first) - 1, 0, 0.0
     for k in range(molecules):
-        energy += 0.5 * _one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, first, sites, box, cutoff)
-    accepted = 0
+        energy += 0.5 * _one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, sites, box, cutoff)
     for record in range(len(energies)):
-        for _ in range(every * molecules):
-            k = int(rng.random() * molecules)
+        for trial in range(draws.shape[1]):
+            draw = draws[record, trial]
+            k = int(draw[4] * molecules)
             a, b = first[k], first[k + 1]
             y = x[a:b].copy()
-            _proposed(y, moves, rng)
-            change = _one(y, a, b, x, first, sites, box, cutoff)
-            change -= _one(x[a:b], a, b, x, first, sites, box, cutoff)
-            if change <= 0.0 or rng.random() < np.exp(-change / kt):
+            _propose(y, draw, axes[record, trial], moves)
+            change = _one(y, a, b, x, sites, box, cutoff) - _one(x[a:b], a, b, x, sites, box, cutoff)
+            if change <= 0.0 or draw[5] < np.exp(-change / kt):
                 x[a:b] = y
                 energy += change
                 accepted += 1

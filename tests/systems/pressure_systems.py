@@ -10,9 +10,8 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State
-from kcons.thermostats import thermal_velocities
+from kcons.thermostats import Barostat, CellSystem, thermal_velocities
 from kcons.thermostats.correlated_series import spread
-from kcons.thermostats.pressure import Barostat, CellSystem
 
 Array = NDArray[np.float64]
 #: 3 rows, and methane by all its 10 distances, of rank 9.

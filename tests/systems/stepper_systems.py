@@ -10,24 +10,13 @@ from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge, MovingTarget
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.steppers import (
-    BlanesMoan4,
-    BlanesMoan6,
-    BlanesMoan6a,
-    Geodesic,
-    KahanLi6,
-    Rattle,
-    State,
-    Stepper,
-    Suzuki4,
-    System,
-    Yoshida4,
-)
+from kcons.steppers import RungeKuttaNystrom, State, Stepper, System
+from kcons.steppers.splitting import SCHEMES, Splitting
 
-#: Reversible, and symplectic for position rows.
-COMPOSED: list[Stepper] = [Rattle(), Geodesic(4), Yoshida4(), Suzuki4(), KahanLi6()]
-NYSTROM: list[Stepper] = [BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()]
-SYMMETRIC: list[Stepper] = [*COMPOSED, *NYSTROM]
+#: Every stepper by fractions, and those whose forces may depend on velocities, and those whose may not.
+SYMMETRIC: list[Splitting] = [make() for make in SCHEMES.values()]
+COMPOSED = [stepper for stepper in SYMMETRIC if not isinstance(stepper, RungeKuttaNystrom)]
+NYSTROM = [stepper for stepper in SYMMETRIC if isinstance(stepper, RungeKuttaNystrom)]
 #: For comparison only.
 PROJECTED: list[Stepper] = [
     ProjectedEquation(),

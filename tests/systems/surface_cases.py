@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import openmm
 from openmm import unit
-from openmm_systems import context_of
+from openmm_systems import context_of, state_of
 
 from kcons.constraints import Cylinder, Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.constraints.constraint_set import ConstraintSet
@@ -79,13 +79,6 @@ def on_surface(kind, scheme, dt, platform="Reference", *, atoms=(0, 1, 2), **arg
     options = {"surfaces": KINDS[kind](atoms, POSITIONS[atoms]), "system": system, "device": False} | arguments
     integrator = SurfaceIntegrator(dt * unit.picosecond, scheme, positions=POSITIONS, **options)
     return integrator, started(system, integrator, POSITIONS, VELOCITIES, platform)
-
-
-def state_of(context):
-    state = context.getState(positions=True, velocities=True)
-    x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-    v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
-    return np.array(x), np.array(v)
 
 
 def energy_of(context, integrator):

@@ -108,6 +108,12 @@ def molecules(name="dumbbells", n=11, *, ions=0, at=0.0, force=springs, **option
     return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
 
 
+def water_and_more():
+    """Rigid water and a bond given twice: rows, positions, masses."""
+    x = np.array([[0.0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0], [1.5, 1.2, 0.7], [2.4, 1.4, 0.2]])
+    return [Distance([[0, 1], [0, 2], [1, 2], [3, 4], [4, 3]])], x, [16.0, 1.0, 1.0, 3.0, 2.0]
+
+
 class ByTheEngine:
     """A thermostat whose steps are made operation by operation."""
 

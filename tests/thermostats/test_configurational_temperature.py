@@ -1,24 +1,28 @@
-"""The temperature of configurations, whole and by kind of motion: closed forms, samples without forces, thermostats."""
+"""The temperature of configurations, whole and by kind of motion; the share of slow forces in the stiffness."""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import fluids as fluid
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from thermostat_systems import dumbbells, quartic, system, waves
 
 from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
 from kcons.errors import InputError
-from kcons.steppers import State, run
+from kcons.steppers import State, System, run
 from kcons.thermostats import (
     Estimate,
+    ForceGroups,
     Isokinetic,
     Langevin,
     NoseHooverChain,
     TemperatureSplit,
     mean,
+    slow_share,
     thermal_velocities,
 )
 from kcons.thermostats.configurational_temperature import temperature
@@ -133,18 +137,30 @@ def test_a_cluster_alone_has_no_temperature_of_shifts_and_turns():
 
 
 def test_curvatures_of_a_fluid():
-    """Against the compiled second derivatives: one configuration, many draws."""
+    """Against differences of forces and torques of whole molecules: one configuration, many draws."""
     chosen = fluid.dumbbells(8)
     forces, kt = chosen.forces, chosen.thermal_energy
     x = forces.metropolis(chosen.positions, kt, 500, 10, 1, chosen.shift, chosen.turn)[1]
     split = TemperatureSplit(chosen.system(), rng=3)
     for _ in range(1000):
         split.add(x)
-    forward, bend, torque, twist = forces.split_sample(x)
+    centers = x.reshape(8, 2, 3).mean(axis=1, keepdims=True)
+
+    def loads(arms, moved=0.0):
+        """Force and torque on each molecule."""
+        f = forces.force((centers + arms + moved).reshape(-1, 3)).reshape(8, 2, 3)
+        return f.sum(axis=1), np.cross(arms, f).sum(axis=1)
+
+    arms, h, bend, twist = x.reshape(8, 2, 3) - centers, 1e-5, 0.0, 0.0
+    for k, axis, sign in itertools.product(range(8), np.eye(3), (-1, 1)):
+        this = (np.arange(8) == k)[:, None, None]
+        turned = np.where(this, Rotation.from_rotvec(sign * h * axis).apply(arms[k]), arms)
+        bend -= sign * loads(arms, this * sign * h * axis)[0][k] @ axis / (2 * h)
+        twist -= sign * loads(turned)[1][k] @ axis / (2 * h)
     mass, inertia = 2.0, 2 * (0.5 * fluid.BOND) ** 2
     above = np.array(split._series)[0, 0]
-    assert above[0] == pytest.approx(forward / mass, rel=1e-9)
-    assert above[1] == pytest.approx(torque / inertia, rel=1e-9)
+    for found, each, size in zip(above[:2], loads(arms), (mass, inertia), strict=True):
+        assert found == pytest.approx((each**2).sum() / size, rel=1e-9)
     shift, turn, rest = curvatures(split)
     assert abs(shift.off(bend / mass)) <= 3.5 and shift.error < 0.04 * shift.value
     assert abs(turn.off(twist / inertia)) <= 3.5 and turn.error < 0.04 * turn.value
@@ -314,3 +330,68 @@ def test_frames_off_the_constraints():
         split.add(off)
     assert len(split) == 1 and tuple(caught.value.atoms) == (2, 3)
     split.add(held.motion.restore_positions(off))
+
+
+K = 3.0
+
+
+def grouped(rows, x, masses, **forces) -> System:
+    return system(rows, x, masses, ForceGroups(forces))
+
+
+def test_springs_of_free_atoms():
+    """k/m of each: 9 and 1 in the squares of H, whose traces are 3 (81 + 1) and 3; normal moves of many frames."""
+    x = np.array([[0.0, 0, 0], [5.0, 0, 0]])
+    fast, slow = np.array([[9.0], [0.0]]), np.array([[0.0], [4.0]])
+    held = grouped([], x, [1.0, 4.0], fast=lambda x, t: -fast * x, slow=lambda x, t: -slow * x)
+    share = slow_share(held, np.tile(x, (4000, 1, 1)))
+    assert share == pytest.approx(np.sqrt(1 / 82), rel=0.05)
+    other = slow_share(held, np.tile(x, (4000, 1, 1)), "fast")
+    assert share**2 + other**2 == pytest.approx(1, rel=1e-6)
+
+
+def test_signs_do_not_cancel():
+    """A saddle without a trace, beside a trap of the same size."""
+    saddle = np.diag([1.0, 1.0, -2.0])
+    held = grouped([], [[1.0, 2, 3]], [1.0], fast=lambda x, t: -x - x @ saddle, slow=lambda x, t: x @ saddle)
+    frames = np.tile([[1.0, 2, 3]], (4000, 1, 1))
+    assert slow_share(held, frames, displacement=0.01) == pytest.approx(np.sqrt(2), rel=0.05)
+
+
+def test_a_rigid_pair_turns_freely_in_a_trap():
+    """All of the stiffness is that of its center; what pulls along the pair does nothing, wherever it has turned to."""
+    x = np.array([[0.3, -0.2, 0.1], [0.3, -0.2, 1.5]])
+
+    def along(x, t):
+        d = x[1] - x[0]
+        return 50 * np.array([d, -d])
+
+    def held(**more):
+        return grouped([Distance([[0, 1]])], x, [2.0, 2.0], fast=lambda x, t: -K * x, **more)
+
+    frames = np.tile(x, (20, 1, 1))
+    assert slow_share(held(slow=along), frames, displacement=1e-3) < 1e-6
+    assert slow_share(held(slow=lambda x, t: -2 * K * x), frames) == pytest.approx(2 / 3, rel=1e-6)
+
+
+def test_fixed_atoms_make_no_longer_moves():
+    """A pair that repels steeply, alone and beside a slab."""
+    slab = [[i, j, -20.0] for i in range(10) for j in range(10)]
+
+    def fast(x, t):
+        d = x[1] - x[0]
+        push = 12 * d / np.linalg.norm(d) ** 14
+        return np.vstack([-push - x[0], push - x[1], np.zeros((len(x) - 2, 3))])
+
+    def slow(x, t):
+        return np.vstack([-0.5 * x[:2], np.zeros((len(x) - 2, 3))])
+
+    shares = []
+    for fixed in ([], slab):
+        x = np.array([[0.0, 0, 0], [1.0, 0, 0], *fixed])
+        rows = [FixedAtoms(np.arange(2, len(x)))] if fixed else []
+        shares.append(slow_share(grouped(rows, x, np.ones(len(x)), fast=fast, slow=slow), np.tile(x, (200, 1, 1))))
+    assert shares[1] == pytest.approx(shares[0], rel=0.3)
+    held = grouped([FixedAtoms([0])], [[0.0, 0, 0]], [1.0], fast=lambda x, t: -x, slow=lambda x, t: -x)
+    with pytest.raises(InputError, match="all atoms are fixed"):
+        slow_share(held, [[[0.0, 0, 0]]], displacement=0.1)

@@ -89,14 +89,6 @@ def test_errors_of_oscillators(turn, n, span):
     assert 0.9 <= scatter([mean(values) for values in series]) <= 1.15
 
 
-@pytest.mark.validation
-@pytest.mark.filterwarnings("ignore:.*independent ones")
-@pytest.mark.parametrize("name", SERIES, ids=lambda name: name.replace(" ", "-"))
-def test_errors_of_many_runs(name):
-    rng = np.random.default_rng(11)
-    assert 0.9 <= scatter([mean(SERIES[name](rng)) for _ in range(2000)]) <= 1.15
-
-
 @pytest.mark.filterwarnings("ignore:.*independent ones")
 def test_errors_of_ratios():
     """Above and below the line depend on each other, and both on something slow."""

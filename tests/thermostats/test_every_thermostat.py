@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from thermostat_systems import distance, molecules, quartic, quartic_potential, waves, waves_potential
+from thermostat_systems import distance, dumbbells, molecules, quartic, quartic_potential, waves, waves_potential
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State, System, run
@@ -19,6 +19,7 @@ from kcons.thermostats import (
     Langevin,
     LangevinRespa,
     NoseHooverChain,
+    thermal_velocities,
 )
 
 TWO = {"slow": 1, "fast": 4}
@@ -114,3 +115,20 @@ def test_steps_and_systems_that_cannot_be(name):
     after = stepper.step(held, state, 0.1)
     still = stepper.step(held, after, 0.0)
     assert np.array_equal(still.positions, after.positions) and np.array_equal(still.velocities, after.velocities)
+
+
+@pytest.mark.parametrize(
+    ("thermostat", "away", "spread", "slope"),
+    [(Isokinetic(0.5), 0.0, 2e-3, 3e-5), (NoseHooverChain(0.5, 1.0), 1.2, 5e-3, 1e-5)],
+    ids=["isokinetic", "chain"],
+)
+def test_conserved_energy_has_no_slope(thermostat, away, spread, slope):
+    """But for what a random walk leaves; a thermostat that leaks energy shows 1e-3 and more."""
+    held, x = dumbbells(2, force=quartic, potential=quartic_potential)
+    x = x - away
+    state = thermostat.start(held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4)))
+    values = []
+    look = lambda s: values.append(thermostat.conserved_energy(held, s))  # noqa: E731
+    run(held, state, 0.01, 20_000, stepper=thermostat, observers=[look], every=20)
+    assert np.std(values) <= spread
+    assert abs(np.polyfit(np.linspace(0, 200, len(values)), values, 1)[0]) <= slope

@@ -1,7 +1,8 @@
-"""Degrees of freedom, counted by hand, and what the thermostats hold by them."""
+"""Degrees of freedom by hand, conserved momenta, bodies apart; velocities drawn on the constraints."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,7 @@ from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.motion import Motion
 from kcons.steppers import State, System
 from kcons.thermostats import Isokinetic, NoseHooverChain, freedom, thermal_velocities
-from kcons.thermostats.freedom import LOOK_AT, drift_velocity, open_directions
+from kcons.thermostats.freedom import LOOK_AT, open_directions
 
 RNG = np.random.default_rng(11)
 SCATTERED = 3.0 * RNG.standard_normal((12, 3))
@@ -133,8 +134,6 @@ def test_what_cannot_be():
         freedom(held, state, swirling(x), momentum="maybe")
     with pytest.raises(UnsupportedError, match="hold atoms in space in every direction"):
         freedom(held, state, swirling(x), momentum="conserved")
-    with pytest.raises(UnsupportedError, match="total momentum is not conserved"):
-        drift_velocity(x, WEIGHTS, open_directions(held.motion, x))
     rigid = system([Distance(TEN)], METHANE, np.ones(5), swirling)
     state = State(METHANE, METHANE)
     assert freedom(rigid, state, swirling(METHANE)).count == 3
@@ -306,3 +305,50 @@ def test_fluids_in_cells_are_not_warned_of_and_cost_one_evaluation():
     assert len(calls) == 3  # at the start, of the step, and with every second atom moved
     thermostat.step(held, state, 1e-3)
     assert len(calls) == 4
+
+
+def test_covariance_is_the_constrained_one():
+    """<v v^T> = kT M_par^+, dense and by definition, with redundant rows."""
+    x = METHANE
+    held = system([Distance(TEN)], x, [12.0, 1, 1, 1, 1])
+    rng = np.random.default_rng(0)
+    n, kt = 20_000, 0.7
+    drawn = np.array([thermal_velocities(held, x, kt, rng).ravel() for _ in range(n)])
+    rows = held.motion.constraint_set.jacobian(x).toarray()
+    inverse = np.repeat(1 / held.masses, 3)
+    spread = rows * inverse
+    expected = kt * (np.diag(inverse) - spread.T @ np.linalg.pinv(rows @ spread.T, rcond=1e-10) @ spread)
+    found = drawn.T @ drawn / n
+    # Standard error of each element of a covariance matrix.
+    error = np.sqrt((np.outer(np.diag(expected), np.diag(expected)) + expected**2) / n) + 1e-15
+    assert (np.abs(found - expected) / error).max() <= 4.5
+    kinetic = 0.5 * (held.masses.repeat(3) * drawn**2).sum(axis=1)
+    g = 15 - 9
+    assert kinetic.mean() == pytest.approx(0.5 * g * kt, abs=4 * kt * math.sqrt(g / 2 / n))
+    assert kinetic.var() == pytest.approx(0.5 * g * kt**2, rel=0.06)
+    assert np.abs(rows @ drawn.T).max() <= 1e-12
+
+
+def test_momentum_is_taken_out_along_open_directions_only():
+    x = np.random.default_rng(0).standard_normal((5, 3)) * [1, 1, 0]
+    flat = system([Plane(range(5), [0, 0, 1.0], lambda t: 0.3 * t)], x, np.arange(1.0, 6))
+    v = thermal_velocities(flat, x, 1.0, 5, zero_momentum=True)
+    np.testing.assert_allclose(flat.masses @ v, [0, 0, 0.3 * 15], atol=1e-14)
+
+
+def test_moving_targets_are_followed():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    held = system([Distance([[0, 1]], lambda t: 1 + 0.5 * t)], x, [1.0, 3.0])
+    v = thermal_velocities(held, x, 1.0, 5)
+    assert v[1, 0] - v[0, 0] == pytest.approx(0.5, rel=1e-13)
+
+
+def test_fixed_atoms_stay():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    held = system([FixedAtoms([0]), Distance([[0, 1]])], x, [1.0, 3.0])
+    v = thermal_velocities(held, x, 1.0, 5)
+    assert (v[0] == 0).all() and v[1, 0] == 0 and np.abs(v[1, 1:]).min() > 0
+    with pytest.raises(UnsupportedError, match="hold atoms in space in every direction"):
+        thermal_velocities(held, x, 1.0, 5, zero_momentum=True)
+    still = system([FixedAtoms([0, 1])], x, [1.0, 3.0])
+    assert (thermal_velocities(still, x, 1.0, 5) == 0).all()

@@ -13,8 +13,7 @@ from thermostat_systems import dumbbells, quartic, quartic_potential, system, wa
 from kcons.constraints import Distance, FixedAtoms, MovingTarget, Sphere
 from kcons.steppers import State, System, run
 from kcons.thermostats import Langevin, thermal_velocities
-from kcons.thermostats.langevin import noise_generator
-from kcons.thermostats.noise import fill_normal
+from kcons.thermostats.noise import fill_normal, noise_generator
 
 
 def started(n=2, **options):

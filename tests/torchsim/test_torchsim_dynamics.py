@@ -15,7 +15,7 @@ from torch_models import FS, Butanes, Drops, K, butane, drop, off, state_of, tot
 from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.steppers import Rattle, State, System, run
-from kcons.torchsim import Constraints, hold, langevin, nose_hoover, nve
+from kcons.torchsim import hold, langevin, nose_hoover, nve
 
 RESULT = Path(__file__).parents[2] / "docs" / "results" / "torchsim.json"
 
@@ -75,29 +75,6 @@ def test_energy_of_sixteen_drops_does_not_drift():
     assert abs(drift) < 1e-3
     assert off(end).max() < 1e-13
     assert float(end.calc_temperature().mean()) > 250
-
-
-class PositionsOnly(Constraints):
-    """What TorchSim's own constraints do."""
-
-    def adjust_positions(self, state, new_positions):
-        new_positions.copy_(self.move(state, new_positions)[0])
-
-    def adjust_momenta(self, state, momenta):
-        masses = state.masses[:, None]
-        momenta.copy_(masses * self.tangent(state, momenta / masses))
-
-
-@pytest.mark.slow
-def test_integrators_of_torchsim_would_lose_energy():
-    """Why they are refused: positions are corrected, and momenta know nothing of it."""
-    model = Drops()
-    state = settled(4, 8, 100, model=model)
-    state.constraints = [PositionsOnly(state.constraints[0].motions, state.constraints[0].system_idx)]
-    begun = total_energy(state)
-    for _ in range(150):
-        state = ts.nve_step(state, model, dt=2 * FS)
-    assert float((total_energy(state) - begun).mean()) / (8 * 300 * K) < -0.3
 
 
 def temperatures(pair, state, model, steps, dt, skip, **settings):

@@ -9,7 +9,7 @@ import torch_sim as ts
 from torch_models import Butanes, Drops, butane, drop, off
 
 from kcons.constraints import Dihedral
-from kcons.errors import UnsupportedError
+from kcons.errors import ConvergenceError, UnsupportedError
 from kcons.torchsim import hold, langevin
 
 CARBONS = [0, 1, 2, 3]
@@ -105,3 +105,12 @@ def test_cells_are_not_relaxed(optimizer):
 class WithStress(Drops):
     def forward(self, state, **_):
         return {**super().forward(state), "stress": torch.zeros((state.n_systems, 3, 3), dtype=state.dtype)}
+
+
+def test_steps_that_cannot_be_held_are_told():
+    state = ts.concatenate_states([drop(2), drop(2, 1)])
+    hold(state, "water")
+    far = state.positions.clone()
+    far[6:9] += torch.tensor([[0.0], [40.0], [-40.0]], dtype=far.dtype)
+    with pytest.raises(ConvergenceError, match="copy 1, row"):
+        state.constraints[0].adjust_positions(state, far)

@@ -99,7 +99,7 @@ def plan(
         MDAnalysis is needed and not installed.
     """
     path = Path(path)
-    for name in (path, *([coordinates] if coordinates else [])):
+    for name in (path, coordinates or path):
         if not Path(name).is_file():
             raise InputError(f"there is no file {name}", item="file")
     by_openmm = path.suffix.lower() in SUFFIXES and coordinates is None and select == "all" and find_spec("openmm")
@@ -111,9 +111,8 @@ def plan(
         warnings.simplefilter("always")
         try:
             if by_openmm:
-                rows = _by_openmm(
-                    path.read_text(encoding="utf-8", errors="replace"), path, constrain, angles, hydrogens
-                )
+                text = path.read_text(encoding="utf-8", errors="replace")
+                rows = _by_openmm(text, path, constrain, angles, hydrogens)
             else:
                 from kcons.mdanalysis import constraints_of, open_universe
 
@@ -148,29 +147,19 @@ def _by_openmm(text: str, path: Path, constrain: str, angles: str, hydrogens: An
         if not topology.getNumAtoms():
             raise ValueError("it has no atoms")
     except Exception as error:  # OpenMM's readers raise whatever went wrong inside of them
-        raise InputError(
-            f"it cannot be read; does it hold molecules, in the format of its ending? ({type(error).__name__}: "
-            f"{error})",
-            item="file",
-        ) from error
+        said = f"does it hold molecules, in the format of its ending? ({type(error).__name__}: {error})"
+        raise InputError(f"it cannot be read; {said}", item="file") from error
     if hydrogens is not None:
-        topology, x = _with_hydrogens(topology, x, hydrogens)
+        modeller = app.Modeller(topology, x)
+        try:
+            # Without a platform the fastest is taken, of whatever precision, and hydrogens differ between machines.
+            modeller.addHydrogens(hydrogens, platform=place("CPU"))
+        except ValueError as error:
+            raise _explained(error, topology) from error
+        topology, x = modeller.topology, modeller.positions
     snapshot = snapshot_of(topology, x).in_unit(1.0)
     holding = Holding(constrain, angles=angles)  # type: ignore[arg-type]
     return rows_of(snapshot, holding, np.asarray, "mend the file")
-
-
-def _with_hydrogens(topology: Any, positions: Any, field: Any) -> tuple[Any, Any]:
-    import openmm
-    from openmm import app
-
-    modeller = app.Modeller(topology, positions)
-    try:
-        # Without a platform the fastest is taken, of whatever precision, and hydrogens differ from machine to machine.
-        modeller.addHydrogens(field, platform=openmm.Platform.getPlatformByName("CPU"))
-    except ValueError as error:
-        raise _explained(error, topology) from error
-    return modeller.topology, modeller.positions
 
 
 def from_file(
@@ -248,9 +237,8 @@ def build(
     else:
         lines = (Path(app.__file__).parent / "data" / "test.pdb").read_text()
     held = constrain or held
-    return _test_system(
-        structure, _planned(text, _by_openmm(lines, Path(name), held, "distances"), held), rng, force_field, platform
-    )
+    found = _planned(text, _by_openmm(lines, Path(name), held, "distances"), held)
+    return _test_system(structure, found, rng, force_field, platform)
 
 
 def _test_system(name: str, found: Plan, rng: int, forces: str | Sequence[str], platform: str) -> TestSystem:
@@ -266,7 +254,7 @@ def _test_system(name: str, found: Plan, rng: int, forces: str | Sequence[str], 
     if isinstance(forces, str):
         potential = _of_ase(snapshot, forces)
     else:
-        from kcons.openmm.integrator.system_checks import SystemRows
+        from kcons.openmm.integrator.guard import SystemRows
 
         engine = _openmm_engine(snapshot, found.rows, forces, platform)
         potential, of_system = engine.potential(), SystemRows.of(engine.system)
@@ -323,11 +311,8 @@ def force_field_of(files: Sequence[str]) -> Any:
     try:
         return app.ForceField(*files)
     except Exception as error:
-        raise InputError(
-            f"force field {' '.join(files)}: {error}; give files that OpenMM has, or paths, such as "
-            f"--forcefield {' '.join(FORCE_FIELD)}",
-            item="forcefield",
-        ) from error
+        remedy = f"give files that OpenMM has, or paths, such as --forcefield {' '.join(FORCE_FIELD)}"
+        raise InputError(f"force field {' '.join(files)}: {error}; {remedy}", item="forcefield") from error
 
 
 def _openmm_engine(snapshot: Any, rows: Sequence[Any], force_field: Sequence[str], platform: str) -> OpenMMEngine:
@@ -338,10 +323,7 @@ def _openmm_engine(snapshot: Any, rows: Sequence[Any], force_field: Sequence[str
     from kcons.openmm.topology import openmm_topology
 
     if not all(isinstance(item, Distance) for item in rows):
-        raise UnsupportedError(
-            "OpenMM's System holds distances only; leave out what needs linear rows (rigid residues), or give --forces "
-            "of an ASE calculator"
-        )
+        raise UnsupportedError("OpenMM's System holds distances only; give --forces of an ASE calculator")
     platform = platform or ("Reference" if snapshot.topology.n_atoms <= FEW_ATOMS else "CPU")
     place(platform)  # complain before the long part
     topology, known = openmm_topology(snapshot)[0], {}
@@ -365,11 +347,8 @@ def _system_of(topology: Any, field: Any, **held: Any) -> Any:
         width = min(float(vectors[k][k]._value) for k in range(3))
         cutoff = min(CUTOFF, 0.45 * width)
         if cutoff < SHORTEST:
-            raise InputError(
-                f"the box is {width:g} nm wide, too narrow for periodic forces; remove it (CRYST1) from the file, or "
-                "fill a larger one with water",
-                item="box",
-            )
+            remedy = "remove it (CRYST1) from the file, or fill a larger one with water"
+            raise InputError(f"the box is {width:g} nm wide, too narrow for periodic forces; {remedy}", item="box")
         options = {"nonbondedMethod": app.PME, "nonbondedCutoff": cutoff, "switchDistance": SWITCH * cutoff}
         options["ewaldErrorTolerance"] = EWALD_TOLERANCE
     try:
@@ -406,10 +385,8 @@ def _of_ase(snapshot: Any, name: str) -> Potential:
     try:
         finite = bool(np.all(np.isfinite(potential.forces(atoms.positions))))
     except Exception as error:  # calculators raise whatever they like
-        text = " ".join(str(error.__cause__ or error).split()) or type(error).__name__
-        raise InputError(
-            f"the calculator {name} fails on these atoms: {text}; choose other --forces", item="forces"
-        ) from error
+        said = f"fails on these atoms: {' '.join(str(error.__cause__ or error).split()) or type(error).__name__}"
+        raise InputError(f"the calculator {name} {said}; choose other --forces", item="forces") from error
     if not finite:
         raise InputError(f"the calculator {name} gives forces that are not finite; choose others", item="forces")
     potential.forget()
@@ -440,6 +417,5 @@ for _name, _text, _unit in (
     ("dhfr-water", "the same in water, 23558 atoms; OpenMM", "system"),
     ("villin", "protein in water, 8867 atoms; OpenMM", "system"),
 ):
-    add_system(
-        _name, build, _text, unit=_unit, only=True, takes=("constrain", "force_field", "platform"), structure=_name
-    )
+    _takes = ("constrain", "force_field", "platform")
+    add_system(_name, build, _text, unit=_unit, only=True, takes=_takes, structure=_name)

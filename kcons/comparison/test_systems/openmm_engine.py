@@ -27,30 +27,20 @@ ASE_LENGTH, ASE_TIME = 0.1, 1e-3 / units.fs
 
 @dataclass
 class OpenMMEngine:
-    """What OpenMM needs to run a test system.
+    """What OpenMM needs to run a test system."""
 
-    Attributes
-    ----------
-    build : callable
-        Makes the System: masses, forces, and as its constraints those rows of the test system that are distances.
-    length, time : float
-        One unit of length of the test system in nm, one unit of time in ps.
-    platform : str
-        Where it runs. 'Reference' computes forces in double, 'CPU' in single precision.
-    surfaces : sequence of Constraint
-        Spheres and other surfaces that hold particles, in nm.
-    home : bool
-        Whether the test system belongs to OpenMM: its forces are OpenMM's, and its methods are the usual ones.
-    patience : float
-        Seconds that the set-up of OpenMM's own constraints may take before a second one is refused.
-    """
-
+    #: Makes the System: masses, forces, and as its constraints those rows of the test system that are distances.
     build: Callable[[], openmm.System]
+    #: One unit of length of the test system in nm, one unit of time in ps.
     length: float = ASE_LENGTH
     time: float = ASE_TIME
+    #: Where it runs. 'Reference' computes forces in double, 'CPU' in single precision.
     platform: str = "Reference"
+    #: Spheres and other surfaces that hold particles, in nm.
     surfaces: Sequence[Constraint] = ()
+    #: Whether the test system belongs to OpenMM: its forces are OpenMM's, and its methods are the usual ones.
     home: bool = False
+    #: Seconds that the set-up of OpenMM's own constraints may take before a second one is refused.
     patience: float = inf
     _waited: float = field(default=0.0, init=False, repr=False)
 

@@ -48,82 +48,56 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Reference:
-    """Where the trajectory is at the horizon.
+    """Where the trajectory is at the horizon."""
 
-    Attributes
-    ----------
-    positions : ndarray, shape (n_atoms, 3)
-    error : float
-        Estimated root-mean-square error an atom; 0 for closed forms.
-    how : str
-        How it was obtained.
-    """
-
+    #: Shape (n_atoms, 3).
     positions: FloatArray
+    #: Estimated root-mean-square error an atom; 0 for closed forms.
     error: float
+    #: How it was obtained.
     how: str
 
 
 @dataclass(frozen=True)
 class TestSystem:
-    """One system with its start, its forces and its reference solution.
-
-    Attributes
-    ----------
-    name, title : str
-    constraint_set : ConstraintSet
-        What is held; also the masses and the cell.
-    positions, velocities : ndarray, shape (n_atoms, 3)
-        Start, on the constraints and tangent to them.
-    potential : Potential
-    symbols : str or sequence of str
-        For ASE.
-    horizon : float
-        Time at which trajectories are compared; short enough that chaos does not decide.
-    time_steps : sequence of float
-        Default steps, internal units; each divides the horizon.
-    tolerances : sequence of float
-        Default relative tolerances for adaptive integrators.
-    units : Units
-    bonds : ndarray of int, shape (n, 2), or None
-        Pairs whose distances, all held, are the same thing as the constraint set; None if there are none.
-    fixed : ndarray of int, shape (n,)
-        Atoms that the constraint set holds by FixedAtoms; MD engines that hold `bonds` fix them in their own way.
-    refusals : mapping
-        Method name -> why it cannot run this test system.
-    solution : callable, optional
-        The reference at a given time, in closed form or by an independent integrator; without it the test system is
-        converged at a step far below those compared.
-    cell : ndarray, shape (3,) or (3, 3), or None
-    openmm : OpenMMEngine, optional
-        How OpenMM runs it: the same masses and forces as a System.
-    reference_pace : float
-        The finest step compared, times this, decides about the work of a converged reference.
-    thermal_energy : float
-        k_B T of its velocities; 0 for test systems that have no temperature.
-    """
+    """One system with its start, its forces and its reference solution."""
 
     #: For pytest, which collects classes of such names.
     __test__ = False
 
     name: str
     title: str
+    #: What is held; also the masses and the cell.
     constraint_set: ConstraintSet
+    #: Start, on the constraints and tangent to them, shape (n_atoms, 3).
     positions: FloatArray
     velocities: FloatArray
     potential: Potential
+    #: For ASE.
     symbols: str | Sequence[str]
+    #: Time at which trajectories are compared; short enough that chaos does not decide.
     horizon: float
+    #: Default steps, internal units; each divides the horizon.
     time_steps: Sequence[float]
+    #: Default relative tolerances for adaptive integrators.
     tolerances: Sequence[float] = (1e-2, 1e-4, 1e-6)
     units: Units = ASE_UNITS
+    #: Pairs whose distances, all held, are the same thing as the constraint set, shape (n, 2); None if there are none.
     bonds: IntArray | None = None
+    #: Atoms that the constraint set holds by FixedAtoms; MD engines that hold `bonds` fix them in their own way.
     fixed: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    #: Method name -> why it cannot run this test system.
     refusals: Mapping[str, str] = field(default_factory=dict)
+    #: The reference at a given time, in closed form or by an independent integrator; without it the test system is
+    #: converged at a step far below those compared.
     solution: Callable[[float], Reference] | None = None
+    #: Shape (3,) or (3, 3).
     cell: FloatArray | None = None
+    #: How OpenMM runs it: the same masses and forces as a System.
     openmm: OpenMMEngine | None = None
+    #: The finest step compared, times this, decides about the work of a converged reference.
     reference_pace: float = 1.0
+    #: k_B T of its velocities; 0 for test systems that have no temperature.
     thermal_energy: float = 0.0
 
     @cached_property
@@ -151,25 +125,17 @@ class TestSystem:
 
     def with_time_steps(self, shown: Sequence[float]) -> TestSystem:
         """The same test system with other steps, in the unit of time it shows."""
-        steps = []
+        horizon, unit = self.horizon / self.units.time_unit, self.units.time
         for dt in shown:
-            internal = dt * self.units.time_unit
-            if not (np.isfinite(internal) and 0 < internal <= self.horizon * (1 + 1e-9)):
-                raise InputError(
-                    f"time step {dt:g} {self.units.time}: give a positive step of at most the horizon, "
-                    f"{self.horizon / self.units.time_unit:g} {self.units.time}",
-                    item="dt",
-                )
-            count = self.horizon / internal
-            if abs(count - round(count)) > 1e-6 * count:
-                raise InputError(
-                    f"time step {dt:g} {self.units.time} does not divide the horizon of "
-                    f"{self.horizon / self.units.time_unit:g} {self.units.time}; try "
-                    f"{self.horizon / self.units.time_unit / max(1, round(count)):g}",
-                    item="dt",
-                )
-            steps.append(internal)
-        return replace(self, time_steps=tuple(sorted(set(steps), reverse=True)))
+            if not (np.isfinite(dt) and 0 < dt <= horizon * (1 + 1e-9)):
+                remedy = f"give a positive step of at most the horizon, {horizon:g} {unit}"
+                raise InputError(f"time step {dt:g} {unit}: {remedy}", item="dt")
+            count = round(horizon / dt)
+            if abs(horizon / dt - count) > 1e-6 * count:
+                remedy = f"does not divide the horizon of {horizon:g} {unit}; try {horizon / max(1, count):g}"
+                raise InputError(f"time step {dt:g} {unit} {remedy}", item="dt")
+        steps = sorted({dt * self.units.time_unit for dt in shown}, reverse=True)
+        return replace(self, time_steps=tuple(steps))
 
     def shortened(self, factor: int) -> TestSystem:
         """The same test system with its horizon divided by `factor` and only the steps that still divide it."""

@@ -337,8 +337,8 @@ class CustomVelocity(PythonRows, VelocityRows):
         Atoms of each row.
     coefficients : callable
         ``coefficients(r) -> (width, 3)`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``. It must
-        depend on nothing else. Where Numba has compiled it, kernels call it without Python. Its change along the motion
-        is differenced, order four: about eleven digits. `VelocityFormula` is differentiated exactly.
+        depend on nothing else. Its change along the motion is differenced, order four: about eleven digits.
+        `VelocityFormula` is differentiated exactly.
     target : float, array_like, callable of time, or MovingTarget
         What the row is held at, 0 by default.
     time_dependent : bool

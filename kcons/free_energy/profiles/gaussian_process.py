@@ -14,8 +14,8 @@ smoother one.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -138,6 +138,7 @@ class Points:
 Asked: TypeAlias = tuple[Points, Sequence[int]]
 
 
+@dataclass(eq=False)
 class GradientProcess:
     """What is known of a free energy from gradients (n, d) at points, with covariances (n, d, d) of their errors.
 
@@ -146,33 +147,26 @@ class GradientProcess:
     beside it whose components know nothing of each other: how far the vectors are from being any gradient.
     """
 
-    def __init__(
-        self,
-        points: Points,
-        gradients: FloatArray,
-        covariances: FloatArray,
-        axes: Sequence[Axis],
-        parameters: FloatArray,
-        trends: Sequence[bool],
-        rotation: float = 0.0,
-    ) -> None:
-        self.points, self.gradients, self.covariances = points, gradients, covariances
-        self.axes, self.parameters, self.trends, self._rotation = axes, parameters, trends, rotation
-        # Gradients that vanish within their errors may be as large as these.
-        squares = gradients**2 + np.diagonal(covariances, axis1=1, axis2=2)
-        self._size = max(float(np.sqrt(g.mean())) * axis.length for g, axis in zip(squares.T, axes, strict=True)) or 1.0
-        steepest = math.sqrt(float(squares.max())) or 1.0
-        self._slopes = [_TREND * steepest if free else 0.0 for free in trends]
-        n, d = gradients.shape
-        self._seen: Asked = (points, range(d))
-        noise = np.einsum("ipq,ij->piqj", covariances, np.eye(n)).reshape(n * d, n * d)
-        self._root = cholesky(self._prior(parameters) + noise, lower=True, check_finite=False)
-        self._weights = cho_solve((self._root, True), gradients.T.ravel(), check_finite=False)
+    points: Points
+    gradients: FloatArray
+    covariances: FloatArray
+    axes: Sequence[Axis]
+    parameters: FloatArray
+    trends: Sequence[bool]
+    rotation: float = 0.0
 
-    def changed(self, **what: Any) -> GradientProcess:
-        """The same with other trends, or another rotation."""
-        seen = (self.points, self.gradients, self.covariances, self.axes, self.parameters)
-        return GradientProcess(*seen, **{"trends": self.trends, **what})
+    def __post_init__(self) -> None:
+        # Gradients that vanish within their errors may be as large as these.
+        squares = self.gradients**2 + np.diagonal(self.covariances, axis1=1, axis2=2)
+        lengths = [axis.length for axis in self.axes]
+        self._size = float((np.sqrt(squares.mean(axis=0)) * lengths).max()) or 1.0
+        steepest = math.sqrt(float(squares.max())) or 1.0
+        self._slopes = [_TREND * steepest if free else 0.0 for free in self.trends]
+        n, d = self.gradients.shape
+        self._seen: Asked = (self.points, range(d))
+        noise = np.einsum("ipq,ij->piqj", self.covariances, np.eye(n)).reshape(n * d, n * d)
+        self._root = cholesky(self._prior(self.parameters) + noise, lower=True, check_finite=False)
+        self._weights = cho_solve((self._root, True), self.gradients.T.ravel(), check_finite=False)
 
     def log_likelihood(self) -> float:
         """Of the gradients seen."""
@@ -216,10 +210,10 @@ class GradientProcess:
                         for z, c in ((one, p), (other, q))
                     ]
                     product = product + slope**2 * np.outer(*ends)
-            if self._rotation and p == q >= 0:
+            if self.rotation and p == q >= 0:
                 du, dw = (z.designs[p][1] @ factors[p] for z in (one, other))
                 alike = math.prod(part[0][0] for part in parts)
-                product = product + self._rotation**2 * variance * alike * np.outer(du, dw)
+                product = product + self.rotation**2 * variance * alike * np.outer(du, dw)
             return np.asarray(product)
 
         return np.block([[block(p, q) for q in columns] for p in rows])
@@ -272,7 +266,7 @@ class Learned:
     def closed(self) -> Learned:
         """The same without constant slopes."""
         free = [False] * len(self.best.axes)
-        best, *others = (process.changed(trends=free) for process in (self.best, *self.others))
+        best, *others = (replace(process, trends=free) for process in (self.best, *self.others))
         return Learned(best, others, self.weights)
 
     def mean(self, x: FloatArray, components: Sequence[int]) -> FloatArray:
@@ -305,23 +299,21 @@ def learn(
             value += 0.5 * (level**2 + bends @ bends)
         return value
 
-    def unlikely(p: FloatArray) -> float:
+    def unlikely(p: FloatArray, directions: FloatArray | None = None) -> tuple[float, FloatArray]:
+        """Minus the logarithm of what the gradients make of that density, and its slopes along some directions."""
+        along = np.zeros((0, len(p))) if directions is None else directions.T
         try:
-            return float(prior(p)) - process(p).log_likelihood()
+            here = process(p)
         except np.linalg.LinAlgError:
-            return _IMPOSSIBLE
+            return _IMPOSSIBLE, np.zeros(len(along))
+        slope = [prior(p + _TINY * 1j * direction).imag / _TINY for direction in along]
+        return float(prior(p)) - here.log_likelihood(), slope - here.slope(along)
 
     def search(start: FloatArray, directions: FloatArray) -> OptimizeResult:
         """The most likely parameters that are sums of `directions`, shape (parameters, k)."""
 
         def function(q: FloatArray) -> tuple[float, FloatArray]:
-            p = directions @ q
-            try:
-                here = process(p)
-            except np.linalg.LinAlgError:
-                return _IMPOSSIBLE, np.zeros_like(q)
-            slope = np.array([prior(p + _TINY * 1j * direction).imag / _TINY for direction in directions.T])
-            return float(prior(p)) - here.log_likelihood(), slope - here.slope(directions.T)
+            return unlikely(directions @ q, directions)
 
         options = {"ftol": 1e-12, "gtol": 1e-7, "maxiter": 200}
         bounds = [(-_FURTHEST, _FURTHEST)] * len(start)
@@ -340,25 +332,17 @@ def learn(
         best = np.asarray(search(best, np.eye(len(best))).x)
     # Where windows are symmetric eigenvalues are equal, and rounding would choose their directions: parameters count a
     # little differently.
-    tilt = 1.0 + _TILT * np.linspace(0.0, 1.0, len(best)) ** 2
-    sizes, directions = np.linalg.eigh(tilt[:, None] * _curvature(unlikely, best) * tilt)
-    away = directions * np.sqrt(len(best) / np.maximum(sizes, _FLATTEST))
+    n, every = len(best), np.eye(len(best))
+    ends = [(unlikely(best + step, every)[1], unlikely(best - step, every)[1]) for step in _STEP * every]
+    curvature = np.array([after - before for after, before in ends]) / (2 * _STEP)
+    tilt = 1.0 + _TILT * np.linspace(0.0, 1.0, n) ** 2
+    sizes, directions = np.linalg.eigh(tilt[:, None] * (curvature + curvature.T) / 2 * tilt)
+    away = directions * np.sqrt(n / np.maximum(sizes, _FLATTEST))
     chosen = np.clip(np.concatenate([best + away.T, best - away.T]), -_FURTHEST, _FURTHEST)
     # The density of each over that of the normal distribution which the points stand for.
-    logarithms = unlikely(best) - np.array([unlikely(p) for p in chosen]) + 0.5 * len(best)
+    logarithms = unlikely(best)[0] - np.array([unlikely(p)[0] for p in chosen]) + 0.5 * n
     weights = np.exp(np.clip(logarithms, -50.0, _HEAVIEST))
     kept = weights > 1e-3 * weights.max()
     if not (logarithms[kept] > -50.0).all():  # nothing near is possible
         chosen, weights, kept = best[None], np.ones(1), np.ones(1, dtype=bool)
     return Learned(process(best), [process(p) for p in chosen[kept]], weights[kept] / weights[kept].sum())
-
-
-def _curvature(function: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
-    """Second derivatives by differences."""
-    n, steps = len(at), _STEP * np.eye(len(at))
-    found = np.empty((n, n))
-    for i, j in zip(*np.tril_indices(n), strict=True):
-        a, b = steps[i], steps[j]
-        corners = function(at + a + b) - function(at + a - b) - function(at - a + b) + function(at - a - b)
-        found[i, j] = found[j, i] = corners / (4 * _STEP**2)
-    return found

@@ -7,11 +7,10 @@ much more likely the vectors are if their components need not belong to one free
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,21 +34,6 @@ _SAME = 1e-3
 _TOGETHER = 200
 
 
-class Consistency(NamedTuple):
-    """Whether the mean forces are a gradient.
-
-    Attributes
-    ----------
-    rotation : float
-        Most likely size of what is no gradient, relative to the gradient.
-    p_value : float
-        Probability of such a gain of likelihood by chance, if they are a gradient.
-    """
-
-    rotation: float
-    p_value: float
-
-
 class Minimum(NamedTuple):
     """A minimum of a surface: where, F and the standard error of F, both against the zero of the surface."""
 
@@ -70,7 +54,6 @@ class Surface:
     periods : tuple of float or None
     zero : ndarray, shape (d,)
         Where F is 0.
-    consistency : Consistency
     """
 
     windows: FloatArray
@@ -79,18 +62,18 @@ class Surface:
     high: FloatArray
     periods: tuple[float | None, ...]
     zero: FloatArray
-    consistency: Consistency
     _process: Learned
 
     def free_energy(self, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """F and its standard error, both against `zero`, at places of shape (m, d)."""
-        found = []
-        for places in np.array_split(self._places(x), max(1, math.ceil(len(as_float_array(x, "x")) / _TOGETHER))):
-            values, covariance = self._process.posterior((np.vstack([places, self.zero]), [-1]))
-            variance = np.diag(covariance)[:-1] - 2 * covariance[:-1, -1] + covariance[-1, -1]
-            found.append((values[:-1] - values[-1], np.sqrt(np.maximum(variance, 0.0))))
-        F, errors = (np.concatenate(part) for part in zip(*found, strict=True))
-        return F, errors
+        places = self._places(x)
+        F, variance = np.zeros(len(places)), np.zeros(len(places))
+        for k in range(0, len(places), _TOGETHER):
+            part = slice(k, k + _TOGETHER)
+            values, covariance = self._process.posterior((np.vstack([places[part], self.zero]), [-1]))
+            F[part] = values[:-1] - values[-1]
+            variance[part] = np.diag(covariance)[:-1] - 2 * covariance[:-1, -1] + covariance[-1, -1]
+        return F, np.sqrt(np.maximum(variance, 0.0))
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
         """F(b) - F(a) with its standard error."""
@@ -102,9 +85,16 @@ class Surface:
     def minima(self) -> list[Minimum]:
         """Minima inside of the range, lowest first; each is what a search from some window comes to."""
         size, periods = self.high - self.low, np.array([period or 0.0 for period in self.periods])
+        bounds = [(0.0, 1.0) if period is None else (None, None) for period in self.periods]
+        how: dict[str, Any] = {"jac": True, "method": "L-BFGS-B", "bounds": bounds, "options": {"ftol": 1e-13}}
+
+        def value(part: FloatArray) -> tuple[float, FloatArray]:
+            there = self._process.mean((self.low + part * size)[None], range(-1, len(size)))[:, 0]
+            return float(there[0]), there[1:] * size
+
         found: list[FloatArray] = []
         for start in self.windows:
-            (place,) = self._places(_descended(self._process, start, self.low, self.high, self.periods)[None])
+            (place,) = self._places((self.low + minimize(value, (start - self.low) / size, **how).x * size)[None])
             at_an_end = (periods == 0) & ((place <= self.low) | (place >= self.high))
             known = (np.abs(nearest_image(place - other, periods) / size).max() <= _SAME for other in found)
             if not at_an_end.any() and not any(known):
@@ -163,51 +153,32 @@ def fit_surface(
     )
     axes = [Axis(float(a), float(b - a), p is not None) for a, b, p in zip(low, high, turns, strict=True)]
     process = learn(places, forces, covariances, axes, [p is None for p in turns])
-    consistency = _consistency(process.best)
-    if consistency.p_value < _CHANCE:
-        warnings.warn(
-            f"the mean forces are no gradient: a field beside it of {consistency.rotation:.0%} of its size is more "
-            f"likely (p = {consistency.p_value:.1e}). Windows are in different states of what is not held, or their "
-            "errors are too small",
-            UserWarning,
-            stacklevel=2,
-        )
+    if d > 1:
+        _warn_of_rotation(process.best)
     if zero is None:
         lowest = places[np.argmin(process.mean(places, [-1])[0])]
     else:
         lowest = as_float_array(zero, "zero")
         if lowest.shape != (d,) or not np.isfinite(lowest).all():
             raise InputError(f"zero must be {d} finite numbers", item="zero")
-    surface = Surface(places, forces, low, high, turns, lowest, consistency, process)
+    surface = Surface(places, forces, low, high, turns, lowest, process)
     surface._places(lowest[None])
     return surface
 
 
-def _descended(
-    process: Learned, start: FloatArray, low: FloatArray, high: FloatArray, periods: Sequence[float | None]
-) -> FloatArray:
-    """Where the free energy is lowest near `start`, in the range."""
-    size = high - low
-
-    def value(part: FloatArray) -> tuple[float, FloatArray]:
-        found = process.mean((low + part * size)[None], range(-1, len(low)))[:, 0]
-        return float(found[0]), found[1:] * size
-
-    bounds = [(0.0, 1.0) if period is None else (None, None) for period in periods]
-    found = minimize(value, (start - low) / size, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-13})
-    return np.asarray(low + found.x * size)
-
-
-def _consistency(process: GradientProcess) -> Consistency:
-    """By the ratio of likelihoods with and without a field that is no gradient, all lengths as they are."""
-    if len(process.axes) == 1:
-        return Consistency(0.0, 1.0)
-
-    found = [process.changed(rotation=float(size)).log_likelihood() for size in _ROTATIONS]
+def _warn_of_rotation(process: GradientProcess) -> None:
+    """Warn where a field that is no gradient makes the vectors more likely, all lengths as they are."""
+    found = [replace(process, rotation=float(size)).log_likelihood() for size in _ROTATIONS]
     best = int(np.argmax(found))
-    gain = 2 * (found[best] - process.log_likelihood())
-    # The size cannot be negative: chance has it at 0 half of the time.
-    return Consistency(float(_ROTATIONS[best]), 0.5 * float(chi2.sf(gain, 1))) if gain > 0 else Consistency(0.0, 1.0)
+    # By the ratio of likelihoods. The size cannot be negative: chance has it at 0 half of the time.
+    chance = 0.5 * float(chi2.sf(2 * (found[best] - process.log_likelihood()), 1))
+    if chance < _CHANCE:
+        warnings.warn(
+            f"the mean forces are no gradient: a field beside it of {_ROTATIONS[best]:.0%} of its size is more likely "
+            f"(p = {chance:.1e}). Windows are in different states of what is not held, or their errors are too small",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _checked(

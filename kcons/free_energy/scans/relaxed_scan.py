@@ -11,9 +11,12 @@ Y. Qiu et al., J. Chem. Phys. 152, 244116 (2020).
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from os import PathLike
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from ase import Atoms
@@ -21,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY, applied_forces
 from kcons.ase.constraints_object import Constraints
+from kcons.ase.named_calculators import described
 from kcons.ase.topology import bonds_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
@@ -34,12 +38,14 @@ from kcons.errors import (
     InputError,
     KconsError,
     NonFiniteError,
+    UnreadableError,
 )
 from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals
-from kcons.free_energy.scans.scan_result import Attempt, Attempts, Grid, Point, Scan
+from kcons.free_energy.scans.scan_result import Attempt, Grid, Point, Scan
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.minimization import minimize
 from kcons.motion.motion import Motion
+from kcons.steppers.files import ResultFolder
 
 #: Energy by which a structure has to be lower to be handed on to the neighbors, in eV (10^-5 hartree).
 LOWER = 2.7e-4
@@ -48,6 +54,9 @@ MOST_ATOMS = 150
 
 #: Relaxations to a point that failed after which it is given up.
 MOST_TRIES = 4
+#: What is in a folder: what the scan is of, its relaxations, and what `Scan.write` makes of them.
+PLAN, PLACE = "plan.json", "relaxations"
+FILES = (f"{PLACE}/*.npz", "scan.json", "scan.csv", "scan.png", "scan.extxyz")
 
 #: Told of every attempt: points done, points in all, and a line about it.
 Progress = Callable[[int, int, str], None]
@@ -110,10 +119,27 @@ def scan(
     grid = Grid(items, lists)  # type: ignore[arg-type]
     fmax, evaluations = positive(fmax, "fmax"), whole_number(evaluations, "evaluations")
     surface = _Surface(atoms, grid, constraints_in(held, "held"))
-    settings = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
-    attempts = Attempts(folder, atoms, grid, surface.held, settings)
-    with attempts.taken():
-        return _Wavefront(surface, grid, attempts, settings, progress).run()
+    settings: dict[str, Any] = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
+    results = None
+    if folder is not None:
+        plan = {
+            "symbols": str(atoms.symbols),
+            "positions": atoms.positions.tolist(),
+            "cell": atoms.cell.array.tolist(),
+            "pbc": atoms.pbc.tolist(),
+            "calculator": described(atoms.calc, atoms),
+            "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
+            "values": [axis.tolist() for axis in grid.values],
+            "held": [item.todict() for item in surface.held],
+            "settings": settings,
+        }
+        results = ResultFolder(folder, PLAN, plan, FILES, "a scan")
+        results.refuse_others()
+    with nullcontext() if results is None else results.taken():
+        place = None if results is None else results.path / PLACE
+        if place is not None:
+            place.mkdir(exist_ok=True)
+        return _Wavefront(surface, place, settings, progress).run()
 
 
 class _Surface:
@@ -209,11 +235,11 @@ class _Wavefront:
     """Which point is relaxed next, and from where."""
 
     def __init__(
-        self, surface: _Surface, grid: Grid, attempts: Attempts, settings: dict[str, float], progress: Progress | None
+        self, surface: _Surface, place: Path | None, settings: dict[str, Any], progress: Progress | None
     ) -> None:
-        self.surface, self.grid, self.attempts, self.progress = surface, grid, attempts, progress
-        self.settings = settings
-        self.scan = Scan(grid, surface.bare, surface.held)
+        self.surface, self.place, self.settings, self.progress = surface, place, settings, progress
+        self.grid = surface.grid
+        self.scan = Scan(self.grid, surface.bare, surface.held)
         #: The attempt whose structure a point has handed on to its neighbors.
         self._handed: dict[Point, int] = {}
         self._queue: deque[tuple[Point, int | None]] = deque()
@@ -246,19 +272,29 @@ class _Wavefront:
             self._tried.add((point, source))
             self._settle(self._made(point, source))
 
+    def _kept(self) -> Attempt | None:
+        """The next attempt as an earlier run made it; None if there is none."""
+        number = len(self.scan.attempts)
+        file = None if self.place is None else self.place / f"{number:05d}.npz"
+        return Attempt.load(file, number) if file is not None and file.exists() else None
+
     def _made(self, point: Point, source: int | None) -> Attempt:
-        attempts = self.scan.attempts
-        attempt = self.attempts.kept(len(attempts), point, source)
+        attempts, attempt = self.scan.attempts, self._kept()
+        if attempt is not None and (attempt.point, attempt.source) != (point, source):
+            raise UnreadableError(
+                f"relaxation {len(attempts)} in {self.place} is of another scan; take another folder", item="folder"
+            )
         if attempt is None:
             self._tried_now.add(point)
             attempt = Attempt(len(attempts), point, source)
-            how = self.settings["fmax"], int(self.settings["evaluations"])
+            how = self.settings["fmax"], self.settings["evaluations"]
             try:
                 self.surface.relaxed(attempt, None if source is None else attempts[source], *how)
             except KconsError as error:
                 attempt.error = f"{self.grid.said(point)}: {type(error).__name__}: {error}"
                 self._first = self._first or error
-            self.attempts.keep(attempt)
+            if self.place is not None:
+                attempt.save(self.place / f"{attempt.number:05d}.npz")
         attempts.append(attempt)
         return attempt
 
@@ -278,26 +314,21 @@ class _Wavefront:
     def _reach_the_rest(self) -> bool:
         """Ask for a point that was not reached from a reached one that has not been tried for it, the nearest one."""
         missing = [point for point in self.grid.points if point not in self.scan.best]
+        tries = Counter(point for point, _ in self._tried)
         pairs = [
             (self.grid.apart(point, self.grid.at(other)), point, number)
             for point in missing
             for other, number in self._handed.items()
-            if (point, number) not in self._tried
+            if (point, number) not in self._tried and tries[point] < MOST_TRIES
         ]
-        # From so far away that nothing has come of it.
-        tries = {point: sum(tried == point for tried, _ in self._tried) for point in missing}
-        pairs = [entry for entry in pairs if tries[entry[1]] < MOST_TRIES]
-        if not pairs:
-            return False
-        _, point, number = min(pairs)
-        self._queue.append((point, number))
-        return True
+        self._queue.extend((point, number) for _, point, number in sorted(pairs)[:1])
+        return bool(pairs)
 
     def _try_again(self) -> bool:
         """Try a point that failed in an earlier run, once in this one, as it was tried first; False if none is left."""
         attempts = self.scan.attempts
         failed = (a for a in attempts if a.point not in self.scan.best and a.point not in self._tried_now)
-        again = self.attempts.tried(len(attempts)) or next(failed, None)
+        again = self._kept() or next(failed, None)
         if again is None:
             return False
         self._settle(self._made(again.point, again.source))

@@ -1,14 +1,12 @@
-"""The points of a scan, what it found and how that is shown; relaxations in a folder, kept one by one."""
+"""The points of a scan, its relaxations, in memory and in files, and how they are shown."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
@@ -23,21 +21,17 @@ from rich.table import Table
 
 from kcons import __version__
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.named_calculators import described
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import ANGLE, LENGTH, as_float_array
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, UnreadableError, UnsupportedError
-from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, text
+from kcons.steppers.files import in_one_piece, stored_arrays, text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: One eV in kJ/mol, and the difference of energies that is told of, in kJ/mol.
 KJ, TOLD = units.mol / units.kJ, 0.1
-#: What is in a folder: what the scan is of, its relaxations, and what `Scan.write` makes of them.
-PLAN, PLACE = "plan.json", "relaxations"
-FILES = (f"{PLACE}/*.npz", "scan.json", "scan.csv", "scan.png", "scan.extxyz")
 #: Values this near to each other, relative to their range, are the same.
 SAME = 1e-9
 
@@ -186,62 +180,6 @@ class Attempt:
             raise UnreadableError(f"{path} cannot be read ({error}); remove it", item="folder") from error
 
 
-class Attempts:
-    """A folder of attempts, which must not have another scan in it; without a folder nothing is kept."""
-
-    def __init__(
-        self,
-        folder: str | PathLike[str] | None,
-        atoms: Atoms,
-        grid: Grid,
-        held: Sequence[Constraint],
-        settings: Mapping[str, Any],
-    ) -> None:
-        self._results: ResultFolder | None = None
-        if folder is not None:
-            plan = {
-                "symbols": str(atoms.symbols),
-                "positions": atoms.positions.tolist(),
-                "cell": atoms.cell.array.tolist(),
-                "pbc": atoms.pbc.tolist(),
-                "calculator": described(atoms.calc, atoms),
-                "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
-                "values": [axis.tolist() for axis in grid.values],
-                "held": [item.todict() for item in held],
-                "settings": dict(settings),
-            }
-            self._results = ResultFolder(folder, PLAN, plan, FILES, "a scan")
-            self._results.refuse_others()
-
-    @contextmanager
-    def taken(self) -> Iterator[None]:
-        """Make the folder, and keep other scans out of it."""
-        with nullcontext() if self._results is None else self._results.taken():
-            if self._results is not None:
-                (self._results.path / PLACE).mkdir(exist_ok=True)
-            yield
-
-    def _file(self, number: int) -> Path:
-        assert self._results is not None
-        return self._results.path / PLACE / f"{number:05d}.npz"
-
-    def tried(self, number: int) -> Attempt | None:
-        """An attempt of an earlier run; None if there is none."""
-        there = self._results is not None and self._file(number).exists()
-        return Attempt.load(self._file(number), number) if there else None
-
-    def kept(self, number: int, point: Point, source: int | None) -> Attempt | None:
-        """The attempt of an earlier run that began so; None if there is none."""
-        found = self.tried(number)
-        if found is not None and (found.point, found.source) != (point, source):
-            raise UnreadableError(f"{self._file(number)} is of another scan; take another folder", item="folder")
-        return found
-
-    def keep(self, attempt: Attempt) -> None:
-        if self._results is not None:
-            attempt.save(self._file(attempt.number))
-
-
 class _Shown(Table):
     """A table that `print` shows as a terminal does."""
 
@@ -281,10 +219,6 @@ class Scan:
         for point, attempt in self.best.items():
             table[point] = attempt.energy
         return table
-
-    @property
-    def _lowest(self) -> float:
-        return min((attempt.energy for attempt in self.best.values()), default=float("nan"))
 
     @property
     def hysteresis(self) -> FloatArray:
@@ -341,7 +275,8 @@ class Scan:
 
     def rows(self) -> list[dict[str, Any]]:
         """Of each point the values, energies, hysteresis, calls, the force left, and why it failed."""
-        energy, spread, lowest = self.energies, self.hysteresis, self._lowest
+        energy, spread = self.energies, self.hysteresis
+        lowest = np.nanmin(energy)
         return [
             {
                 **self._values(point),
@@ -359,10 +294,10 @@ class Scan:
         """What was done, and what failed."""
         lines = [
             f"{len(self.best)} of {len(self.grid.points)} points, {len(self.attempts)} relaxations, "
-            f"{self.evaluations} calls of energy and forces; lowest energy {self._lowest:.6f} eV"
+            f"{self.evaluations} calls of energy and forces; lowest energy {np.nanmin(self.energies):.6f} eV"
         ]
         spread = self.hysteresis * KJ
-        if self.best and np.nanmax(spread) >= TOLD:
+        if np.nanmax(spread) >= TOLD:
             worst = tuple(int(n) for n in np.unravel_index(np.nanargmax(spread), spread.shape))
             lines.append(
                 f"from different neighbors the energy differs by up to {spread[worst]:.2f} kJ/mol, at "
@@ -391,7 +326,7 @@ class Scan:
         """Energy along one coordinate, or over two; points that failed are crosses."""
         from matplotlib.figure import Figure
 
-        grid, energy, spread = self.grid, (self.energies - self._lowest) * KJ, self.hysteresis * KJ
+        grid, energy, spread = self.grid, (self.energies - np.nanmin(self.energies)) * KJ, self.hysteresis * KJ
         figure = Figure(figsize=(7, 4.5), layout="constrained")
         axes = figure.subplots()
         labels = [f"{name} / {unit}" for name, unit in zip(grid.names, grid.units, strict=True)]

@@ -212,15 +212,12 @@ class _Simulation:
         self._dynamics: Any = None
 
     def hold(self, begin: Sequence[float], end: Sequence[float], seed: int, velocities: int | None) -> None:
-        settings, dt = self._settings, self._settings.timestep * units.fs
-        friction = settings.friction / (1000 * units.fs)
-        rows = [*self.held.others, *self.held.at(begin)]
+        settings, held, dt = self._settings, self.held, self._settings.timestep * units.fs
+        still, rows = ([*held.others, *part] for part in (held.at(begin), held.towards(begin, end, settings.pull * dt)))
         if velocities is not None:
-            draw_velocities(self.atoms, settings.temperature, velocities, constraints=rows)
-        if tuple(begin) != tuple(end):
-            rows = [*self.held.others, *self.held.towards(begin, end, settings.pull * dt)]
-        temperature = settings.temperature
-        self._dynamics = ConstrainedLangevin(self.atoms, dt, temperature, friction, rng=seed, constraints=rows)
+            draw_velocities(self.atoms, settings.temperature, velocities, constraints=still)
+        bath = settings.temperature, settings.friction / (1000 * units.fs)
+        self._dynamics = ConstrainedLangevin(self.atoms, dt, *bath, rng=seed, constraints=rows)
 
     def step(self, steps: int) -> None:
         self._dynamics.run(steps)

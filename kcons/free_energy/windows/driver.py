@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-import time
 import traceback
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED as FIRST
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -49,7 +46,7 @@ BOLTZMANN = 0.00831446261815324
 RETRIES = 3
 #: Files of a folder of windows, those of `FreeEnergy` and of the command line included.
 FILES = (
-    *(f"{kind}-*.{ending}" for kind in ("window", "pull") for ending in ("npz", "txt")),
+    *("window-*.npz", "pull-*.npz"),
     *("free_energy.json", "profile.csv", "profile.png", "pulls.json"),
 )
 #: Differences of the two sides that are less probable than this are marked, and widen errors.
@@ -79,8 +76,6 @@ class WindowResult:
         Probability of a larger difference between the sides if both were equilibrated; NaN with one side.
     raw : ndarray, shape (d,)
         The plain mean of the multipliers, for comparison.
-    seconds : float
-        Processor time that its runs took, whichever call made them.
     """
 
     number: int
@@ -90,7 +85,6 @@ class WindowResult:
     sides: dict[str, MeanForce]
     p_value: float
     raw: FloatArray
-    seconds: float
 
     @property
     def error(self) -> FloatArray:
@@ -146,13 +140,12 @@ class FreeEnergy:
     def between(self, a: float, b: float) -> Estimate | None:
         """F(b) - F(a) of the profile, in whichever turn the places are given; None where it does not reach both."""
         profile, period, ends = self.profile, float(self.periods[0]), np.array([a, b])
-        low, high = profile.x[[0, -1]]
         if period:
-            ends += period * np.ceil((low - ends) / period - 1e-9)
-        slack = 1e-9 * (high - low)
-        if ends.min() < low - slack or ends.max() > high + slack:
+            ends += period * np.ceil((profile.x[0] - ends) / period - 1e-9)
+        try:
+            return profile.difference(*ends.tolist())
+        except InputError:
             return None
-        return profile.difference(*ends.tolist())
 
     def _places(self) -> tuple[FloatArray, list[float | None]]:
         """Where the windows are, shape (n, d), and the period of each coordinate that they go all around."""
@@ -232,11 +225,10 @@ class FreeEnergy:
 
     def beside(self, pulled: Pulled, start: FloatArray, end: FloatArray) -> tuple[dict[str, Any], str]:
         """What pulls gave, as plain data and in a sentence; of one coordinate with the windows between the ends."""
-        best, name = pulled.best, "Jarzynski" if pulled.bar is None else "BAR"
+        best = pulled.best
         numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist(), "overlap": pulled.overlap}
-        estimates = {"bar": pulled.bar, "jarzynski": pulled.jarzynski}
-        numbers |= {key: [*estimate] for key, estimate in estimates.items() if estimate is not None}
-        said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name})"
+        numbers |= {"bar": [*best], "jarzynski": [*pulled.jarzynski]}
+        said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol (BAR)"
         if isinstance(self._profile(), Profile):
             windows = self.between(float(start[0]), float(end[0]))
             if windows is None:
@@ -285,9 +277,7 @@ class FreeEnergy:
         return written
 
 
-def combine_sides(
-    number: int, target: FloatArray, sides: dict[str, MeanForce], sampler: Sampler, seconds: float
-) -> WindowResult:
+def combine_sides(number: int, target: FloatArray, sides: dict[str, MeanForce], sampler: Sampler) -> WindowResult:
     """The mean of both sides, and how probable their difference is."""
     per = sampler.kJ / sampler.scales
     forces, raws = (np.array([getattr(side, name) * per for side in sides.values()]) for name in ("force", "raw"))
@@ -298,7 +288,7 @@ def combine_sides(
         if chance < UNLIKELY:
             half = (forces[0] - forces[1]) / 2
             covariance = covariance + np.outer(half, half)
-    return WindowResult(number, target, forces.mean(axis=0), covariance, sides, chance, raws.mean(axis=0), seconds)
+    return WindowResult(number, target, forces.mean(axis=0), covariance, sides, chance, raws.mean(axis=0))
 
 
 class Windows:
@@ -325,7 +315,7 @@ class Windows:
     workers : int, optional
         How many of these; by default one for each core.
     progress : callable, optional
-        ``progress(finished, all, seconds left)``.
+        ``progress(finished, all)``.
 
     Raises
     ------
@@ -347,7 +337,7 @@ class Windows:
         rng: Rng = 1,
         executor: Executor | None = None,
         workers: int | None = None,
-        progress: Callable[[int, int, float], None] | None = None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self.sampler, self.executor, self.progress = sampler, executor, progress
         self.workers = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
@@ -433,16 +423,17 @@ class Windows:
         return result
 
     def _jobs(self, number: int) -> list[Window]:
-        """The runs of a window; the same ones whenever they are asked for. Without a pull they begin where they end."""
+        """The runs of a window; without a pull they begin where they end."""
         target = np.array(self._targets[number])
         approach = self.approach if self.settings.pull else 0.0
-        jobs = []
-        for k, side in enumerate(SIDES if self.both_sides else SIDES[:1]):
-            start = target + (-1 if side == "up" else 1) * approach
-            seed = int(np.random.SeedSequence([self.seed, number, k]).generate_state(1)[0])
-            begin, end = (tuple((q / self.sampler.scales).tolist()) for q in (start, target))
-            jobs.append(Window(number, side, begin, end, seed))
-        return jobs
+        ways = zip(SIDES[: 1 + self.both_sides], (-1, 1), strict=False)
+        return [self._job(number, side, target + sign * approach, target) for side, sign in ways]
+
+    def _job(self, number: int, side: str, *ends: FloatArray) -> Window:
+        """A run from one place to another; the same one whenever it is asked for."""
+        seed = np.random.SeedSequence([self.seed, number, (*SIDES, *DIRECTIONS).index(side)]).generate_state(1)[0]
+        start, target = (tuple((end / self.sampler.scales).tolist()) for end in ends)
+        return Window(number, side, start, target, int(seed))
 
     def pull(self, start: ArrayLike, end: ArrayLike, count: int = 20) -> Pulled:
         """F(end) - F(start) from the works of pulls both ways, kJ/mol, by BAR; and by Jarzynski.
@@ -460,7 +451,7 @@ class Windows:
         Raises
         ------
         InputError
-            No steps to pull in; fewer than 5 pulls that did not fail.
+            No steps to pull in; a pull failed. Those that are finished are kept.
         """
         whole_number(count, "count", MIN_PULLS)
         if not self.settings.pull:
@@ -468,22 +459,24 @@ class Windows:
         ends = np.vstack([places_of([np.atleast_1d(end)], self.sampler.names) for end in (start, end)])
         if np.array_equal(*ends):
             raise InputError("start and end of the pulls are the same; give two places", item="end")
-        ends = ends / self.sampler.scales
-        jobs: list[list[Window]] = []
-        for k, direction in enumerate(DIRECTIONS):
-            begin, target = (tuple(place.tolist()) for place in (ends if k == 0 else ends[::-1]))
-            seeds = (np.random.SeedSequence([self.seed, number, 2 + k]).generate_state(1)[0] for number in range(count))
-            jobs.append([Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)])
+        ways = zip(DIRECTIONS, (ends, ends[::-1]), strict=True)
+        jobs = [[self._job(number, way, *places) for number in range(count)] for way, places in ways]
         missing = [job for each in jobs for job in each if not self.file(job).exists()]
         with self.taken():
-            failed = self._sample(missing, len(jobs) * count)
+            failed = self._sample(missing, 2 * count)
         if failed:
-            said = f"{len(failed)} of {len(jobs) * count} pulls failed; {': '.join(next(iter(failed.items())))}"
-            if any(sum(job.name not in failed for job in each) < MIN_PULLS for each in jobs):
-                raise InputError(f"{said}. A difference needs {MIN_PULLS} each way", item="pull")
-            warnings.warn(f"{said}. They are left out, which makes the result doubtful", UserWarning, stacklevel=2)
-        found = [[Series.load(self.file(job)) for job in each if job.name not in failed] for each in jobs]
-        return _pulled(found, self.sampler.kJ, BOLTZMANN * self.settings.temperature)
+            said = f"{len(failed)} of {2 * count} pulls failed; {': '.join(next(iter(failed.items())))}"
+            raise InputError(f"{said}. Ask again: finished ones are kept", item="pull")
+        kJ, kT = self.sampler.kJ, BOLTZMANN * self.settings.temperature
+        pulls = [[Series.load(self.file(job)) for job in each] for each in jobs]
+        forward, backward = (
+            np.array([series.work_of(thermal_multipliers(series, kT / kJ))[-1] * kJ for series in each])
+            for each in pulls
+        )
+        # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
+        first, last = (logsumexp([-0.5 * series.log_det_z[0] for series in each]) for each in pulls)
+        shift = kT * float(first - last)
+        return pull_free_energy(forward + shift, backward - shift, thermal_energy=kT)
 
     def _finished(self, window: Window) -> bool:
         """Whether a window is there; raises where its file is one of other values."""
@@ -507,37 +500,27 @@ class Windows:
     def _sample(self, jobs: Sequence[Window], total: int) -> dict[str, str]:
         """Run windows or pulls, again where a process was killed; why those failed that did."""
         failed: dict[str, str] = {}
-        tries = Counter[str]()
-        left, began, done = list(jobs), time.monotonic(), 0
-        while left:
-            again: list[Window] = []
+        left = list(jobs)
+        for _ in range(1 + RETRIES if left else 0):
             try:
                 with nullcontext(self.executor) if self.executor else _processes(self.workers, len(left)) as pool:
                     how = self.sampler, self.settings
                     running = {pool.submit(_sampled, *how, job, self.file(job)): job for job in left}
-                    while running:
-                        for future in wait(running, return_when=FIRST).done:
-                            job = running.pop(future)
-                            problem = _problem(future)
-                            tries[job.name] += 1
-                            if problem == _KILLED and tries[job.name] <= RETRIES:
-                                again.append(job)
-                                continue
-                            done += 1
-                            note = self.folder / f"{job.name}.failed.txt"
-                            note.unlink(missing_ok=True)
-                            if problem is not None:
-                                failed[job.name] = problem
-                                note.write_text(problem, encoding="utf-8")
-                            if self.progress is not None:
-                                spent = time.monotonic() - began
-                                self.progress(total - len(jobs) + done, total, spent / done * (len(jobs) - done))
+                    for future in as_completed(running):
+                        error = future.exception()
+                        if isinstance(error, BrokenExecutor) or type(error).__name__ in _LOST:
+                            continue
+                        left.remove(running[future])
+                        if error is not None:
+                            failed[running[future].name] = "".join(traceback.format_exception_only(error)).strip()
+                        if self.progress is not None:
+                            self.progress(total - len(left), total)
             except BrokenExecutor:
                 if self.executor is not None:
                     raise  # nothing can be sent to it any more
-                again = [job for job in left if not self.file(job).exists() and job.name not in failed]
-            left = again
-        return failed
+            if not left:
+                break
+        return failed | {job.name: _KILLED for job in left}
 
     # -- what came of it ------------------------------------------------------------------------
 
@@ -546,58 +529,29 @@ class Windows:
         kT = BOLTZMANN * self.settings.temperature / self.sampler.kJ
         found, problems = [], dict(self._failed)
         for number, target in enumerate(self._targets):
-            sides, seconds = dict[str, MeanForce](), 0.0
-            for job in self._jobs(number):
-                if not self.file(job).exists():
-                    continue
+            sides: dict[str, MeanForce] = {}
+            for job in filter(lambda job: self.file(job).exists(), self._jobs(number)):
                 try:
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore", UserWarning)  # few independent samples: said of the window
-                        series = Series.load(self.file(job))
-                        sides[job.side] = mean_force(series, kT)
-                        seconds += series.seconds
+                        sides[job.side] = mean_force(Series.load(self.file(job)), kT)
                 except KconsError as error:
                     problems[job.name] = f"{type(error).__name__}: {error}"
             if sides:
-                found.append(combine_sides(number, np.array(target), sides, self.sampler, seconds))
+                found.append(combine_sides(number, np.array(target), sides, self.sampler))
         found.sort(key=lambda w: w.value.tolist())
         return FreeEnergy(self.sampler.names, self.periods, found, problems, tuple(self.sampler.angles))
 
 
-#: What is said of a window whose process was killed, or whose worker was lost.
+#: What is said of a window whose process was killed, and errors of Dask that say so.
 _KILLED = "its process was killed each time (a script that starts processes does so below if __name__ == '__main__':)"
-
-
-def _problem(future: Future[None]) -> str | None:
-    """Why a window failed; None if it did not."""
-    error = future.exception()
-    if error is None:
-        return None
-    if isinstance(error, BrokenExecutor) or type(error).__name__ in ("KilledWorker", "CancelledError"):
-        return _KILLED
-    return "".join(traceback.format_exception_only(error)).strip()
+_LOST = ("KilledWorker", "CancelledError")
 
 
 def _sampled(sampler: Sampler, settings: Settings, window: Window, file: Path) -> None:
     """In a worker: one window, unless another run has finished it meanwhile."""
     if not file.exists():
         (sampler.sample if window.side in SIDES else sampler.pull)(window, settings, file)
-
-
-def _pulled(pulls: Sequence[Sequence[Series]], kJ: float, kT: float) -> Pulled:
-    """What pulls forward and backward say, with kT in kJ/mol."""
-    forward, backward = (
-        np.array([series.work_of(thermal_multipliers(series, kT / kJ))[-1] * kJ for series in each]) for each in pulls
-    )
-    # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
-    start, end = (_log_mean(np.array([-0.5 * series.log_det_z[0] for series in each])) for each in pulls)
-    shift = kT * (start - end)
-    return pull_free_energy(forward + shift, backward - shift, thermal_energy=kT)
-
-
-def _log_mean(logarithms: FloatArray) -> float:
-    """ln of the mean of exp."""
-    return float(logsumexp(logarithms) - np.log(len(logarithms)))
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Windows as an input file describes them, in TOML.
 
 A table of the file is a dataclass below, a key one of its fields. What may be given is said by the annotation,
-`Annotated[type, Rule]`, with words for the error. A key without a default has to be there.
+`Annotated[type, rule]`, as for arguments. A key without a default has to be there.
 """
 
 from __future__ import annotations
@@ -9,24 +9,23 @@ from __future__ import annotations
 import math
 import sys
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from functools import partial
 from itertools import product
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
-from typing import Annotated, Any, NamedTuple, TypeAlias, get_type_hints
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, FixedAtoms
-from kcons.constraints.arguments import ANGLE, whole_number
+from kcons.constraints.arguments import ANGLE, Count, Positive, Rule, rules_of, whole_number
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError, did_you_mean
+from kcons.errors import InputError, did_you_mean
+from kcons.free_energy.profiles.pulls import MIN_PULLS
 from kcons.free_energy.windows.window import Sampler, Settings
 from kcons.steppers.files import as_path
 
@@ -51,20 +50,19 @@ FAMILIES: dict[str, Callable[[list[list[int]]], Constraint]] = {
     "angle": Angle,
     "dihedral": Dihedral,
 }
-#: Values between which each kind lies, in angstrom and degrees.
-_RANGES = {
-    "distance": (0.0, math.inf),
-    "difference": (-math.inf, math.inf),
-    "angle": (0.0, 180.0),
-    "dihedral": (-math.inf, math.inf),
-}
+#: Values between which each kind lies, in angstrom and degrees; the others may have any.
+_RANGES = {"distance": (0.0, math.inf), "angle": (0.0, 180.0)}
 
 
-class Rule(NamedTuple):
-    """What a value of TOML must be, in words and as a test."""
+def _is(words: str, test: Callable[[Any], bool]) -> Rule:
+    """A rule for a value of TOML, in words and as a test."""
 
-    words: str
-    test: Callable[[Any], bool]
+    def rule(value: Any, item: str) -> Any:
+        if not test(value):
+            raise InputError(f"{item} is {short(value)}; give {words}", item=item.split()[0])
+        return value
+
+    return rule
 
 
 def _number(value: Any) -> bool:
@@ -80,19 +78,17 @@ def _list(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 
 _NUMBERS, _ATOMS = _list(_number), _list(_whole)
-Text: TypeAlias = Annotated[str, Rule("a text", lambda v: isinstance(v, str))]
-Table: TypeAlias = Annotated[dict, Rule("a table", lambda v: isinstance(v, dict))]
-Truth: TypeAlias = Annotated[bool, Rule("true or false", lambda v: isinstance(v, bool))]
-Number: TypeAlias = Annotated[float, Rule("a number", _number)]
-Positive: TypeAlias = Annotated[float, Rule("a number above 0", lambda v: _number(v) and v > 0)]
-Count: TypeAlias = Annotated[int, Rule("a whole number above 0", lambda v: _whole(v) and v > 0)]
-ZeroOrOne: TypeAlias = Annotated[int, Rule("0 or 1", lambda v: _whole(v) and v in (0, 1))]
-Numbers: TypeAlias = Annotated[list, Rule("numbers", _NUMBERS)]
-NumberOrNumbers: TypeAlias = Annotated[Any, Rule("a number, or numbers", lambda v: _number(v) or _NUMBERS(v))]
-Atoms: TypeAlias = Annotated[list, Rule("whole numbers", _ATOMS)]
-Pairs: TypeAlias = Annotated[list, Rule("pairs of whole numbers", _list(lambda pair: _ATOMS(pair) and len(pair) == 2))]
-#: Of which `Settings` say more.
-Single: TypeAlias = Annotated[Any, Rule("one value", lambda v: not isinstance(v, dict | list))]
+Text: TypeAlias = Annotated[str, _is("a text", lambda v: isinstance(v, str))]
+Table: TypeAlias = Annotated[dict, _is("a table", lambda v: isinstance(v, dict))]
+Truth: TypeAlias = Annotated[bool, _is("true or false", lambda v: isinstance(v, bool))]
+Number: TypeAlias = Annotated[float, _is("a number", _number)]
+ZeroOrOne: TypeAlias = Annotated[int, _is("0 or 1", lambda v: _whole(v) and v in (0, 1))]
+Numbers: TypeAlias = Annotated[list, _is("numbers", _NUMBERS)]
+NumberOrNumbers: TypeAlias = Annotated[Any, _is("a number, or numbers", lambda v: _number(v) or _NUMBERS(v))]
+Atoms: TypeAlias = Annotated[list, _is("whole numbers", _ATOMS)]
+Pairs: TypeAlias = Annotated[list, _is("pairs of whole numbers", _list(lambda pair: _ATOMS(pair) and len(pair) == 2))]
+#: Of which `Settings` and `Windows` say more.
+Single: TypeAlias = Annotated[Any, _is("one value", lambda v: not isinstance(v, dict | list))]
 
 
 @dataclass(kw_only=True)
@@ -107,7 +103,6 @@ class Forces:
     settings: Table | None = None
     system: Text | None = None
     platform: Text | None = None
-    properties: Table | None = None
 
 
 @dataclass(kw_only=True)
@@ -123,38 +118,39 @@ class Coordinate:
     values: Numbers | None = None
 
     def __post_init__(self) -> None:
-        self.families = [family for family in FAMILIES if getattr(self, family) is not None]
-        atoms = getattr(self, self.families[0]) if self.families else []
-        self.called = self.name or "-".join([*self.families, *map(str, atoms)])
-        if len(self.families) != 1:
+        families = [family for family in FAMILIES if getattr(self, family) is not None]
+        self.family = families[0] if families else ""
+        self.called = self.name or "-".join([*families, *map(str, getattr(self, self.family, ()))])
+        if len(families) != 1:
             raise InputError(
-                f"coordinate {self.called} is {' and '.join(self.families) or 'nothing'}; give the atoms of a "
+                f"coordinate {self.called} is {' and '.join(families) or 'nothing'}; give the atoms of a "
                 f"{', '.join(FAMILIES)}",
                 item="coordinate",
             )
+        ends = {"from": self.begin, "to": self.to, "windows": self.windows}
+        given = [key for key, value in ends.items() if value is not None]
+        if self.values is not None and given:
+            raise InputError(f"coordinate {self.called} has values and {given[0]}; give one of them", item="coordinate")
+        if self.values is None and len(given) < 3:
+            raise InputError(f"coordinate {self.called}: give values, or from, to and windows", item="coordinate")
+        self.count = len(self.values) if self.values is not None else self.windows or 0
 
     def constraint(self, first: int) -> Constraint:
-        (family,) = self.families
-        return FAMILIES[family]([counted(getattr(self, family), first)])
+        return FAMILIES[self.family]([counted(getattr(self, self.family), first)])
 
     def places(self) -> FloatArray:
         """Where windows are, in angstrom and radian."""
-        name, (family,), ends = self.called, self.families, (self.begin, self.to, self.windows)
-        if self.values is not None:
-            given = [key for key, value in zip(("from", "to", "windows"), ends, strict=True) if value is not None]
-            if given:
-                raise InputError(f"coordinate {name} has values and {given[0]}; give one of them", item="coordinate")
-            places = np.array(self.values, dtype=np.float64)
-        elif self.begin is not None and self.to is not None and self.windows is not None:
-            _refuse_more(self.windows, "windows")
-            turn = family == "dihedral" and abs(self.to - self.begin) >= 360 - 1e-9
-            places = np.linspace(self.begin, self.to, self.windows, endpoint=not turn)
-        else:
-            raise InputError(f"coordinate {name}: give values, or from, to and windows", item="coordinate")
-        low, high = _RANGES[family]
+        places = np.array(self.values, dtype=np.float64)
+        if self.values is None:
+            assert self.begin is not None and self.to is not None
+            turn = self.family == "dihedral" and abs(self.to - self.begin) >= 360 - 1e-9
+            places = np.linspace(self.begin, self.to, self.count, endpoint=not turn)
+        low, high = _RANGES.get(self.family, (-math.inf, math.inf))
         for place in places[(places <= low) | (places >= high)].tolist():
-            raise InputError(f"there is no {family} of {place:g} to hold {name} at; leave it out", item="coordinate")
-        return np.radians(places) if family in ("angle", "dihedral") else places
+            raise InputError(
+                f"there is no {self.family} of {place:g} to hold {self.called} at; leave it out", item="coordinate"
+            )
+        return np.radians(places) if self.family in ("angle", "dihedral") else places
 
 
 @dataclass(kw_only=True)
@@ -184,13 +180,8 @@ class Improve:
 class Pulls:
     begin: NumberOrNumbers | None = field(default=None, metadata={"key": "from"})
     to: NumberOrNumbers | None = None
-    count: Single = 20
-    steps: Single = 20_000
-
-
-@dataclass(kw_only=True)
-class Workers:
-    processes: Count | None = None
+    count: Annotated[int, partial(whole_number, least=MIN_PULLS)] = 20
+    steps: Count = 20_000
 
 
 #: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
@@ -205,7 +196,6 @@ _TABLES: dict[str, Any] = {
     "sampling": make_dataclass("Sampling", [(key, kind | None, None) for key, kind in _SAMPLING.items()]),
     "improve": Improve,
     "pulls": Pulls,
-    "workers": Workers,
 }
 
 
@@ -227,7 +217,6 @@ class InputFile:
         Of `Windows.pull`: start and end in angstrom and radian, count.
     pull_steps : int
         Steps of each of these.
-    processes : int or None
     """
 
     sampler: Sampler
@@ -237,35 +226,6 @@ class InputFile:
     improve: dict[str, Any] | None
     pulls: dict[str, Any] | None
     pull_steps: int
-    processes: int | None
-
-
-@contextmanager
-def executor_at(scheduler: str | None) -> Iterator[Executor | None]:
-    """Where the windows run, by the address of a scheduler of Dask; None for processes of this machine.
-
-    Raises
-    ------
-    InputError
-        No scheduler answers.
-    UnsupportedError
-        Dask is not installed.
-    """
-    if scheduler is None:
-        yield None
-        return
-    try:
-        from distributed import Client
-
-        client = Client(scheduler, timeout="10s")
-    except ModuleNotFoundError:
-        raise UnsupportedError(
-            "a scheduler is one of Dask, which is not installed: python -m pip install 'dask[distributed]'"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"no scheduler of Dask answers at {scheduler}: {error}", item="scheduler") from error
-    with closing(client):
-        yield client.get_executor(pure=False)
 
 
 def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -> InputFile:
@@ -287,8 +247,8 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     """
     path = as_path(file, "file")
     data = _toml(path)
-    tables: dict[str, Any] = {"forces": Forces(), "coordinate": [], "workers": Workers()}
-    for name, content in {"sampling": {}, **data}.items():
+    tables: dict[str, Any] = {}
+    for name, content in {"forces": {}, "sampling": {}, **data}.items():
         _refuse_unknown(name, _TABLES, "the input file")
         many = name == "coordinate"
         if many != isinstance(content, list):
@@ -303,18 +263,19 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         if entry.called in coordinates:
             raise InputError(f"two coordinates have the name {entry.called}; give each its own", item="coordinate")
         coordinates[entry.called] = entry.constraint(tables["structure"].count_from)
-    places = [entry.places() for entry in tables["coordinate"]]
-    _refuse_more(math.prod(map(len, places)), "coordinate")
-    targets = np.array(list(product(*places)))
+    count = math.prod(entry.count for entry in tables["coordinate"])
+    if count > MOST_WINDOWS:
+        raise InputError(f"the input file has {count:,} windows; give at most {MOST_WINDOWS:,}", item="coordinate")
+    targets = np.array(list(product(*(entry.places() for entry in tables["coordinate"]))))
     sampling = {key: value for key, value in vars(tables["sampling"]).items() if value is not None}
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
     pulls = tables.get("pulls")
-    if "improve" in data and (len(coordinates) > 1 or len(targets) < 3):
+    if "improve" in data and (len(coordinates) > 1 or count < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
-            f"{len(targets)} windows: leave it out, or begin with 3 windows or more along one",
+            f"{count} windows: leave it out, or begin with 3 windows or more along one",
             item="improve",
         )
     return InputFile(
@@ -325,7 +286,6 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         data.get("improve"),
         None if pulls is None else _pulls(pulls, coordinates, targets),
         Pulls.steps if pulls is None else pulls.steps,
-        tables["workers"].processes,
     )
 
 
@@ -336,7 +296,7 @@ def _toml(path: Path) -> dict[str, Any]:
         raise InputError(f"there is no file {path}", item="file") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error}", item="file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise InputError(f"{path} is no TOML: {error}", item="file") from error
     except RecursionError:
         raise InputError(
@@ -348,26 +308,16 @@ def _read(kind: Any, name: str, entry: Any) -> Any:
     """A table as an object of a dataclass."""
     if not isinstance(entry, dict):
         raise InputError(f"{name} is {short(entry)}; write [{name}] and its keys below", item=name)
-    hints = get_type_hints(kind, include_extras=True)
     own = {each.metadata.get("key", each.name): each for each in fields(kind)}
-    rules = {key: _rule(hints[each.name]) for key, each in own.items()}
+    rules = rules_of(kind)
     for key, value in entry.items():
-        _refuse_unknown(key, rules, f"[{name}]")
-        if not rules[key].test(value):
-            raise InputError(f"{key} of [{name}] is {short(value)}; give {rules[key].words}", item=key)
+        _refuse_unknown(key, own, f"[{name}]")
+        for rule in rules[own[key].name].rules:
+            rule(value, f"{key} of [{name}]")
     for key, each in own.items():
         if key not in entry and each.default is MISSING:
-            raise InputError(f"[{name}] has no {key}; give {rules[key].words}", item=key)
+            raise InputError(f"[{name}] has no {key}; write {key} = ...", item=key)
     return kind(**{own[key].name: value for key, value in entry.items()})
-
-
-def _rule(hint: Any) -> Rule:
-    """The rule of an annotation, or of the part of it that is not None."""
-    for part in (hint, *getattr(hint, "__args__", ())):
-        for extra in getattr(part, "__metadata__", ()):
-            if isinstance(extra, Rule):
-                return extra
-    raise TypeError(f"{hint} has no rule")
 
 
 def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
@@ -376,15 +326,8 @@ def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
         raise InputError(f"{where} has an unknown key {key!r}{hint}; there are {', '.join(known)}", item=key)
 
 
-def _refuse_more(windows: int, item: str) -> None:
-    if windows > MOST_WINDOWS:
-        raise InputError(f"the input file has {windows:,} windows; give at most {MOST_WINDOWS:,}", item=item)
-
-
 def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatArray) -> dict[str, Any]:
     """Arguments of `Windows.pull`; by default from the first window to the last."""
-    for key, low in (("count", 5), ("steps", 1)):
-        whole_number(getattr(entry, key), f"{key} of [pulls]", low)
     start, end = (
         place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
         for key, given, place in (("from", entry.begin, targets[0]), ("to", entry.to, targets[-1]))
@@ -405,16 +348,17 @@ def read_structure(path: Path) -> Any:
     """The last structure of any file that ASE reads, as `Atoms`."""
     import ase.io
 
-    _require_file(path)
-    try:
-        return ase.io.read(path)
-    except Exception as error:
-        raise InputError(f"ASE cannot read {path}: {type(error).__name__}: {error}", item="structure") from error
+    return _opened("ASE", ase.io.read, path)
 
 
-def _require_file(path: Path) -> None:
+def _opened(program: str, read: Callable[[str], Any], path: Path) -> Any:
+    """What a program reads from a file."""
     if not path.is_file():
         raise InputError(f"there is no file {path}", item="structure")
+    try:
+        return read(str(path))
+    except Exception as error:
+        raise InputError(f"{program} cannot read {path}: {type(error).__name__}: {error}", item="structure") from error
 
 
 def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]) -> FloatArray:
@@ -432,19 +376,18 @@ def _sampler(
 ) -> Sampler:
     forces, structure = tables["forces"], tables["structure"]
     place = folder / structure.file
-    _require_file(place)
     if (forces.calculator is None) == (forces.system is None):
         raise InputError(
             "give calculator or system in [forces]: a calculator of ASE, or the XML file of a System of OpenMM",
             item="forces",
         )
-    for key, other in (("settings", "system"), ("platform", "calculator"), ("properties", "calculator")):
+    for key, other in (("settings", "system"), ("platform", "calculator")):
         if getattr(forces, key) is not None and getattr(forces, other) is not None:
             raise InputError(f"{key} of [forces] says nothing to a {other}; leave it out", item=key)
     if forces.system is not None:
         if "held" in tables:
             raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
-        return _of_openmm(place, folder / forces.system, forces, coordinates)
+        return _of_openmm(place, folder / forces.system, forces.platform, coordinates)
     from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
     from kcons.free_energy.windows.ase_windows import AseWindows
 
@@ -457,18 +400,12 @@ def _sampler(
     return AseWindows(atoms, make, coordinates, rows)
 
 
-def _of_openmm(structure: Path, system: Path, forces: Forces, coordinates: Mapping[str, Constraint]) -> Sampler:
+def _of_openmm(structure: Path, system: Path, platform: str | None, coordinates: Mapping[str, Constraint]) -> Sampler:
     from openmm import app
 
     from kcons.free_energy.scans.system_calculator import read_system
     from kcons.free_energy.windows.openmm_windows import OpenMMWindows
 
     made = read_system(system, "system")
-    try:
-        pdb = app.PDBxFile(str(structure)) if structure.suffix == ".cif" else app.PDBFile(str(structure))
-    except Exception as error:
-        raise InputError(
-            f"OpenMM cannot read {structure}: {type(error).__name__}: {error}", item="structure"
-        ) from error
-    x, where = pdb.positions, forces.platform
-    return OpenMMWindows(pdb.topology, made, x, coordinates, platform=where, properties=forces.properties)
+    pdb = _opened("OpenMM", app.PDBxFile if structure.suffix == ".cif" else app.PDBFile, structure)
+    return OpenMMWindows(pdb.topology, made, pdb.positions, coordinates, platform=platform)

@@ -11,7 +11,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import app, unit
 
-from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, Formula
+from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet, same_rows
@@ -20,23 +20,22 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
-from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, Row
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, cell_of, refuse_virtual_sites
-from kcons.openmm.callback_rows.hold import constraints_about
-from kcons.openmm.collective.coordinates import formula_rows
+from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, hold
+from kcons.openmm.callback_rows import CarriedConstraints, constraints_about, refuse_virtual_sites
 from kcons.openmm.device.device_integrator import choose
-from kcons.openmm.quantities import accepted, masses_of, nanometers, with_massless_atoms
-from kcons.openmm.states import positions_of, velocities_of
+from kcons.openmm.quantities import (
+    accepted,
+    cell_of,
+    masses_of,
+    nanometers,
+    positions_of,
+    velocities_of,
+    with_massless_atoms,
+)
 from kcons.openmm.topology import bonds_of
 
 #: What a relaxation leaves of the forces, kJ/mol/nm.
 _FORCE = 50.0
-#: Forces that are coordinates, their energies, and how a term is added.
-_FORCES: dict[type[Constraint], tuple[Any, str, str]] = {
-    Distance: (openmm.CustomBondForce, "r", "addBond"),
-    Angle: (openmm.CustomAngleForce, "theta", "addAngle"),
-    Dihedral: (openmm.CustomTorsionForce, "theta", "addTorsion"),
-}
 #: Part of the box by which files round it.
 _SAME_BOX = 1e-3
 
@@ -68,15 +67,13 @@ class HeldCoordinatesReporter:
     ----------
     file : path or text file
         Comma-separated columns: step, time in ps, then value and multiplier of each coordinate in kJ/mol, nm and
-        radian, ln det Z, and the work that moving targets did since the first report of this reporter.
+        radian, and ln det Z.
     reportInterval : int
         Steps from one report to the next.
     coordinates : mapping of str to Constraint
         Quantities, or plain numbers of nm, ps, dalton, radian.
     beside : iterable of Constraint
         Other rows that are held on the same atoms.
-    append : bool
-        Whether to go on in a file that exists, without a new line of names.
 
     Attributes
     ----------
@@ -104,14 +101,13 @@ class HeldCoordinatesReporter:
         coordinates: Mapping[str, Constraint],
         *,
         beside: Iterable[Constraint] = (),
-        append: bool = False,
     ) -> None:
         self._interval = whole_number(reportInterval, "reportInterval")
         names = list(named(coordinates))
         self._coordinates = dict(zip(names, accepted(coordinates.values()), strict=True))
         self._beside = accepted(beside)
-        self._own, self._titled, self._work = not hasattr(file, "write"), append, 0.0
-        self._file: TextIO = open(file, "a" if append else "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
+        self._own = not hasattr(file, "write")
+        self._file: TextIO = open(file, "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
         self._held: HeldCoordinates | None = None
         self.series = Series(names)
 
@@ -133,8 +129,8 @@ class HeldCoordinatesReporter:
         if isinstance(ensemble, Isokinetic):
             self.series.isokinetic_degrees_of_freedom = ensemble.count(simulation.integrator)
         sample = self._held.sample(x, v, f, time)
-        self._work += self.series.append(sample)
-        numbers = [time, *np.stack([sample.value, sample.multiplier], axis=1).ravel(), sample.log_det_z, self._work]
+        self.series.append(sample)
+        numbers = [time, *np.stack([sample.value, sample.multiplier], axis=1).ravel(), sample.log_det_z]
         self._file.write(",".join([str(simulation.currentStep), *(f"{number:.12g}" for number in numbers)]) + "\n")
         self._file.flush()
 
@@ -166,10 +162,8 @@ class HeldCoordinatesReporter:
         self._held = HeldCoordinates(self._set, self._coordinates, x, time=time, bonds=bonds)
         self._context = simulation.context
         self.series = Series(self._held.names, self._held.periods)
-        if not self._titled:
-            titles = [title for name in self._held.names for title in (name, f"multiplier of {name}")]
-            titles = ["Step", "Time (ps)", *titles, "ln det Z", "work (kJ/mol)"]
-            self._file.write("#" + ",".join(f'"{title}"' for title in titles) + "\n")
+        titles = [title for name in self._held.names for title in (name, f"multiplier of {name}")]
+        self._file.write("#" + ",".join(f'"{title}"' for title in ("Step", "Time (ps)", *titles, "ln det Z")) + "\n")
 
     def __del__(self) -> None:
         if getattr(self, "_own", False) and hasattr(self, "_file"):
@@ -199,7 +193,7 @@ class OpenMMWindows(Sampler):
     InputError
         A Topology of another number of atoms, or of another box.
     UnsupportedError
-        A coordinate of another kind, or of virtual sites; a barostat.
+        A barostat; at `begin`, a coordinate of virtual sites, or of several rows.
     KconsError
         At `begin`: a coordinate that is undefined at the structure or depends on the constraints of the System.
     """
@@ -222,8 +216,6 @@ class OpenMMWindows(Sampler):
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
         self._bonds: IntArray = bonds_of(system, self.positions)
-        for name, item in self.coordinates.items():
-            _force_of(name, item, system.usesPeriodicBoundaryConditions())
 
     @property
     def digest(self) -> str:
@@ -255,36 +247,25 @@ class _Simulation:
         self._seen = held.measured(window.target).seen
         if settings.relax:
             self.hold(window.start, window.start, window.seed, None)
-            integrator: Any = self.simulation.integrator
-            integrator.minimizeEnergy(self.simulation.context, _FORCE, settings.relax)
-            self._x = positions_of(self.simulation.context)
+            self._integrator.minimizeEnergy(self._context, _FORCE, settings.relax)
+            self._x = positions_of(self._context)
 
     def hold(self, begin: Sequence[float], end: Sequence[float], seed: int, velocities: int | None) -> None:
         settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
         system = sampler.system()
-        duration, wraps = max(settings.pull, 1) * dt, system.usesPeriodicBoundaryConditions()
         ensemble = Langevin(settings.temperature, settings.friction)
-        moves = tuple(begin) != tuple(end)
-        parts: list[Any] = self.held.towards(begin, end, duration) if moves else self.held.at(begin)
+        parts: list[Any] = list(self.held.towards(begin, end, settings.pull * dt))
         self._on_device = choose(None, dt, parts=parts, ensemble=ensemble)[0] is DeviceIntegrator
         if not self._on_device:
-            rows = [
-                Row(_force_of(name, item, wraps), float(a), (float(b) - float(a)) / duration, item.period, name=name)
-                for (name, item), a, b in zip(sampler.coordinates.items(), begin, end, strict=True)
-            ]
-            parts = [CollectiveRows(system, rows, positions=sampler.positions)]
+            parts = [hold(system, parts, self._x)]
         integrator: Any = ProjectedIntegrator(dt * unit.picosecond, parts=parts, ensemble=ensemble)
         if self._on_device:
             integrator.record(self._seen)
         integrator.setRandomNumberSeed(seed % 2**31 + 1)
         platform = sampler.platform
         chosen = [] if platform is None else [openmm.Platform.getPlatformByName(platform), sampler.properties]
-        topology = app.Topology()  # one with elements cannot be sent to other processes; this is all that is needed
-        residue = topology.addResidue("X", topology.addChain())
-        for _ in range(system.getNumParticles()):
-            topology.addAtom("X", None, residue)
-        self.simulation = app.Simulation(topology, system, integrator, *chosen)
-        context = self.simulation.context
+        context = openmm.Context(system, integrator, *chosen)
+        self._context, self._integrator = context, integrator
         context.setPositions(self._x)
         integrator.applyConstraints()
         if velocities is None:
@@ -294,24 +275,23 @@ class _Simulation:
             integrator.setVelocitiesToTemperature(context, settings.temperature, velocities % 2**31)
 
     def step(self, steps: int) -> None:
-        self.simulation.step(steps)
-        self._x, self._v = positions_of(self.simulation.context), velocities_of(self.simulation.context)
+        self._integrator.step(steps)
+        self._x, self._v = positions_of(self._context), velocities_of(self._context)
 
     def run(self, steps: int, every: int, take: Callable[..., None]) -> None:
         if not self._on_device:
             for _ in range(steps // every):
-                self.simulation.step(every)
+                self._integrator.step(every)
                 take(*self.state())
             return
         whole: FloatArray = np.zeros((3, *self._x.shape))
-        integrator: Any = self.simulation.integrator
-        for *seen, time in integrator.records(steps // every * every, every):
+        for *seen, time in self._integrator.records(steps // every * every, every):
             whole[:, self._seen] = seen
             take(*whole, time)
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        groups = self.simulation.integrator.getIntegrationForceGroups()
-        return _state(self.simulation.context.getState(positions=True, velocities=True, forces=True, groups=groups))
+        groups = self._integrator.getIntegrationForceGroups()
+        return _state(self._context.getState(positions=True, velocities=True, forces=True, groups=groups))
 
 
 def _state(state: openmm.State) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -343,28 +323,3 @@ def _refuse_another(topology: app.Topology, system: openmm.System) -> None:
     barostats = [type(force).__name__ for force in system.getForces() if "Barostat" in type(force).__name__]
     if barostats:
         raise UnsupportedError(f"the System has a {barostats[0]}; windows are sampled in a box at rest: remove it")
-
-
-def _force_of(name: str, item: Constraint, periodic: bool) -> openmm.Force:
-    """The coordinate as a Force of OpenMM."""
-    if item.n_rows != 1:
-        raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row")
-    atoms = item.atoms[0].tolist()
-    force: Any
-    if isinstance(item, Formula):
-        return formula_rows(item)[0].force
-    if isinstance(item, DistanceDifference):
-        pairs = zip(item.slots, item.weights, strict=True)
-        terms = [f"({weight!r})*distance(p{i + 1},p{j + 1})" for (i, j), weight in pairs]
-        force, add, atoms = openmm.CustomCompoundBondForce(item.width, "+".join(terms)), "addBond", [atoms]
-    elif type(item) in _FORCES:
-        kind, energy, add = _FORCES[type(item)]
-        force = kind(energy)
-    else:
-        raise UnsupportedError(
-            f"{name} is {item!r}; windows in OpenMM hold a Distance, a DistanceDifference, an Angle, a Dihedral or a "
-            "Formula"
-        )
-    getattr(force, add)(*atoms, [])
-    force.setUsesPeriodicBoundaryConditions(periodic)
-    return force

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -142,18 +141,19 @@ class Sampler(ABC):
         """
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
-        """Coordinates at the initial structure, and their periods, shape (d,).
+        """Coordinates at the initial structure, and their periods, shape (d,); warns of torsions over no bonds.
 
         Raises
         ------
         KconsError
             A window cannot be made: a coordinate is undefined here or depends on the other constraints.
         """
-        return self.rows().begin()
+        rows = self.rows()
+        warn_of_gaps(self.coordinates, rows.bonds)
+        return rows.found, rows.periods
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
         """Run the window, and write its `Series` to `file` once it is finished."""
-        began = time.process_time()
         run = self.simulation(self.rows(), window, settings)
         if settings.pull:
             run.hold(window.start, window.target, window.seed, window.seed)
@@ -161,9 +161,7 @@ class Sampler(ABC):
         # New velocities: those of the pull's end have its rate.
         run.hold(window.target, window.target, window.seed + 2, window.seed + 1)
         run.step(settings.equilibration)
-        series = self._recorded(run, window, settings.production, settings.every)
-        series.seconds = time.process_time() - began
-        series.save(file)
+        self._recorded(run, window, settings.production, settings.every).save(file)
 
     def pull(self, window: Window, settings: Settings, file: Path) -> None:
         """Equilibrate at the start, pull to the target, and write the `Series` of the pull, every step of it."""
@@ -249,11 +247,6 @@ class Held:
         self.found = everything.measure(self.positions)[held.rows]
         self.periods = held.periods
 
-    def begin(self) -> tuple[FloatArray, FloatArray]:
-        """The coordinates where windows start from, and their periods; warns of torsions over what is not bonded."""
-        warn_of_gaps(self.coordinates, self.bonds)
-        return self.found, self.periods
-
     def _set(self, rows: list[Constraint]) -> ConstraintSet:
         return ConstraintSet(rows, self.positions, self.masses, cell=self.cell, pbc=self.pbc)
 
@@ -268,7 +261,9 @@ class Held:
         return [item.with_target([float(value)]) for item, value in pairs]
 
     def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
-        """The coordinates moved at a constant rate from time 0 on."""
+        """The coordinates moved at a constant rate from time 0 on; at rest where both ends are the same."""
+        if tuple(begin) == tuple(end):
+            return self.at(begin)
         rows = zip(self.coordinates.values(), begin, end, strict=True)
         return [
             item.with_target(MovingTarget(lambda t, a=a, b=b: a + (b - a) / duration * t))  # type: ignore[misc]

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
+from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
@@ -33,7 +34,7 @@ from kcons.mdanalysis.check.precision import (
     precision_of_reader,
 )
 from kcons.mdanalysis.check.result import Asked, CheckResult, result_of
-from kcons.mdanalysis.check.targets import AtomNames, TargetFile
+from kcons.mdanalysis.check.targets import label, read_targets, with_targets
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.topology import (
     constraints_of,
@@ -45,6 +46,7 @@ from kcons.mdanalysis.topology import (
 from kcons.motion.motion import Motion
 from kcons.topology.holding import Options
 from kcons.topology.rows_by_name import HeldRows
+from kcons.topology.topology import Topology
 
 #: Frames, and atoms in each, that a grid of coordinates is looked for in.
 GRID_FRAMES, GRID_ATOMS = 5, 1000
@@ -119,28 +121,28 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
                 "there are no constraints to check; select others, or look at the bonds of the topology",
                 item="constraints",
             )
-        described = topology_of(universe)
-        labels = AtomNames(universe, described.elements)
+        topology = topology_of(universe)
         self._used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
-        self._masses, reason = _masses(universe, described.masses, given, self._used, labels)
+        self._masses, reason = _masses(universe, topology, given, self._used)
         mode, text = str(targets), _MODES.get(str(targets), "")
         if not text:
-            given, mode, text = tuple(TargetFile(targets).apply(given, labels)), "given", str(targets)
+            given, mode, text = tuple(with_targets(targets, given, topology)), "given", str(targets)
         elif mode != "given":
             given = tuple(item if item.moving or not item.holonomic else item.with_target(None) for item in given)
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
         names = self._path or "memory", str(getattr(universe, "filename", None) or "topology")
         remarks = [f"no temperature: {reason}"] if reason else []
-        self.asked = Asked(names, labels, mode, text, whole_number(worst, "worst"), remarks + _remarks_on(reader))
+        self.asked = Asked(names, topology, mode, text, whole_number(worst, "worst"), remarks + _remarks_on(reader))
         self._given, self._tolerance, self._wants_rank = given, not_negative(tolerance, "tolerance"), rank
         #: Rounding of given targets that were measured in another file, in angstrom a coordinate, by atom.
         self.target_error: FloatArray = np.zeros(n_atoms)
-        self._precision = precision_of_reader(reader, precision)
-        self._by_frame = None
-        if self._precision.exact and precision is None:
-            self._by_frame = by_frame(self._path, reader._xdr.offsets, self._precision)
-        self._may_be_on_grid = precision is None and not (self._precision.step or self._precision.digits)
+        usual = precision_of_reader(reader, precision)
+        self._may_be_on_grid = precision is None and not (usual.step or usual.digits)
+        #: Of each frame.
+        self._precision = [usual] * reader.n_frames
+        if usual.exact and precision is None:
+            self._precision = by_frame(self._path, reader._xdr.offsets, usual)
         self._velocities = velocities_known(reader)
 
     @classmethod
@@ -170,34 +172,35 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             Constraints that cannot be, at the first frame.
         """
         chosen = {"start": start, "stop": stop, "step": step, "frames": frames}
+        numbers = self._numbers(slice(start, stop, step) if frames is None else np.asarray(frames))
+        if frames is not None:
+            chosen["frames"] = numbers
+        remarks = self._look_for_grid(numbers) if self._may_be_on_grid else []
+        remarks += self._bind(int(numbers[0]))
+        damage = damage_of(self._trajectory)
+        masses = self._masses if self._trajectory.ts.has_velocities else None
+        self._compute = _Frames(self._trajectory, self._rows, masses, self._velocities, damage, self._precision)
+        super().run(**chosen, **options)
+        if self.asked.mode == "mean":
+            self._rows.take_means(self.results.found)
+            super().run(**chosen, **options)
+        found: Found = self.results.found
+        if not len(found.frames):
+            assert found.broken is not None
+            raise self._nothing(found.broken)
         # Whether frames that were cut off would have been looked at.
         first, end = (stop, start) if step is not None and step < 0 else (start, stop)
         open_ended = end is None or end < 0 or end > self._trajectory.n_frames or (first or 0) < 0
-        self._to_the_end = Path(self._path).is_file() and frames is None and open_ended
-        numbers = self._numbers(chosen)
-        if frames is not None:
-            chosen["frames"] = numbers
-        remarks = list(self.asked.remarks)
-        if self._may_be_on_grid:
-            self._look_for_grid(numbers)
-        self._bind(int(numbers[0]))
-        self._damage = damage_of(self._trajectory)
-        given = self._masses if self._trajectory.ts.has_velocities else None
-        precision = self._by_frame or self._precision
-        self._compute = _Frames(self._trajectory, self._rows, given, self._velocities, self._damage, precision)
-        self._first_pass = self.asked.mode == "mean"
-        if self._first_pass:
-            super().run(**chosen, **options)
-            self._rows.take_means(self.results.found)
-            self._first_pass = False
-        super().run(**chosen, **options)
-        self.asked.remarks = remarks
+        if found.broken is None and Path(self._path).is_file() and frames is None and open_ended:
+            found.broken = damage or ending_of(self._trajectory)
+        text = described([self._precision[frame] for frame in self.frames.tolist()], self._largest)
+        asked = replace(self.asked, remarks=self.asked.remarks + remarks)
+        self.results.check = result_of(found, self._rows, asked, text, self._rank, int(self._trajectory.n_frames))
         return self
 
-    def _numbers(self, chosen: dict[str, Any]) -> Sequence[int]:
+    def _numbers(self, part: slice | NDArray[Any]) -> list[int]:
         """Frames to look at, at least one, counted from the beginning."""
-        count, name, given = self._trajectory.n_frames, self.asked.names[0], chosen["frames"]
-        part = slice(*(chosen[end] for end in ("start", "stop", "step"))) if given is None else np.asarray(given)
+        count, name = self._trajectory.n_frames, self.asked.names[0]
         try:
             numbers: list[int] = np.arange(count)[part].tolist()
         except (IndexError, ValueError, TypeError) as error:
@@ -210,8 +213,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
         return numbers
 
-    def _look_for_grid(self, numbers: Sequence[int]) -> None:
-        """Take the grid that coordinates lie on, in frames from first to last, for the precision of the file."""
+    def _look_for_grid(self, numbers: Sequence[int]) -> list[str]:
+        """Take the grid that coordinates lie on, in frames from first to last, for the precision; what to say of it."""
         used = self._used[:: -(-len(self._used) // GRID_ATOMS)]
         seen = []
         for k in np.unique(np.linspace(0, len(numbers) - 1, GRID_FRAMES).astype(int)).tolist():
@@ -219,15 +222,16 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             with suppress(*READ_ERRORS):
                 seen.append(np.array(self._trajectory[numbers[k]].positions[used]))
         step = grid_of(seen) if seen and np.isfinite(seen).all() else 0.0
-        self._precision = replace(self._precision, step=step)
-        if step:
-            self.asked.remarks.append(
-                f"coordinates lie on a grid of {step:g} Å, as after a conversion from XTC or text: that is taken for "
-                "their precision, unless one is given"
-            )
+        self._precision = [replace(self._precision[0], step=step)] * len(self._precision)
+        if not step:
+            return []
+        return [
+            f"coordinates lie on a grid of {step:g} Å, as after a conversion from XTC or text: that is taken for "
+            "their precision, unless one is given"
+        ]
 
-    def _bind(self, frame: int) -> None:
-        """Rows and their targets at one frame, which must be finite."""
+    def _bind(self, frame: int) -> list[str]:
+        """Rows and their targets at one frame, which must be finite; what to say of their rank."""
         try:
             ts = self._trajectory[frame]
             bad = self._used[~np.isfinite(ts.positions[self._used]).all(axis=1)]
@@ -239,17 +243,15 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             raise self._nothing(Break(frame, str(error))) from None
         self._largest = float(np.abs(ts.positions[self._used]).max())
         masses = np.ones(ts.n_atoms) if self._masses is None else self._masses
-        precision = self._precision_at(frame)
+        precision = self._precision[frame]
         self._rows = RowTable(self._given, masses, ts, precision, self.target_error, self._tolerance)
         self._rank: int | None = None
         try:
             if self._wants_rank:
                 self._rank = Motion(self._rows.set, precision.stored(ts.positions)).rank
         except KconsError as error:
-            self.asked.remarks.append(f"no rank: {error}")
-
-    def _precision_at(self, frame: int) -> Any:
-        return self._precision if self._by_frame is None else self._by_frame[frame]
+            return [f"no rank: {error}"]
+        return []
 
     def _nothing(self, broken: Break) -> UnreadableError:
         """Of a trajectory of which nothing can be told."""
@@ -261,19 +263,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 
     def _get_aggregator(self) -> ResultsGroup:
         return ResultsGroup(lookup={"found": Found.joined})
-
-    def _conclude(self) -> None:
-        found: Found = self.results.found
-        if self._first_pass:
-            return
-        if not len(found.frames):
-            assert found.broken is not None
-            raise self._nothing(found.broken)
-        if found.broken is None and self._to_the_end:
-            found.broken = self._damage or ending_of(self._trajectory)
-        text = described([self._precision_at(frame) for frame in self.frames.tolist()], self._largest)
-        n_in_file = int(self._trajectory.n_frames)
-        self.results.check = result_of(found, self._rows, self.asked, text, self._rank, n_in_file)
 
     @property
     def check(self) -> CheckResult:
@@ -303,14 +292,16 @@ class _Frames:
     masses: FloatArray | None
     velocities: bool
     damage: Break | None
-    #: Of all frames, or of each.
-    precision: FilePrecision | Sequence[FilePrecision]
+    #: Of each frame.
+    precision: list[FilePrecision]
 
     def __call__(
         self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
     ) -> Any:
         """Look at frames, in order, up to the first that cannot be used."""
         numbers, trajectory, previous = indexed_frames[:, 1], self.trajectory, -1
+        # The reader of DCD copies a frame before it reads the next one into the copy, which takes as long again.
+        in_place = isinstance(trajectory, DCDReader) and not trajectory.transformations
         found = Found.nothing(self.rows.n_rows, numbers)
         with quiet(), ProgressBar(total=len(numbers), verbose=bool(verbose), **(progressbar_kwargs or {})) as bar:
             for k, number in enumerate(numbers.tolist()):
@@ -319,12 +310,13 @@ class _Frames:
                         found.broken = self.damage
                     else:
                         # Seeking reads compressed files from their beginning.
-                        ts = trajectory.next() if 0 <= previous == number - 1 else trajectory[number]
+                        if not 0 <= previous == number - 1:
+                            ts = trajectory[number]
+                        else:
+                            ts = trajectory._read_next_timestep(trajectory.ts) if in_place else trajectory.next()
                         previous = number
                         v = ts.velocities if ts.has_velocities and self.velocities else None
-                        told = self.precision
-                        told = told if isinstance(told, FilePrecision) else told[number]
-                        self.rows.look(found, k, ts, told, self.masses, v)
+                        self.rows.look(found, k, ts, self.precision[number], self.masses, v)
                 except (*READ_ERRORS, KconsError) as error:
                     found.broken = broken_by(error, trajectory, number)
                 if found.broken is not None:
@@ -335,7 +327,7 @@ class _Frames:
 
 
 def _masses(
-    universe: Any, masses: FloatArray, given: Sequence[Constraint], used: NDArray[np.int64], labels: AtomNames
+    universe: Any, topology: Topology, given: Sequence[Constraint], used: NDArray[np.int64]
 ) -> tuple[FloatArray | None, str]:
     """Masses; or None where they cannot be used, and why.
 
@@ -344,6 +336,7 @@ def _masses(
     InputError
         Constraints on atoms that do not exist, or that need masses.
     """
+    masses = topology.masses
     if used[-1] >= len(masses):
         raise InputError(
             f"there is no atom {used[-1]}; the topology has atoms 0 to {len(masses) - 1}",
@@ -353,7 +346,7 @@ def _masses(
     bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
     if not len(bad):
         return masses, ""
-    reason = f"{labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}"
+    reason = f"{label(topology, bad[:1].tolist())} has mass {masses[bad[0]]:g}"
     if not hasattr(universe.atoms, "masses"):
         reason = "the topology has no masses"
     reason += "; give a topology with masses, such as PSF, PRMTOP or TPR"
@@ -421,43 +414,40 @@ def check_trajectory(
         A trajectory of which nothing can be told: cut off, or not finite, in its first frame.
     """
     chosen = _slice(frames)
-    if workers < 1:
-        raise InputError(f"{workers} workers; give 1 or more", item="workers")
-    of_topology = str(targets) == "topology"
+    whole_number(workers, "workers", 1)
     if str(targets) not in ("topology", "first", "mean"):
-        TargetFile(targets)  # complain of it before anything long
-    held = {name: options.pop(name) for name in Options.__annotations__ if name in options}
+        read_targets(targets)  # complain of it before anything long
+    of_topology, errors = str(targets) == "topology", None
+    universe = open_universe(topology, topology_format=topology_format)
     if of_topology:
-        universe = open_universe(topology, topology_format=topology_format)
         if not hasattr(universe, "trajectory"):
             raise InputError(
                 f"{topology} has no coordinates to take lengths from; give --targets first, mean, or a TOML file",
                 item="targets",
             )
         with quiet():
-            precision = precision_of(topology, format_of(universe.trajectory))
-            errors = precision.half_step(universe.atoms.positions)
-        constraints = _held(universe, constrain, held)
-        load_trajectory(universe, trajectory, topology, format=format)
+            errors = precision_of(topology, format_of(universe.trajectory)).half_step(universe.atoms.positions)
     else:
-        universe = open_universe(topology, trajectory, format=format, topology_format=topology_format)
+        load_trajectory(universe, trajectory, topology, format=format)
         # Bonds are looked for in the first frame that is looked at; one that is not there is for the check to refuse.
         with quiet(), suppress(*READ_ERRORS):
             _ = universe.trajectory[chosen.get("start") or 0]
-        constraints = _held(universe, constrain, held)
-    check = ConstraintCheck(universe, constraints, targets="given" if of_topology else targets, **options)
-    check.asked.names = str(trajectory), str(topology)
+    held = _held(universe, constrain, {name: options.pop(name) for name in Options.__annotations__ if name in options})
     if of_topology:
+        load_trajectory(universe, trajectory, topology, format=format)
+    check = ConstraintCheck(universe, held, targets="given" if of_topology else targets, **options)
+    check.asked.names = str(trajectory), str(topology)
+    if errors is not None:
         check.asked.targets, check.target_error = f"coordinates of {topology}", errors
-    if guessed := constraints.bonds_guessed:
+    if guessed := held.bonds_guessed:
         check.asked.remarks.append(
             f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "
             "topology with bonds, such as PSF, PRMTOP or TPR"
         )
-    if len(loose := constraints.loose_hydrogens):
+    if len(loose := held.loose_hydrogens):
         check.asked.gaps.append(
             f"no bond was found for {len(loose)} hydrogens, the first of which is "
-            f"{constraints.topology.atom_name(int(loose[0]))}, so that rows are missing; give files with the cell, at "
+            f"{held.topology.atom_name(int(loose[0]))}, so that rows are missing; give files with the cell, at "
             "whose faces molecules may be cut, or a topology with bonds"
         )
     few = ALONE.get(format_of(universe.trajectory), ALONE[""])
@@ -473,23 +463,22 @@ def _held(universe: Any, constrain: str | None, held: dict[str, Any]) -> HeldRow
         try:
             return constraints_of(universe, constrain, **held)
         except InputError as error:
-            if error.item == "positions" and not np.isfinite(universe.atoms.positions).all():
-                reader = universe.trajectory
-                raise UnreadableError(
-                    f"{reader.filename}: {error}, in frame {reader.frame}, the first to be looked at; begin at a later "
-                    "one (--frames A:), or write the file again",
-                    item="trajectory",
-                ) from None
-            raise
+            if error.item != "positions" or np.isfinite(universe.atoms.positions).all():
+                raise
+            reader = universe.trajectory
+            raise UnreadableError(
+                f"{reader.filename}: {error}, in frame {reader.frame}, the first to be looked at; begin at a later "
+                "one (--frames A:), or write the file again",
+                item="trajectory",
+            ) from None
 
 
 def _slice(frames: str | None) -> dict[str, Any]:
-    if frames is None:
-        return {}
+    """'A:B:STEP' as arguments."""
     try:
-        numbers = [int(word) if word.strip() else None for word in frames.split(":")]
+        numbers = [int(word) if word.strip() else None for word in (":" if frames is None else frames).split(":")]
     except ValueError:
         numbers = []
-    if not 2 <= len(numbers) <= 3 or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
+    if not 2 <= len(numbers) <= 3 or (numbers[2:] and numbers[2] is not None and numbers[2] < 1):
         raise InputError(f"frames are {frames!r}; give them as A:B or A:B:STEP, such as 100::10", item="frames")
     return dict(zip(("start", "stop", "step"), numbers, strict=False))

@@ -29,7 +29,7 @@ from kcons.errors import NonFiniteError
 from kcons.mdanalysis.check.endings import Break
 from kcons.mdanalysis.check.precision import FilePrecision
 from kcons.mdanalysis.topology import NARROWEST
-from kcons.solvers.kernels.lattices import NO_LATTICE, nearest_image
+from kcons.solvers.kernels.lattices import NO_LATTICE, TRICLINIC, lattice_numbers, minimum_image
 
 #: Natural units of rows, in this order.
 UNITS = ("Å", "rad")
@@ -270,7 +270,9 @@ def _by_row(constraints: Sequence[Constraint], values: Sequence[Any]) -> Any:
 
 @njit(cache=True, nogil=True)
 def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untyped-def]
-    """Deviations of all rows in one frame.
+    """Put deviations of all rows in one frame, the `frame`-th, into `by_row` and `by_unit`.
+
+    The first atom of a row that is not finite is returned, and nothing changed then; -1 if there is none.
 
     Parameters
     ----------
@@ -281,17 +283,10 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
         grid of the coordinates in the file, 0 if there is none; what their rounding is, see `FilePrecision`.
     held : (ndarray, ndarray, ndarray)
         See `_HELD`; deviation, rounding and rate of rows that are no lengths; first row, end and unit of runs.
-    by_row, by_unit : structured arrays
-        Changed in place.
-    frame : int
-
-    Returns
-    -------
-    int
-        The first atom of a row that is not finite; nothing was changed then. -1 if there is none.
     """
     x, bits, is_held, v = atoms
     lattice, limit, step, base, factor, reach = space
+    cell = lattice_numbers(lattice)
     table, given, runs = held
     powers, points = np.empty(len(x), dtype=np.float32), np.empty((len(x), 3))
     # As the file holds them.
@@ -318,7 +313,7 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
                 dx, dy, dz = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
                 square = dx * dx + dy * dy + dz * dz
                 if not square < limit:
-                    dx, dy, dz = nearest_image(dx, dy, dz, lattice)
+                    dx, dy, dz = minimum_image(dx, dy, dz, cell, TRICLINIC)
                     square = dx * dx + dy * dy + dz * dz
                 off = np.sqrt(square) - row.target
                 rounding = _ROOT_THREE * (2.0 * base + factor * (powers[i] + powers[j]))

@@ -11,7 +11,6 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -97,11 +96,8 @@ def _ending(reader: Any, path: str) -> Break | None:
     elif name in ("XTC", "TRR"):
         end = reader._xdr._bytes_tell()
     elif more := _behind_the_only_frame(path, name, reader.n_atoms):
-        return Break(
-            1,
-            f"MDAnalysis reads one frame of {name} files, and {more}; write the frames as XTC, DCD or PDB",
-            ends=False,
-        )
+        reason = f"MDAnalysis reads one frame of {name} files, and {more}; write the frames as XTC, DCD or PDB"
+        return Break(1, reason, ends=False)
     else:
         return None
     return Break(n, f"{size - end} bytes follow the last whole frame") if end < size else None
@@ -140,43 +136,44 @@ def _order(path: str) -> str:
         return "<" if struct.unpack("<i", file.read(4))[0] in (84, 164) else ">"
 
 
-def _behind_the_only_frame(path: str | Path, file_format: str, n_atoms: int) -> str:
+def _behind_the_only_frame(path: str, file_format: str, n_atoms: int) -> str:
     """What lies behind the frame of a format of which MDAnalysis reads one; '' if nothing does."""
+    more, what, models = 0, "lines", 0
     if file_format == "CIF":
         import gemmi
 
-        of_atoms = [block.find_values("_atom_site.pdbx_PDB_model_num") for block in gemmi.cif.read(str(path))]
+        of_atoms = [block.find_values("_atom_site.pdbx_PDB_model_num") for block in gemmi.cif.read(path)]
         models = sum(len(set(numbers)) for numbers in of_atoms)
-        return f"this one has {models}" if models > 1 else ""
-    if file_format == "COOR":
-        more = os.path.getsize(path) - 4 - 24 * n_atoms
-        return f"{more} bytes follow it" if more > 0 else ""
-    if file_format not in ("GRO", "INPCRD", "CONFIG", "PQR", "PDBQT"):
-        return ""
-    lines = atoms = models = 0
-    with anyopen(str(path), "rb") as file:
-        for number, line in enumerate(file, 1):
-            lines = number if line.strip() else lines
-            atoms += line.startswith((b"ATOM", b"HETATM"))
-            models += line.startswith(b"MODEL")
-    if file_format in ("PQR", "PDBQT"):
-        if models > 1:
-            return f"this one has {models}"
-        return f"{atoms - n_atoms} atoms follow it" if atoms > n_atoms else ""
-    # At most: title, number of atoms and a cell; of INPCRD two atoms a line, with velocities.
-    most = {"GRO": n_atoms + 3, "INPCRD": 3 + 2 * ((n_atoms + 1) // 2)}.get(file_format)
-    if most is None:
-        most = 5 + n_atoms * (2 + int(_line(path, 1).split()[0]))
-    return f"{lines - most} lines follow it" if lines > most else ""
+    elif file_format == "COOR":
+        more, what = os.path.getsize(path) - 4 - 24 * n_atoms, "bytes"
+    elif file_format in ("PQR", "PDBQT"):
+        with anyopen(path, "rb") as file:
+            begins = [line[:5] for line in file if line.startswith((b"ATOM", b"HETATM", b"MODEL"))]
+        models = begins.count(b"MODEL")
+        more, what = len(begins) - models - n_atoms, "atoms"
+    elif file_format in ("GRO", "INPCRD", "CONFIG"):
+        with anyopen(path, "rb") as file:
+            lines = max((number for number, line in enumerate(file, 1) if line.strip()), default=0)
+        # At most: title, number of atoms and a cell; of INPCRD two atoms a line, with velocities.
+        most = {"GRO": n_atoms + 3, "INPCRD": 3 + 2 * ((n_atoms + 1) // 2)}.get(file_format)
+        more = lines - (most or 5 + n_atoms * (2 + int(_line(path, 1).split()[0])))
+    if models > 1:
+        return f"this one has {models}"
+    return f"{more} {what} follow it" if more > 0 else ""
 
 
-def _text_break(path: str | Path, file_format: str, n_atoms: int) -> Break | None:
+def _text_break(path: str, file_format: str, n_atoms: int) -> Break | None:
     """Where the whole frames of a text format end whose frames have equal numbers of lines; None for other formats.
 
     Of PDB, whose frames may differ, only a last line without an end is seen.
     """
+    lines, blank, models, line, wrong = 0, 0, 0, b"", None
     if file_format == "PDB":
-        return _pdb_break(path)
+        with anyopen(path, "rb") as file:
+            for line in file:
+                models += line.startswith(b"MODEL")
+        cut = line.startswith((b"ATOM", b"HETATM")) and not line.endswith(b"\n")
+        return Break(max(models, 1) - 1, "its last line has no end") if cut else None
     if file_format not in ("XYZ", "LAMMPSDUMP", "TXYZ", "TRJ"):
         return None
     # Lines of a title; those of a frame besides its atoms, and which of them says how many atoms there are.
@@ -189,8 +186,8 @@ def _text_break(path: str | Path, file_format: str, n_atoms: int) -> Break | Non
     elif file_format == "TXYZ":
         # Six numbers of the cell may follow the number of atoms.
         per_frame += _all_numbers(_line(path, 1), 6)
-    lines, blank, line, wrong = -title, 0, b"", None
-    with anyopen(str(path), "rb") as file:
+    lines = -title
+    with anyopen(path, "rb") as file:
         for line in file:
             blank = 0 if line.strip() else blank + 1
             if count >= 0 and lines % per_frame == count and wrong is None and line.endswith(b"\n"):
@@ -199,10 +196,9 @@ def _text_break(path: str | Path, file_format: str, n_atoms: int) -> Break | Non
                     wrong = lines // per_frame, line
             # Empty lines at the end are no frame.
             if wrong is not None and not blank:
-                said = wrong[1].decode(errors="replace").strip()
-                return Break(
-                    wrong[0], f"it has {said!r:.40} where its number of atoms has to be, {n_atoms}", ends=False
-                )
+                said = f"{wrong[1].decode(errors='replace').strip()!r:.40}"
+                reason = f"it has {said} where its number of atoms has to be, {n_atoms}"
+                return Break(wrong[0], reason, ends=False)
             lines += 1
     lines -= blank
     whole = (lines - (not line.endswith(b"\n"))) // per_frame
@@ -210,19 +206,9 @@ def _text_break(path: str | Path, file_format: str, n_atoms: int) -> Break | Non
     return Break(whole, f"{more} lines follow the last whole frame") if more > 0 else None
 
 
-def _pdb_break(path: str | Path) -> Break | None:
-    models, line = 0, b""
-    with anyopen(str(path), "rb") as file:
-        for line in file:
-            models += line.startswith(b"MODEL")
-    if line.startswith((b"ATOM", b"HETATM")) and not line.endswith(b"\n"):
-        return Break(max(models, 1) - 1, "its last line has no end")
-    return None
-
-
-def _line(path: str | Path, number: int) -> bytes:
+def _line(path: str, number: int) -> bytes:
     """A line of a text file, counted from 0; b'' behind its end."""
-    with anyopen(str(path), "rb") as file:
+    with anyopen(path, "rb") as file:
         found: bytes = next(islice(file, number, None), b"")
     return found
 

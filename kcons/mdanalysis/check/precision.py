@@ -61,17 +61,11 @@ class FilePrecision:
     def coefficients(self) -> tuple[float, float, float]:
         """How far rounding moves coordinates: by base at most, and by base + factor 2^e of atoms from reach on.
 
-        Returns
-        -------
-        base, factor, reach : float
-            2^e <= |x| < 2^(e+1) for an atom's largest coordinate; reach is a power of two, or 0.
-
-        Notes
-        -----
-        Integers of XTC are turned into nanometers, and these into angstrom, with four roundings; they can be had back
-        where these make less than half a step. Where they cannot, the one taken for it is off by twice the four.
+        2^e <= |x| < 2^(e+1) for an atom's largest coordinate; reach is a power of two, or 0.
         """
         if self.exact:
+            # Integers of XTC are turned into nanometers, and these into angstrom, with four roundings; they can be had
+            # back where these make less than half a step. Elsewhere the one taken for it is off by twice the four.
             return 0.5 * self.step, 16 * HALF_UNIT, 2.0 ** np.floor(np.log2(self.step / (8 * HALF_UNIT)))
         if self.digits:
             # The last digit is worth 10^(1 - digits) of the number, at most, and numbers are below 2 2^e.
@@ -87,17 +81,7 @@ class FilePrecision:
         return np.rint(exact * (1.0 / self.grid)) * self.grid if self.grid > 0 else exact
 
     def half_step(self, coordinates: ArrayLike) -> FloatArray:
-        """Largest error by rounding of the coordinates of atoms; infinite where there are no numbers.
-
-        Parameters
-        ----------
-        coordinates : array_like, shape (..., 3)
-            In angstrom.
-
-        Returns
-        -------
-        ndarray, shape (...)
-        """
+        """Largest error by rounding of coordinates of atoms, shape (..., 3); infinite where there are no numbers."""
         size = np.abs(np.asarray(coordinates, dtype=np.float64)).max(axis=-1)
         base, factor, reach = self.coefficients
         with np.errstate(all="ignore"):
@@ -108,15 +92,9 @@ class FilePrecision:
 
 
 def precision_of(path: str | Path, file_format: str, step: float | None = None) -> FilePrecision:
-    """Precision of a file; read from the file itself where it says.
+    """Precision of a file, whose format is as MDAnalysis names it; read from the file itself where it says.
 
-    Parameters
-    ----------
-    path : str or Path
-    file_format : str
-        As MDAnalysis names it, such as 'XTC'.
-    step : float, optional
-        What a person knows better, in angstrom.
+    `step` is what a person knows better, in angstrom.
 
     Raises
     ------
@@ -142,13 +120,7 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
 
 
 def precision_of_reader(reader: Any, step: float | None = None) -> FilePrecision:
-    """Precision of the coordinates that a reader of MDAnalysis gives; of several files, that of the coarsest.
-
-    Raises
-    ------
-    InputError
-        `step`, in angstrom, is not positive.
-    """
+    """As `precision_of`, of the coordinates that a reader gives; of several files that of the coarsest."""
     parts = [precision_of_reader(part, step) for part in getattr(reader, "readers", ())]
     if parts:
         return replace(max(parts, key=lambda part: float(part.half_step([1.0]))), exact=False)
@@ -177,12 +149,10 @@ def described(precisions: Sequence[FilePrecision], largest: float) -> str:
     return f"{usual.format} stores coordinates in single precision: steps of {step}"
 
 
-def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision] | None:
-    """Precision of each frame, by where it begins, of an XTC file put together from several; None if all are alike."""
+def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision]:
+    """Precision of each frame, by where it begins, of an XTC file, which may be put together from several."""
     with open(path, "rb") as file:
         found = [_xtc_precision(file, int(offset)) for offset in offsets]
-    if len(set(found)) < 2:
-        return None
     kinds = {steps: replace(usual, step=10.0 / steps, exact=True) if steps else usual for steps in set(found)}
     return [kinds[steps] for steps in found]
 
@@ -215,8 +185,7 @@ def grid_of(coordinates: ArrayLike) -> float:
 
 
 def _off_grid(x: FloatArray, step: float) -> FloatArray:
-    result: FloatArray = np.abs(x - np.rint(x / step) * step)
-    return result
+    return np.asarray(np.abs(x - np.rint(x / step) * step))
 
 
 def _gro_decimals(path: str | Path) -> int:

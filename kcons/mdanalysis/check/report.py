@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from kcons.mdanalysis.check.result import CheckResult
 
 COLORS = {"kept": "green", "tolerated": "green", "violated": "red", "incomplete": "yellow"}
-#: What `write` writes.
+#: What `write` writes: data, picture, page.
 FILES = ("check.json", "check.png", "check.txt")
 #: Deviations that are this part of the largest, or less, are not drawn.
 _NOTHING = 1e-6
@@ -62,9 +61,11 @@ def _units(result: CheckResult) -> Table:
         headers += ["largest |Av|\na ps", "rms |Av|\na ps"]
     rows = []
     for unit in result.units:
-        drift = "" if unit.drift is None else f"{1000 * unit.drift.slope:.1e}"
-        if unit.drift is not None and not unit.drift.significant:
-            drift = f"({drift})"
+        drift = ""
+        if unit.drift is not None and unit.drift_error is not None:  # in parentheses where it may be none
+            drift = (
+                f"{1000 * unit.drift:.1e}" if abs(unit.drift) > 3 * unit.drift_error else f"({1000 * unit.drift:.1e})"
+            )
         cells = [unit.unit, str(unit.n_rows), f"{unit.largest:.2e}", f"{unit.rms:.2e}", f"{unit.rounding_rms:.2e}"]
         cells += [f"{unit.mean:.1e}", f"{unit.largest_mean:.1e}", drift]
         if rates:
@@ -128,41 +129,28 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
     figure.savefig(path, dpi=150, format="png")
 
 
-def write(result: CheckResult, folder: Path, *, text: str = "") -> list[Path]:
-    """Put check.json, check.png and, if given, the page as text into `folder`; the paths written.
+def results(folder: Path, trajectory: str | Path) -> ResultFolder:
+    """The folder of the check of a trajectory."""
+    return ResultFolder(folder, FILES[0], {"file": str(Path(trajectory).resolve())}, FILES, "a check")
+
+
+def write(
+    folder: Path, trajectory: str | Path, data: dict[str, Any], picture: bytes = b"", text: str = ""
+) -> list[Path]:
+    """Write what there is, and take away what an earlier check of the same trajectory left; the paths written.
 
     Raises
     ------
     OccupiedError
         The folder has the check of another trajectory, or other files of these names; nothing was written.
     """
-    picture = io.BytesIO()
-    plot(result, picture)
-    return _put(folder, result.trajectory, result.to_dict(), picture.getvalue(), text)
-
-
-def write_failure(trajectory: str | Path, reason: str, folder: Path) -> list[Path]:
-    """As `write`, of a trajectory of which nothing could be read: check.json alone."""
-    return _put(folder, trajectory, {"trajectory": str(trajectory), "status": "incomplete", "verdict": reason})
-
-
-def results(folder: Path, trajectory: str | Path) -> ResultFolder:
-    """The folder of the check of a trajectory."""
-    return ResultFolder(folder, FILES[0], {"file": str(Path(trajectory).resolve())}, FILES, "a check")
-
-
-def _put(
-    folder: Path, trajectory: str | Path, data: dict[str, Any], picture: bytes = b"", text: str = ""
-) -> list[Path]:
-    """Write what there is, and take away what an earlier check of the same trajectory left."""
     place = results(folder, trajectory)
-    whole = as_json({**place.owner, **data})
     # Names of files need not be text; in JSON the replacement is what stands for such a character.
+    whole = f"{as_json({**place.owner, **data})}\n".encode(errors="backslashreplace")
     page = f"{text}\n".encode(errors="replace") if text else b""
-    contents = [f"{whole}\n".encode(errors="backslashreplace"), picture, page]
     written = []
     with place.taken():
-        for path, content in zip([folder / name for name in FILES], contents, strict=True):
+        for path, content in zip([folder / name for name in FILES], (whole, picture, page), strict=True):
             if not content:
                 path.unlink(missing_ok=True)
                 continue

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from kcons.constraints.target import FloatArray
 from kcons.mdanalysis.check.deviations import UNITS, Found, RowTable
 from kcons.mdanalysis.check.endings import Break
-from kcons.mdanalysis.check.targets import AtomNames
+from kcons.mdanalysis.check.targets import label
+from kcons.thermostats import Estimate
 from kcons.thermostats.correlated_series import slope
+from kcons.topology.topology import Topology
 
 #: Boltzmann's constant in amu Å²/(ps² K).
 BOLTZMANN = 0.831446261815324
@@ -20,150 +22,95 @@ BOLTZMANN = 0.831446261815324
 STILL = 1e-2
 
 
-@dataclass(frozen=True)
-class Drift:
-    """Straight line through one number a frame."""
-
-    slope: float
-    error: float
-
-    @property
-    def significant(self) -> bool:
-        """Whether the slope exceeds three times its standard error."""
-        return abs(self.slope) > 3 * self.error
-
-
-def fitted(times: FloatArray, values: FloatArray) -> Drift | None:
-    """Least squares of values against times, which may depend on their neighbors; None for fewer than three times."""
+def fitted(times: FloatArray, values: FloatArray) -> Estimate | None:
+    """Slope of values, which may depend on their neighbors, against times; None for fewer than three times."""
     good = np.isfinite(values) & np.isfinite(times)
     t, y = times[good], values[good]
-    if len(t) < 3 or not np.ptp(t) > 0:
-        return None
-    found = slope(t, y)
-    return Drift(found.value, found.error)
+    return slope(t, y) if len(t) > 2 and np.ptp(t) > 0 else None
 
 
 @dataclass(frozen=True)
 class UnitResult:
-    """Rows of one natural unit.
-
-    Attributes
-    ----------
-    unit : str
-    n_rows : int
-    largest, rms, mean : float
-        Over all rows and frames: largest absolute deviation, root mean square, mean.
-    bound : float
-        What rounding in the file makes of a row that is kept, at most, in the frame and row where it makes most.
-    tolerance : float
-        What the tolerance allows the shortest row, besides rounding.
-    rounding_rms : float
-        The root mean square of rounding alone.
-    largest_mean : float
-        Largest absolute mean of a row over the frames: rounding averages out of it.
-    drift : Drift or None
-        Of the root mean square, an ps.
-    rate_largest, rate_rms : float or None
-        Of A v, where velocities are stored.
-    """
+    """All rows of one natural unit, over all frames."""
 
     unit: str
     n_rows: int
+    #: Largest absolute deviation, root mean square, mean.
     largest: float
     rms: float
     mean: float
+    #: What rounding in the file makes of a row that is kept, at most, in the frame and row where it makes most.
     bound: float
+    #: What the tolerance allows the shortest row, besides rounding.
     tolerance: float
+    #: The root mean square of rounding alone.
     rounding_rms: float
+    #: Largest absolute mean of a row over the frames: rounding averages out of it.
     largest_mean: float
-    drift: Drift | None
+    #: Slope of the root mean square, a ps, and its standard error; None for fewer than three times.
+    drift: float | None
+    drift_error: float | None
+    #: Of A v, where velocities are stored.
     rate_largest: float | None = None
     rate_rms: float | None = None
 
 
 @dataclass(frozen=True)
 class RowResult:
-    """One of the worst rows.
-
-    Attributes
-    ----------
-    row : int
-    name : str
-    atoms : list of int
-    unit : str
-    target : float
-    largest, allowed : float
-        Absolute deviation and what was allowed, in the frame where the first exceeds the second most.
-    mean : float
-        Over the frames.
-    frame : int or None
-        That frame; None where nothing could be told in any.
-    """
+    """One of the worst rows."""
 
     row: int
     name: str
     atoms: list[int]
     unit: str
     target: float
-    largest: float
+    #: Mean over the frames; absolute deviation, and what was allowed, in the frame where it exceeds this most.
     mean: float
+    largest: float
     allowed: float
+    #: That frame; None where nothing could be told in any.
     frame: int | None
 
 
 @dataclass
 class CheckResult:
-    """All that a check found.
+    """All that a check found."""
 
-    Attributes
-    ----------
-    status : {'kept', 'tolerated', 'violated', 'incomplete'}
-        Kept to the precision of the file; kept to the tolerance given; neither; no violation, but not all that was
-        asked could be told, see `gaps`.
-    verdict : str
-        The same in a sentence.
-    frames, times : list
-        Frames looked at, and their times in ps.
-    units : list of UnitResult
-    worst : list of RowResult
-        Violated rows first, then by their largest deviation.
-    series : dict
-        Numbers by frame: largest and root mean square deviation, and the largest that rounding makes, for each unit;
-        temperature.
-    rank, degrees_of_freedom : int or None
-        None where the rank could not be found; see `remarks`.
-    temperature : dict or None
-        Mean, standard deviation and drift in K; None without velocities or masses.
-    broken : Break or None
-        Where the file ends too early, or is no longer numbers.
-    gaps : list of str
-        Why the check is no verdict on all that was asked.
-    """
-
+    #: What to call the files.
     trajectory: str
     topology: str
     n_atoms: int
     n_rows: int
     n_constrained: int
+    #: 'kept' to the precision of the file; 'tolerated': kept to the tolerance given; 'violated': neither; 'incomplete':
+    #: no violation, but not all that was asked could be told, see `gaps`.
     status: str
     precision: str
     tolerance: float
     targets: str
+    #: Frames looked at, and their times in ps.
     frames: list[int]
     times: list[float]
     n_frames_in_file: int
     units: list[UnitResult]
+    #: Violated rows first, then by their largest deviation.
     worst: list[RowResult]
     violated_rows: int
     violated_frames: int
     first_violated_frame: int | None
+    #: None where the rank could not be found; see `remarks`.
     rank: int | None
     degrees_of_freedom: int | None
+    #: Mean, standard deviation and drift in K; None without velocities or masses.
     temperature: dict[str, float] | None
+    #: Where the file ends too early, or is no longer numbers.
     broken: Break | None
+    #: By frame: largest and root mean square deviation and the largest that rounding makes, by unit; temperature.
     series: dict[str, list[float]]
+    #: Why the check is no verdict on all that was asked.
     gaps: list[str]
     remarks: list[str]
+    #: The status in a sentence.
     verdict: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -194,7 +141,7 @@ class Asked:
 
     #: What to call trajectory and topology.
     names: tuple[str, str]
-    labels: AtomNames
+    topology: Topology
     #: Where targets come from, 'given', 'first' or 'mean', and the same in words.
     mode: str
     targets: str
@@ -240,13 +187,13 @@ def result_of(
         freedom, kelvin = _temperatures(found, rank, held.masses, remarks)
         if kelvin is not None:
             series["temperature K"] = kelvin.tolist()
-            line = fitted(times, kelvin)
+            line = fitted(times, kelvin) or Estimate(np.nan, np.nan)
             temperature = {
                 "mean": float(np.nanmean(kelvin)),
                 "deviation": float(np.nanstd(kelvin)),
                 "frames": float(np.isfinite(kelvin).sum()),
-                "slope": line.slope if line else float("nan"),
-                "slope_error": line.error if line else float("nan"),
+                "slope": line.value,
+                "slope_error": line.error,
             }
     return CheckResult(
         trajectory=asked.names[0],
@@ -262,7 +209,7 @@ def result_of(
         times=times.tolist(),
         n_frames_in_file=n_in_file,
         units=units,
-        worst=[_row(table, asked.labels, found, int(row)) for row in order[: asked.worst]],
+        worst=[_row(table, asked.topology, found, int(row)) for row in order[: asked.worst]],
         violated_rows=int(violated.sum()),
         violated_frames=len(frames),
         first_violated_frame=int(frames[0]) if len(frames) else None,
@@ -284,6 +231,7 @@ def _unit(table: RowTable, found: Found, unit: int, untold: NDArray[np.bool_], m
     of_targets = table.of_targets if mode != "mean" else np.where(table.measured, 0.0, table.of_targets)
     rounding = (table.spread * np.hypot(found.mean("rounded"), of_targets))[mine]
     rates = seen[np.isfinite(seen["rate_squares"])]
+    line = fitted(np.array(found.frames["time"]), found.rms[:, unit])
     return UnitResult(
         unit=UNITS[unit],
         n_rows=n,
@@ -294,19 +242,20 @@ def _unit(table: RowTable, found: Found, unit: int, untold: NDArray[np.bool_], m
         tolerance=float(table.tolerance * table.sizes[mine].min()),
         rounding_rms=float(np.sqrt(np.mean(rounding**2))),
         largest_mean=float(np.abs(found.mean("total"))[mine].max()),
-        drift=fitted(np.array(found.frames["time"]), found.rms[:, unit]),
+        drift=None if line is None else line.value,
+        drift_error=None if line is None else line.error,
         rate_largest=float(rates["rate"].max()) if len(rates) else None,
         rate_rms=float(np.sqrt(rates["rate_squares"].mean() / n)) if len(rates) else None,
     )
 
 
-def _row(table: RowTable, labels: AtomNames, found: Found, row: int) -> RowResult:
+def _row(table: RowTable, topology: Topology, found: Found, row: int) -> RowResult:
     """One row, by name."""
     item, k = table.set.locate(row)
     mine, atoms = found.rows[row], item.atoms[k]
     return RowResult(
         row=row,
-        name=f"{item.family} {labels.row(atoms)}",
+        name=f"{item.family} {label(topology, atoms.tolist())}",
         atoms=[int(a) for a in atoms],
         unit=UNITS[table.units[row]],
         target=float(item.target_at(float(found.frames["time"][0]))[k] + table.means[row]),

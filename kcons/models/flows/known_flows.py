@@ -191,9 +191,7 @@ class ParticleOnSphere(Flow):
 
     def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
         """The free motion x(t), shape (3,) or (k, 3)."""
-        x0, v0 = np.split(
-            self._state(np.concatenate([np.ravel(as_float_array(x0, "x0")), np.ravel(as_float_array(v0, "v0"))])), 2
-        )
+        x0, v0 = np.split(self._state(np.append(as_float_array(x0, "x0"), as_float_array(v0, "v0"))), 2)
         speed = float(np.linalg.norm(v0))
         if abs(np.linalg.norm(x0) - self.radius) > 1e-9 * self.radius:
             raise InputError(f"x0 is {np.linalg.norm(x0):.9g} from the center, not {self.radius:.9g}", item="x0")
@@ -268,31 +266,20 @@ class Thermostat(Flow):
         w = X[self.masses.size :]
         return np.concatenate([w, self._force(self.positions(X)) / self.root - self.friction(X) * w])
 
-    def tangents(self, X: FloatArray) -> FloatArray:
-        """Orthonormal vectors along the surface of constant K, shape (2n, 2n - 1)."""
-        n = self.masses.size
-        return np.asarray(scipy.linalg.block_diag(np.eye(n), scipy.linalg.null_space(X[None, n:])))
-
-    def surface_divergence(self, X: ArrayLike) -> float:
-        """div V along the surface, tr(T^T dV/dX T); equal to -(g - 1) alpha."""
-        T = self.tangents(self._state(X))
-        return float(np.trace(T.T @ self.jacobian(0.0, X) @ T))
-
     def compression(self, X0: ArrayLike, times: ArrayLike, pieces: int = 1) -> Compression:
         """Measure the compression of phase space along a trajectory, and predict it from alpha."""
-        X0 = self._state(X0)
+        X0, n, g = self._state(X0), self.masses.size, self.degrees_of_freedom
         extended = Flow(lambda t, Y: np.append(self.velocity(t, Y[:-1]), self.friction(Y[:-1])), self.n + 1)
         wanted, pieces = np.atleast_1d(as_float_array(times, "times")), whole_number(pieces, "pieces")
         Y, volume, rows = np.append(X0, 0.0), 0.0, [(0.0, 0.0)]
         for a, b in pairwise(wanted):
             for c, d in pairwise(np.linspace(a, b, pieces + 1)):
-                # The tangent vectors start anew as orthonormal ones: carried far, they would all turn into one.
-                T = self.tangents(Y[:-1])
+                # Vectors along the surface start anew as orthonormal ones: carried far, they would all turn into one.
+                T = scipy.linalg.block_diag(np.eye(n), scipy.linalg.null_space(Y[None, n:-1]))
                 found = phase_volume(extended, Y, [c, d])
                 carried = found.propagators[-1, :-1, :-1] @ T
                 volume += 0.5 * float(np.linalg.slogdet(carried.T @ carried)[1])
                 Y = found.states[-1]
             rows.append((volume, float(Y[-1])))
         volumes, frictions = np.array(rows).T
-        g = self.degrees_of_freedom
         return Compression(wanted, volumes, -(g - 1) * frictions, g)

@@ -145,16 +145,12 @@ def _bounds(T: ComplexArray, noise: float) -> FloatArray:
     """
     n, size = len(T), max(float(np.linalg.norm(T)), noise) or 1.0
     departure = float(np.linalg.norm(np.triu(T, 1))) / size
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         theta = noise / size * float(np.sum(departure ** np.arange(n)))
-        return np.minimum(n * _conditions(T) * noise, size * max(theta, theta ** (1.0 / n)))
-
-
-def _conditions(T: ComplexArray) -> FloatArray:
-    """1/|y^H x| of each eigenvalue of a triangular matrix, in the order of its diagonal."""
-    _, left, right = scipy.linalg.eig(T, left=True, right=True)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.maximum(1.0, 1.0 / np.abs(np.einsum("ij,ij->j", left.conj(), right))))
+        # 1/|y^H x| of each eigenvalue, in the order of the diagonal.
+        _, left, right = scipy.linalg.eig(T, left=True, right=True)
+        condition = np.maximum(1.0, 1.0 / np.abs(np.einsum("ij,ij->j", left.conj(), right)))
+        return np.minimum(n * condition * noise, size * max(theta, theta ** (1.0 / n)))
 
 
 def _clusters(values: ComplexArray, errors: FloatArray) -> list[NDArray[np.intp]]:

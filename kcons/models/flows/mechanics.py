@@ -64,17 +64,14 @@ class HamiltonianFlow(Flow):
 
     def _gradient(self, t: float, X: FloatArray) -> FloatArray:
         """(dH/dq, dH/dp), shape (2f,)."""
-        by_differences = None
-        parts = []
-        for name, own in (("dH_dq", slice(0, self.f)), ("dH_dp", slice(self.f, None))):
-            function = self._given[name]
-            if function is None:
-                if by_differences is None:
-                    by_differences = self._differences_of_energy(t, X, STEP)
-                parts.append(by_differences[own])
-                continue
-            parts.append(called(name, lambda X, g=function: self._of(g, X, t), (self.f,), X))
-        return np.concatenate(parts)
+        found = {
+            name: called(name, lambda X, g=function: self._of(g, X, t), (self.f,), X)
+            for name, function in self._given.items()
+            if function is not None
+        }
+        if len(found) < 2:
+            found = dict(zip(self._given, np.split(self._differences_of_energy(t, X, STEP), 2), strict=True)) | found
+        return np.concatenate([found[name] for name in self._given])
 
     def _differences_of_energy(self, t: float, X: FloatArray, step: float) -> FloatArray:
         return jacobian_by_differences(lambda s, Y: self._of(self.hamiltonian, Y, s), t, X, step)
@@ -87,10 +84,11 @@ class HamiltonianFlow(Flow):
         """As `Flow.solve`; gradients are compared with differences of H at the start."""
         X, t = self._state(X0), float(t_span[0])
         slope, rounding = self._gradient(t, X), 1e-10 * abs(self.energy(X, t))
-        coarse, fine = (self._differences_of_energy(t, X, step) for step in (STEP, STEP / 2))
-        for name, own in (("dH_dq", slice(0, self.f)), ("dH_dp", slice(self.f, None))):
-            given = None if self._given[name] is None else slope[own]
-            check_derivative(name, "H", given, coarse[own], fine[own], rounding=rounding)
+        differences = (self._differences_of_energy(t, X, step) for step in (STEP, STEP / 2))
+        for (name, function), own, *both in zip(
+            self._given.items(), *(np.split(part, 2) for part in (slope, *differences)), strict=True
+        ):
+            check_derivative(name, "H", None if function is None else own, *both, rounding=rounding)
         return super().solve(t_span, X, method, **options)
 
 

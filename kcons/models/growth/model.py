@@ -158,17 +158,19 @@ class Logistic(GrowthModel):
         return self.alpha / self.beta
 
     def exact(self, t: ArrayLike, x0: float) -> FloatArray:
-        """x(t) (notes eq. 66), written so that no exponential overflows."""
-        exponent, x0 = -self.alpha * as_float_array(t, "t"), finite_number(x0, "x0")
+        """x(t) (notes eq. 66), written so that what overflows is in the denominator."""
+        times, x0 = as_float_array(t, "t"), finite_number(x0, "x0")
         if x0 < 0:
             raise InputError(f"x0 is {x0:g}; populations are not negative", item="x0")
-        if x0 > self.plateau and np.any(exponent >= -np.log1p(-self.plateau / x0)):
-            since = np.log1p(-self.plateau / x0) / self.alpha
+        if x0 in (0.0, self.plateau):
+            return np.full(times.shape, x0)
+        with np.errstate(over="ignore"):
+            share = self.plateau / x0 - 1.0
+            left = 1.0 + share * np.exp(-self.alpha * times)
+        if np.any(left <= 0):
+            since = np.log(-share) / self.alpha
             raise InputError(f"x = {x0:g} at t = 0 came from infinity at t = {since:.6g}; give later times", item="t")
-        # Either way with exponentials of what is not positive.
-        up, down = np.exp(np.minimum(exponent, 0.0)), np.exp(-np.maximum(exponent, 0.0))
-        fed = self.beta * x0 * np.expm1(-np.abs(exponent))
-        return np.asarray(self.alpha * x0 * down / (self.alpha * up - np.where(exponent > 0, -fed, fed)))
+        return np.asarray(self.plateau / left)
 
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
         """dV/dx, shape (1, 1)."""

@@ -32,7 +32,7 @@ from kcons.constraints.arguments import (
     refuse_other,
     whole_number,
 )
-from kcons.constraints.target import WRONG, contradicted, exact_step
+from kcons.constraints.target import WRONG, contradiction, first_derivative_4
 from kcons.errors import BudgetError, ConstraintError, InputError
 from kcons.models.growth.model import Mixture, OfState, Populations
 from kcons.models.integration import called, check_derivative, jacobian_by_differences
@@ -149,31 +149,31 @@ class HolonomicRow(Row):
         given = None if self._gradient is None else self.gradient(p) * p.x
         rounding = 1e-12 * abs(self.measure(p))
         check_derivative("gradient", f"{self.name}, times x,", given, coarse, fine, rounding=rounding, smooth=SMOOTH)
-        self._check_rate(p, -self.rate(p))
+        self._check_rate(p)
 
-    def _check_rate(self, p: Populations, given: float) -> None:
-        """Compare the derivative in time with differences, where these are smooth."""
+    def _check_rate(self, p: Populations) -> None:
+        """Compare the derivative in time with differences, slow and fast ones, where these are smooth."""
+        size = self.size(p)
 
-        def differences(h: float) -> FloatArray:
-            h = exact_step(h, p.time)
-            ends = [self.measure(Populations.from_logarithms(p.time + dt, p.log_x)) for dt in (h, -h)]
-            return np.asarray(ends[0] - ends[1]) / (2 * h)
+        def over_time(function: Callable[[Populations], float]) -> Callable[[float], FloatArray]:
+            return lambda t: np.array([function(Populations.from_logarithms(t, p.log_x))])
 
-        with np.errstate(all="ignore"):
-            coarse, fine = differences(1e-3), differences(5e-4)
-            wrong = bool(contradicted(given, coarse, fine, np.asarray(1e-9 * self._magnitude(p))))
-            near = [differences(h) for h in (1e-6, 1e-9)] if wrong else []  # these see what changes faster
-        if not wrong or any(abs(v - given) <= WRONG * np.maximum(np.abs(v), abs(given)) for v in near):
-            return
-        said = (
-            "depends on time, but has no time_derivative: give it"
-            if self._time_derivative is None
-            else "changes with time at another rate than differences of it: correct it"
-        )
-        raise InputError(f"{self.name} {said} ({given:.6g}; differences give {fine:.6g})", item="time_derivative")
-
-    def _magnitude(self, p: Populations) -> float:
-        return abs(self.measure(p))
+        rate, value = over_time(lambda q: -self.rate(q)), over_time(lambda q: self.measure(q) + size)
+        for step in (1e-2, 1e-8):
+            found = contradiction(rate, value, p.time, step)
+            if found is None:
+                continue
+            near = [float(first_derivative_4(value, found.time, h)[0]) for h in (1e-6, 1e-9)]  # of what changes faster
+            if not any(abs(v - found.given) <= WRONG * max(abs(v), abs(found.given)) for v in near):
+                said = (
+                    "depends on time, but has no time_derivative: give it"
+                    if self._time_derivative is None
+                    else "changes with time at another rate than differences of it: correct it"
+                )
+                raise InputError(
+                    f"{self.name} {said} ({found.given:.6g}; differences give {found.found:.6g})",
+                    item="time_derivative",
+                )
 
 
 class LinearRow(HolonomicRow):
@@ -225,10 +225,7 @@ class LinearRow(HolonomicRow):
         return self.coefficients
 
     def check_derivatives(self, p: Populations) -> None:
-        self._check_rate(p, -self.rate(p))
-
-    def _magnitude(self, p: Populations) -> float:
-        return self.size(p)
+        self._check_rate(p)
 
 
 class TotalPopulation(LinearRow):

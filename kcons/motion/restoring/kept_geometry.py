@@ -11,12 +11,11 @@ import scipy.sparse as sp
 from kcons.constraints import Distance, DistanceDifference
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import connected, minimum_image
+from kcons.constraints.periodic.one_piece import connected, make_whole, minimum_image, neighbor_lists, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
-from kcons.motion.restoring.rigid_pieces import MoleculeGraph
-from kcons.plan.independent_blocks import fixed_atoms
+from kcons.plan.independent_blocks import edge_blocks, fixed_atoms
 from kcons.solvers.rank_revealing import independent
 from kcons.topology.guessed_bonds import NEAREST, across, bonds_without_elements
 from kcons.topology.topology import BoolArray, bond_angles, sorted_pairs
@@ -66,6 +65,92 @@ def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | 
     return pairs[kept]
 
 
+class MoleculeGraph:
+    """The bonds of the molecules to which some atoms belong, and what is left where one of them is cut.
+
+    Parameters
+    ----------
+    n_atoms : int
+    bonds : ndarray of int, shape (n, 2)
+    atoms : ndarray of int
+        Molecules with none of these are left out.
+
+    Attributes
+    ----------
+    bonds : ndarray of int, shape (n, 2)
+        Those of the molecules that are kept; i < j, sorted.
+    atoms : ndarray of int
+        All atoms of these molecules, molecule by molecule; what lies beyond a bond stands together.
+    molecules : list of ndarray of int
+    """
+
+    def __init__(self, n_atoms: int, bonds: IntArray, atoms: IntArray) -> None:
+        pairs = sorted_pairs(bonds)
+        label, _ = connected(pairs, n_atoms)
+        chosen = np.zeros(n_atoms, dtype=bool)
+        chosen[atoms] = True
+        kept = np.zeros(n_atoms, dtype=bool)
+        kept[np.isin(label, label[atoms])] = True
+        self.bonds = pairs[kept[pairs].all(axis=1)] if len(pairs) else pairs
+        self._starts, self._ends = neighbor_lists(self.bonds, n_atoms)
+        order, parents = spanning_tree(self.bonds, n_atoms)
+        self._lay_out(order[kept[order]], parents[kept[order]], n_atoms)
+
+    def neighbors(self, atom: int) -> IntArray:
+        """Atoms bonded to one."""
+        return self._ends[self._starts[atom] : self._starts[atom + 1]]
+
+    def _lay_out(self, order: IntArray, parents: IntArray, n_atoms: int) -> None:
+        """Put what hangs from an atom behind it, and find the bridges: bonds that are blocks of their own."""
+        parent, size = np.arange(n_atoms), np.ones(n_atoms, dtype=np.int64)
+        parent[order] = parents
+        tree = list(zip(order.tolist(), parents.tolist(), strict=True))
+        for atom, above in reversed(tree):
+            if atom != above:
+                size[above] += size[atom]
+        begin, free, used = np.zeros(n_atoms, dtype=np.int64), np.zeros(n_atoms, dtype=np.int64), 0
+        for atom, above in tree:
+            if atom == above:
+                begin[atom], used = used, used + size[atom]
+            else:
+                begin[atom] = free[above]
+                free[above] += size[atom]
+            free[atom] = begin[atom] + 1
+        self.atoms = order[np.argsort(begin[order])]
+        self._parent, self._begin, self._end = parent, begin, begin + size
+        self.molecules = [self._hanging(root) for root in self.atoms.tolist() if parent[root] == root]
+        i, j = self.bonds.T
+        block = edge_blocks(i, j, n_atoms) if len(self.bonds) else i
+        self._bridge = np.zeros(n_atoms, dtype=bool)  # by the far atom of each
+        self._bridge[np.where(parent[j] == i, j, i)[np.bincount(block)[block] == 1]] = True
+
+    def _hanging(self, atom: int) -> IntArray:
+        """An atom and all that hang from it."""
+        return self.atoms[self._begin[atom] : self._end[atom]]
+
+    def molecule(self, atom: int) -> IntArray:
+        """All atoms of the molecule of one of `atoms`."""
+        while self._parent[atom] != atom:
+            atom = int(self._parent[atom])
+        return self._hanging(atom)
+
+    def bonded(self, j: int, k: int) -> bool:
+        """Whether two atoms are."""
+        return bool(np.any(self.neighbors(j) == k))
+
+    def beyond(self, j: int, k: int) -> IntArray | None:
+        """Atoms on the side of k when the bond j-k is cut; None if there is no bond, or one in a ring."""
+        if self._parent[k] == j and self._bridge[k]:
+            return self._hanging(k)
+        if self._parent[j] == k and self._bridge[j]:
+            return np.setdiff1d(self.molecule(j), self._hanging(j), assume_unique=True)
+        return None
+
+    def whole(self, x: FloatArray, lattice: FloatArray | None) -> FloatArray:
+        """Positions with every molecule in one piece: each atom in the image next to the one it was reached from."""
+        return make_whole(x, self.atoms, self._parent[self.atoms], lattice)
+
+
 class Geometry:
     """The start of a restoration: its bonds and angles, how far its rows are off, and what may not change.
 
@@ -99,7 +184,7 @@ class Geometry:
         with np.errstate(all="ignore"):
             self.misfit = np.abs(held.value(start, time)) / held.scale
         self.usable = bool(np.isfinite(start[held.touched]).all())
-        self._spans: dict[tuple[int, ...], tuple[FloatArray, dict[int, int]]] = {}
+        self._spans: dict[tuple[int, ...], tuple[IntArray, FloatArray]] = {}
 
     @cached_property
     def _given(self) -> IntArray | None:
@@ -118,14 +203,14 @@ class Geometry:
     def far(self) -> bool:
         """Whether a row of lengths or angles is far off."""
         return self.usable and any(
-            bool(np.any(miss > FAR)) for item, miss in self._off_rows() if item.translation_invariant
+            bool(np.any(miss > FAR)) for item, _, miss in self.off_rows() if item.translation_invariant
         )
 
-    def _off_rows(self) -> list[tuple[Constraint, FloatArray]]:
-        """Constraints and by how much their rows are off."""
+    def off_rows(self) -> list[tuple[Constraint, int, FloatArray]]:
+        """Constraints on positions, their first rows, and by how much their rows are off."""
         held = self.held
         return [
-            (item, self.misfit[first : first + item.n_rows])
+            (item, int(first), self.misfit[first : first + item.n_rows])
             for item, first in zip(held.constraints, held.starts, strict=False)
             if item.holonomic
         ]
@@ -135,7 +220,7 @@ class Geometry:
         """Whether bonds are given, or something else than bonds is off: then all angles are to be what they were."""
         if self._given is not None:
             return True
-        for item, miss in self._off_rows():
+        for item, _, miss in self.off_rows():
             off = item.atoms[miss > OFF]
             if item.family in ("Angle", "Dihedral", "CenterDistance") and len(off):
                 return True
@@ -155,7 +240,7 @@ class Geometry:
         lengths = self._held_lengths[1]
         if len(lengths) > 1 and np.sum(lengths > FAR) > 0.5 * len(lengths):
             return False
-        return all(item.family in _INTERNAL or not np.any(miss > OFF) for item, miss in self._off_rows())
+        return all(item.family in _INTERNAL or not np.any(miss > OFF) for item, _, miss in self.off_rows())
 
     def changed(self, x: FloatArray, *, strict: bool) -> InfeasibleError | None:
         """What to raise if a bond or an angle that no row holds has changed.
@@ -244,19 +329,19 @@ class Geometry:
     def _held_lengths(self) -> tuple[IntArray, FloatArray]:
         """Pairs whose distance a row holds, alone or with others, i < j, and by which part of it they were off."""
         pairs, miss = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
-        for item, first in zip(self.held.constraints, self.held.starts, strict=False):
+        for item, _, off in self.off_rows():
             if isinstance(item, Distance | DistanceDifference):
                 named = item.pairs
                 pairs.append(np.sort(named.reshape(-1, 2), axis=1))
-                miss.append(np.repeat(self.misfit[first : first + item.n_rows], named.shape[1]))
+                miss.append(np.repeat(off, named.shape[1]))
         return np.concatenate(pairs), np.concatenate(miss)
 
     @cached_property
     def _moved_legs(self) -> set[tuple[int, int]]:
         """(vertex, end) of the legs of what was off and turns them: other angles with such a leg change with them."""
         legs: set[tuple[int, int]] = set()
-        for item, first in zip(self.held.constraints, self.held.starts, strict=False):
-            off = np.flatnonzero(self.misfit[first : first + item.n_rows] > 1e-6)
+        for item, _, miss in self.off_rows():
+            off = np.flatnonzero(miss > 1e-6)
             if item.family == "Angle":
                 for i, j, k in item.atoms[off].tolist():
                     legs |= {(j, i), (j, k)}
@@ -284,44 +369,38 @@ class Geometry:
 
     def _follows(self, x: FloatArray, atoms: IntArray) -> bool:
         """Whether the rows hold a bond or an angle: its gradient lies in the span of theirs."""
-        center = x[atoms[1]]
-        arms = [minimum_image(x[a] - center, self.held.lattice) for a in atoms[[0, -1]]]
-        gradient = np.zeros((len(atoms), 3))
-        if len(atoms) == 2:
-            gradient[0] = arms[0]
-        else:
+        u, w = (minimum_image(x[a] - x[atoms[1]], self.held.lattice) for a in atoms[[0, -1]])
+        ends = [u]
+        if len(atoms) == 3:
             # That of the cosine: the angle's own is undefined where it is straight.
-            u, w = arms
             lu, lw = np.linalg.norm(u), np.linalg.norm(w)
             cosine = u @ w / (lu * lw)
-            gradient[0], gradient[2] = (w / lw - cosine * u / lu) / lu, (u / lu - cosine * w / lw) / lw
-        gradient[1] = -gradient.sum(axis=0)
-        size = float(np.linalg.norm(gradient))
-        basis, place = self._span(x, atoms)
-        if not size > 0 or any(int(a) not in place for a in atoms):
-            return False
-        target = np.zeros((basis.shape[1] // 3, 3))
-        target[[place[int(a)] for a in atoms]] = gradient / size
-        flat = target.ravel()
-        return bool(np.linalg.norm(flat - basis.T @ (basis @ flat)) < 1e-6)
+            ends = [(w / lw - cosine * u / lu) / lu, (u / lu - cosine * w / lw) / lw]
+        gradient = np.zeros(x.shape)
+        for atom, end in zip(atoms[::2], ends, strict=True):
+            gradient[atom] += end
+            gradient[atoms[1]] -= end
+        columns, basis = self._span(x, atoms)
+        square, along = float(np.vdot(gradient, gradient)), basis @ gradient.ravel()[columns]
+        return square > 0 and bool(square - along @ along < 1e-12 * square)
 
-    def _span(self, x: FloatArray, atoms: IntArray) -> tuple[FloatArray, dict[int, int]]:
-        """An orthonormal basis of the gradients of the rows around some atoms, and where their atoms stand in it."""
+    def _span(self, x: FloatArray, atoms: IntArray) -> tuple[IntArray, FloatArray]:
+        """The columns and an orthonormal basis of the gradients of the rows around some atoms."""
         incidence, labels = self.held.incidence, self.labels
         touching = np.unique(incidence.T.tocsr()[atoms].indices)
         clusters = np.unique(labels[touching])
         key = tuple(clusters.tolist())
         if key not in self._spans:
             rows = np.union1d(touching[labels[touching] < 0], np.flatnonzero(np.isin(labels, clusters[clusters >= 0])))
-            used = np.unique(incidence[rows].indices)
-            columns = (3 * used[:, None] + np.arange(3)).ravel()
+            table = sp.csr_array(self.held.jacobian(x, self.time))[rows]
+            columns = np.unique(table.indices)
             basis = np.zeros((0, len(columns)))
             if 0 < len(rows) <= _MOST_ROWS:
-                table = sp.csr_array(self.held.jacobian(x, self.time))[rows][:, columns].toarray()
-                size = np.linalg.norm(table, axis=1, keepdims=True)
-                _, weight, basis = np.linalg.svd(table / np.where(size > 0, size, 1.0), full_matrices=False)
+                dense = table[:, columns].toarray()
+                size = np.linalg.norm(dense, axis=1, keepdims=True)
+                _, weight, basis = np.linalg.svd(dense / np.where(size > 0, size, 1.0), full_matrices=False)
                 basis = basis[independent(weight)]
-            self._spans[key] = basis, {int(a): n for n, a in enumerate(used.tolist())}
+            self._spans[key] = columns, basis
         return self._spans[key]
 
 

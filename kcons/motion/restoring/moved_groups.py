@@ -24,14 +24,16 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
 from kcons.motion.certificate import off_row
 from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
 from kcons.motion.restoring.nearest_point import least_squares
-from kcons.motion.restoring.rigid_pieces import Move, bend, stretch, torsion
 from kcons.plan.plan import Plan
 from kcons.solvers import tolerances
 
+#: Moves atoms in place by an amount; False where it is undefined.
+Move = Callable[[FloatArray, float], bool]
 #: Rows that moved groups leave off by less than this (radian, or part of the length) are left to the search for the
 #: nearest point.
 NEAR = 0.25
@@ -242,15 +244,13 @@ class _Motions:
 
     def _owns(self) -> list[tuple[int, ConstraintSet, IntArray, Move]]:
         """Rows that are off and have a motion of their own, each as a set of its own with its atoms, and the motion."""
-        held = self.held
-        off = self.geometry.misfit > OFF * 1e-3
         found = []
-        for item, first in zip(held.constraints, held.starts, strict=False):
+        for item, first, miss in self.geometry.off_rows():
             if item.family in ("Distance", "Angle", "Dihedral"):
-                for n in np.flatnonzero(off[first : first + item.n_rows]).tolist():
+                for n in np.flatnonzero(miss > OFF * 1e-3).tolist():
                     move = self._own(item.family, item.atoms[n])
                     if move is not None:
-                        found.append((int(first) + n, *held.subset(np.array([int(first) + n])), move))
+                        found.append((first + n, *self.held.subset(np.array([first + n])), move))
         return found
 
     def _sweep(self, y: FloatArray) -> None:
@@ -267,8 +267,64 @@ class _Motions:
                     continue
                 largest = max(largest, size)
                 made += 1
-                if made > MOST_MOVES or not move.make(y, -sigma):
+                if made > MOST_MOVES or not move(y, -sigma):
                     return
             if largest < 1e-12 or (largest > 0.9 * last and largest < 1e-9):
                 break
             last = min(last, largest)
+
+
+def torsion(atoms: IntArray, j: int, k: int) -> Move:
+    """Turn about the line from j to k: with the last atom of a dihedral among `atoms`, it grows by the amount."""
+    return lambda x, amount: _turn(x, atoms, x[j], x[k] - x[j], amount)
+
+
+def bend(atoms: IntArray, i: int, j: int, k: int) -> Move:
+    """Turn about j in the plane of i, j, k: with k among `atoms`, the angle i-j-k grows by the amount."""
+
+    def move(x: FloatArray, amount: float) -> bool:
+        u, w = x[i] - x[j], x[k] - x[j]
+        normal = cross(u, w)
+        if not np.linalg.norm(normal) > 1e-9 * np.linalg.norm(u) * np.linalg.norm(w):
+            normal = cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])  # straight: any plane does
+        return _turn(x, atoms, x[j], normal, amount)
+
+    return move
+
+
+def stretch(atoms: IntArray, others: IntArray, masses: FloatArray, axis: Callable[[FloatArray], FloatArray]) -> Move:
+    """Shift one piece along an axis and the other against it, their common center at rest.
+
+    Parameters
+    ----------
+    atoms, others : ndarray of int
+        The pieces; one without atoms means that the other one moves alone.
+    masses : ndarray, shape (n_atoms,)
+    axis : callable
+        Points from `others` to `atoms`, any length.
+    """
+    a, b = float(masses[atoms].sum()), float(masses[others].sum())
+    part = (b / (a + b) if a + b > 0 else 0.5) if len(atoms) and len(others) else float(len(atoms) > 0)
+
+    def move(x: FloatArray, amount: float) -> bool:
+        way = axis(x)
+        size = float(np.linalg.norm(way))
+        if size > 0:
+            x[atoms] += amount * part / size * way
+            x[others] += amount * (part - 1.0) / size * way
+        return size > 0
+
+    return move
+
+
+def _turn(x: FloatArray, atoms: IntArray, origin: FloatArray, axis: FloatArray, angle: float) -> bool:
+    """Turn atoms about an axis (right-handed) in place; False where it has no length."""
+    size = float(np.linalg.norm(axis))
+    if not size > 0:
+        return False
+    axis = axis / size
+    arm = x[atoms] - origin
+    across = arm - (arm @ axis)[:, None] * axis
+    # In this form small turns lose nothing: 1 - cos is taken from the half angle.
+    x[atoms] += np.sin(angle) * cross(axis, arm) - 2 * np.sin(angle / 2) ** 2 * across
+    return True

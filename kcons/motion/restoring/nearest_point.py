@@ -1,7 +1,8 @@
-"""Positions that are far off, brought onto the constraints; for starts, not for time steps."""
+"""Positions that are far off, brought onto the constraints, and steps along these; for starts, not for time steps."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -11,13 +12,13 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, KconsError
-from kcons.motion.restoring.descent import Descent, largest
 from kcons.motion.solver_sequence import FAILED, IterationBudget, SolverSequence
 from kcons.solvers.tolerances import EPS
 
 #: Rounds of the search for the nearest point on the constraints, and steps towards any point on them.
 NEAREST_ROUNDS = 200
-#: Moves that get no smaller are rounding below so much of the size of the system, or of the distance from the origin.
+#: What is left along the constraints is rounding below so much of the size of the system, or of the distance from the
+#: origin.
 _STILL, _ROUNDING = 1e-12, 16 * EPS
 #: Of least squares: the damping that keeps free motions out, in parts of the largest square of a slope; how often a
 #: step is damped more; and what is no step, in parts of the size of the system.
@@ -25,11 +26,16 @@ LEAST, TRIES, _REACHED = 1e-10, 12, 1e-10
 #: Steps towards any point on the constraints are at first no longer than this part of what rows are off by: longer ones
 #: end in more places from which there is no way on.
 SHORT_STEPS = 0.2
-#: Rounds of the fixed-point iteration in which moves do not halve, after which it is given up; and what of the way to
-#: the start may be along the constraints where the search ends.
-SLOW, _FOOT = 3, 1e-12
+#: Part of the way to the start that may be along the constraints where the search ends.
+_FOOT = 1e-12
 #: Part of the way to the nearest point that may be left along the constraints without a word.
 LEFT_OVER = 1e-6
+#: Steps that are remembered for the curvature.
+MEMORY = 20
+#: Of the slope at the start, what a step must gain at least.
+GAIN = 1e-4
+#: Shortenings of one step.
+SHORTENINGS = 20
 
 
 class FarStart:
@@ -74,23 +80,19 @@ class FarStart:
             fallback.budget = None
 
     def _search(self, x: FloatArray) -> float:
-        start = x.copy()
-        here = x.copy()
+        start, here = x.copy(), x.copy()
         try:
             self._positions(here, start)
         except ConvergenceError:
             self._reach(here)
-        found = self._settle(start, here)
-        if not found:
-            self._descend(start, here)
+        self._descend(start, here)
         np.copyto(x, here)
-        if found:
-            return 0.0
-        along = start - x
-        along[self._atom_labels() < 0] = 0.0
+        held = self._atom_labels() >= 0
+        along = np.where(held[:, None], start - x, 0.0)
         size = float(np.max(np.abs(along), initial=0.0))
         self._tangents(x, along)
-        return float(np.max(np.abs(along), initial=0.0)) / size if size > 0.0 else 0.0
+        left = float(np.max(np.abs(along), initial=0.0))
+        return left / size if left > max(_STILL * extent(start[held]), _rounding(start[held])) else 0.0
 
     def _reach(self, x: FloatArray) -> None:
         """Some point on the constraints, for starts too far off for one projection, in place."""
@@ -131,41 +133,17 @@ class FarStart:
             worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
             raise self._failures.start(x, start, int(rows[worst]), float(off[worst]), steps, time) from failure
 
-    def _settle(self, start: FloatArray, x: FloatArray) -> bool:
-        """x <- start + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers, in place.
-
-        Its fixed point is the foot of the mass-weighted perpendicular from the start. False where moves do not halve
-        for long, and `x` as it was, or nearer to that point.
-        """
-        here, first, last, slow = x, np.inf, np.inf, 0
-        still = max(_STILL * extent(start), _ROUNDING * float(np.abs(start).max(initial=0.0)))
-        while self._budget.iterations > 0 and slow < SLOW:
-            ahead = start.copy()
-            try:
-                self._positions(ahead, here)
-            except ConvergenceError:
-                return False
-            move = float(np.max(np.abs(ahead - here), initial=0.0))
-            if move == 0.0 or (move > 0.5 * last and move < still):
-                np.copyto(x, ahead)
-                return True
-            if move > 2 * last:
-                return False
-            first = move if last == np.inf else first
-            slow += move > 0.5 * last
-            here, last = ahead, move
-        if last < first:
-            np.copyto(x, here)
-        return False
-
     def _descend(self, start: FloatArray, x: FloatArray) -> None:
         """Walk along the constraints towards the start in place, to the foot of a perpendicular from there."""
         away = self._atom_labels() < 0
         inverse = self._plan.inverse_masses
         mass = np.divide(1.0, inverse, out=np.zeros(len(x)), where=inverse > 0)[:, None]
 
+        def apart(y: FloatArray) -> FloatArray:
+            return np.where(away[:, None], 0.0, start - y)
+
         def along(y: FloatArray, move: FloatArray) -> FloatArray:
-            move = np.where(away[:, None], 0.0, move)
+            move = move.copy()
             self._tangents(y, move)
             return move
 
@@ -173,11 +151,11 @@ class FarStart:
             self._positions(y, reference)
             return y
 
-        descent = Descent(lambda y: start - y, along, onto, mass)
+        descent = Descent(apart, along, onto, mass)
         left = descent.downhill(x)
         longest = largest(left)
         for _ in range(NEAREST_ROUNDS):
-            if self._budget.iterations <= 0 or largest(left) <= _FOOT * largest(start - x):
+            if self._budget.iterations <= 0 or largest(left) <= max(_FOOT * largest(apart(x)), _rounding(start[~away])):
                 return
             ahead, left, gained = descent.advanced(x, left, longest)
             if not gained:
@@ -192,6 +170,96 @@ class FarStart:
         atom_label[incidence.indices[entry_label >= 0]] = entry_label[entry_label >= 0]
         atom_label[self._plan.inverse_masses == 0] = -1
         return atom_label
+
+
+class Descent:
+    """Steps that lower a potential, all on the constraints; vectors are compared in the mass metric.
+
+    Parameters
+    ----------
+    acceleration : callable
+        Downhill at given positions: the force of the potential by the masses, shape (n_atoms, 3).
+    along : callable
+        ``along(x, move)``: what of a move is along the constraints at x.
+    onto : callable
+        ``onto(x, reference)``: positions on the constraints; raises where there are none near.
+    mass : ndarray, shape (n_atoms, 1)
+    """
+
+    def __init__(
+        self,
+        acceleration: Callable[[FloatArray], FloatArray],
+        along: Callable[[FloatArray, FloatArray], FloatArray],
+        onto: Callable[[FloatArray, FloatArray], FloatArray],
+        mass: FloatArray,
+    ) -> None:
+        self._acceleration, self._along, self._onto, self._mass = acceleration, along, onto, mass
+        #: Moves and what the acceleration lost by them, both along the constraints.
+        self._memory: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=MEMORY)
+
+    def downhill(self, x: FloatArray) -> FloatArray:
+        """The acceleration along the constraints."""
+        return self._along(x, self._acceleration(x))
+
+    def _product(self, a: FloatArray, b: FloatArray) -> float:
+        return float(np.vdot(a, self._mass * b))
+
+    def advanced(self, x: FloatArray, a: FloatArray, longest: float) -> tuple[FloatArray, FloatArray, bool]:
+        """Positions and acceleration after a step that gains; those given, and False, if there is none."""
+        while True:
+            move = self._along(x, self._newton(a))
+            if not self._product(a, move) > 0 or not self._memory:
+                self._memory.clear()
+                move = a * (longest / largest(a))
+            move = move * min(1.0, longest / largest(move))
+            slope, size = self._product(a, move), 1.0
+            for _ in range(SHORTENINGS):
+                try:
+                    there = self._onto(x + size * move, x)
+                except KconsError:  # too far for this place
+                    size *= 0.25
+                    continue
+                if np.array_equal(there, x):  # all that is left is rounding
+                    break
+                after = self.downhill(there)
+                left = self._product(after, move)
+                # The potential falls by the mean of the slopes, to third order.
+                if slope + left > GAIN * slope:
+                    self._remember(there, size * move, a - after)
+                    return there, after, True
+                size *= max(0.1, min(0.7, slope / (slope - left)))
+            if not self._memory:
+                return x, a, False
+            self._memory.clear()  # it led nowhere: once more downhill
+
+    def _remember(self, x: FloatArray, move: FloatArray, lost: FloatArray) -> None:
+        move, lost = self._along(x, move), self._along(x, lost)
+        size = np.sqrt(self._product(move, move) * self._product(lost, lost))
+        if self._product(move, lost) > 1e-10 * size:
+            self._memory.append((move, lost))
+
+    def _newton(self, a: FloatArray) -> FloatArray:
+        """The move that the memory suggests (two-loop recursion)."""
+        if not self._memory:
+            return a
+        q, parts = a.copy(), []
+        for move, lost in reversed(self._memory):
+            parts.append(self._product(move, q) / self._product(move, lost))
+            q -= parts[-1] * lost
+        move, lost = self._memory[-1]
+        found = q * (self._product(move, lost) / self._product(lost, lost))
+        for (move, lost), part in zip(self._memory, reversed(parts), strict=True):
+            found += (part - self._product(lost, found) / self._product(move, lost)) * move
+        return found
+
+
+def largest(vectors: FloatArray) -> float:
+    """The longest of some vectors."""
+    return float(np.sqrt(np.max(np.einsum("ij,ij->i", vectors, vectors), initial=0.0)))
+
+
+def _rounding(x: FloatArray) -> float:
+    return _ROUNDING * float(np.abs(x).max(initial=0.0))
 
 
 def least_squares(
@@ -244,17 +312,17 @@ def least_squares(
             except RuntimeError:  # exactly singular: sizes that differ by more than double precision
                 return step
             move = -factor.solve(gradient)
-            largest = float(np.abs(move).max(initial=0.0))
+            farthest = float(np.abs(move).max(initial=0.0))
             trial = x.copy()
-            trial.reshape(-1)[columns] += move * min(1.0, longest / largest if largest > 0 else 1.0)
+            trial.reshape(-1)[columns] += move * min(1.0, longest / farthest if farthest > 0 else 1.0)
             found = residuals(trial)
-            if bold or largest > longest or float(found @ found) < error:
+            if bold or farthest > longest or float(found @ found) < error:
                 break
             damping = max(4 * damping, 1e-3)
         else:
             return step
         x[...], off = trial, found
         damping = 0.1 * damping if damping > 1e-7 else 0.0
-        if not largest > still:
+        if not farthest > still:
             return step + 1
     return steps

@@ -3,7 +3,3 @@
 - `coordinates`: Forces as coordinates
 - `collective_rows`: `CollectiveRows`, the program that holds them, and the rows at the state of a Context
 """
-
-from kcons.openmm.collective.collective_rows import CollectiveRows
-
-__all__ = ["CollectiveRows"]

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import numpy as np
 import openmm
@@ -44,18 +43,14 @@ from kcons.openmm.collective.coordinates import (
     Row,
     as_constraint,
     as_rows,
+    finite_number,
     found_values,
     moved_atoms,
-    number,
     period_of,
     put_in_groups,
     unit_of,
 )
-from kcons.openmm.integrator.ensemble import Integrator
-from kcons.openmm.integrator.part import BOND, NEAR, Part, Solver, Violation
-from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import (
+from kcons.openmm.integrator.guard import (
     SystemRows,
     forces_alone,
     forces_of,
@@ -64,10 +59,20 @@ from kcons.openmm.integrator.system_checks import (
     require_context,
     virtual_sites,
 )
-from kcons.openmm.quantities import masses_of, with_massless_atoms
-from kcons.openmm.states import box_of, energy_of, forces_at, motion_of, positions_of, velocities_of, width_of
+from kcons.openmm.integrator.part import BOND, NEAR, Part, Precision, Solver, Violation
+from kcons.openmm.integrator.program import Integrator, Program
+from kcons.openmm.quantities import (
+    box_of,
+    energy_of,
+    forces_at,
+    masses_of,
+    motion_of,
+    positions_of,
+    velocities_of,
+    width_of,
+    with_massless_atoms,
+)
 from kcons.openmm.topology import bonds_of
-from kcons.steppers.operations import Exchange
 
 #: Relative tolerance of rows in double precision.
 TOLERANCE = 1e-13
@@ -146,7 +151,9 @@ class CollectiveRows(Part):
         self._units = [unit_of(force) for force in forces]
         wanted = self._read_numbers(given, positions is not None)
         self.periods = tuple(
-            period_of(row.force) if row.period is None else number(row.period, f"period of row {k}", self._units[k])
+            period_of(row.force)
+            if row.period is None
+            else finite_number(row.period, f"period of row {k}", self._units[k])
             for k, row in enumerate(given)
         )
         #: The particles of each row.
@@ -164,7 +171,7 @@ class CollectiveRows(Part):
         """Rates, which are kept, and targets, None where they are to be found."""
         self._rates, targets = [], []
         for k, (row, of) in enumerate(zip(given, self._units, strict=True)):
-            target = None if row.target is None else number(row.target, f"target of row {k}", of)
+            target = None if row.target is None else finite_number(row.target, f"target of row {k}", of)
             if target is None and not placed:
                 raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
             if target is not None and of == unit.radian and abs(target) > MOST_TURNED:
@@ -173,7 +180,7 @@ class CollectiveRows(Part):
                     item="target",
                 )
             targets.append(target)
-            self._rates.append(number(row.rate, f"rate of row {k}", of, unit.picosecond))
+            self._rates.append(finite_number(row.rate, f"rate of row {k}", of, unit.picosecond))
         return targets
 
     def _find_what_meets(self, system: openmm.System, asked: bool) -> None:
@@ -194,6 +201,7 @@ class CollectiveRows(Part):
         self._meet = [[bool(a & b) for b in bodies] for a in bodies]
         together = _components(self.n_rows, [(i, j) for i, row in enumerate(self._meet) for j in range(i) if row[j]])
         self._blocks = [np.flatnonzero(together == k).tolist() for k in range(int(together.max()) + 1)]
+        self._block_of = {k: block for block in self._blocks for k in block}
 
     # -- told by an integrator ------------------------------------------------------------------
 
@@ -218,8 +226,8 @@ class CollectiveRows(Part):
         if row not in range(self.n_rows):
             raise InputError(f"there is no row {row}; rows are numbered from 0 to {self.n_rows - 1}", item="row")
         of = self._units[row]
-        value = number(target, f"target of row {row}", of)
-        slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
+        value = finite_number(target, f"target of row {row}", of)
+        slope = None if rate is None else finite_number(rate, f"rate of row {row}", of, unit.picosecond)
         if slope is not None and self._rates[row] == 0.0:
             raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
         require_holder(integrator)
@@ -263,67 +271,30 @@ class CollectiveRows(Part):
     def _pushes(self) -> str:
         return _sum(f"{self._of('push', k)}*{self._of('row', k)}" for k in range(self.n_rows))
 
-    def _solved(self, block: list[int], i: int, name: str) -> str:
+    def _solved(self, i: int, name: str) -> str:
         """Expression for (inverse vector)_i."""
-        return _sum(f"{self._inverse(i, j)}*{self._of(name, j)}" for j in block)
+        return _sum(f"{self._inverse(i, j)}*{self._of(name, j)}" for j in self._block_of[i])
 
     # -- variables ------------------------------------------------------------------------------
 
     def declare(self, p: Program) -> None:
-        c, integrator = self.code, p.integrator
-        scheme = integrator.scheme
-        alone = len(integrator.parts) == 1
-        self._single = len(scheme.drifts) * len(scheme.flight) == 1
-        numbers = [
-            ("push", "L: x moves by L times the row"),
-            ("more", "change of L"),
-            ("sigma", "coordinate less target"),
-            ("now", "the same, after the last push"),
-            ("change", "what the push changed"),
-            ("expected", "push that the inverse at hand expects for that"),
-            ("left", "last push times the inverse"),
-            ("own", "size of the row alone, for its pivot"),
-            ("slope", "rate of the coordinate less that of the target"),
-            ("impulse", "multiplier times time, over this step"),
-            ("work", "work done by moving the target"),
-        ]
-        for k, name in enumerate(self.names):
-            p.vector(self._of("row", k), f"M_par^+ gradient of row {k}, {name}")
+        c = self.code
+        self._single = len(p.scheme.drifts) * len(p.scheme.flight) == 1
+        for k in range(self.n_rows):
             p.setting(self._of("target", k), f"target of row {k}", self._targets[k])
             p.setting(self._of("rate", k), "change of this target in a ps", self._rates[k])
-            for what, words in numbers:
-                p.number(self._of(what, k), words)
-        for block in self._blocks:
-            for i in block:
-                for j in block:
-                    p.number(self._inverse(i, j), f"inverse of G, then of d sigma{i}/d push{j}", float(i == j))
-                    if j <= i:
-                        p.number(self._gram(i, j), "gradient of one row . M_par^+ gradient of the other")
-                        p.number(f"factor{c}_{i}_{j}", "Cholesky factor of G")
-                        p.number(f"back{c}_{i}_{j}", "inverse of that factor")
-        p.setting(f"small{c}", "a pivot below this fraction of the row's own norm means dependence", PIVOT)
-        p.setting(f"tolerance{c}", "what the residual may be", self.tolerance)
-        p.number(f"pivot{c}", "what is left of a row beside those before it")
-        p.number(f"weight{c}", "denominator of the update")
-        p.number(f"length{c}", "square of the last push")
-        p.number(f"singular{c}", "1 + number of the first row that vanishes or depends on others")
-        p.number(f"residual{c}", "size of sigma relative to the scales")
-        p.number(f"iterations{c}", "quasi-Newton iterations of the last drift")
-        p.number(f"state{c}", "of the iteration: 1 iterate, 2 give up, 3 push without measuring, 0 done")
-        p.number(f"held{c}", "whether the rows hold")
-        p.number(f"bad_sum{c}", "not a number if a multiplier is none")
+            p.number(self._of("work", k), "work done by moving the target")
         if self.driven:
             p.number(f"clock{c}", "time of the targets where the step began")
             p.number(f"flown{c}", "time of its drifts")
             p.number(f"began{c}", "good_steps when it began")
-        if self.lean:
+        p.setting(f"small{c}", "a pivot below this fraction of the row's own norm means dependence", PIVOT)
+        p.setting(f"tolerance{c}", "what the residual may be", self.tolerance)
+        if p.lean:
             p.number(f"renew{c}", "1 if G is to be computed", 1.0)
-        self._base = "xu" if alone else p.vector(f"base{c}", "positions as other parts leave them")
-        self._start = "x_last"
-        if self.meets_system:
-            p.vector(f"v_kept{c}", "velocities while v is used to project rows")
-            if not self._single or _halved(integrator, scheme):
-                self._start = p.vector(f"start{c}", "positions at the start of the drift")
+        #: Where the other parts leave positions, and where they are at the start of the drift.
+        self._base = "xu" if len(p.parts) == 1 else f"base{c}"
+        self._start = f"start{c}" if self.meets_system and (not self._single or p.halves) else "x_last"
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """What counts as small is what Forces of the platform can tell."""
@@ -362,7 +333,7 @@ class CollectiveRows(Part):
 
     def _directions(self, p: Program, *, sizes: bool = False, slopes: bool = False) -> None:
         """row = M_par^+ gradient, at x. Where v is needed for that, lean programs keep it themselves."""
-        keep = self.meets_system and not (self.lean and not slopes)
+        keep = self.meets_system and not (p.lean and not slopes)
         if keep:
             p.each(f"v_kept{self.code}", "v", "v is needed to project the rows")
         v = f"v_kept{self.code}" if self.meets_system else "v"
@@ -384,11 +355,10 @@ class CollectiveRows(Part):
     def _invert(self, p: Program, sizes: bool = False) -> None:
         """G and its inverse, by Cholesky's factor; `singular` tells the first row whose pivot vanishes."""
         c, singular = self.code, f"singular{self.code}"
-        for block in self._blocks:
-            for i in block:
-                for j in block:
-                    if j <= i and self._meet[i][j]:
-                        p.sum(self._gram(i, j), f"m*{self._of('row', i)}*{self._of('row', j)}", "G")
+        for i in range(self.n_rows):
+            for j in range(i + 1):
+                if self._meet[i][j]:
+                    p.sum(self._gram(i, j), f"m*{self._of('row', i)}*{self._of('row', j)}", "G")
         if sizes and not self.meets_system:
             for k in range(self.n_rows):
                 p.let(self._of("own", k), self._gram(k, k), "its size")
@@ -441,13 +411,13 @@ class CollectiveRows(Part):
             self._push(p)
             self._measure(p)
             self._decide(p, first=False)
-        if self.lean:
+        if p.lean:
             with p.when(f"state{c} > 2", "one more, which need not be measured"):
                 self._push(p)
             p.let(f"held{c}", f"max(held{c}, delta(state{c}-3))", "it does what it did before")
         p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")
         self._note_impulses(p, h)
-        if self.lean:
+        if p.lean:
             p.let(f"renew{c}", f"max(step(iterations{c}-2.5), 1-behind)", "has it become slow?")
         if not self._single:
             self._gradients(p)
@@ -485,7 +455,7 @@ class CollectiveRows(Part):
             self._update(p, f"delta(state{c}-1)*step(1e10-residual{c})")
         p.let(f"iterations{c}", f"iterations{c}+delta(state{c}-1)", "count")
         again = "1"
-        if self.lean:
+        if p.lean:
             sure = f"between*step(tolerance{c}-{_LEFT!r}*residual{c})"
             again = f"select({sure}, 3, 1)"
         p.let(
@@ -494,10 +464,9 @@ class CollectiveRows(Part):
             f"*step({_ITERATIONS - 1}-iterations{c}), {again}, 2), 0)",
             "done, or once more, or give up",
         )
-        for block in self._blocks:
-            for k in block:
-                more = f"select(delta(state{c}-1)+delta(state{c}-3), -({self._solved(block, k, 'sigma')}), 0)"
-                p.let(self._of("more", k), more, "what is missing")
+        for k in rows:
+            more = f"select(delta(state{c}-1)+delta(state{c}-3), -({self._solved(k, 'sigma')}), 0)"
+            p.let(self._of("more", k), more, "what is missing")
         for k in rows:
             push = self._of("push", k)
             p.let(push, f"select(delta(state{c}-2), 0, {push}+{self._of('more', k)})", "push more")
@@ -510,7 +479,7 @@ class CollectiveRows(Part):
         c, of = self.code, self._of
         for block in self._blocks:
             for i in block:
-                p.let(of("expected", i), self._solved(block, i, "change"), "push that explains the change")
+                p.let(of("expected", i), self._solved(i, "change"), "push that explains the change")
                 p.let(of("left", i), _sum(f"{of('more', j)}*{self._inverse(j, i)}" for j in block), "more^T inverse")
             p.let(f"weight{c}", _sum(f"{of('left', j)}*{of('change', j)}" for j in block), "denominator of the update")
             p.let(f"length{c}", _sum(f"{of('more', j)}^2" for j in block), "square of the push")
@@ -524,7 +493,7 @@ class CollectiveRows(Part):
     def _note_impulses(self, p: Program, h: str) -> None:
         for k in self._driven_rows:
             push, impulse = self._of("push", k), self._of("impulse", k)
-            before = "0" if self.lean else f"select(delta(stage), 0, {impulse})"
+            before = "0" if p.lean else f"select(delta(stage), 0, {impulse})"
             p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
 
     # -- velocities -----------------------------------------------------------------------------
@@ -540,9 +509,8 @@ class CollectiveRows(Part):
         for k in rows:
             if self._rates[k] != 0.0:
                 p.let(self._of("slope", k), f"{self._of('slope', k)}-({self._rate(k)})", "less that of the target")
-        for block in self._blocks:
-            for k in block:
-                p.let(self._of("more", k), f"-({self._solved(block, k, 'slope')})", "multiplier times time")
+        for k in rows:
+            p.let(self._of("more", k), f"-({self._solved(k, 'slope')})", "multiplier times time")
         p.let(f"bad_sum{c}", _sum(f"abs({self._of('more', k)})" for k in rows), "to find what is no number")
         bad = f"select(singular{c}, {c}, select(step(1e200-bad_sum{c}), 0, {c}))"
         p.let("failed", f"select(failed, failed, {bad})", "independent rows, finite velocities?")
@@ -576,20 +544,9 @@ class CollectiveRows(Part):
     def solver_at(self, context: openmm.Context, *, plain: bool = False) -> Solver:
         """The engine with these rows at their targets, and with the constraints of the System that they meet.
 
-        OpenMM computes the rows, in double precision.
-
-        Parameters
-        ----------
-        context : openmm.Context
-        plain : bool
-            Whether distances, angles and dihedrals are those of kcons: groups are moved whole towards these.
-
-        Raises
-        ------
-        InputError
-            The context was made before the rows were added to its System.
-        SingularGeometryError
-            A row has no gradient.
+        OpenMM computes the rows, in double precision; with `plain`, distances, angles and dihedrals are those of kcons:
+        groups are moved whole towards these. `InputError` for a context that was made before the rows were added to its
+        System, `SingularGeometryError` for a row without gradient.
         """
         require_context(context)
         x, masses = positions_of(context), masses_of(context.getSystem())
@@ -656,19 +613,6 @@ class CollectiveRows(Part):
             raise
         finally:
             context.setVelocities(velocities)
-
-    def apply_velocities(self, context: openmm.Context) -> None:
-        """Make the velocities of the context tangent to the rows and to the System's constraints.
-
-        Raises
-        ------
-        SingularGeometryError
-            A row has no gradient.
-        """
-        require_context(context)
-        if context.getSystem().getNumConstraints():
-            context.applyVelocityConstraints(context.getIntegrator().getConstraintTolerance())
-        super().apply_velocities(context)
 
     def restore(self, context: openmm.Context) -> None:
         """`apply_positions`, then `apply_velocities`; raises what these do."""
@@ -920,12 +864,6 @@ def owner(rows: CollectiveRows, context: openmm.Context) -> Integrator | None:
     ):  # the member that made steps last
         integrator = rows.program.integrator
     return integrator if rows in getattr(integrator, "parts", ()) else None
-
-
-def _halved(integrator: Any, scheme: Any) -> bool:
-    """Whether a bath acts between two halves of the drift: the second one does not begin where the step does."""
-    ensemble = getattr(integrator, "ensemble", None)
-    return ensemble is not None and any(isinstance(each, Exchange) for each in ensemble.operations(scheme))
 
 
 def _sum(terms: Iterable[str]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +17,8 @@ from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.system_checks import ROW_NAME, forces_alone, groups_of
-from kcons.openmm.quantities import nanometers
-from kcons.openmm.states import energy_of
+from kcons.openmm.integrator.guard import ROW_NAME, forces_alone, groups_of
+from kcons.openmm.quantities import energy_of, nanometers, number
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,35 +50,21 @@ class Row:
     name: str = ""
 
 
-def number(value: Any, item: str, of: unit.Unit | None = None, per: unit.Unit = unit.dimensionless) -> float:
-    """A finite number in nm, ps, radian, kJ/mol from a number or a Quantity.
+def finite_number(value: Any, item: str, of: unit.Unit | None = None, per: unit.Unit = unit.dimensionless) -> float:
+    """A finite number in nm, ps, radian, kJ/mol from a number or a Quantity; `InputError` for others.
 
-    Parameters
-    ----------
-    value : float or Quantity
-    item : str
-        For messages.
-    of : Unit, optional
-        What a Quantity must be a multiple of; if that is not known, of what is made of lengths, angles, masses, charges
-        and energies.
-    per : Unit
-        What that is divided by.
-
-    Raises
-    ------
-    InputError
-        It is neither, not finite, or of another unit.
+    A Quantity must be of unit `of` over `per`; if that is not known, of what is made of lengths, angles, masses,
+    charges and energies, over `per`.
     """
-    if unit.is_quantity(value):
-        fits = _may_be_a_coordinate(value.unit * per) if of is None else value.unit.is_compatible(of / per)
-        if not fits:
-            wanted = f"in {of / per}" if of is not None else "in nm, radian, kJ/mol or what the coordinate is in"
-            raise InputError(f"{item} is {value}, and the coordinate is of another kind; give it {wanted}", item=item)
+    if of is None and unit.is_quantity(value):
+        if not _may_be_a_coordinate(value.unit * per):
+            raise InputError(
+                f"{item} is {value}, and the coordinate is of another kind; give it in nm, radian, kJ/mol or what the "
+                "coordinate is in",
+                item=item,
+            )
         value = value.value_in_unit_system(unit.md_unit_system)
-    try:
-        result = float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{item} is {value!r}; give a number or a Quantity", item=item) from None
+    result = number(value, (unit.dimensionless if of is None else of) / per, item)
     if not math.isfinite(result):
         raise InputError(f"{item} is {result}; give a finite number", item=item)
     return result
@@ -100,12 +85,7 @@ _POWERS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "^"
 def as_rows(given: Row | openmm.Force | Formula | Sequence[Row | openmm.Force | Formula]) -> list[Row]:
     """Whatever stands for rows, or for one, as rows; a formula is one for each of its rows.
 
-    Raises
-    ------
-    InputError
-        What is no row.
-    UnsupportedError
-        A formula, or its target, that moves with the time; one of velocities.
+    `InputError` for what is no row, `UnsupportedError` for a formula that moves with the time, or is one of velocities.
     """
     rows: list[Row] = []
     for each in [given] if isinstance(given, Row | openmm.Force | Formula) else given:
@@ -189,7 +169,8 @@ def _variables(force: openmm.CustomCVForce) -> list[openmm.Force]:
 def _atoms_of(force: openmm.Force) -> set[int] | None:
     """The particles a Force depends on; None where that cannot be told, or where it is all of them."""
     if isinstance(force, openmm.CustomCVForce):
-        return _united(map(_atoms_of, _variables(force)))
+        found = [_atoms_of(variable) for variable in _variables(force)]
+        return None if None in found else set().union(*found)  # type: ignore[arg-type]
     if isinstance(force, openmm.CustomCentroidBondForce):
         return {atom for groups, *_ in _terms(force) for g in groups for atom in force.getGroupParameters(g)[0]}
     if isinstance(force, openmm.CustomCompoundBondForce):
@@ -200,19 +181,8 @@ def _atoms_of(force: openmm.Force) -> set[int] | None:
     return {int(a) for term in _terms(force) for a in term[: _TERMS[kind][1]]} if kind in _TERMS else None
 
 
-def _united(sets: Iterable[set[int] | None]) -> set[int] | None:
-    found = list(sets)
-    return None if None in found else set().union(*found)  # type: ignore[arg-type]
-
-
 def moved_atoms(system: openmm.System, force: openmm.Force) -> set[int]:
-    """The particles whose positions determine a Force; all where that cannot be told.
-
-    Raises
-    ------
-    InputError
-        One is not in the System.
-    """
+    """The particles whose positions determine a Force; all where that cannot be told. `InputError` for others."""
     atoms, every = _atoms_of(force), set(range(system.getNumParticles()))
     if atoms is not None and atoms - every:
         raise InputError(
@@ -268,14 +238,7 @@ def unit_of(force: openmm.Force) -> unit.Unit | None:
 
 
 def as_constraint(force: openmm.Force, target: float) -> Constraint | None:
-    """The constraint of kcons that a Force of one term is; None where it is none of the plain ones.
-
-    Parameters
-    ----------
-    force : openmm.Force
-    target : float
-        In nm or radian.
-    """
+    """The constraint of kcons that a Force of one plain term is, at a target in nm or radian; None if it is none."""
     force, expression = _plain(force)
     kind = _CONSTRAINTS.get((type(force).__name__, expression))
     terms = _terms(force) if kind is not None else []
@@ -294,13 +257,7 @@ def as_constraint(force: openmm.Force, target: float) -> Constraint | None:
 
 
 def free_groups(system: openmm.System, count: int, what: str, remedy: str = "use fewer groups for forces") -> list[int]:
-    """The force groups that no force of the System uses, from 1 on.
-
-    Raises
-    ------
-    UnsupportedError
-        There are not so many; `what` needs them.
-    """
+    """The force groups that no force of the System uses, from 1 on; `UnsupportedError` if `what` needs more."""
     taken: set[int] = set().union(*(groups_of(force) for force in system.getForces()))
     free = sorted(set(range(1, 32)) - taken)
     if len(free) < count:
@@ -311,14 +268,10 @@ def free_groups(system: openmm.System, count: int, what: str, remedy: str = "use
 
 
 def put_in_groups(system: openmm.System, forces: Sequence[openmm.Force]) -> list[int]:
-    """Give each Force a group of its own, and add those that are in no System, by the name of rows; returns the groups.
+    """Give each Force a group of its own, and add those that are in no System, by the name of rows; returns groups.
 
-    Raises
-    ------
-    InputError
-        A Force of another System, or one that is named twice; nothing was changed.
-    UnsupportedError
-        More rows than free force groups; nothing was changed.
+    Nothing was changed where that raises: `InputError` for a Force of another System, or one that is named twice,
+    `UnsupportedError` for more rows than free force groups.
     """
     present = {int(force.this): force for force in system.getForces()}
     identities = [int(force.this) for force in forces]
@@ -349,10 +302,7 @@ def put_in_groups(system: openmm.System, forces: Sequence[openmm.Force]) -> list
 def found_values(system: openmm.System, forces: Sequence[openmm.Force], positions: object) -> FloatArray:
     """The energy of each Force at the given positions, shape (len(forces),); evaluated apart from all else.
 
-    Raises
-    ------
-    InputError
-        Positions of the wrong shape, or at which a row is not a number.
+    `InputError` for positions of the wrong shape, or at which a row is not a number.
     """
     x = nanometers(positions, system.getNumParticles())  # type: ignore[arg-type]
     context = forces_alone(system, forces)

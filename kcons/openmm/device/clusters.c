@@ -25,17 +25,14 @@ DEVICE void rows_evaluate(ROWS int cluster, mixed time, mixed half_way, int move
         for (int p = begin; p < end; p++) {
             int a = PLACE(p), at = 3*(p-begin);
             mixed ux = x[a], uy = x[a+1], uz = x[a+2];
-            if (how == 2 && moved) {ux = base[at]; uy = base[at+1]; uz = base[at+2];}
-            else if (how == 2) {
-                int b = PLACE(p > begin ? p-1 : p);
-                ux -= x[b]; uy -= x[b+1]; uz -= x[b+2];
-                ROWS_NEAR(ux, uy, uz)
-                if (p > begin) {ux += base[at-3]; uy += base[at-2]; uz += base[at-1];}
-                base[at] = ux; base[at+1] = uy; base[at+2] = uz;
+            if (how == 2) {
+                if (!moved && p == begin) base[0] = base[1] = base[2] = 0;
+                else if (!moved) ROWS_STEP(base, at, x, a, PLACE(p-1))
+                ux = base[at]; uy = base[at+1]; uz = base[at+2];
             }
             else if (how) {ux -= x[s]; uy -= x[s+1]; uz -= x[s+2];}
             if (how == 3) {
-                GLOBAL const mixed* n = rows_cells+ROWS_FIRST_CELL+ROW(k, 8)+at;
+                GLOBAL const mixed* n = rows_cells+ROW(k, 8)+at;
                 ux += n[0]*box0.x+n[1]*box1.x+n[2]*box2.x; uy += n[1]*box1.y+n[2]*box2.y; uz += n[2]*box2.z;
             }
             if (rolls) for (int c = 0; c < 3; c++) r[size+at+c] = moved ? d[a+c] : (mixed) 0;

@@ -6,7 +6,7 @@ import ctypes
 import json
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import partial, partialmethod
 from typing import Any
 
 import numpy as np
@@ -19,23 +19,18 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
-from kcons.openmm.device.held_rows import molecules_of
-from kcons.openmm.device.held_rows import refusal as rows_refusal
+from kcons.openmm.device.held_rows import constraints_of, function_on_device
 from kcons.openmm.device.kernel_rows import KernelRows, as_parts
 from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
 from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
-from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble, Step
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
-from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.program import ConstantEnergy, Ensemble, Program, to_scheme, write_step
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.schemes import to_scheme
-from kcons.openmm.integrator.steps import write_step
-from kcons.openmm.quantities import nanometers
-from kcons.openmm.states import box_of, positions_of
+from kcons.openmm.quantities import box_of, nanometers, positions_of
 from kcons.openmm.surface_integrator import SurfaceIntegrator
 from kcons.steppers.operations import Chain, Exchange, Fly, Operation, Project
 from kcons.steppers.splitting import Splitting
@@ -45,6 +40,9 @@ from kcons.thermostats.nose_hoover import FRACTIONS
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
 _EMPTY = b'<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
 _DOUBLES, _WHOLES = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_int)
+#: Integrators by their address, for parts, which no text describes; and why the last plan could not be made.
+_ALIVE: weakref.WeakValueDictionary[int, DeviceIntegrator] = weakref.WeakValueDictionary()
+_REFUSALS: list[Exception] = []
 #: Places in what the kernel `look` tells: sum of v^2; whether a row failed, in which step, its number, its residual.
 _MOTION, _FAILED, _STEP, _ROW, _RESIDUAL = 0, 2, 3, 4, 5
 
@@ -63,13 +61,13 @@ class _Given(ctypes.Structure):
     )
 
 
-_PLANNER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_Given))
-#: Integrators by their address, for parts, which no text describes.
-_ALIVE: weakref.WeakValueDictionary[int, DeviceIntegrator] = weakref.WeakValueDictionary()
+class _Shared(ctypes.Structure):
+    """What the plugin keeps of an integrator, as there: what both sides read and write."""
 
-
-#: Why the last plan could not be made.
-_REFUSALS: list[Exception] = []
+    _fields_ = (
+        *((name, ctypes.c_int) for name in ("whole", "noisy", "every", "since", "moved")),
+        ("told", ctypes.c_double * 7),
+    )
 
 
 # -- what becomes of operations ---------------------------------------------------------------------
@@ -81,8 +79,11 @@ def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
         return f"{type(ensemble).__name__} has no kernels"
     if parts and isinstance(ensemble, LangevinRespa):
         return f"{type(ensemble).__name__} holds no parts"
-    if parts and (why := rows_refusal(parts)):
-        return why
+    try:
+        for item in constraints_of(parts):
+            function_on_device(item)
+    except UnsupportedError as error:
+        return str(error)
     for operation in ensemble.operations(scheme):
         if operation.verb not in VERBS or (isinstance(operation, Fly) and operation.exact):
             return f"the operation {operation.verb!r} has no kernel"
@@ -167,7 +168,7 @@ class DeviceProgram(Program):
 
     def listing(self) -> str:
         """The variables, and what is done between two evaluations of forces."""
-        known = [f"  {name}: {self._words[name]}" for name in [*self.settings, *self.kept]]
+        known = [f"  {name}: {self.words[name]}" for name in [*self.settings, *self.kept]]
         return "\n".join(["on the device: one kernel between two evaluations of forces or sums", "variables", *known])
 
 
@@ -182,7 +183,6 @@ class DeviceIntegrator(ProjectedIntegrator):
         There is no plugin, or it has no kernels for this step.
     """
 
-    _program_type = DeviceProgram
     program: DeviceProgram
     #: Rows of the Context, once they are known.
     rows: Any = None
@@ -191,7 +191,9 @@ class DeviceIntegrator(ProjectedIntegrator):
     _recorded: Sequence[int] = ()
 
     def _make(self, dt: float) -> None:
-        build_planner()
+        library = build.library()
+        library.kcons_set_planner(_planner)
+        library.kcons_shared.restype, library.kcons_read.restype = ctypes.POINTER(_Shared), _DOUBLES
         made = openmm.XmlSerializer.deserialize(_EMPTY.decode())
         self.this = made.this  # the proxy of this class owns what XmlSerializer has made
         openmm.Integrator.setStepSize(self, dt)
@@ -200,20 +202,18 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _held(self, parts: Any) -> tuple[Part, ...]:
         return as_parts(parts)
 
-    def _write(self, program: Program) -> Step:
+    def _write(self) -> Program:
         """A step without parts: kernels hold their rows."""
-        step = Step(program, self.scheme, (), self._ensemble)
-        write_step(step)
-        for part in self.parts:
-            part.program = self.program
-        return step
+        program = DeviceProgram(self, self.scheme, (), self._ensemble)
+        write_step(program)
+        return program
 
     def describe(self) -> bool:
         """Tell the plugin what a step is; returns whether it knew another one."""
         program = self.program
         description = json.dumps(
             {
-                "operations": plain_operations(self._step.operations, self.ensemble),
+                "operations": plain_operations(self.program.operations, self.ensemble),
                 "settings": program.settings,
                 "memory": program.kept,
                 "seed": self._seed,
@@ -227,12 +227,21 @@ class DeviceIntegrator(ProjectedIntegrator):
             return False
         self._described = description
         spread = program.settings.get("kT", 0.0) * program.settings.get("friction", 0.0)
-        build.library().kcons_describe(self._address, description.encode(), int(self.ensemble.noisy and spread > 0))
+        self._shared.noisy = self.ensemble.noisy and spread > 0
+        rows = [row for item in constraints_of(self.parts) if item.width > 1 for row in item.atoms.tolist()]
+        clusters = np.array([number for row in rows for number in (len(row), *row)], dtype=np.int32)
+        found = clusters.ctypes.data_as(_WHOLES)
+        build.library().kcons_describe(self._address, description.encode(), found, clusters.size)
         return True
 
     @property
     def _address(self) -> ctypes.c_void_p:
         return ctypes.c_void_p(int(self.this))
+
+    @property
+    def _shared(self) -> _Shared:
+        shared: _Shared = build.library().kcons_shared(self._address).contents
+        return shared
 
     @property
     def bound(self) -> bool:
@@ -241,12 +250,11 @@ class DeviceIntegrator(ProjectedIntegrator):
 
     def read(self, name: str) -> FloatArray:
         """An array of the device, by its name in `kcons.openmm.device.kernels`."""
-        library, address = build.library(), self._address
-        count = library.kcons_read(address, name.encode(), None, 0)
-        values = np.zeros(max(count, 0))
-        if count < 0 or library.kcons_read(address, name.encode(), values.ctypes.data_as(_DOUBLES), count) < 0:
-            raise _REFUSALS.pop() if _REFUSALS else openmm.OpenMMException(library.kcons_error().decode())
-        return values
+        count = ctypes.c_int()
+        found = build.library().kcons_read(self._address, name.encode(), ctypes.byref(count))
+        if not found:
+            raise _REFUSALS.pop() if _REFUSALS else openmm.OpenMMException(build.library().kcons_error().decode())
+        return np.ctypeslib.as_array(found, (count.value,)).copy()
 
     def write(self, name: str, values: FloatArray) -> None:
         """Write an array of the device."""
@@ -261,13 +269,13 @@ class DeviceIntegrator(ProjectedIntegrator):
         super().attach(context)
         guard = self._guard
         assert guard is not None
-        build.library().kcons_set_whole(self._address, int(guard.moving or not guard.undisturbed))
+        self._shared.whole = guard.moving or not guard.undisturbed
 
     def _run_block(self, guard: Guard, steps: int, ends: bool) -> None:
         self._run(guard, steps, ends)
 
     def _run(self, guard: Guard, steps: int, ends: bool) -> None:
-        if guard.in_run and build.library().kcons_was_moved(self._address):
+        if guard.in_run and self._shared.moved:
             guard.begin()
         first = guard.context.getStepCount()
         for part in self.parts:
@@ -276,7 +284,7 @@ class DeviceIntegrator(ProjectedIntegrator):
         try:
             self._advance(guard.context, steps)
         except openmm.OpenMMException as error:
-            told = self._look()
+            told = list(self._shared.told)
             guard.put_back()
             if told[_FAILED]:
                 raise self._unsolved(told, guard) from error
@@ -294,9 +302,8 @@ class DeviceIntegrator(ProjectedIntegrator):
         rows = self.rows
         for done in range(0, steps, rows.block):
             block = min(steps - done, rows.block)
-            positions = positions_of(context) if rows.looks else None
-            cell = np.array(box_of(context)) if rows.looks else None
-            for name, values in rows.renew(context.getTime()._value, self._dt, block, positions, cell).items():
+            now = (positions_of(context), np.array(box_of(context))) if rows.n_cells else ()
+            for name, values in rows.renew(context.getTime()._value, self._dt, block, *now).items():
                 self.write(name, values)
             openmm.Integrator.step(self, block)
 
@@ -349,21 +356,16 @@ class DeviceIntegrator(ProjectedIntegrator):
             context = self._watch().context
             time, since = context.getTime()._value, context.getStepCount()
             self.write("recorded", np.array([every, since]))
-            build.library().kcons_record_every(self._address, every, since)
+            self._shared.every, self._shared.since = every, since
             try:
                 self.step(min(steps - done, room * every))
             finally:
-                build.library().kcons_record_every(self._address, 0, 0)
+                self._shared.every = 0
             made = (context.getStepCount() - since) // every
             found = self.read("records").reshape(room, n, 3, 3)
             for k in range(made):
                 x, v, f = found[k].swapaxes(0, 1)
                 yield x, v, f, time + (k + 1) * every * self._dt
-
-    def _look(self) -> list[float]:
-        told = (ctypes.c_double * 7)()
-        build.library().kcons_told(self._address, told)
-        return list(told)
 
     # -- variables, as the CustomIntegrator has them ------------------------------------------------
 
@@ -371,31 +373,12 @@ class DeviceIntegrator(ProjectedIntegrator):
         """A variable of the step, see `listing`."""
         program = self.program
         if name == "motion":
-            return self._look()[_MOTION]
+            return float(self._shared.told[_MOTION])
         if name == "failed":  # a call that fails raises
             return 0.0
         if name in program.kept and self.bound:
             return float(self.read("memory")[program.kept.index(name)])
         return {**program.numbers, **program.settings}[program.known(name)]
-
-    def getNumGlobalVariables(self) -> int:
-        return len(self.program.numbers)
-
-    def getGlobalVariableName(self, index: int) -> str:
-        return list(self.program.numbers)[index]
-
-    def getGlobalVariable(self, index: int) -> float:
-        return self.getGlobalVariableByName(self.getGlobalVariableName(index))
-
-    def setGlobalVariable(self, index: int, value: float) -> None:
-        """As for a CustomIntegrator, settings have their own value again in the next step."""
-        self.program.write(self.getGlobalVariableName(index), value)
-
-    def getNumPerDofVariables(self) -> int:
-        """None, and there are no tables and computations either."""
-        return 0
-
-    getNumComputations = getNumTabulatedFunctions = getNumPerDofVariables
 
     def setRandomNumberSeed(self, seed: int) -> None:
         """The seed of noise, before the Context is made; 0 for one that nobody knows."""
@@ -406,29 +389,21 @@ class DeviceIntegrator(ProjectedIntegrator):
         return self._seed
 
 
-def _refuse_of_programs(name: str) -> Any:
-    def refuse(self: DeviceIntegrator, *args: Any, **options: Any) -> None:
-        raise UnsupportedError(
-            f"{name} is about the program of a CustomIntegrator, and these steps have kernels; give device=False"
-        )
-
-    return refuse
+def _refuse(self: DeviceIntegrator, name: str, *_: Any, **__: Any) -> None:
+    raise UnsupportedError(
+        f"{name} is about the program of a CustomIntegrator, and these steps have kernels; give device=False"
+    )
 
 
 for _name, _method in vars(openmm.CustomIntegrator).items():
     if _name[0].islower() and getattr(DeviceIntegrator, _name) is _method and not hasattr(openmm.Integrator, _name):
-        setattr(DeviceIntegrator, _name, _refuse_of_programs(_name))
+        setattr(DeviceIntegrator, _name, partialmethod(_refuse, _name))
 
 
 # -- plans for a Context ------------------------------------------------------------------------------
 
 
-def build_planner() -> None:
-    """Load the plugin, and tell it who makes plans."""
-    build.library().kcons_set_planner(_planner)
-
-
-@_PLANNER
+@ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_Given))
 def _planner(made: int, given: Any) -> int:
     try:
         _fill(ctypes.c_void_p(made), given.contents)
@@ -440,48 +415,34 @@ def _planner(made: int, given: Any) -> int:
 
 
 def _fill(made: ctypes.c_void_p, given: _Given) -> None:
-    library = build.library()
-    masses = np.ctypeslib.as_array(given.masses, (given.particles,)).copy()
+    """Hand a plan over to the plugin, for what it tells of a Context."""
+    library, platform = build.library(), given.platform.decode()
     n, described = given.constraints, json.loads(given.description)
-    pairs = np.array(given.pairs[: 2 * n], dtype=np.int64).reshape(n, 2)
-    lengths = np.array(given.lengths[:n], dtype=np.float64)
+    pairs, lengths = np.array(given.pairs[: 2 * n], dtype=np.int64).reshape(n, 2), np.array(given.lengths[:n])
     integrator = _ALIVE.get(given.integrator)
     if described["parts"] and integrator is None:
         raise UnsupportedError(
             "the parts of an integrator are those of its Python object: keep a reference to it, and in place of "
             "reading its text make it again, with parts="
         )
-    part = integrator.parts[0] if integrator is not None and integrator.parts else None
-    assert part is None or isinstance(part, KernelRows)
-    if not given.positions:
-        for atoms in molecules_of(pairs, () if part is None else part.given):
-            members = np.ascontiguousarray(atoms, dtype=np.int32)
-            library.kcons_plan_cluster(made, members.ctypes.data_as(_WHOLES), members.size)
-        return
+    part = integrator.parts[0] if integrator is not None and integrator.parts else KernelRows(())
+    assert isinstance(part, KernelRows)
+    masses = np.ctypeslib.as_array(given.masses, (given.particles,)).copy()
     positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
     box = np.array(given.box[:9]).reshape(3, 3)
-    held = KernelRows(()) if part is None else part
-    rows = held.rows_at(masses, (pairs, lengths), positions, box if box.any() else None, given.time)
+    rows = part.rows_at(masses, (pairs, lengths), positions, box if box.any() else None, given.time)
     if integrator is not None:
         integrator.rows = rows
-    platform = given.platform.decode()
     done = plan(described, platform, masses, given.groups, rows)
-    compiled = build.kernels_library(done.source) if platform in PLAIN else ""
-    library.kcons_plan_source(
-        made, done.source.encode(), str(compiled).encode(), done.items, done.work_group, done.slots
-    )
+    compiled = str(build.kernels_library(done.source)) if platform in PLAIN else ""
+    library.kcons_plan_source(made, done.source.encode(), compiled.encode(), done.items, done.work_group, done.slots)
     for array in done.arrays:
         values = np.ascontiguousarray(array.values, dtype=np.float64)
-        pointer = values.ctypes.data_as(_DOUBLES)
-        whole = array.kind == "int"
-        library.kcons_plan_array(made, array.name.encode(), int(whole), int(array.saved), pointer, values.size)
+        about = array.name.encode(), int(array.kind == "int"), int(array.saved)
+        library.kcons_plan_array(made, *about, values.ctypes.data_as(_DOUBLES), values.size)
     for number, actions in enumerate(done.parts):
-        for action in actions:
-            library.kcons_plan_action(
-                made, number, action.verb, action.kernel.encode(), ctypes.c_int32(action.groups), action.slot
-            )
-    order = np.ascontiguousarray(done.order, dtype=np.int32)
-    library.kcons_plan_order(made, order.ctypes.data_as(_WHOLES), order.size)
+        for kernel, groups, slot in actions:
+            library.kcons_plan_action(made, number, kernel.encode(), ctypes.c_int32(groups), slot)
 
 
 class DeviceSurfaceIntegrator(SurfaceIntegrator, DeviceIntegrator):

@@ -1,13 +1,8 @@
-"""What is held on the device: rows with their functions and numbers, and clusters that look alike.
-
-Rows that share a moving atom are one cluster, as the engine's plan says. Clusters that look alike are one pattern,
-whose code or tables are written once.
-"""
+"""What is held on the device: constraint objects of parts, their functions, and clusters that look alike."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,32 +10,13 @@ import numpy as np
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.functions.straight_line import Function, function_of
-from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import UnsupportedError
-from kcons.motion.motion import Motion
 from kcons.openmm.device.c_writer import c_functions
-from kcons.plan.clusters_alike import alike
 
 #: Rows, atoms of a cluster and atoms of a row up to which a work-item has the cluster in registers.
 ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4
 #: How rows take their atoms, see `clusters.c`.
 STORED, RELATIVE, NEAREST, IN_CELLS = range(4)
-
-
-def refusal(parts: Any) -> str:
-    """Why parts of an integrator cannot be held on the device; '' if they can.
-
-    Parameters
-    ----------
-    parts : Part, Constraint or sequence of such
-        Of the integrator.
-    """
-    try:
-        for item in constraints_of(parts):
-            function_on_device(item)
-    except UnsupportedError as error:
-        return str(error)
-    return ""
 
 
 def constraints_of(parts: Any) -> list[Constraint]:
@@ -65,16 +41,6 @@ def constraints_of(parts: Any) -> list[Constraint]:
     return found
 
 
-def molecules_of(pairs: IntArray, parts: Any) -> list[IntArray]:
-    """Atoms that OpenMM has to keep together, row by row: `pairs` of the System, shape (n, 2), and rows of parts."""
-    return [
-        row for table in [pairs, *(item.atoms for item in constraints_of(parts) if item.width > 1)] for row in table
-    ]
-
-
-# -- functions --------------------------------------------------------------------------------------
-
-
 def function_on_device(item: Constraint) -> Function:
     """The function of an object's rows.
 
@@ -93,11 +59,8 @@ def function_on_device(item: Constraint) -> Function:
     return found
 
 
-# -- rows and clusters ------------------------------------------------------------------------------
-
-
 class Row(NamedTuple):
-    """A row of a pattern: number of its function, its atoms in the cluster, how it takes them, and what it is."""
+    """A row of a shape: number of its function, its atoms in the cluster, how it takes them, and what it is."""
 
     function: int
     atoms: tuple[int, ...]
@@ -109,105 +72,26 @@ class Row(NamedTuple):
     period: float
 
 
-@dataclass(frozen=True)
-class Pattern:
-    """Clusters that look alike: its rows, those that depend on others last.
+class Shape(NamedTuple):
+    """Clusters that look alike, whose code or tables are written once: its rows, those that depend on others last.
 
-    `clusters` are their rows in the set, shape (n, n_rows), `atoms` their particles, shape (n, n_atoms).
+    `atoms` are their particles, shape (n, n_atoms), `clusters` their rows in the set, (n, n_rows); single atoms have no
+    rows and no `name`, which ends those of functions. The first cluster has the number `first` among those of the name.
     """
 
-    rows: tuple[Row, ...]
     atoms: IntArray
-    clusters: IntArray
+    rows: tuple[Row, ...] = ()
+    clusters: IntArray = np.zeros((0, 0), np.int64)
+    name: str = ""
+    first: int = 0
 
     @property
-    def small(self) -> bool:
-        """Whether a work-item has a cluster."""
-        widest = max(len(row.atoms) for row in self.rows)
-        return len(self.rows) <= ITEM_ROWS and self.atoms.shape[1] <= ITEM_ATOMS and widest <= ITEM_WIDTH
+    def together(self) -> bool:
+        """Whether a work-group has a cluster; else a work-item."""
+        widest = max((len(row.atoms) for row in self.rows), default=0)
+        return len(self.rows) > ITEM_ROWS or self.atoms.shape[1] > ITEM_ATOMS or widest > ITEM_WIDTH
 
     @property
-    def rank(self) -> int:
+    def n_rows(self) -> int:
+        """Independent rows of a cluster."""
         return sum(not row.depends for row in self.rows)
-
-
-class HeldRows:
-    """All rows of an engine, as the device has them.
-
-    Parameters
-    ----------
-    motion : Motion
-    summed_from : int
-        The first row whose multipliers are summed.
-    time : float
-
-    Attributes
-    ----------
-    functions : list of Function
-    patterns : list of Pattern
-    target, scale : ndarray, shape (n_rows,)
-        The scale is what tolerances are relative to: the length held, 1 for all that is no length.
-    parameters : list of ndarray
-        Of each row.
-    doubtful : ndarray of bool, shape (n_rows,)
-        Rows of clusters in which rows depend on others.
-    moving, in_cells : list of int
-        Rows whose targets move, and rows whose atoms stand in cells that are given, in the order of tables.
-    """
-
-    def __init__(self, motion: Motion, summed_from: int, time: float) -> None:
-        self.motion, self.set, self.summed_from = motion, motion.constraint_set, summed_from
-        self.functions: list[Function] = []
-        self.moving: list[int] = []
-        self.in_cells: list[int] = []
-        held = self.set
-        self.target = held.target(time)
-        size = np.concatenate([item.scale(time) for item in held.constraints] or [np.zeros(0)])
-        self.scale = np.where(size > 0, size, 1.0)
-        self.parameters: list[FloatArray] = []
-        atoms: list[IntArray] = []
-        rows: list[Row] = []
-        last = motion.plan.eliminate_last
-        self.doubtful = last.copy()
-        for some in motion.plan.dependent:
-            self.doubtful[some] = True
-        known: dict[Function, int] = {}
-        for item, start in zip(held.constraints, held.starts, strict=False):
-            self.parameters += list(item.parameters().reshape(item.n_rows, -1))
-            atoms += list(item.atoms)
-            number = -1 if item.fixes_atoms else known.setdefault(function_on_device(item), len(known))
-            # OpenMM keeps molecules in one piece: its own constraints know no images.
-            open_ = held.lattice is None or start + item.n_rows <= summed_from
-            how = np.full(item.n_rows, STORED if not item.relative else RELATIVE if open_ else NEAREST)
-            if item.relative and item.whole is not None and not open_:
-                how[item.whole] = IN_CELLS
-            moves, period = isinstance(item.target, MovingTarget), item.period or 0.0
-            if moves:
-                self.moving += range(start, start + item.n_rows)
-            for k in range(item.n_rows):
-                flags = not item.holonomic, moves, bool(last[start + k]), bool(start + k >= summed_from)
-                rows.append(Row(number, (), int(how[k]), *flags, period))
-        self.functions += known
-        self.patterns = self._patterns(rows, atoms)
-
-    def _patterns(self, rows: list[Row], atoms: list[IntArray]) -> list[Pattern]:
-        plan = self.motion.plan
-        found = alike(plan.labels, plan.eliminate_last, rows, atoms)
-        return [
-            Pattern(tuple(row._replace(atoms=local) for row, local in key), each.atoms, each.rows)
-            for key, each in found.items()
-        ]
-
-    def cells_of(self, x: FloatArray) -> FloatArray:
-        """Whole cells that bring the atoms of the rows `in_cells` beside the first one, one row after another."""
-        lattice = self.set.lattice
-        found: list[FloatArray] = []
-        made: dict[int, FloatArray] = {}
-        for row in self.in_cells:
-            item, k = self.set.locate(row)
-            if id(item) not in made:
-                assert lattice is not None
-                cells = np.round((self.set.gather(item, x) - x[item.atoms]) @ lattice[1])
-                made[id(item)] = cells - cells[:, :1]
-            found.append(made[id(item)][k].ravel())
-        return np.concatenate(found) if found else np.zeros(1)

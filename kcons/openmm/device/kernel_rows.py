@@ -13,15 +13,13 @@ import openmm
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.callback_rows.carried_constraints import CarriedConstraints, Engine, cell_of, refuse_virtual_sites
+from kcons.openmm.callback_rows import CarriedConstraints, Engine, refuse_virtual_sites
 from kcons.openmm.device.held_rows import constraints_of
-from kcons.openmm.device.rows import DeviceRows, rows_of
-from kcons.openmm.integrator.part import Part, Solver
-from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.device.rows import DeviceRows
+from kcons.openmm.integrator.guard import SystemRows, settled_rows
+from kcons.openmm.integrator.part import Part, Precision, Solver
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import SystemRows, settled_rows
-from kcons.openmm.quantities import accepted, masses_of
-from kcons.openmm.states import positions_of
+from kcons.openmm.quantities import accepted, masses_of, positions_of
 
 
 class KernelRows(CarriedConstraints):
@@ -46,8 +44,6 @@ class KernelRows(CarriedConstraints):
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
         for part in carried:
             part._engine.served = True
-        #: The engine of what `hold` made, until the Context is known.
-        self._carried = carried[0]._engine if len(carried) == len(parts) == 1 else None
         #: Whether rows take periodic images: as `hold` was told, else as the System.
         self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
         self._bound: tuple[DeviceRows, Engine] | None = None
@@ -72,7 +68,7 @@ class KernelRows(CarriedConstraints):
         Raises
         ------
         KconsError
-            As `rows_of`.
+            As `DeviceRows`.
         """
         pairs, lengths = system_rows
         # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
@@ -83,27 +79,21 @@ class KernelRows(CarriedConstraints):
         made_of = masses.tobytes(), *(np.asarray(array).tobytes() for array in system_rows)
         if self._bound is None or self._of != made_of:
             cell = None if self._wraps is False else cell
-            rows = rows_of(masses, system_rows, self.given, positions, cell, time)
+            rows = DeviceRows(masses, system_rows, self.given, positions, cell, time)
             self._bound, self._of = (rows, Engine(rows.motion, masses, cell)), made_of
             self._slopes = None
         return self._bound[0]
 
     def bind(self, context: openmm.Context) -> DeviceRows:
         """The rows for a Context, at its positions."""
-        if self._bound is not None and self._context() is context:
-            return self._bound[0]
-        self._context = weakref.ref(context)
-        system = context.getSystem()
-        known = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-        pairs = np.array([[i, j] for i, j, _ in known], dtype=np.int64).reshape(-1, 2)
-        lengths = np.array([length._value for _, _, length in known], dtype=float)
-        cell = None
-        if system.usesPeriodicBoundaryConditions():
-            cell = cell_of(context.getState().getPeriodicBoxVectors())
-        masses = masses_of(system)
-        refuse_virtual_sites(system, self.atoms, masses)
-        time = float(context.getTime()._value)
-        return self.rows_at(masses, (pairs, lengths), positions_of(context), cell, time)
+        if self._context() is not context:
+            system, program = context.getSystem(), self.program
+            assert program is not None
+            refuse_virtual_sites(system, self.atoms, masses_of(system))
+            program.integrator.read("seed")  # makes the plan, which asks `rows_at`
+            self._context = weakref.ref(context)
+        assert self._bound is not None
+        return self._bound[0]
 
     @property
     def atoms(self) -> IntArray:
@@ -114,8 +104,6 @@ class KernelRows(CarriedConstraints):
 
     @property
     def _engine(self) -> Any:  # type: ignore[override]
-        if self._bound is None and self._carried is not None:
-            return self._carried
         if self._bound is None:
             raise InputError(
                 "these rows are known at the first step of a Context; call integrator.attach(context) after its "
@@ -143,8 +131,8 @@ class KernelRows(CarriedConstraints):
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Whatever the precision is: residuals are what it can hold."""
 
-    def _check_system(self, system: openmm.System, precision: Precision) -> None:
-        self._engine.precision = precision
+    def _check_system(self, system: openmm.System) -> None:
+        """Kernels are made for the System of a Context."""
 
     def check_masses(self, system: openmm.System) -> None:
         """Kernels are made for the masses of a Context."""

@@ -15,6 +15,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.device.held_rows import Shape
 
 #: Platforms whose kernels are plain C++.
 PLAIN = ("Reference", "CPU")
@@ -26,45 +27,15 @@ _SUMS = 7
 
 
 class Array(NamedTuple):
-    """An array on the device, which kernels know by its name.
+    """An array of 'mixed' or 'int' numbers, which kernels know by its name, and what it begins with.
 
-    Attributes
-    ----------
-    name : str
-    kind : {'mixed', 'int'}
-    values : ndarray
-        What it begins with.
-    saved : bool
-        Whether it belongs to a state: checkpoints and States have it.
+    One that is `saved` belongs to a state: checkpoints and States have it.
     """
 
     name: str
     kind: str
     values: FloatArray | IntArray
     saved: bool = False
-
-
-class Shape(NamedTuple):
-    """Clusters of atoms whose code is the same.
-
-    Attributes
-    ----------
-    name : str
-        Ending of the names of its functions; empty for single atoms.
-    atoms : ndarray of int, shape (n_clusters, n)
-    together : bool
-        Whether a work-group has a cluster; else a work-item.
-    n_rows : int
-        Independent rows of a cluster.
-    first : int
-        Number of the first cluster among those of this name.
-    """
-
-    name: str
-    atoms: IntArray
-    together: bool = False
-    n_rows: int = 0
-    first: int = 0
 
 
 _COMMON = """
@@ -161,6 +132,11 @@ static inline real4 make_real4(double x, double y, double z, double w) {return r
 #define PUT_V(a, p) GET_3(velocities, p, v, a)
 #define GET_X(a, p) GET_3(x, a, positions, p)
 #define PUT_X(a, p) GET_3(positions, p, x, a)
+struct Numbers {int step, launch; double dt, time, tolerance, box[9];};
+#define UNPACK_NUMBERS int step = given->step, launch = given->launch; \\
+  double dt = given->dt, time = given->time, tolerance = given->tolerance; const double* box_ = given->box; \\
+  real4 box0 = {box_[0], box_[1], box_[2], 0}, box1 = {box_[3], box_[4], box_[5], 0}; \\
+  real4 box2 = {box_[6], box_[7], box_[8], 0};
 """
 
 _BOX = ("box0", "box1", "box2")
@@ -182,20 +158,11 @@ def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_grou
     names = ["step", "launch", "HELD_TO", *_BOX, *(a.name for a in passed)] + ["scratch"] * (scratch > 0)
     forces = [f"force{k}" for k in range(slots)]
     if plain:
-        given = "void** pointers, const double* reals, const int* integers, int GROUP_ID, int NUM_GROUPS"
-        own = [("mixed", name) for name in ("positions", "velocities", "inverse_masses", *forces)]
-        own += [(array.kind, array.name) for array in arrays]
-        lines = [
-            f"{kind.replace('mixed', 'double')}* {name} = ({kind}*) pointers[{k}];"
-            for k, (kind, name) in enumerate(own)
-        ]
-        lines += [f"double {name} = reals[{k}];" for k, name in enumerate(("dt", "time", "tolerance"))]
-        lines += [f"int {name} = integers[{k}];" for k, name in enumerate(("step", "launch"))]
-        lines += [
-            f"real4 {b} = {{reals[{k}], reals[{k + 1}], reals[{k + 2}], 0}};"
-            for k, b in zip((3, 6, 9), _BOX, strict=True)
-        ]
-        unpack = " ".join(lines)
+        given = "void** pointers, const Numbers* given, int GROUP_ID, int NUM_GROUPS"
+        own = [("double", name) for name in ("positions", "velocities", "inverse_masses", *forces)]
+        own += [(array.kind.replace("mixed", "double"), array.name) for array in arrays]
+        unpack = "UNPACK_NUMBERS "
+        unpack += " ".join(f"{kind}* {name} = ({kind}*) pointers[{k}];" for k, (kind, name) in enumerate(own))
     else:
         alone = "" if scratch else "RESTRICT "  # items of a group read what others have written
         own_arrays = [f"GLOBAL {array.kind}* {alone}{array.name}" for array in arrays]
@@ -234,24 +201,11 @@ def standard_arrays(
 
 
 class Op(NamedTuple):
-    """An operation as plain data.
+    """An operation as plain data: a verb of `VERBS`, the fraction of the step that it is over, and whose forces.
 
-    Attributes
-    ----------
-    verb : str
-        As `kcons.steppers.operations` has them; 'note' is for the kinetic energy that a State tells.
-    share : float
-        The fraction of the step that it is over.
-    group : str
-        Whose forces.
-    flights : tuple of float
-        Of a drift the RATTLE drifts, of a chain the parts that it consists of, as fractions of the step.
-    ends : tuple of float
-        At which fractions of the step they end; of others, when they are.
-    begun : int
-        0 in the step that is being made, -1 in the one before.
-    use : int
-        Number of its noise within the step.
+    A drift has `flights`, the RATTLE drifts that it consists of, a chain its parts, all as fractions of the step;
+    `ends` are when flights end, or when other operations are. `begun` is 0 in the step that is being made, -1 in the
+    one before. `use` is the number of its noise within the step.
     """
 
     verb: str
@@ -263,7 +217,7 @@ class Op(NamedTuple):
     use: int = 0
 
 
-#: What kernels can do.
+#: What kernels can do, as `kcons.steppers.operations` has it; 'note' is for the kinetic energy that a State tells.
 VERBS = ("kick", "fly", "project", "exchange", "turn", "chain", "evaluate", "note", "rescale", "restore")
 
 
@@ -338,7 +292,7 @@ def _once(code: str, *names: str) -> str:
     return f" if (LOCAL_ID == 0) {{\n{code}{stored}}}\n SYNC_THREADS;{read}\n SYNC_THREADS;\n"
 
 
-#: The closed form of `kcons.thermostats.isokinetic.kick`, everything divided by exp(z).
+#: The closed form of `kcons.thermostats.isokinetic`, everything divided by exp(z).
 _CLOSED_FORM = """ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(-z);
  mixed aim = sum0/sqrt(max((mixed) (sum2*sum1), TINY));
  aim = min(max(aim, (mixed) -1), (mixed) 1);
@@ -399,7 +353,7 @@ _RECORD = """ if (failure[0] != 0) return;
 """
 
 
-#: What happens on the spheres of a cluster, see `kcons.thermostats.multistep.sphere_kernels`: component c of an atom is
+#: What happens on the spheres of a cluster, see `kcons.thermostats.sphere_kernels`: component c of an atom is
 #: its part of the center of mass, which is on sphere OF[c], and the rest on OF[3]; -1 for none. KEEP and PUSH are what
 #: v and d are multiplied by, OWN what auxiliary variables are.
 _SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};
@@ -408,14 +362,14 @@ _SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};
  mixed keep[COUNT], push[COUNT], kept_own[COUNT];
  SYNC
  if (of[0] >= 0) {
-  EVERY if (w[a] != 0) {mass += 1/w[a]; for (int c = 0; c < 3; c++) {cv[c] += v[3*a+c]/w[a]; cd[c] += D/w[a];}}
+  EVERY if (w[a] != 0) {mass += 1/w[a]; for (int c = 0; c < 3; c++) {cv[c] += v[3*a+c]/w[a]; cd[c] += PUSHED/w[a];}}
   for (int c = 0; c < 3; c++) {
    cv[c] /= mass; cd[c] /= mass;
    vv[of[c]] += mass*cv[c]*cv[c]; vd[of[c]] += mass*cv[c]*cd[c]; dd[of[c]] += mass*cd[c]*cd[c];
   }
  }
  if (of[3] >= 0) EVERY if (w[a] != 0) for (int c = 0; c < 3; c++) {
-  mixed m = 1/w[a], p = v[3*a+c]-cv[c], q = D-cd[c];
+  mixed m = 1/w[a], p = v[3*a+c]-cv[c], q = PUSHED-cd[c];
   vv[of[3]] += m*p*p; vd[of[3]] += m*p*q; dd[of[3]] += m*q*q;
  }
  for (int s = 0; s < COUNT; s++) {
@@ -427,7 +381,7 @@ _SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};
  SYNC
  EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {
   mixed r = v[3*a+c]-cv[c];
-  if (of[3] >= 0) r = keep[of[3]]*r+push[of[3]]*(D-cd[c]);
+  if (of[3] >= 0) r = keep[of[3]]*r+push[of[3]]*(PUSHED-cd[c]);
   if (of[c] >= 0) r += keep[of[c]]*cv[c]+push[of[c]]*cd[c];
   v[3*a+c] = r;
  }
@@ -446,31 +400,28 @@ _RULES = {
 }
 
 
-class Spheres(NamedTuple):
-    """Spheres of clusters: of which kind, and how many auxiliary variables each has; see `IsokineticSpheres`."""
+def _spheres_of(kind: str, shape: Shape, moving: Any, placed: bool) -> tuple[tuple[int, ...], list[int]]:
+    """Spheres of the center of mass along x, y, z and of the rest, -1 for none; degrees of freedom on each."""
+    free = 3 * int(moving.sum()) - shape.n_rows
+    if kind == "cluster" or placed or not moving.all():
+        return (-1, -1, -1, 0 if free else -1), [free] if free else []
+    centers, parts = ((0, 1, 2), [1, 1, 1]) if kind == "axes" else ((0, 0, 0), [3])
+    return (*centers, len(parts) if free > 3 else -1), [*parts, *([free - 3] if free > 3 else [])]
 
-    kind: str
-    auxiliary: int
 
-    def of(self, shape: Shape, moving: Any, placed: bool) -> tuple[tuple[int, ...], list[int]]:
-        """Spheres of the center of mass along x, y, z and of the rest, -1 for none; degrees of freedom on each."""
-        free = 3 * int(moving.sum()) - shape.n_rows
-        if self.kind == "cluster" or placed or not moving.all():
-            return (-1, -1, -1, 0 if free else -1), [free] if free else []
-        centers, parts = ((0, 1, 2), [1, 1, 1]) if self.kind == "axes" else ((0, 0, 0), [3])
-        return (*centers, len(parts) if free > 3 else -1), [*parts, *([free - 3] if free > 3 else [])]
+def _with(text: str, words: Mapping[str, object]) -> str:
+    """A text with other words."""
+    for word, meaning in words.items():
+        text = text.replace(word, str(meaning))
+    return text
 
 
 class Action(NamedTuple):
-    """What the plugin does: launch a kernel, evaluate forces."""
+    """What the plugin does: launch a kernel, or, where it has no name, evaluate forces of some groups for a slot."""
 
-    verb: int
-    kernel: str = ""
+    kernel: str
     groups: int = -1
     slot: int = 0
-
-
-LAUNCH, EVALUATE = range(2)
 
 
 class _Place(NamedTuple):
@@ -493,15 +444,17 @@ class Kernels:
         #: Particles whose rows have a place in space: what cells OpenMM has moved them by is taken back for them.
         self.placed = held.placed
         self.resting = len(held.fixed) > 0  # particles with a mass
-        self.spheres = Spheres(*described["spheres"]) if described["spheres"][0] else None
-        self.sphere_of: list[Any] = []
+        #: Kind of spheres, empty for none, and auxiliary variables of each; spheres of each shape, see `_SPHERES`,
+        #: degrees of freedom on them, and where the auxiliary variables of the shape begin.
+        self.spheres, self.per_sphere = described["spheres"]
+        self.sphere_of: list[tuple[tuple[int, ...], list[int], int]] = []
         self.auxiliary = self.items = self.crowds = self.work = self.particles = 0
         self.places: list[_Place] = []
         self.order: list[IntArray] = []
         everything = np.arange(len(masses))
         moving = (masses > 0) & ~np.isin(everything, held.fixed)
         free = np.setdiff1d(everything, np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
-        for shape in [*held.shapes, *([Shape("", free[:, None])] if len(free) else [])]:
+        for shape in [*held.shapes, *([Shape(free[:, None])] if len(free) else [])]:
             clusters = len(shape.atoms)
             self.places.append(_Place(shape, self.crowds if shape.together else self.items, self.particles, self.work))
             atoms = (shape.atoms if shape.together else shape.atoms.T).ravel()
@@ -510,11 +463,11 @@ class Kernels:
             self.items += clusters * (not shape.together)
             self.particles += shape.atoms.size
             self.work += 10 * shape.atoms.size * shape.together
-            if self.spheres is not None:
+            if self.spheres:
                 placed = bool(np.isin(shape.atoms, held.placed).any())
-                found = self.spheres.of(shape, moving[shape.atoms[0]], placed)
-                self.sphere_of.append((*found, self.auxiliary))
-                self.auxiliary += clusters * len(found[1]) * self.spheres.auxiliary
+                of, freedom = _spheres_of(self.spheres, shape, moving[shape.atoms[0]], placed)
+                self.sphere_of.append((of, freedom, self.auxiliary))
+                self.auxiliary += clusters * len(freedom) * self.per_sphere
         self.source: list[str] = []
         self._reset()
         self._bank = 0
@@ -567,63 +520,49 @@ class Kernels:
         self._add("", f" SYNC velocities_NAME(ROWS_PASS CLUSTER, 1, {_time(op, op.ends[0])}, x, v, w);\n")
 
     def _exchange(self, op: Op) -> None:
-        if self.spheres is not None:
-            self._stir(op)
-            return
-        damp, size = self._bath(op)
-        noise = (
-            f" EACH if (w[a] != 0) {{\n  mixed g[4], s = {size}*sqrt(w[a]);\n"
-            f"  gaussians(g, ORDER(AT), step+({op.begun}), {op.use}, seed[0]);\n"
-            f"  for (int c = 0; c < 3; c++) v[3*a+c] = {damp}*v[3*a+c]+s*g[c];\n }}\n"
-        )
-        # What the drift before has left across the rows is an impulse of theirs; what noise adds is none.
-        along = " SYNC velocities_NAME(ROWS_PASS CLUSTER, {}, time, x, v, w);\n"
-        self._add("", along.format(1) * self.tidy)
-        self._add(noise)
-        self._add("", along.format(0) * self.tidy)
-
-    def _bath(self, op: Op) -> tuple[str, str]:
-        """Names of what friction leaves of velocities, and of the size of noise."""
+        """Friction and noise; on spheres the noise is along the rows, and auxiliary variables have their own."""
         damp, size = f"damp{op.use}_{-op.begun}", f"size{op.use}_{-op.begun}"
         y = f"(P_friction*{_of_dt(op.share)})"
         self._before += _once(f" mixed {damp} = exp(-{y}), {size} = sqrt(-expm1(-2*{y})*P_kT);\n", damp, size)
-        return damp, size
-
-    def _stir(self, op: Op) -> None:
-        """Friction and noise on spheres, the noise along the rows; auxiliary variables have noise of their own."""
-        assert self.spheres is not None
-        damp, size = self._bath(op)
-        draw = f"gaussians(g, ORDER(AT), step+({op.begun}), {{}}, seed[0]);"
-        start = (
-            f" {{ROOM EACH {{mixed g[4], s = sqrt(w[a]); {draw.format(op.use)}\n"
-            "  for (int c = 0; c < 3; c++) d[3*a+c] = s*g[c];}\n"
-        )
-        ends = f" EACH for (int c = 0; c < 3; c++) v[3*a+c] = {damp}*v[3*a+c]+{size}*d[3*a+c];\n"
-        self._add(start, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n")
-        self._add(ends)
+        draw = f"mixed g[4]; gaussians(g, ORDER(AT), step+({op.begun}), {{}}, seed[0]);"
+        noise = f"{{{draw.format(op.use)} mixed s = sqrt(w[a]);\n  for (int c = 0; c < 3; c++)"
+        if not self.spheres:
+            # What the drift before has left across the rows is an impulse of theirs; what noise adds is none.
+            along = " SYNC velocities_NAME(ROWS_PASS CLUSTER, {}, time, x, v, w);\n"
+            self._add("", along.format(1) * self.tidy)
+            self._add(f" EACH if (w[a] != 0) {noise} v[3*a+c] = {damp}*v[3*a+c]+{size}*s*g[c];}}\n")
+            self._add("", along.format(0) * self.tidy)
+            return
+        self._tangent(f" EACH {noise} d[3*a+c] = s*g[c];}}\n")
+        self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] = {damp}*v[3*a+c]+{size}*d[3*a+c];\n")
         for k, (_, freedom, first) in enumerate(self.sphere_of):
-            number = len(freedom) * self.spheres.auxiliary
+            number = len(freedom) * self.per_sphere
             own = f"auxiliary[{first}+(ITEM)*{number}+j]"
             self._code[k] += (
-                f" if (FIRST) for (int j = 0; j < {number}; j++) {{int a = 0; mixed g[4]; "
-                f"{draw.format(f'{op.use}+1024*(j+1)')} {own} = {damp}*{own}+{size}*g[0];}}\n }}\n"
+                f" if (FIRST) for (int j = 0; j < {number}; j++) {{int a = 0; {draw.format(f'{op.use}+1024*(j+1)')} "
+                f"{own} = {damp}*{own}+{size}*g[0];}}\n }}\n"
             )
         self._rescale(Op("restore"))
 
+    def _tangent(self, start: str, rest: str = "") -> None:
+        """Begin a block with d, of which what is across the rows is taken away."""
+        self._add(
+            f" {{ROOM{start}{rest}",
+            f" {{ROOM{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n{rest}",
+        )
+
     def _turn(self, op: Op) -> None:
-        if self.spheres is not None:
-            start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {_of_dt(op.share)}*{self._force(op)}*w[a];\n"
-            self._add(start, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n")
+        push = f" EACH for (int c = 0; c < 3; c++) d[3*a+c] = {_of_dt(op.share)}*{self._force(op)}*w[a];\n"
+        if self.spheres:
+            self._tangent(push)
             self._rescale(op)
             self._add(" }\n")
             return
-        push = f"{_of_dt(op.share)}*{self._force(op)}*w[a]"
-        sums = (
+        self._tangent(
+            push,
             " EACH {if (w[a] != 0) for (int c = 0; c < 3; c++) {mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a];"
-            " acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;}\n PUT_U(a, AT)}\n }\n"
+            " acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;}\n PUT_U(a, AT)}\n }\n",
         )
-        start = f" {{ROOM EACH for (int c = 0; c < 3; c++) d[3*a+c] = {push};\n"
-        self._add(start + sums, f"{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n{sums}")
         self._gather(3)
         self._before += _once(_CLOSED_FORM, "keep", "push")
         self._add(
@@ -637,28 +576,30 @@ class Kernels:
         )
         self._gather(1)
         shares = ", ".join(f"(mixed) {share!r}" for share in op.flights)
-        self._before += _once(_CHAIN.replace("SHARES", shares).replace("PARTS", str(len(op.flights))), "factor")
+        self._before += _once(_with(_CHAIN, {"SHARES": shares, "PARTS": len(op.flights)}), "factor")
         self._add(" EACH for (int c = 0; c < 3; c++) v[3*a+c] *= factor;\n")
 
     def _rescale(self, op: Op) -> None:
         """Velocities back to their spheres; `restore` and `turn` move auxiliary variables, too."""
-        assert self.spheres is not None
         self._used = True
         for k, (of, freedom, start) in enumerate(self.sphere_of):
             if freedom:
-                number = self.spheres.auxiliary
-                squares = ", ".join(f"(mixed) {g + number - 1}" for g in freedom)
-                text = _SPHERES.replace("RULE", _RULES[op.verb]).replace("OF}", f"{', '.join(map(str, of))}}}")
-                text = text.replace("D-", "d[3*a+c]-" if op.verb == "turn" else "0-")
-                text = text.replace("+= D/", "+= d[3*a+c]/" if op.verb == "turn" else "+= 0/")
-                text = text.replace("SQUARES", squares).replace("COUNT", str(len(freedom)))
-                place = f"{start}+(ITEM)*{len(freedom) * number}"
-                self._code[k] += text.replace("PLACE", place).replace("AUXILIARY", str(number))
+                number = self.per_sphere
+                words = {
+                    "RULE": _RULES[op.verb],
+                    "OF}": f"{', '.join(map(str, of))}}}",
+                    "PUSHED": "d[3*a+c]" if op.verb == "turn" else 0,
+                    "SQUARES": ", ".join(f"(mixed) {g + number - 1}" for g in freedom),
+                    "COUNT": len(freedom),
+                    "PLACE": f"{start}+(ITEM)*{len(freedom) * number}",
+                    "AUXILIARY": number,
+                }
+                self._code[k] += _with(_SPHERES, words)
 
     _restore = _rescale
 
     def _evaluate(self, op: Op) -> None:
-        self._close(Action(EVALUATE, "", self.groups[op.group], list(self.groups).index(op.group)))
+        self._close(Action("", self.groups[op.group], list(self.groups).index(op.group)))
 
     def _note(self, op: Op) -> None:
         self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc3 += v[3*a+c]*v[3*a+c]/w[a];\n")
@@ -678,8 +619,8 @@ class Kernels:
     def _close(self, action: Action | None = None) -> None:
         """A kernel of what was written since the last; `action` comes after it."""
         if self._used or self._before:
-            name = f"{self._name}{sum(a.verb == LAUNCH for a in self._actions)}"
-            self._actions.append(Action(LAUNCH, name))
+            name = f"{self._name}{len(self._actions)}"
+            self._actions.append(Action(name))
             ends = accumulators = ""
             places = {f"acc{k}": self._bank + k for k in range(self._sums)} | ({"acc3": 6} if self._noted else {})
             if places:
@@ -688,28 +629,25 @@ class Kernels:
                 ends = f"{_summed(list(places))} if (LOCAL_ID == 0) {{{stores}}}\n"
                 accumulators = f" mixed {' = 0, '.join(places)} = 0;\n"
                 self._bank = 3 - self._bank if self._sums else self._bank
-            self.source.append(self._header(name) + self._before + accumulators + self._clusters() + ends + "}\n")
+            self.source.append(
+                f"KERNEL void {name}(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];SCRATCH\n"
+                " if (failure[0] != 0 && failure[0] != launch+1) return;\n"
+                f"{self._before}{accumulators}{self._clusters()}{ends}}}\n"
+            )
         if action is not None:
             self._actions.append(action)
         self._reset()
 
-    def _header(self, name: str) -> str:
-        return (
-            f"KERNEL void {name}(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];SCRATCH\n"
-            " if (failure[0] != 0 && failure[0] != launch+1) return;\n"
-        )
-
     def _clusters(self) -> str:
         """Loops over the clusters that a group has and those that an item has."""
-        crowds = [(place, code) for place, code in zip(self.places, self._code, strict=True) if place.shape.together]
-        items = [(place, code) for place, code in zip(self.places, self._code, strict=True) if not place.shape.together]
         text = ""
-        for loop, kinds in (
-            (" {\n", crowds),
-            (f" for (int item = GLOBAL_ID; item < {self.items}; item += GLOBAL_SIZE) {{\n", items),
+        for together, loop in (
+            (True, ""),
+            (False, f"for (int item = GLOBAL_ID; item < {self.items}; item += GLOBAL_SIZE)"),
         ):
-            if any(code for _, code in kinds):
-                text += loop + "".join(self._cluster(place, code) for place, code in kinds if code) + " }\n"
+            kinds = [each for each in zip(self.places, self._code, strict=True) if each[0].shape.together is together]
+            if found := "".join(self._cluster(place, code) for place, code in kinds if code):
+                text += f" {loop} {{\n{found} }}\n"
         return text
 
     def _cluster(self, place: _Place, code: str) -> str:
@@ -738,8 +676,7 @@ class Kernels:
         text = load + code + store
         words |= {"NAME": shape.name, "CLUSTER": f"{cluster}+{shape.first}", "ITEM": cluster}
         words |= {"EVERY": f"for (int a = 0; a < {n}; a++)", "FIRST": "LOCAL_ID == 0" if shape.together else "1"}
-        for word, meaning in words.items():
-            text = text.replace(word, meaning)
+        text = _with(text, words)
         end = place.begin + clusters
         if shape.together:  # barriers are inside, which no condition may be about
             loop = f"for (int item = {place.begin}+GROUP_ID; item < {end}; item += NUM_GROUPS)"
@@ -749,39 +686,23 @@ class Kernels:
 
 
 class Plan(NamedTuple):
-    """What the plugin needs for a Context.
-
-    Attributes
-    ----------
-    source : str
-    arrays : list of Array
-    parts : tuple of three lists of Action
-        Head, middle and tail of a step.
-    order : ndarray of int
-        Of atoms in the array `atoms`; -1-k for those that rest.
-    items, work_group, slots : int
-        Work-items that there is work for, their number in a group, and how many groups of forces are kept.
-    """
+    """What the plugin needs for a Context, see `Plan` in `plugin/program_integrator.h`."""
 
     source: str
     arrays: list[Array]
     parts: tuple[list[Action], list[Action], list[Action]]
-    order: IntArray
     items: int
     work_group: int
     slots: int
 
 
 def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, held: Any) -> Plan:
-    """Everything that the plugin needs.
+    """The plan for a platform.
 
     Parameters
     ----------
     described : mapping
         What `DeviceIntegrator.describe` says of a step.
-    platform : str
-        Its name.
-    masses : ndarray, shape (n_particles,)
     groups : int
         Bit mask of the force groups that act.
     held : DeviceRows
@@ -793,13 +714,13 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     parameters, memory, particles = described["settings"], described["memory"], len(masses)
     kernels = Kernels(described, masses, masks, held)
     parts = divided(operations, described["noisy"])
-    actions = tuple(kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
+    head, middle, tail = (kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
     recorded, room = described["recorded"], room_for(len(described["recorded"]))
     order = np.concatenate([*kernels.order, np.array(recorded, dtype=np.int64)])
     arrays = standard_arrays([*parameters.values()], len(memory), seed, particles)
     arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
-    if kernels.spheres is not None:
-        if any(g + kernels.spheres.auxiliary < 2 for _, freedom, _ in kernels.sphere_of for g in freedom):
+    if kernels.spheres:
+        if any(g + kernels.per_sphere < 2 for _, freedom, _ in kernels.sphere_of for g in freedom):
             raise InputError("a sphere of one degree of freedom has the radius 0; give auxiliary=1", item="auxiliary")
         first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
         arrays.append(Array("auxiliary", "mixed", first, saved=True))
@@ -813,13 +734,13 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     look = f"KERNEL void look(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];\n{_LOOK}}}\n"
     if recorded:
         forces = "+".join(f"FORCE(force{k}, p, c)" for k in range(len(masks)))
-        text = _RECORD.replace("COUNT", str(len(recorded))).replace("FIRST", str(kernels.particles))
-        look += f"KERNEL void record(ARGUMENTS) {{\n UNPACK\n{text.replace('FORCES', forces)}}}\n"
+        text = _with(_RECORD, {"COUNT": len(recorded), "FIRST": kernels.particles, "FORCES": forces})
+        look += f"KERNEL void record(ARGUMENTS) {{\n UNPACK\n{text}}}\n"
     source = preamble(platform, arrays, held.scratch, held.work_group, len(masks))
     source += "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
     items = kernels.items + kernels.crowds * work_group
-    return Plan(source, arrays, actions, order, items, work_group, len(masks))  # type: ignore[arg-type]
+    return Plan(source, arrays, (head, middle, tail), items, work_group, len(masks))
 
 
 def room_for(particles: int) -> int:

@@ -7,68 +7,56 @@ is written as (u.u - t^2)/2t with the gradient u/t, which needs neither root nor
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.openmm.device.c_writer import literal
-from kcons.openmm.device.held_rows import IN_CELLS, NEAREST, STORED, HeldRows, Pattern, Row
+from kcons.openmm.device.held_rows import IN_CELLS, NEAREST, STORED, Row, Shape
 
 #: Rows from which a matrix has the precision of forces: registers are then scarce, and residuals are exact still.
 FEW = 4
 
 
-class Record:
-    """Numbers of each cluster of a pattern, one after another; targets of the System that all share are in the code.
+class ItemWriter:
+    """The two functions of a shape for a work-item, and what they read of each cluster.
 
     Attributes
     ----------
-    start, size : int
-        Place of those of the first cluster, and how many a cluster has.
-    targets, scales : list of str
-        Of each row, as C.
-    parameters, cells : list of int
-        Where those of each row begin; cells count from `first_cell`, and there are `cell_size` a cluster.
     table : ndarray, shape (n_clusters, size)
+        Numbers of each cluster; those of the first one begin at `start`, of the present one at ``n``.
     """
 
-    def __init__(self, pattern: Pattern, held: HeldRows, start: int, first_cell: int) -> None:
-        self.start, self.first_cell, self.cell_size, self.size = start, first_cell, 0, 0
-        self.targets: list[str] = []
-        self.scales: list[str] = []
-        self.parameters: list[int] = []
-        self.cells: list[int] = []
-        columns = [np.zeros((len(pattern.clusters), 0))]
-        place = {row: k for k, row in enumerate(held.moving)}
-        for k, row in enumerate(pattern.rows):
-            mine = pattern.clusters[:, k]
-            goals = np.array([place[i] for i in mine], dtype=float) if row.moves else held.target[mine]
-            for values, texts in ((goals, self.targets), (held.scale[mine], self.scales)):
-                if not row.summed and np.all(values == values[0]):
-                    texts.append(literal(values[0]))
-                else:
-                    texts.append(f"n[{self.size}]")
-                    columns.append(values[:, None])
-                    self.size += 1
-            self.parameters.append(self.size)
-            columns.append(np.array([held.parameters[i] for i in mine]))
-            self.size += columns[-1].shape[1]
-            self.cells.append(self.cell_size)
-            self.cell_size += 3 * len(row.atoms) if row.how == IN_CELLS else 0
-        self.table: FloatArray = np.hstack(columns)
-
-
-class ItemWriter:
-    """The two functions of a pattern for a work-item; numbers of cluster c begin at ``n``."""
-
-    def __init__(self, name: str, pattern: Pattern, record: Record, first_row: int, held: HeldRows) -> None:
-        self.name, self.record, self.held = name, record, held
-        self.rows, self.count = pattern.rows, len(pattern.rows)
-        self.single = pattern.atoms.shape[1] == 1
+    def __init__(self, shape: Shape, held: Any, start: int, first_row: int) -> None:
+        self.name, self.held, self.start = shape.name, held, start
+        self.rows, self.count = shape.rows, len(shape.rows)
+        self.single = shape.atoms.shape[1] == 1
         self.row_number = f"{first_row}+cluster*{self.count}"
         #: Whether the matrix is in the precision of forces.
         self.coarse = self.count >= FEW and not any(row.depends for row in self.rows)
         self.filled: list[set[int]] = []
+        #: Of each row, as C: its target or the number of its moving one, its scale, where cells and parameters begin.
+        self.targets: list[str] = []
+        self.scales: list[str] = []
+        self.cells: list[str] = []
+        self.parameters: list[str] = []
+        self.table: FloatArray = np.zeros((len(shape.clusters), 0))
+        for row, mine in zip(self.rows, shape.clusters.T, strict=True):
+            self.targets.append(self._number((held.mover if row.moves else held.target)[mine], row))
+            self.scales.append(self._number(held.scale[mine], row))
+            self.cells.append(self._number(held.cell[mine], row) if row.how == IN_CELLS else "")
+            self.parameters.append(f"n+{self.table.shape[1]}")
+            self.table = np.column_stack([self.table, [held.parameters[i] for i in mine]])
+
+    def _number(self, values: FloatArray | IntArray, row: Row) -> str:
+        """A number of each cluster, as C; it is in the code for constraints of the System that share it."""
+        if not row.summed and np.all(values == values[0]):
+            return literal(values[0])
+        self.table = np.column_stack([self.table, values])
+        return f"n[{self.table.shape[1] - 1}]"
 
     def text(self) -> str:
         return self.positions() + self.velocities()
@@ -86,11 +74,11 @@ class ItemWriter:
             kept = f", b{k}[{size}]" if row.how == NEAREST else ""
             return f" mixed r{k}[{size * (1 + row.rolls)}], o{k}[{1 + size}], g{k}[{size}]{kept};\n"
 
-        lengths = self._each(lambda k, r: f" mixed i{k} = 1/{self.record.targets[k]};\n" if self._plain(r) else "")
+        lengths = self._each(lambda k, r: f" mixed i{k} = 1/{self.targets[k]};\n" if self._plain(r) else "")
         return (
             f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
-            f"mixed* {changed}, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.record.start}+cluster*"
-            f"{self.record.size};\n{self._each(room)}{lengths} mixed off[{self.count}], sum[{self.count}];\n "
+            f"mixed* {changed}, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
+            f"{self.table.shape[1]};\n{self._each(room)}{lengths} mixed off[{self.count}], sum[{self.count}];\n "
             f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n"
         )
 
@@ -108,8 +96,8 @@ class ItemWriter:
                     if row.how == NEAREST:
                         place = f"b{k}[{3 * i + c}]"
                 if row.how == IN_CELLS and i:
-                    cells = f"{self.record.first_cell + self.record.cells[k] + 3 * i}+cluster*{self.record.cell_size}"
-                    shift = [f"rows_cells[{cells}+{m}]*box{m}.{'xyz'[c]}" for m in range(c, 3)]
+                    cells = f"rows_cells[(int) {self.cells[k]}+{3 * i}"
+                    shift = [f"{cells}+{m}]*box{m}.{'xyz'[c]}" for m in range(c, 3)]
                     place = "+".join([place, *shift])
                 half_way = "(mixed) 0.5*" if row.rolls else ""
                 lines.append(f" {own} = {place}{f'+{half_way}{way}' if moved else ''};")
@@ -121,21 +109,15 @@ class ItemWriter:
         """Shortest images along the list, once: atoms move by less than half the cell."""
         if row.how != NEAREST:
             return ""
-        lines = [f" b{k}[{c}] = 0;" for c in range(3)]
-        for i in range(1, len(row.atoms)):
-            a, s = 3 * row.atoms[i], 3 * row.atoms[i - 1]
-            lines.append(f" {{mixed ux = x[{a}]-x[{s}], uy = x[{a + 1}]-x[{s + 1}], uz = x[{a + 2}]-x[{s + 2}];")
-            lines.append(" ROWS_NEAR(ux, uy, uz)")
-            lines += [f" b{k}[{3 * i + c}] = b{k}[{3 * i - 3 + c}]+{u};" for c, u in enumerate(("ux", "uy", "uz"))]
-            lines.append("}")
-        return "".join(lines) + "\n"
+        steps = (f" ROWS_STEP(b{k}, {3 * i}, x, {3 * b}, {3 * a})" for i, (a, b) in enumerate(pairwise(row.atoms), 1))
+        return f" b{k}[0] = b{k}[1] = b{k}[2] = 0;{''.join(steps)}\n"
 
     def _value(self, k: int, row: Row, time: str, moved: bool, out: str) -> str:
         """Value less target, or value alone, and gradient of a row."""
         text = self._gathered(k, row, moved)
         if not self._plain(row):
-            return f"{text} rows_f{row.function}(r{k}, n+{self.record.parameters[k]}, {time}, {out});\n"
-        u, t = [f"r{k}[{3 + c}]" for c in range(3)], self.record.targets[k]
+            return f"{text} rows_f{row.function}(r{k}, {self.parameters[k]}, {time}, {out});\n"
+        u, t = [f"r{k}[{3 + c}]" for c in range(3)], self.targets[k]
         square = "+".join(f"{each}*{each}" for each in u)
         lines = [f" {out}[{1 + c}] = -i{k}*{u[c]}; {out}[{4 + c}] = i{k}*{u[c]};" for c in range(3)]
         return f"{text} {out}[0] = ({square}-{t}*{t})*((mixed) 0.5*i{k});{''.join(lines)}\n"
@@ -150,8 +132,8 @@ class ItemWriter:
     def _wanted(self, k: int, row: Row, time: str, rate: int) -> str:
         """Target of a row at a time, or its rate; of rows of velocities there is no rate."""
         if row.moves:
-            return f"rows_moving(rows_knots, (int) {self.record.targets[k]}, {time}, {rate})"
-        return "0" if rate else self.record.targets[k]
+            return f"rows_moving(rows_knots, (int) {self.targets[k]}, {time}, {rate})"
+        return "0" if rate else self.targets[k]
 
     # -- algebra ---------------------------------------------------------------------------------
 
@@ -222,7 +204,7 @@ class ItemWriter:
                 rounded = f" a{k} += ROWS_ROUNDING*({size});"
             return (
                 f" mixed t{k} = {'h*' if row.rolls else ''}{goal}, "
-                f"a{k} = tolerance*{self.record.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''};{rounded}\n"
+                f"a{k} = tolerance*{self.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''};{rounded}\n"
             )
 
         def turn(k: int, row: Row) -> str:
@@ -253,7 +235,7 @@ class ItemWriter:
         def demanded(k: int, row: Row) -> str:
             rate = self._wanted(k, row, "time", 0 if row.rolls else 1)
             if self.held.functions[row.function].rate is not None:
-                rate += f"-rows_f{row.function}_rate(r{k}, n+{self.record.parameters[k]}, time)"
+                rate += f"-rows_f{row.function}_rate(r{k}, {self.parameters[k]}, time)"
             return f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
 
         def speed(k: int, row: Row) -> str:

@@ -11,8 +11,7 @@ import openmm
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import OverdeterminedError, UnsupportedError
-from kcons.openmm.integrator.ensemble import Ensemble, Integrator
-from kcons.openmm.integrator.system_checks import (
+from kcons.openmm.integrator.guard import (
     forces_alone,
     forces_of,
     groups_in,
@@ -20,8 +19,8 @@ from kcons.openmm.integrator.system_checks import (
     knows_a_place,
     removes_center_of_mass_motion,
 )
-from kcons.openmm.quantities import held_without_mass, masses_of
-from kcons.openmm.states import box_of, forces_at, positions_of, velocities_of
+from kcons.openmm.integrator.program import Ensemble, Integrator
+from kcons.openmm.quantities import box_of, forces_at, held_without_mass, masses_of, positions_of, velocities_of
 from kcons.thermostats.freedom import (
     BALANCED,
     SHAKE,
@@ -75,13 +74,7 @@ class CountsMomenta(Ensemble):
         return found
 
     def count(self, integrator: Integrator) -> int:
-        """g of an integrator: its momenta that are independent, less those that are conserved.
-
-        Raises
-        ------
-        OverdeterminedError
-            There is none.
-        """
+        """g: the momenta that are independent, less those that are conserved; `OverdeterminedError` for none."""
         guard = integrator._watch()
         if guard.thermal is None:
             count = integrator.independent_momenta() - len(self.momenta(integrator).directions)
@@ -94,15 +87,7 @@ class CountsMomenta(Ensemble):
         return integrator.degrees_of_freedom() / self.count(integrator)
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        """Find g, and tell of momenta that are conserved.
-
-        Raises
-        ------
-        OverdeterminedError
-            No degree of freedom is left.
-        UnsupportedError
-            Targets move.
-        """
+        """Find g, and tell of momenta that are conserved; `UnsupportedError` where targets move."""
         moving = [part for part in integrator.parts if part.driven]
         if moving:
             raise UnsupportedError(
@@ -123,19 +108,10 @@ class CountsMomenta(Ensemble):
 
 
 def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum: Momentum) -> Momenta:
-    """Find conserved momenta from the forces and the constraints.
+    """Conserved momenta, from the forces and the constraints.
 
-    Parameters
-    ----------
-    integrator : ProjectedIntegrator
-    context : openmm.Context
-    momentum : {'auto', 'conserved', 'free'}
-        'conserved': in all directions that the rows allow; 'free': in none.
-
-    Raises
-    ------
-    UnsupportedError
-        'conserved', and rows or particles without mass hold all directions.
+    `momentum` is 'auto', 'conserved' (in all directions that the rows allow; `UnsupportedError` where rows or particles
+    without mass hold all), or 'free' (in none).
     """
     if momentum == "free":
         return NONE

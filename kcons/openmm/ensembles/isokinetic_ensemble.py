@@ -13,11 +13,9 @@ from kcons.constraints.arguments import checked, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
-from kcons.openmm.integrator.ensemble import Integrator, Step
-from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.program import Program
-from kcons.openmm.quantities import GAS_CONSTANT, kelvins
-from kcons.openmm.states import energy_of
+from kcons.openmm.integrator.part import Precision
+from kcons.openmm.integrator.program import Integrator, Program
+from kcons.openmm.quantities import GAS_CONSTANT, energy_of, kelvins
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.splitting import Composition, RungeKuttaNystrom, Splitting
 
@@ -33,7 +31,7 @@ class Isokinetic(CountsMomenta):
 
     Configurations are canonical at T for 2K = (g - 1) kT, g being the independent momenta: three for each particle
     with a mass, less the rank of all constraints, less three where total momentum is conserved. A kick at fixed
-    positions has the closed form of `kcons.thermostats.isokinetic.kick` with F = M_par^+ f.
+    positions has the closed form of `kcons.thermostats.isokinetic` with F = M_par^+ f.
 
     Parameters
     ----------
@@ -111,44 +109,28 @@ class Isokinetic(CountsMomenta):
 
     # -- program --------------------------------------------------------------------------------
 
-    def declare(self, program: Program) -> None:
-        p = program
+    def declare(self, p: Program) -> None:
         p.setting("two_k", "2K, kept; 0 until the first step", 0.0)
         p.setting("exact", "whether v is made tangent before unseen kicks, and 2K summed", 0.0)
         p.remember("growth", "integral of alpha over time")
         p.number("lost", "kicks that turned velocities round and lost digits")
-        p.vector("w", "velocities before a kick")
-        for name, words in (
-            ("ww", "w.M.w"),
-            ("wq", "w.M.q, q = h M_par^+ f"),
-            ("qq", "q.M.q"),
-            ("z", "sqrt(q.M.q/2K)"),
-            ("aim", "cosine between w and q"),
-            ("decay", "exp(-z)"),
-            ("sinhc", "exp(-z) sinh(z)/z"),
-            ("coshc", "exp(-z) (cosh(z)-1)/z^2"),
-            ("scale", "exp(-z) s', by which velocities are divided"),
-            ("keep", "share of w"),
-            ("push", "share of q"),
-        ):
-            p.number(name, words)
 
-    def kick(self, step: Step, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
-        """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
+    def kick(self, p: Program, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
+        """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic`.
 
         F = M_par^+ f only enters as q = h F, which is of the size of velocities.
         """
-        p, q = step.program, f"{h}*{step.force}/m"
+        q = f"{h}*{p.force}/m"
         if unseen:
-            _add_up(step, q, f"{h}*{step.force}*v")
+            _add_up(p, q, f"{h}*{p.force}*v")
         else:
             if impulse:
                 p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
             if impulse or not tangent:
-                step.project()
+                p.project()
             p.each("w", "v", "velocities before the kick")
             p.each("v", q, "kick by the applied forces alone")
-            step.project()
+            p.project()
             p.sum("wq", "m*w*v", "along the kick")
             p.sum("ww", "m*w*w", "2K before")
             p.sum("qq", "m*v*v", "size of the kick")
@@ -171,12 +153,7 @@ class Isokinetic(CountsMomenta):
     def ready(self, integrator: Integrator, context: openmm.Context, masses: FloatArray, v: FloatArray) -> None:
         """Find K; scale the velocities, unless they are right to rounding.
 
-        Raises
-        ------
-        InputError
-            All velocities are zero.
-        OverdeterminedError
-            g is 1 where a temperature is asked for, or 0.
+        `InputError` for a start at rest, `OverdeterminedError` for g of 1 where a temperature is asked for, or 0.
         """
         found = float(masses @ np.einsum("ij,ij->i", v, v))
         if not found > 0:
@@ -237,19 +214,18 @@ class Isokinetic(CountsMomenta):
         return energy_of(integrator.context, integrator.getIntegrationForceGroups()) + heat
 
 
-def _add_up(step: Step, q: str, along: str) -> None:
+def _add_up(p: Program, q: str, along: str) -> None:
     """Make v w + q, and find the lengths of a kick that is not seen, without telling w and q apart.
 
     w + q is v + h f/m made tangent; what v has across the constraints the next drift absorbs. Unless `exact`, v is not
     made tangent between such kicks, and w.M.w is taken to be 2K, which drifts keep to third order (rigid bodies: to
     rounding); the length of w + q shows what it is off by, and the kick takes that back.
     """
-    p = step.program
     p.let("ww", "two_k", "2K before, as drifts keep it")
     with p.when("select(behind, exact, 1) != 0", "to rounding; v may have been changed by whom ever"):
         p.sum("ww", "m*v*v", "2K before")
     p.each("v", f"v+{q}", "the applied forces act")
-    step.project()
+    p.project()
     p.sum("wq", "m*v*v", "(w+q).M.(w+q)")
     p.sum("qq", along, "q.M.(w+q)")
     p.let("wq", "wq-qq-ww", "along the kick")

@@ -12,13 +12,12 @@ import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, Step
-from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.system_checks import groups_in, groups_of
+from kcons.openmm.integrator.guard import groups_in, groups_of
+from kcons.openmm.integrator.program import BetweenHalves, Integrator, Program
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.multistep.respa import SlowKicks, levels_of, middle_of, nested
+from kcons.thermostats.force_groups import SlowKicks, levels_of, middle_of, nested
 
 #: Operations of an inner step: a kick, half a drift, the bath, half a drift, forces, a kick.
 _INNER = 6
@@ -73,29 +72,27 @@ class Langevin(BetweenHalves):
     def __repr__(self) -> str:
         return f"Langevin({self.temperature:g} K, {self.friction:g}/ps)"
 
-    def declare(self, program: Program) -> None:
+    def declare(self, p: Program) -> None:
         kT, friction = self.settings().values()
-        program.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", kT)
-        program.setting("friction", "1/ps", friction)
-        program.number("kept_share", "what friction leaves of v in a step")
-        program.number("spread", "size of the noise")
+        p.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", kT)
+        p.setting("friction", "1/ps", friction)
 
-    def middle(self, step: Step, u: str) -> None:
-        friction_and_noise(step.program, u, "dt")
-        if step.parts:
+    def middle(self, p: Program, u: str) -> None:
+        friction_and_noise(p, u, "dt")
+        if p.parts:
             # Multipliers are those of the drifts: what noise has across the constraints is none of theirs.
-            step.project()
+            p.project()
 
     def settings(self) -> dict[str, float]:
         return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}
 
 
-def friction_and_noise(program: Program, u: str, h: str) -> None:
+def friction_and_noise(p: Program, u: str, h: str) -> None:
     """From velocities u to v, through a bath for a time h."""
-    program.let("kept_share", f"exp(-friction*{h})", "friction")
+    p.let("kept_share", f"exp(-friction*{h})", "friction")
     # 1 - exp(-2y) = 2 exp(-y) sinh(y) loses no digits for small y.
-    program.let("spread", f"sqrt(2*kT*kept_share*sinh(friction*{h}))", "noise")
-    program.each("v", f"kept_share*({u})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
+    p.let("spread", f"sqrt(2*kT*kept_share*sinh(friction*{h}))", "noise")
+    p.each("v", f"kept_share*({u})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
 
 
 # -- several time steps -----------------------------------------------------------------------------
@@ -179,7 +176,7 @@ class LangevinRespa(Langevin):
 
     @property
     def levels(self) -> tuple:  # type: ignore[type-arg]
-        """Groups from the slowest to the fastest, see `kcons.thermostats.multistep.respa`."""
+        """Groups from the slowest to the fastest, see `kcons.thermostats.force_groups`."""
         return levels_of({str(group): count for group, count in self.steps})
 
     def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
@@ -209,47 +206,43 @@ class LangevinRespa(Langevin):
 
     # -- program --------------------------------------------------------------------------------
 
-    def write(self, step: Step) -> bool:
+    def write(self, p: Program) -> None:
         """The operations of a step, inner steps alike as loops."""
-        if step.parts:
+        if p.parts:
             raise UnsupportedError(
                 f"{self!r} holds the constraints of the System only, and no parts: use one time step, or "
                 "kcons.thermostats.LangevinRespa with forces from OpenMM"
             )
-        p = step.program
-        step.filtered = False
-        p.number("inner_left", "inner steps that are left")
+        p.filtered = False
         p.let_others_act()
-        done = step.operations
+        done = p.operations
         last = max(k for k, operation in enumerate(done) if isinstance(operation, Fly)) - (_INNER - 3)
         for block, times in _loops(done[:last], self.levels[-1].group):
             if times == 1:
-                _write_all(step, block)
+                _write_all(p, block)
                 continue
             p.let("inner_left", str(times), "inner steps alike follow")
             with p.loop("inner_left > 0", "inner steps"):
-                _write_all(step, block)
+                _write_all(p, block)
                 p.let("inner_left", "inner_left-1", "one is made")
         ends = last + _INNER - 2
-        _write_all(step, done[last:ends])
-        step.note_middle("v")
-        _write_all(step, done[ends:])
-        step.note_end()
-        return True
+        _write_all(p, done[last:ends])
+        p.note_middle("v")
+        _write_all(p, done[ends:])
+        p.note_end()
 
 
-def _write_all(step: Step, operations: Sequence[Operation]) -> None:
-    p = step.program
+def _write_all(p: Program, operations: Sequence[Operation]) -> None:
     for operation in operations:
         if isinstance(operation, Kick):
             force, h = f"f{operation.group}", f"{operation.fraction!r}*dt"
             p.each("v", f"v+{h}*{force}/m", f"forces of group {operation.group} act (kick)")
         elif isinstance(operation, Fly):
             for length in operation.flights:
-                impulse = step.drift(f"({length!r}*dt)")
+                impulse = p.drift(f"({length!r}*dt)")
                 p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
         elif isinstance(operation, Exchange):
             # The drift that follows absorbs what noise has across constraints.
             friction_and_noise(p, "v", f"{operation.fraction!r}*dt")
         elif isinstance(operation, Project):
-            step.project()
+            p.project()

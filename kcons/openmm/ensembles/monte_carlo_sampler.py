@@ -18,16 +18,13 @@ from kcons.errors import (
     ReversibilityError,
     UnsupportedError,
 )
-from kcons.openmm.integrator.ensemble import ConstantEnergy, Step
-from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.guard import forces_of
+from kcons.openmm.integrator.program import ConstantEnergy, Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.system_checks import forces_of
-from kcons.openmm.quantities import GAS_CONSTANT, kelvins, masses_of
-from kcons.openmm.states import energy_of, positions_of, velocities_of
+from kcons.openmm.quantities import GAS_CONSTANT, energy_of, kelvins, masses_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats import Counts
-from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.monte_carlo import (
     ACCEPTED,
     CHANGE,
@@ -43,6 +40,7 @@ from kcons.thermostats.monte_carlo import (
     UNSOLVED,
     step_range,
 )
+from kcons.thermostats.noise import noise_generator
 
 #: What acts on a state between steps and knows no way back.
 OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")
@@ -58,17 +56,9 @@ class ReversedDrifts(ConstantEnergy):
     start.
     """
 
-    def declare(self, program: Program) -> None:
-        program.number("missed", "square of how far the worst way back has missed its start")
-        program.number("miss", "the same for one drift")
-        program.vector("x_begin", "where a drift begins")
-        program.vector("x_land", "where it ends")
-        program.vector("v_land", "the velocities there")
-
-    def drift(self, step: Step, h: str, u: str) -> str:
+    def drift(self, p: Program, h: str, u: str) -> str:
         """The drift, taken back and made again."""
-        p = step.program
-        if step.parts:
+        if p.parts:
             raise UnsupportedError(
                 "drifts are taken back in steps without parts; give HamiltonianMonteCarlo a ProjectedIntegrator with "
                 "these parts, and it takes back whole trajectories"
@@ -77,7 +67,7 @@ class ReversedDrifts(ConstantEnergy):
         if u != "v":
             p.each("v", u, "the velocities it begins with")
         p.hold_velocities("the drift begins tangent to the constraints, as its way back does")
-        p.each("v", f"v+{step.flight(h, 'v')}", "the constraint forces act on v as well")
+        p.each("v", f"v+{p.flight(h, 'v')}", "the constraint forces act on v as well")
         p.each("v_land", "v", "to come back to")
         p.each("x_land", "x", "to come back to")
         p.hold_velocities("the way back begins tangent to the constraints")

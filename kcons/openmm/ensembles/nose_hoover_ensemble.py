@@ -12,10 +12,8 @@ from kcons.constraints.arguments import Count, checked, positive
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import CountsMomenta, Momentum
-from kcons.openmm.integrator.ensemble import BetweenHalves, Integrator, Step, use
-from kcons.openmm.integrator.program import Program
-from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
-from kcons.openmm.states import energy_of
+from kcons.openmm.integrator.program import BetweenHalves, Integrator, Program
+from kcons.openmm.quantities import GAS_CONSTANT, energy_of, kelvins, number
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.nose_hoover import FRACTIONS, HALF
@@ -109,32 +107,22 @@ class NoseHoover(CountsMomenta):
 
     # -- program --------------------------------------------------------------------------------
 
-    def declare(self, program: Program) -> None:
-        p = program
+    def declare(self, p: Program) -> None:
         p.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", self.settings()["kT"])
         p.setting("frequency", "of the chain, 1/ps", self.frequency)
         p.setting("momenta", "g, independent momenta; 0 until the first step", 0.0)
         for name in self._links():
             p.remember(name, "velocity of a link of the chain, 1/ps")
         p.remember("chain_place", "g times the place of the first link, and those of the others")
-        for name, words in (
-            ("chain_inertia", "mass of a link; that of the first is g times as large"),
-            ("twice", "2K"),
-            ("scale", "what the chain scales velocities by"),
-            ("chain_part", "part of the time in which the chain moves"),
-            ("chain_h", "its length"),
-        ):
-            p.number(name, words)
         p.table("chain_share", (*FRACTIONS, *FRACTIONS), "length of part k as a fraction of the time, twice")
         if "between" in p.numbers:
-            use(p, "behind")
+            p.use("behind")
 
-    def open(self, program: Program) -> None:
-        self._remember(program)
-        self._advance(program, "1+behind" if "behind" in program.numbers else "1")
+    def open(self, p: Program) -> None:
+        self._remember(p)
+        self._advance(p, "1+behind" if "behind" in p.numbers else "1")
 
-    def close(self, program: Program) -> None:
-        p = program
+    def close(self, p: Program) -> None:
         if "between" not in p.numbers:
             self._advance(p, "1")
             return
@@ -142,18 +130,18 @@ class NoseHoover(CountsMomenta):
             self._advance(p, "1")
         p.let("behind", "between", "the next step makes up for it")
 
-    def _remember(self, program: Program) -> None:
-        if "failed" in program.numbers:
+    def _remember(self, p: Program) -> None:
+        if p.parts:
             for name in self._state():
-                program.let(program.number(_before(name), f"{name} before the step"), name, "to come back to")
+                p.let(f"{name}_last", name, "to come back to")
 
-    def take_back(self, program: Program) -> None:
+    def take_back(self, p: Program) -> None:
         for name in self._state():
-            program.let(name, _before(name), "the chain is back where the step began")
+            p.let(name, f"{name}_last", "the chain is back where the step began")
 
-    def _advance(self, program: Program, halves: str) -> None:
+    def _advance(self, p: Program, halves: str) -> None:
         """Move the chain on for half a step, or two halves one after the other; see `kcons.thermostats.nose_hoover`."""
-        p, links = program, self._links()
+        links = self._links()
         parts = len(p.tables["chain_share"]) // 2
         time = f"{HALF.fraction!r}*dt"
         p.sum("twice", "m*v*v", "2K, the only sum")
@@ -238,20 +226,16 @@ class NoseHooverMiddle(BetweenHalves, NoseHoover):
 
     adds_up = owes = False
 
-    def open(self, program: Program) -> None:
-        self._remember(program)
+    def open(self, p: Program) -> None:
+        self._remember(p)
 
-    def close(self, program: Program) -> None:
+    def close(self, p: Program) -> None:
         pass
 
-    def middle(self, step: Step, u: str) -> None:
-        step.program.each("v", u, "the constraint forces act on v as well")
-        step.project()
-        self._advance(step.program, "2")
-
-
-def _before(name: str) -> str:
-    return f"{name}_last"
+    def middle(self, p: Program, u: str) -> None:
+        p.each("v", u, "the constraint forces act on v as well")
+        p.project()
+        self._advance(p, "2")
 
 
 def _per_picosecond(frequency: unit.Quantity | float) -> float:

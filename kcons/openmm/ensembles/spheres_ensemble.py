@@ -10,8 +10,7 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive
 from kcons.errors import UnsupportedError
-from kcons.openmm.integrator.ensemble import Ensemble, Integrator, Step
-from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.program import Ensemble, Integrator, Program
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
@@ -105,16 +104,15 @@ class IsokineticSpheres(Ensemble):
     def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         return self._on_arrays().operations()
 
-    def declare(self, program: Program) -> None:
+    def declare(self, p: Program) -> None:
         kT, friction = self.settings().values()
-        program.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", kT)
-        program.setting("friction", "1/ps", friction)
+        p.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", kT)
+        p.setting("friction", "1/ps", friction)
 
-    def write(self, step: Step) -> bool:
+    def write(self, p: Program) -> None:
         """No program: kernels have the spheres."""
-        if not step.program.on_device:
+        if not p.on_device:
             raise UnsupportedError(f"{self!r} is made by kernels: give device=True, or take LangevinRespa")
-        return True
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse targets that move."""

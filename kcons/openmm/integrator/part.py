@@ -1,4 +1,4 @@
-"""What an integrator may hold besides the constraints of its System."""
+"""What an integrator may hold besides the constraints of its System, and how precisely a platform can hold it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,89 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InfeasibleError, KconsError
 from kcons.motion.motion import Motion
-from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.states import motion_of, positions_of
+from kcons.openmm.quantities import motion_of, positions_of
+from kcons.steppers.state import START_TOLERANCE
 
 #: Starts that are off by less (relative) are put right, as integrators of OpenMM do in their first step.
 NEAR = 0.1
 #: What a row without a length of its own is off by is compared with this one (nm), a short bond.
 BOND = 0.1
+#: The tolerance of the System's constraints unless another is asked for, by precision. In single precision velocities
+#: cannot be brought closer than to some 1e-6: OpenMM's solver would go on to its last iteration.
+TOLERANCES = {"double": 1e-10, "mixed": 1e-8, "single": 1e-5}
+#: Unit roundoff of single numbers.
+SINGLE = 2.0**-24
+
+
+@dataclass(frozen=True)
+class Precision:
+    """The precision in which the platform of a Context computes.
+
+    Attributes
+    ----------
+    platform : str
+    name : {'double', 'mixed', 'single'}
+        Reference and CPU integrate in double. CUDA, HIP and OpenCL have a property for it: 'mixed' computes forces in
+        single and integrates in double; positions are pairs of single numbers.
+    """
+
+    platform: str
+    name: str
+
+    @classmethod
+    def of(cls, context: openmm.Context) -> Precision:
+        """That of a Context."""
+        platform = context.getPlatform()
+        given = "Precision" in platform.getPropertyNames()
+        return cls(platform.getName(), platform.getPropertyValue(context, "Precision") if given else "double")
+
+    def __str__(self) -> str:
+        return f"{self.platform}, {self.name} precision"
+
+    @property
+    def rounds_lengths(self) -> bool:
+        """Whether the solvers of the platform keep lengths, or their squares, as single numbers."""
+        return self.platform not in ("Reference", "CPU")
+
+    @property
+    def tolerance(self) -> float:
+        """The tolerance of the System's constraints unless another is asked for."""
+        return TOLERANCES[self.name]
+
+    @property
+    def place(self) -> float:
+        """Unit roundoff of a coordinate: in mixed precision positions are pairs of single numbers."""
+        return {"double": 2.0**-53, "mixed": 2.0**-48, "single": SINGLE}[self.name]
+
+    def grain(self, reach: float) -> float:
+        """Spacing of coordinates at a distance from the origin."""
+        return float(np.spacing(reach)) if self.name == "double" else 2 * self.place * reach
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """What positions, of the scale of a row, and velocities, of their size, may be off."""
+        return (START_TOLERANCE, START_TOLERANCE) if self.name == "double" else (self.tolerance, self.speeds)
+
+    @property
+    def solvers(self) -> float:
+        """What the arithmetic of OpenMM's solvers adds to a relative distance."""
+        return 5e-7 if self.name == "single" else 1e-12
+
+    @property
+    def speeds(self) -> float:
+        """What is left of velocities along constraints, of their size: SHAKE on GPUs makes 15 iterations at most."""
+        return 1e-6 if self.rounds_lengths else 0.0
+
+    @property
+    def forces(self) -> float:
+        """Relative error of forces and of the values of Forces that are rows, after some hundred operations."""
+        return 1e-13 if self.name == "double" else 5e-7
+
+    @property
+    def seen(self) -> float:
+        """Unit roundoff of a coordinate as Forces see it."""
+        return 2.0**-53 if self.name == "double" else SINGLE
 
 
 @dataclass(frozen=True)
@@ -77,16 +152,7 @@ class Violation:
 
 
 class Solver(NamedTuple):
-    """The engine of kcons for the rows of a part.
-
-    Attributes
-    ----------
-    motion : Motion
-    atoms : ndarray of int or slice
-        The particles that it knows, in its order.
-    time : float
-        That of the targets now, ps.
-    """
+    """The engine of kcons for the rows of a part, the particles that it knows, and the time of targets now, ps."""
 
     motion: Motion
     atoms: IntArray | slice = slice(None)
@@ -102,11 +168,11 @@ class Part(ABC):
     puts positions and velocities back to what they were before it and asks the part that has this code for the
     error to raise.
 
-    Steps after which the state is not read may end without `project` (see `kcons.openmm.integrator.steps`): the next
-    drift absorbs what v has across the rows. `lean` is set to True before `declare` where a program has such steps.
+    Steps after which the state is not read may end without `project` (see `kcons.openmm.integrator.program`): the next
+    drift absorbs what v has across the rows. A program with such steps is `lean`.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
-    `kcons.openmm.integrator.system_checks.refuse_agents`.
+    `kcons.openmm.integrator.guard.refuse_agents`.
 
     Attributes
     ----------
@@ -119,12 +185,8 @@ class Part(ABC):
         Whether it adds to x of its own particles only, so that it comes after the constraints of the System.
     groups : frozenset of int
         Force groups that carry rows, not forces.
-    lean : bool
-        Set by the integrator.
-    exact : bool
-        Whether `land_alone` flies exactly; set by the integrator where `flies_exactly` and the scheme asks for it.
     flies_exactly : bool
-        Whether `land_alone` can do so.
+        Whether `land_alone` can fly exactly, as it does where the program is `exact`.
     alone : bool
         Whether it is known that the System has no constraints. Where there is no other part, `land_alone` is the
         whole drift then.
@@ -138,8 +200,6 @@ class Part(ABC):
     meets_system: bool = False
     lands_last: bool = False
     groups: frozenset[int] = frozenset()
-    lean: bool = False
-    exact: bool = False
     flies_exactly: bool = False
     alone: bool = False
     stays_finite: bool = False
@@ -220,13 +280,7 @@ class Part(ABC):
         return None
 
     def apply_positions(self, context: openmm.Context) -> None:
-        """Bring the positions of the context onto the rows; velocities stay as they are.
-
-        Raises
-        ------
-        KconsError
-            The rows cannot be reached; nothing was changed.
-        """
+        """Bring the positions of the context onto the rows, or raise; velocities stay as they are."""
         self.restore_by(self.solver_at(context), context)
 
     def restore_by(self, solver: Solver | None, context: openmm.Context, bonds: ArrayLike | None = None) -> None:
@@ -249,13 +303,7 @@ class Part(ABC):
         context.computeVirtualSites()
 
     def apply_velocities(self, context: openmm.Context) -> None:
-        """Make the velocities of the context tangent to the rows: the nearest ones in the mass metric.
-
-        Raises
-        ------
-        KconsError
-            There are none; nothing was changed.
-        """
+        """Make the velocities of the context tangent to the rows, the nearest ones in the mass metric, or raise."""
         solver = self.solver_at(context)
         assert solver is not None
         motion, atoms, time = solver

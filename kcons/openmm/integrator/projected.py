@@ -13,23 +13,28 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.arguments import Rng, positive, seed_from, whole_number
-from kcons.errors import InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
-from kcons.openmm.integrator.ensemble import VARIABLES, ConstantEnergy, Ensemble, Step
-from kcons.openmm.integrator.guard import Guard, check_finite, find_context
-from kcons.openmm.integrator.minimization import descend
-from kcons.openmm.integrator.part import Part
-from kcons.openmm.integrator.precision import TOLERANCES, Precision
-from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.schemes import to_scheme
-from kcons.openmm.integrator.steps import write_step
-from kcons.openmm.integrator.system_checks import require_context, warn_of_barostat
-from kcons.openmm.quantities import kelvins, number, relative_tolerance
-from kcons.openmm.states import motion_of, positions_of, velocities_of
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, InputError, KconsError, MissingSettingError, NonFiniteError, UnsupportedError
+from kcons.openmm.integrator.guard import Guard, check_finite, find_context, require_context, warn_of_barostat
+from kcons.openmm.integrator.part import TOLERANCES, Part, Precision
+from kcons.openmm.integrator.program import ConstantEnergy, Ensemble, Program, to_scheme, write_step
+from kcons.openmm.quantities import (
+    forces_at,
+    kelvins,
+    masses_of,
+    motion_of,
+    number,
+    positions_of,
+    relative_tolerance,
+    velocities_of,
+)
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
 #: A time step in ps without a unit that is longer may be one in fs.
 _LONG = 0.02
+#: Longest way of a particle in one step of a minimization, nm.
+_STRIDE = 0.01
 #: What `failed` is where others have moved x between two calls.
 _MOVED = -1
 
@@ -100,7 +105,6 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
     #: Of the System's constraints; None where the platform decides.
     asked_tolerance: float | None = None
     _guard: Guard | None = None
-    _program_type = Program
     #: Chooses the class, and says why it is not that whose steps are made on the device; of `kcons.openmm.device`.
     _on_device: ClassVar[Callable[..., tuple[type[ProjectedIntegrator], str]]]
     #: Why steps are not made on the device, where that was asked.
@@ -140,33 +144,47 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             )
         self._ensemble.check(self.scheme)
         self.parts = self._held(parts)
-        if sum(part.meets_system for part in self.parts) > 1:
-            raise UnsupportedError("only one part may share atoms with the constraints of the System")
-        _refuse_shared(self.parts)
         self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
         if self.row_groups:
             openmm.Integrator.setIntegrationForceGroups(self, set(range(32)) - self.row_groups)
-        self.program = self._program_type(self)
-        self._step = self._write(self.program)
+        self.program = self._write()
         self.program.hand_over()
+        for part in self.parts:
+            part.program = self.program
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
-        """The parts, of what was given."""
-        return _listed(parts)
+        """Parts, or a single one, as a tuple; refused are others, and parts each of which would undo what others do."""
+        given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
+        known: set[int] = set()
+        for part in given:
+            if not isinstance(part, Part):
+                raise InputError(
+                    f"parts has {part!r:.80}, which is no part of an integrator; kcons.openmm.hold(system, "
+                    "constraints, positions) makes one of constraints, CollectiveRows of Forces",
+                    item="parts",
+                )
+            atoms = {int(a) for held in getattr(part, "atoms", ()) for a in np.ravel(held)}
+            if known & atoms:
+                raise UnsupportedError(
+                    f"two parts hold particle {min(known & atoms)}; give all rows that share particles to one call of "
+                    "kcons.openmm.hold"
+                )
+            known |= atoms
+        if sum(part.meets_system for part in given) > 1:
+            raise UnsupportedError("only one part may share atoms with the constraints of the System")
+        return given
 
     def _make(self, dt: float) -> None:
         """Make the integrator of OpenMM."""
         super().__init__(dt)
 
-    def _write(self, program: Program) -> Step:
-        """Write the program; parts keep what they need to know of it, and that it is the one they serve."""
+    def _write(self) -> Program:
+        """Write the program, of which parts keep what they need to know."""
         for k, part in enumerate(self.parts, start=1):
             part.code = k
-        step = Step(program, self.scheme, self.parts, self._ensemble)
-        write_step(step)
-        for part in self.parts:
-            part.program = self.program
-        return step
+        program = Program(self, self.scheme, self.parts, self._ensemble)
+        write_step(program)
+        return program
 
     def __repr__(self) -> str:
         held = "".join(f", {part!r}" for part in self.parts)
@@ -188,7 +206,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
 
     def operations(self) -> tuple[Operation, ...]:
         """What a step consists of, as for steppers on arrays; `listing` adds how OpenMM computes it."""
-        return self._step.operations
+        return self.program.operations
 
     # -- the Context ----------------------------------------------------------------------------
 
@@ -241,7 +259,9 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """Parts that have served another integrator since serve this one again."""
         if all(part.program is self.program for part in self.parts):
             return
-        self._write(self._program_type(self))  # the same as that which the integrator has
+        self._write()  # the same as the program that the integrator has
+        for part in self.parts:
+            part.program = self.program
         if self._guard is not None:
             self.take_precision(self._guard.precision)
             self._guard.started = False
@@ -297,8 +317,8 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
 
     def _run_block(self, guard: Guard, steps: int, ends: bool) -> None:
         """Make steps, with the shorter program for those after which the state is not read."""
-        unseen = steps - 1 if self._step.lazy and not guard.in_parts else 0
-        if unseen > 0 and guard.undisturbed and not (self._step.joined and guard.moving):
+        unseen = steps - 1 if self.program.lazy and not guard.in_parts else 0
+        if unseen > 0 and guard.undisturbed and not (self.program.joined and guard.moving):
             with self._control("between"):
                 self._run(guard, unseen, False)
             steps -= unseen
@@ -367,7 +387,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         for _ in range(steps):
             time, count = context.getTime()._value, context.getStepCount()
             with self._control("phase"):
-                openmm.CustomIntegrator.step(self, self._step.phases)
+                openmm.CustomIntegrator.step(self, self.program.phases)
             context.setTime(time + dt)
             context.setStepCount(count + 1)
 
@@ -492,7 +512,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         tolerance = positive(number(tolerance, unit.kilojoule_per_mole / unit.nanometer, "tolerance"), "tolerance")
         maxIterations = whole_number(maxIterations, "maxIterations", 0)
         if self.parts:
-            descend(self, context, tolerance, maxIterations)
+            _descend(self, context, tolerance, maxIterations)
         else:
             openmm.LocalEnergyMinimizer.minimize(context, tolerance, maxIterations)
             self.applyConstraints(context)
@@ -557,12 +577,12 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
 
         The method raises `InputError` if it is below zero; with `Isokinetic`, zero.
         """
-        if not self.thermostatted:
+        if not hasattr(self.ensemble, "temperature"):
             self._given("temperature")
         return self._set_temperature
 
     def _set_temperature(self, temperature: unit.Quantity | float) -> None:
-        self._take(self.ensemble.at(kelvins(temperature)))
+        self._take(self.ensemble.replaced(temperature=kelvins(temperature)))
         guard = self._guard
         if guard is not None and guard.alive is not None and guard.started:
             warn_of_barostat(guard.context, self._given("temperature"), stacklevel=3)
@@ -580,7 +600,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         The method raises `InputError` if it is below zero.
         """
         self._given("friction")
-        return lambda friction: self._take(self.ensemble.with_friction(friction))
+        return lambda friction: self._take(self.ensemble.replaced(friction=friction))
 
     @property
     def getFriction(self) -> Callable[[], unit.Quantity]:
@@ -692,9 +712,10 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         every = None if self.spare else self.check_every
         made_with = (self.getStepSize(), self.scheme, self.parts, self.asked_tolerance, every, self.ensemble)
         program = self.program
-        # What belongs to a state or a step a copy starts without; clocks of targets that move go by the good steps.
-        left = {*program.settings, *program.idle, *program.memory, *VARIABLES} - {"good_steps"}
-        run = {name: self.getGlobalVariableByName(name) for name in program.numbers if name not in left}
+        # What belongs to a state a copy starts without; clocks of targets that move go by the good steps.
+        left = {*program.settings, *program.idle, *program.memory, "stale"}
+        kept = [name for name in program.words if name in program.numbers and name not in left]
+        run = {name: self.getGlobalVariableByName(name) for name in kept}
         return made_with, program.settings, run, self.getIntegrationForceGroups(), self.getRandomNumberSeed()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -744,27 +765,66 @@ def picoseconds(timestep: Any) -> float:
     return dt
 
 
-def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
-    """Parts, or a single one, as a tuple; `InputError` for what is none."""
-    given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
-    for part in given:
-        if not isinstance(part, Part):
-            raise InputError(
-                f"parts has {part!r:.80}, which is no part of an integrator; kcons.openmm.hold(system, constraints, "
-                "positions) makes one of constraints, CollectiveRows of Forces",
-                item="parts",
-            )
-    return given
+# -- minima on the constraints --------------------------------------------------------------------
 
 
-def _refuse_shared(parts: Sequence[Part]) -> None:
-    """Refuse particles that two parts hold: each would undo what the other does."""
-    known: set[int] = set()
-    for part in parts:
-        atoms = {int(a) for held in getattr(part, "atoms", ()) for a in np.ravel(held)}
-        if known & atoms:
-            raise UnsupportedError(
-                f"two parts hold particle {min(known & atoms)}; give all rows that share particles to one call of "
-                "kcons.openmm.hold"
-            )
-        known |= atoms
+def _descend(integrator: ProjectedIntegrator, context: openmm.Context, tolerance: float, iterations: int) -> None:
+    """Fast inertial relaxation along the constraints of the System and of the parts.
+
+    Velocities are the search direction in the mass metric: each step projects f/m, turns v towards it, goes, and
+    brings x back onto the constraints. Velocities of the context stay as they were. It ends where the root mean square
+    of the projected force components is below a tolerance (kJ/mol/nm), or after so many iterations (0: 50,000);
+    `ConvergenceError` where the constraints cannot be reached, however short the steps.
+
+    References
+    ----------
+    Bitzek et al., Phys. Rev. Lett. 97, 170201 (2006).
+    """
+    system = context.getSystem()
+    masses = masses_of(system)[:, None]
+    inverse = np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0)
+    groups = integrator.getIntegrationForceGroups()
+    kept = velocities_of(context)
+    dt, alpha, since_turn = 1e-3, 0.1, 0
+    v = np.zeros((len(masses), 3))
+    try:
+        integrator.applyConstraints(context)
+        for _ in range(iterations or 50_000):
+            pull = _tangent(integrator, context, forces_at(context, groups) * inverse)
+            if np.sqrt(np.mean((masses * pull) ** 2)) <= tolerance:
+                return
+            v = _tangent(integrator, context, v + dt * pull)
+            if np.sum(masses * v * pull) > 0:
+                since_turn += 1
+                v = (1 - alpha) * v + alpha * pull * np.sqrt(np.sum(masses * v * v) / np.sum(masses * pull * pull))
+                if since_turn > 5:
+                    dt, alpha = 1.1 * dt, 0.99 * alpha
+            else:
+                v[:], alpha, since_turn = 0.0, 0.1, 0
+                dt *= 0.5
+            dt, v = _move(integrator, context, v, dt)
+    finally:
+        context.setVelocities(kept)
+
+
+def _move(
+    integrator: ProjectedIntegrator, context: openmm.Context, v: FloatArray, dt: float
+) -> tuple[float, FloatArray]:
+    x = positions_of(context)
+    for _ in range(30):
+        stride = dt * v
+        longest = float(np.sqrt(np.max(np.sum(stride**2, axis=1))))
+        context.setPositions(x + stride * min(1.0, _STRIDE / longest if longest > 0 else 1.0))
+        try:
+            integrator.applyConstraints(context)
+            return dt, v
+        except ConvergenceError:
+            dt, v = 0.25 * dt, 0.25 * v
+    context.setPositions(x)
+    raise ConvergenceError("the constraints cannot be kept along the descent, however short the steps")
+
+
+def _tangent(integrator: ProjectedIntegrator, context: openmm.Context, v: FloatArray) -> FloatArray:
+    context.setVelocities(v)
+    integrator.applyVelocityConstraints(context)
+    return velocities_of(context)

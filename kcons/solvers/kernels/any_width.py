@@ -39,19 +39,19 @@ def instruction(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]
 
     Parameters
     ----------
-    result : Numba type
+    result : Numba type, or what gives the signature for kinds of arguments
     *kinds : Numba type or None
         Of the arguments. None takes what is given; the function gets a contiguous array as the pointer to its first
         number, and no intrinsic is found for other arrays.
     """
 
     def made(emit: Callable[..., Any]) -> Any:
-        def function(typingctx, *given):  # type: ignore[no-untyped-def]
+        def function(typingctx, *given):
             if any(isinstance(kind, types.Array) and kind.layout != "C" for kind in given):
                 return None
             taken = [kind or own for kind, own in zip(kinds, given, strict=True)]
 
-            def codegen(context, builder, sig, values):  # type: ignore[no-untyped-def]
+            def codegen(context, builder, sig, values):
                 found = emit(builder, *map(functools.partial(first_of, context, builder), sig.args, values))
                 if isinstance(found, list):
                     return context.make_tuple(builder, sig.return_type, found)
@@ -110,9 +110,11 @@ class Vectors:
         self.llvm = ir.VectorType(DOUBLE, width)
         self.load = reader(self.kind, self.llvm)
         self.store = writer(self.kind, self.llvm)
+        one, number = self.kind, types.float64
+        two = [signature(one, *pair) for pair in ((one, one), (one, number), (number, one))]
         for function, instruction in _INSTRUCTIONS:
-            self._define(function, instruction)
-        self._define_negation()
+            self._define(function, instruction, two)
+        self._define(operator.neg, "fneg", [signature(one, one)])
 
     def splat(self, builder: Any, value: Any) -> Any:
         """All equal to one double; a vector stays as it is."""
@@ -137,35 +139,19 @@ class Vectors:
         """The function of each that LLVM calls `name`, such as 'sqrt'."""
 
         @instruction(self.kind, self.kind)
-        def function(builder, value):  # type: ignore[no-untyped-def]
+        def function(builder, value):
             return call(builder, f"llvm.{name}.v{self.llvm.count}f64", self.llvm, [value])
 
         return function
 
-    def _define(self, function: Any, instruction: str) -> None:
-        kind = self.kind
-        cases = [
-            signature(kind, kind, kind),
-            signature(kind, kind, types.float64),
-            signature(kind, types.float64, kind),
-        ]
-        infer_global(function)(type(f"_{instruction}_{kind.name}", (ConcreteTemplate,), {"cases": cases}))
+    def _define(self, function: Any, instruction: str, cases: list[Any]) -> None:
+        infer_global(function)(type(f"_{instruction}_{self.kind.name}", (ConcreteTemplate,), {"cases": cases}))
 
         def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            left, right = (self.splat(builder, value) for value in args)
-            return getattr(builder, instruction)(left, right, flags=FLAGS)
+            return getattr(builder, instruction)(*(self.splat(builder, value) for value in args), flags=FLAGS)
 
         for case in cases:
             lower_builtin(function, *case.args)(lower)
-
-    def _define_negation(self) -> None:
-        cases = [signature(self.kind, self.kind)]
-        infer_global(operator.neg)(type(f"_neg_{self.kind.name}", (ConcreteTemplate,), {"cases": cases}))
-
-        def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return builder.fneg(args[0], flags=FLAGS)
-
-        lower_builtin(operator.neg, self.kind)(lower)
 
 
 @functools.cache
@@ -182,15 +168,17 @@ def shuffle(builder: Any, left: Any, right: Any, mask: list[int]) -> Any:
     return builder.shuffle_vector(left, right, ir.Constant(ir.VectorType(INT32, len(mask)), mask))
 
 
-def pointer(context: Any, builder: Any, array_type: Any, array: Any, start: Any, to: Any = None) -> Any:
-    """To an entry of an array, or behind a pointer; as one to a vector where `to` is its type."""
-    return place(builder, first_of(context, builder, array_type, array), start, to)
-
-
 def call(builder: Any, name: str, result: Any, args: Any) -> Any:
     """Call an LLVM intrinsic."""
     function_type = ir.FunctionType(result, [a.type for a in args])
     return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), args)
+
+
+@instruction(lambda value: value(value), None)
+def nearest(builder, value):
+    """The nearest whole number: of a double, or of each of some."""
+    width = f"v{value.type.count}" if isinstance(value.type, ir.VectorType) else ""
+    return call(builder, f"llvm.rint.{width}f64", value.type, [value])
 
 
 def masked_point(builder: Any, at: Any) -> Any:
@@ -204,7 +192,7 @@ def reader(kind: Any, vector: Any) -> Callable[..., Any]:
     """The intrinsic that reads from a flat float64 array; doubles where `vector` is None."""
 
     @instruction(kind, None, types.int64)
-    def function(builder, array, start):  # type: ignore[no-untyped-def]
+    def function(builder, array, start):
         return builder.load(place(builder, array, start, vector), align=8)
 
     return function
@@ -214,7 +202,7 @@ def writer(kind: Any, vector: Any) -> Callable[..., Any]:
     """The intrinsic that writes into one."""
 
     @instruction(types.void, None, types.int64, kind)
-    def function(builder, array, start, value):  # type: ignore[no-untyped-def]
+    def function(builder, array, start, value):
         builder.store(value, place(builder, array, start, vector), align=8)
 
     return function

@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from kcons.solvers.kernels.any_width import pointer
+from kcons.solvers.kernels.any_width import INT64, first_of, instruction, place
 
 #: Types of pointers to doubles and to indices, as `at_piece` and `at_first` give them.
 NUMBERS, INDICES = types.CPointer(types.float64), types.CPointer(types.uint32)
@@ -30,91 +30,54 @@ def view(context: Any, builder: Any, kind: Any, data: Any, *shape: Any) -> Any:
     return result._getvalue()
 
 
-@intrinsic
-def _table_array(typingctx, room, header, k):  # type: ignore[no-untyped-def]
-    kind = types.Array(room.dtype, 1, "C")
+def _piece(*shape: int) -> Any:
+    """The intrinsic for a piece of an array, of a fixed shape where one is given."""
 
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        numbers, cuts = (
-            context.make_array(t)(context, builder, a) for t, a in zip(sig.args[:2], args[:2], strict=True)
-        )
-        at = builder.mul(args[2], ir.Constant(args[2].type, 2))
-        start = builder.load(builder.gep(cuts.data, [at]))
-        end = builder.load(builder.gep(cuts.data, [builder.add(at, ir.Constant(at.type, 1))]))
-        return view(context, builder, kind, builder.gep(numbers.data, [start]), builder.sub(end, start))
+    @intrinsic
+    def function(typingctx, room, header, k):
+        kind = types.Array(room.dtype, max(len(shape), 1), "C")
 
-    return kind(room, header, types.int64), codegen
+        def codegen(context, builder, sig, args):
+            numbers, cuts = (first_of(context, builder, *each) for each in zip(sig.args[:2], args[:2], strict=True))
+            at = builder.mul(args[2], INT64(2))
+            start, end = (builder.load(place(builder, cuts, builder.add(at, INT64(side)))) for side in (0, 1))
+            size = [context.get_constant(types.intp, length) for length in shape] or [builder.sub(end, start)]
+            return view(context, builder, kind, place(builder, numbers, start), *size)
+
+        return kind(room, header, types.int64), codegen
+
+    return function
 
 
-#: ``room[header[2 k] : header[2 k + 1]]`` of flat contiguous arrays, `header` of int64.
-table_array: Any = _table_array
+#: ``room[header[2 k] : header[2 k + 1]]`` of flat contiguous arrays, `header` of int64; and the same as a lattice.
+table_array, lattice_piece = _piece(), _piece(2, 3, 3)
 
 
-@intrinsic
-def at_piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
+@instruction(lambda room, *others: types.CPointer(room.dtype)(room, *others), None, None, types.int64)
+def at_piece(builder, room, header, k):
     """Pointer to ``room[header[2 k]]``, where a piece begins.
 
     An array is handed on as seven values, and leaves code behind that counts its users: a kernel that knows the lengths
     of two dozen pieces without them is compiled in two thirds of the time.
     """
-    kind = types.CPointer(room.dtype)
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        at = builder.mul(args[2], ir.Constant(args[2].type, 2))
-        begin = builder.load(pointer(context, builder, sig.args[1], args[1], at))
-        return pointer(context, builder, sig.args[0], args[0], begin)
-
-    return kind(room, header, types.int64), codegen
+    return place(builder, room, builder.load(place(builder, header, builder.mul(k, INT64(2)))))
 
 
-@intrinsic
-def at_first(typingctx, array):  # type: ignore[no-untyped-def]
+@instruction(lambda array: types.CPointer(array.dtype)(array), None)
+def at_first(builder, array):
     """Pointer to the first number of a contiguous array."""
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return context.make_array(sig.args[0])(context, builder, args[0]).data
-
-    return types.CPointer(array.dtype)(array), codegen
-
-
-@intrinsic
-def none_of(typingctx, array):  # type: ignore[no-untyped-def]
-    """No numbers of a contiguous array: ``array[:0]``, in a tenth of the time to compile."""
-    kind = types.Array(array.dtype, 1, "C")
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return view(context, builder, kind, data, context.get_constant(types.intp, 0))
-
-    return kind(array), codegen
-
-
-@intrinsic
-def lattice_piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
-    """The same as a lattice, shape (2, 3, 3)."""
-    kind = types.Array(room.dtype, 3, "C")
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        numbers, cuts = (
-            context.make_array(t)(context, builder, a) for t, a in zip(sig.args[:2], args[:2], strict=True)
-        )
-        at = builder.mul(args[2], ir.Constant(args[2].type, 2))
-        start = builder.load(builder.gep(cuts.data, [at]))
-        shape = [context.get_constant(types.intp, length) for length in (2, 3, 3)]
-        return view(context, builder, kind, builder.gep(numbers.data, [start]), *shape)
-
-    return kind(room, header, types.int64), codegen
+    return array
 
 
 def _flat(dtype: Any, copied: Any = None) -> Any:
     """All memory of a contiguous array as numbers of a type; of others what the function `copied` gives."""
 
     @intrinsic
-    def function(typingctx, array):  # type: ignore[no-untyped-def]
+    def function(typingctx, array):
         own = copied is None or array.layout == "C"
         kind = types.Array(dtype or array.dtype, 1, "C", readonly=own and not array.mutable)
 
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        def codegen(context, builder, sig, args):
             if not own:
                 return context.compile_internal(builder, copied, sig, args)
             source = context.make_array(sig.args[0])(context, builder, args[0])

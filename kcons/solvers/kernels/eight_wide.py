@@ -142,7 +142,7 @@ def scatter_points(builder, points, table, start, x, y, z):
         builder.store(builder.extract_element(row, INT32(2)), builder.gep(at, [INT64(2)]), align=8)
 
 
-absolute, nearest, square_root = _EIGHT.unary("fabs"), _EIGHT.unary("rint"), _EIGHT.unary("sqrt")
+absolute, square_root = _EIGHT.unary("fabs"), _EIGHT.unary("sqrt")
 
 
 @instruction(types.boolean, None, None)

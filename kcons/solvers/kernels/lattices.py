@@ -1,4 +1,4 @@
-"""Lattices and minimum images inside compiled kernels: of one vector, and of eight at once.
+"""Lattices and minimum images inside compiled kernels, of one vector or of eight at once.
 
 A lattice is the cell (rows) and its inverse, shape (2, 3, 3).
 """
@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.kernels.eight_wide import FASTMATH, nearest
+from kcons.solvers.kernels.any_width import nearest
+from kcons.solvers.kernels.eight_wide import FASTMATH
 
 #: Stands for 'no periodicity' where a kernel needs an array of the right type.
 NO_LATTICE = np.zeros((2, 3, 3))
@@ -23,21 +24,6 @@ def lattice_kind(lattice: NDArray[np.float64] | None) -> tuple[NDArray[np.float6
         np.count_nonzero(cell.diagonal()) + np.count_nonzero(inverse.diagonal())
     )
     return lattice, ORTHORHOMBIC if diagonal else TRICLINIC
-
-
-@njit(cache=True, inline="always")
-def nearest_image(x, y, z, lattice):  # type: ignore[no-untyped-def]
-    """Shortest image of a difference; `lattice` holds the cell (rows) and its inverse, both (3, 3)."""
-    inverse = lattice[1]
-    a = np.rint(x * inverse[0, 0] + y * inverse[1, 0] + z * inverse[2, 0])
-    b = np.rint(x * inverse[0, 1] + y * inverse[1, 1] + z * inverse[2, 1])
-    c = np.rint(x * inverse[0, 2] + y * inverse[1, 2] + z * inverse[2, 2])
-    cell = lattice[0]
-    return (
-        x - (a * cell[0, 0] + b * cell[1, 0] + c * cell[2, 0]),
-        y - (a * cell[0, 1] + b * cell[1, 1] + c * cell[2, 1]),
-        z - (a * cell[0, 2] + b * cell[1, 2] + c * cell[2, 2]),
-    )
 
 
 @njit(fastmath=FASTMATH, forceinline=True)

@@ -2,6 +2,11 @@
 
 Works on relative quantities: displacements of the cluster's atoms, and bond vectors made from them;
 positions change once, after every cluster has converged, so that a failure leaves them as they were.
+
+A row's line of eight doubles holds its vectors r and s, the accumulated change of its pivot, and its
+right-hand side: r0 s0 r1 s1 r2 s2 change right. An entry's line of four doubles holds A_lk / pivot and A_kl
+(k < l) and their accumulated changes, which are left at zero for the next time. `links` holds, row by row,
+where its entries and its targets begin and its two ends; atoms are quads (move, inverse mass).
 """
 
 from __future__ import annotations
@@ -16,45 +21,44 @@ from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
 from kcons.solvers.distance_clusters import resolved
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import at_first, at_piece, halves, integers, table_array
-from kcons.solvers.kernels.lattices import OPEN, nearest_image
+from kcons.solvers.kernels.lattices import OPEN, TRICLINIC, lattice_numbers, minimum_image
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
     extract,
     first_vector,
+    keep_loop_rolled,
     load_double,
     load_index,
+    load_pair,
     load_point,
     load_quad,
     pair,
     quad,
     second_vector,
+    settled,
     store_double,
     store_first,
     store_line,
+    store_pair,
     store_quad,
+    swapped,
 )
 from kcons.solvers.sparse.elimination import FAST, make_pattern, number_atoms
-from kcons.solvers.sparse.substitution import (
-    RIGHT,
-    backward,
-    factor,
-    factor_serves,
-    factor_symmetric,
-    forward,
-    hopeless,
-    refines,
-)
 from kcons.solvers.tolerances import (
     EPS,
+    MAX_ITERATIONS,
     NEAR,
     NEWTON_TOLERANCE,
+    PIVOT_TOLERANCE,
     ROUNDING,
     ROUNDINGS,
     SPEED_ROUNDINGS,
     SPEED_TOLERANCE,
 )
 
+#: Places of the two last numbers in a row's line.
+CHANGE, RIGHT = 6, 7
 #: Of the pieces of `SparseDistances.tables`, those that are named.
 _PAIRS, _LENGTHS, _STATE, _PIVOTS, _MOVES, _SOLUTION = 9, 10, 11, 13, 16, 17
 
@@ -105,7 +109,7 @@ class SparseDistances(AddressableSolver):
             (
                 *(pattern.clusters, numbered, atom_start, w, links.ravel(), pattern.columns, pattern.targets),
                 *(couplings, w[ends].sum(axis=1), pairs.astype(np.uint32).ravel(), lengths[pattern.order]),
-                # As `sparse.substitution` says: lines of rows and of entries; pivots. Then where rows began, where
+                # As the module says: lines of rows and of entries; pivots. Then where rows began, where
                 # atoms were, moves and solution.
                 *(room(8 * n), room(4 * n_entries), room(n), room(4 * n), room(4 * n_atoms)),
                 *(room(4 * n_atoms), room(n)),
@@ -116,9 +120,6 @@ class SparseDistances(AddressableSolver):
             part_of(self.tables, _SOLUTION),
             part_of(self.tables, _STATE).reshape(-1, 8)[:, 1:6:2],
         )
-
-    def __reduce__(self) -> tuple[type[SparseDistances], tuple[object, ...]]:
-        return SparseDistances, self._made_of  # addresses are of no use elsewhere
 
     @property
     def lengths(self) -> FloatArray:
@@ -138,8 +139,204 @@ class SparseDistances(AddressableSolver):
         return found
 
 
+# -- elimination and substitution ----------------------------------------------------------------------------
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries):
+    """Assemble entry p of a row (vectors x, y, z: s and r) and take it from its column; returns the entry."""
+    l = 8 * load_index(columns, p)
+    both = x * load_pair(state, l) + y * load_pair(state, l + 2) + z * load_pair(state, l + 4)
+    both = load_double(couplings, p) * both + load_pair(entries, 4 * p + 2)
+    low, up = inverse * extract(both, 0), extract(both, 1)
+    done = pair(low, up)
+    store_quad(entries, 4 * p, settled(done))
+    store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
+    return done
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def update(t, one, two, targets, entries):
+    """Take the product of two entries of a row, to columns l and m, from A_ml and A_lm."""
+    e = 4 * load_index(targets, t) + 2
+    store_pair(entries, e, load_pair(entries, e) - swapped(one) * two)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots):
+    """Assemble and eliminate rows first to last, with forward substitution, in one sweep."""
+    begin, t = load_index(links, 4 * first), load_index(links, 4 * first + 1)
+    for k in range(first, last):
+        x, y, z = swapped(load_pair(state, 8 * k)), swapped(load_pair(state, 8 * k + 2)), load_pair(state, 8 * k + 4)
+        z = swapped(z)
+        inner = extract(x, 0) * extract(x, 1) + extract(y, 0) * extract(y, 1) + extract(z, 0) * extract(z, 1)
+        whole = load_double(weights, k) * inner
+        d = whole + load_double(state, 8 * k + CHANGE)
+        right = load_double(state, 8 * k + RIGHT)
+        inverse = 1.0 / d if abs(d) > PIVOT_TOLERANCE * abs(whole) else 0.0
+        store_double(pivots, k, inverse)
+        end = load_index(links, 4 * k + 4)
+        # Few entries are the rule; spelt out, their numbers stay in registers.
+        count = end - begin
+        if count == 1:
+            _eliminate(begin, x, y, z, inverse, right, columns, couplings, state, entries)
+        elif count == 2:
+            one = _eliminate(begin, x, y, z, inverse, right, columns, couplings, state, entries)
+            two = _eliminate(begin + 1, x, y, z, inverse, right, columns, couplings, state, entries)
+            update(t, one, two, targets, entries)
+            t += 1
+        elif count == 3:
+            one = _eliminate(begin, x, y, z, inverse, right, columns, couplings, state, entries)
+            two = _eliminate(begin + 1, x, y, z, inverse, right, columns, couplings, state, entries)
+            three = _eliminate(begin + 2, x, y, z, inverse, right, columns, couplings, state, entries)
+            update(t, one, two, targets, entries)
+            update(t + 1, one, three, targets, entries)
+            update(t + 2, two, three, targets, entries)
+            t += 3
+        else:
+            for p in range(begin, end):
+                keep_loop_rolled()
+                _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries)
+            for p in range(begin, end - 1):
+                keep_loop_rolled()
+                mine = load_pair(entries, 4 * p)
+                for q in range(p + 1, end):
+                    keep_loop_rolled()
+                    update(t, mine, load_pair(entries, 4 * q), targets, entries)
+                    t += 1
+        begin = end
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, state, entries):
+    l = 8 * load_index(columns, p)
+    inner = sx * load_double(state, l + 1) + sy * load_double(state, l + 3) + sz * load_double(state, l + 5)
+    up = load_double(couplings, p) * inner + load_double(entries, 4 * p + 2)
+    low = up * inverse
+    store_quad(entries, 4 * p, settled(pair(low, up)))
+    store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
+    return low, up
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _update_symmetric(t, low, up, targets, entries):
+    e = 4 * load_index(targets, t) + 2
+    store_double(entries, e, load_double(entries, e) - low * up)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots):
+    """`_factor` for r = s: half the work."""
+    begin, t = load_index(links, 4 * first), load_index(links, 4 * first + 1)
+    for k in range(first, last):
+        sx, sy, sz = load_double(state, 8 * k + 1), load_double(state, 8 * k + 3), load_double(state, 8 * k + 5)
+        whole = load_double(weights, k) * (sx * sx + sy * sy + sz * sz)
+        d = whole + load_double(state, 8 * k + CHANGE)
+        right = load_double(state, 8 * k + RIGHT)
+        inverse = 1.0 / d if d > PIVOT_TOLERANCE * whole else 0.0
+        store_double(pivots, k, inverse)
+        end = load_index(links, 4 * k + 4)
+        count = end - begin
+        if count == 1:
+            _eliminate_symmetric(begin, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+        elif count == 2:
+            low, _up = _eliminate_symmetric(begin, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            _low2, up2 = _eliminate_symmetric(begin + 1, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            _update_symmetric(t, low, up2, targets, entries)
+            t += 1
+        elif count == 3:
+            low, _up = _eliminate_symmetric(begin, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            low2, up2 = _eliminate_symmetric(begin + 1, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            _low3, up3 = _eliminate_symmetric(begin + 2, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            _update_symmetric(t, low, up2, targets, entries)
+            _update_symmetric(t + 1, low, up3, targets, entries)
+            _update_symmetric(t + 2, low2, up3, targets, entries)
+            t += 3
+        else:
+            for p in range(begin, end):
+                keep_loop_rolled()
+                _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            for p in range(begin, end - 1):
+                keep_loop_rolled()
+                low = load_double(entries, 4 * p)
+                for q in range(p + 1, end):
+                    keep_loop_rolled()
+                    _update_symmetric(t, low, load_double(entries, 4 * q + 1), targets, entries)
+                    t += 1
+        begin = end
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _forward(first, last, links, columns, state, entries):
+    """Forward substitution with the factor kept from before."""
+    begin = load_index(links, 4 * first)
+    for k in range(first, last):
+        right = load_double(state, 8 * k + RIGHT)
+        end = load_index(links, 4 * k + 4)
+        for p in range(begin, end):
+            keep_loop_rolled()
+            l = 8 * load_index(columns, p) + RIGHT
+            store_double(state, l, load_double(state, l) - load_double(entries, 4 * p) * right)
+        begin = end
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _backward(first, last, links, columns, state, entries, pivots, moves, solution):
+    """Backward substitution; adds to the multipliers and moves the atoms along s in the same sweep."""
+    end = load_index(links, 4 * last)
+    for back in range(last - first):
+        k = last - 1 - back
+        # The whole line is read before a part of it is written: the other way round the processor waits.
+        s = second_vector(state, 8 * k)
+        step = load_double(state, 8 * k + RIGHT)
+        begin = load_index(links, 4 * k)
+        for p in range(begin, end):
+            keep_loop_rolled()
+            step -= load_double(entries, 4 * p + 1) * load_double(state, 8 * load_index(columns, p) + RIGHT)
+        end = begin
+        step *= load_double(pivots, k)
+        store_double(state, 8 * k + RIGHT, step)
+        store_double(solution, k, load_double(solution, k) + step)
+        i, j = 4 * load_index(links, 4 * k + 2), 4 * load_index(links, 4 * k + 3)
+        store_quad(moves, i, load_quad(moves, i) + (step * load_double(moves, i + 3)) * s)
+        store_quad(moves, j, load_quad(moves, j) - (step * load_double(moves, j + 3)) * s)
+
+
+# -- control of the steps, whatever the rows are; a step may reuse the factor of the one before ---------------
+
+# Spliced into the loops: what is called there from them, with arrays, costs small clusters a sixth of their time.
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def hopeless(iteration, error, previous):
+    """Whether Newton runs away, or has had its time."""
+    return iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def stalled(iteration, error, previous, excess, n_rows):
+    """Whether nothing is to be gained, where the largest residual is `excess` roundings."""
+    return iteration > 4 and error > 0.1 * previous and excess * excess <= ROUNDINGS * ROUNDINGS * n_rows
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def factor_serves(factored, error, previous):
+    """Whether a step with the factor there is gains enough for its lower price."""
+    ratio = error / previous
+    return factored and (error * ratio <= NEWTON_TOLERANCE or ratio < 1e-4)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def refines(iteration, error, previous, allowed):
+    """Whether one refinement of tangents more is worth it: as long as it helps; the least error is accepted."""
+    return not (error <= allowed or iteration > 8 or not (error < 0.5 * previous))
+
+
+# -- what other kernels call ----------------------------------------------------------------------------------
+
+
 @njit(cache=True)
-def _couplings(start, columns, ends, w):  # type: ignore[no-untyped-def]
+def _couplings(start, columns, ends, w):
     """c_kl with (A M^-1 A^T)_kl = c_kl s_k . s_l for each stored entry; 0 where there is only fill."""
     coupling = np.zeros(len(columns))
     for k in range(len(start) - 1):
@@ -161,9 +358,9 @@ def _couplings(start, columns, ends, w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, periodic, atoms, w, links,
+def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, cell, periodic, atoms, w, links,
     state, starts, places, moves, solution,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Reference vectors s and current vectors q of a cluster; largest and total relative error of the lengths."""
     for a in range(first_atom, last_atom):
         g = 3 * load_index(atoms, a)
@@ -175,7 +372,7 @@ def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, p
         s = load_quad(places, i) - load_quad(places, j)
         q = load_quad(moves, i) - load_quad(moves, j)
         if periodic:
-            s, q = _image(s, lattice), _image(q, lattice)
+            s, q = _image(s, cell), _image(q, cell)
         d2 = load_double(lengths, k) * load_double(lengths, k)
         miss = 0.5 * (d2 - dot(q, q))
         store_line(state, 8 * k, q, s, pair(0.0, miss))
@@ -192,13 +389,13 @@ def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, p
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _image(vector, lattice):  # type: ignore[no-untyped-def]
-    x, y, z = nearest_image(extract(vector, 0), extract(vector, 1), extract(vector, 2), lattice)
+def _image(vector, cell):
+    x, y, z = minimum_image(extract(vector, 0), extract(vector, 1), extract(vector, 2), cell, TRICLINIC)
     return quad(x, y, z, 0.0)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore[no-untyped-def]
+def _measure(first, last, lengths, links, state, starts, moves):
     """Current vectors and right-hand sides; largest and total relative error of the lengths."""
     error, total = 0.0, 0.0
     for k in range(first, last):
@@ -214,9 +411,7 @@ def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _positions(  # type: ignore[no-untyped-def]
-    alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
-):
+def _positions(alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers):
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atoms, atom_start, w = at_piece(h, h, 0), at_piece(u, h, 1), at_piece(h, h, 2), at_piece(t, h, 3)
@@ -224,14 +419,14 @@ def _positions(  # type: ignore[no-untyped-def]
     weights, state, entries = at_piece(t, h, 8), at_piece(t, h, _STATE), at_piece(t, h, 12)
     pivots, starts, places = at_piece(t, h, _PIVOTS), at_piece(t, h, 14), at_piece(t, h, 15)
     moves, solution = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
-    periodic = kind != OPEN
+    periodic, cell = kind != OPEN, lattice_numbers(lattice)
     lengths = at_first(wanted) if wanted.size else at_piece(t, h, _LENGTHS)
     worst, worst_row, most = 0.0, -1, 0
     for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
         first_atom, last_atom = atom_start[c], atom_start[c + 1]
         error, total = _begin(
-            first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, periodic, atoms, w, links,
+            first, last, first_atom, last_atom, x_new, x_ref, lengths, cell, periodic, atoms, w, links,
             state, starts, places, moves, solution,
         )  # fmt: skip
         previous = np.inf
@@ -249,11 +444,11 @@ def _positions(  # type: ignore[no-untyped-def]
             if error > 0.5 * previous and error < NEAR and _within_rounding(first, last, state, lengths, places, links):
                 break
             if factor_serves(factored, error, previous):
-                forward(first, last, links, columns, state, entries)
+                _forward(first, last, links, columns, state, entries)
             else:
-                factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
+                _factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
                 factored = True
-            backward(first, last, links, columns, state, entries, pivots, moves, solution)
+            _backward(first, last, links, columns, state, entries, pivots, moves, solution)
             previous = error
             iteration += 1
         for k in range(first, last):
@@ -271,7 +466,7 @@ def _positions(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _within_rounding(first, last, state, lengths, places, links):  # type: ignore[no-untyped-def]
+def _within_rounding(first, last, state, lengths, places, links):
     """Whether each |sigma| is max(1e-14 d, 2 eps (|x_i| + |x_j|)) or so, see `tolerances.ROUNDINGS`."""
     room = ROUNDINGS * np.sqrt(last - first)
     for k in range(first, last):
@@ -286,7 +481,7 @@ def _within_rounding(first, last, state, lengths, places, links):  # type: ignor
 
 
 @njit(cache=True)
-def _worst(first, last, state, lengths):  # type: ignore[no-untyped-def]
+def _worst(first, last, state, lengths):
     """Row of a cluster with the largest relative residual, or the first that is not finite."""
     row, largest = np.int64(first), 0.0
     for k in range(first, last):
@@ -299,7 +494,7 @@ def _worst(first, last, state, lengths):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
+def _tangents(alone, y, x, velocities, inv_dt, wanted, lattice, kind, tables, numbers):
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atoms, atom_start, w = at_piece(h, h, 0), at_piece(u, h, 1), at_piece(h, h, 2), at_piece(t, h, 3)
@@ -307,7 +502,7 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
     weights, state, entries = at_piece(t, h, 8), at_piece(t, h, _STATE), at_piece(t, h, 12)
     pivots, starts, places = at_piece(t, h, _PIVOTS), at_piece(t, h, 14), at_piece(t, h, 15)
     moves, solution, periodic = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION), kind != OPEN
-    driven, rates = wanted.size > 0, at_first(wanted)
+    driven, rates, cell = wanted.size > 0, at_first(wanted), lattice_numbers(lattice)
     worst, worst_row, most = 0.0, -1, 0
     for c in range(h[1] - h[0] - 1):
         first, last = clusters[c], clusters[c + 1]
@@ -322,7 +517,7 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
             s = load_quad(places, i) - load_quad(places, j)
             u = load_quad(moves, i) - load_quad(moves, j)
             if periodic:
-                s = _image(s, lattice)
+                s = _image(s, cell)
             s2 = dot(s, s)
             goal = load_double(rates, k) * np.sqrt(s2) if driven else 0.0
             store_line(state, 8 * k, u, s, pair(0.0, goal - dot(s, u)))
@@ -336,12 +531,12 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
             store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, load_double(w, a)))
         if not (total < np.inf):
             return False, np.inf, 0, _first_bad(first, last, state)
-        factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
+        _factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
         allowed = SPEED_TOLERANCE * np.sqrt(largest)
         error, iteration = 0.0, 0
         previous = np.inf
         while True:
-            backward(first, last, links, columns, state, entries, pivots, moves, solution)
+            _backward(first, last, links, columns, state, entries, pivots, moves, solution)
             iteration += 1
             error, total = 0.0, 0.0
             for k in range(first, last):
@@ -356,7 +551,7 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
             if not refines(iteration, error, previous, allowed):
                 break
             previous = error
-            forward(first, last, links, columns, state, entries)
+            _forward(first, last, links, columns, state, entries)
         if error > SPEED_ROUNDINGS * allowed:
             return False, error, iteration, _largest(first, last, state)
         if error >= worst:
@@ -368,7 +563,7 @@ def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ign
 
 
 @njit(cache=True)
-def _first_bad(first, last, state):  # type: ignore[no-untyped-def]
+def _first_bad(first, last, state):
     """First row whose vectors or right-hand side are zero or not finite."""
     for k in range(first, last):
         s2 = state[8 * k + 1] ** 2 + state[8 * k + 3] ** 2 + state[8 * k + 5] ** 2
@@ -378,7 +573,7 @@ def _first_bad(first, last, state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _largest(first, last, state):  # type: ignore[no-untyped-def]
+def _largest(first, last, state):
     """Row with the largest right-hand side."""
     row = first
     for k in range(first, last):
@@ -388,7 +583,7 @@ def _largest(first, last, state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
+def _apply(x, factor, tables):
     """As `kcons.solvers.addressable_solvers` says."""
     h = integers(tables)
     atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
@@ -397,7 +592,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST)
-def _resolved(x, lattice, kind, tables):  # type: ignore[no-untyped-def]
+def _resolved(x, lattice, kind, tables):
     """As `kcons.solvers.addressable_solvers` says."""
     h = integers(tables)
     return resolved(x, table_array(halves(tables), h, _PAIRS), table_array(tables, h, _LENGTHS), lattice, kind)

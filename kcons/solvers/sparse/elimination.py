@@ -87,8 +87,10 @@ def make_pattern(
     """
     eliminate_last = np.zeros(len(row_start) - 1, np.bool_) if eliminate_last is None else eliminate_last
     size = int(np.sum(np.bincount(row_atoms) ** 2)) if len(row_atoms) else 0
+    atom_start = np.concatenate([[0], np.cumsum(np.bincount(row_atoms, minlength=n_atoms))])
+    atom_rows = np.repeat(np.arange(len(eliminate_last)), np.diff(row_start))[np.argsort(row_atoms, kind="stable")]
     position, struct_start, struct = plain_if_small(_minimum_degree, size)(
-        row_start, row_atoms, n_atoms, eliminate_last
+        row_start, row_atoms, atom_start, atom_rows, eliminate_last
     )
     sizes = np.diff(struct_start).astype(np.float64)
     updates = float(np.sum(sizes * (sizes - 1) / 2))
@@ -103,10 +105,9 @@ def make_pattern(
 
 
 @njit(cache=True)
-def _minimum_degree(row_start, row_atoms, n_atoms, eliminate_last):  # type: ignore[no-untyped-def]
-    """Minimum-degree elimination; returns the position of each row and its pattern when eliminated."""
+def _minimum_degree(row_start, row_atoms, atom_start, atom_rows, eliminate_last):
+    """Minimum-degree elimination; the position of each row, and by steps where its pattern begins, and the patterns."""
     n = len(row_start) - 1
-    atom_start, atom_rows = _rows_of_atoms(row_start, row_atoms, n_atoms)
     mark = np.full(n, -1, np.int32)
     begin = np.empty(n, np.int64)
     count = np.zeros(n, np.int32)
@@ -129,28 +130,23 @@ def _minimum_degree(row_start, row_atoms, n_atoms, eliminate_last):  # type: ign
                     count[k] += 1
         room[k] = count[k]
 
-    # Doubly linked buckets of rows by degree, then of those that come last; first in, first out peels all ends of a
-    # tree evenly.
-    head = np.full(2 * n + 2, -1, np.int32)
-    tail = np.full(2 * n + 2, -1, np.int32)
-    following = np.full(n, -1, np.int32)
-    preceding = np.full(n, -1, np.int32)
-    for k in range(n):
-        _push(head, tail, following, preceding, count[k] + (n + 1) * eliminate_last[k], k)
+    # Rows by degree, then those that come last; of equal ones the one that came first, which peels all ends of a tree
+    # evenly. A row whose degree changes is put in again: what was there before no longer counts.
+    behind = (n + 1) * eliminate_last
+    since = np.arange(n)
+    waiting = [(count[k] + behind[k], since[k], k) for k in range(n)]
+    heapq.heapify(waiting)
+    pushed = n
     position = np.full(n, -1, np.int64)
     struct_start = np.zeros(n + 1, np.int64)
     struct = np.empty(max(16, 4 * n), np.int32)
     struct_used = 0
-    owner = np.empty(n, np.int64)
     mark[:] = -1
-    lowest = 0
     for step in range(n):
-        while head[lowest] < 0:
-            lowest += 1
-        k = head[lowest]
-        _unlink(head, tail, following, preceding, lowest, k)
+        _, came, k = heapq.heappop(waiting)
+        while since[k] != came:
+            _, came, k = heapq.heappop(waiting)
         position[k] = step
-        owner[step] = k
         size = count[k]
         while struct_used + size > len(struct):
             struct = _grown(struct, struct_used)
@@ -159,7 +155,7 @@ def _minimum_degree(row_start, row_atoms, n_atoms, eliminate_last):  # type: ign
             struct[struct_used + p] = pool[base + p]
         struct_start[step] = struct_used
         for p in range(size):
-            i = struct[struct_used + p]
+            i = np.int64(struct[struct_used + p])
             old = count[i]
             first = begin[i]
             # Drop k from i's list, then add those of k's neighbors that i does not know.
@@ -192,109 +188,42 @@ def _minimum_degree(row_start, row_atoms, n_atoms, eliminate_last):  # type: ign
                     new += 1
             count[i] = new
             if new != old:
-                behind = (n + 1) * eliminate_last[i]
-                _unlink(head, tail, following, preceding, old + behind, i)
-                _push(head, tail, following, preceding, new + behind, i)
-                if new + behind < lowest:
-                    lowest = new + behind
-        # mark holds row numbers i; rows are marked afresh for each i, but k must not look known.
+                since[i] = pushed
+                heapq.heappush(waiting, (new + behind[i], pushed, i))
+                pushed += 1
         struct_used += size
     struct_start[n] = struct_used
-    # Patterns are stored by step; hand them back with their owners through `position`.
     return position, struct_start, struct[:struct_used].copy()
 
 
 @register_jitable
-def _rows_of_atoms(row_start, row_atoms, n_atoms):  # type: ignore[no-untyped-def]
-    """The rows in which each atom is, one atom after another, and where those of an atom begin."""
-    atom_start = np.zeros(n_atoms + 1, np.int64)
-    for a in row_atoms:
-        atom_start[a + 1] += 1
-    for a in range(n_atoms):
-        atom_start[a + 1] += atom_start[a]
-    fill = atom_start[:-1].copy()
-    atom_rows = np.empty(len(row_atoms), np.int32)
-    for k in range(len(row_start) - 1):
-        for p in range(row_start[k], row_start[k + 1]):
-            a = row_atoms[p]
-            atom_rows[fill[a]] = k
-            fill[a] += 1
-    return atom_start, atom_rows
-
-
-@register_jitable
-def _grown(array, used):  # type: ignore[no-untyped-def]
+def _grown(array, used):
     larger = np.empty(2 * len(array), array.dtype)
     larger[:used] = array[:used]
     return larger
 
 
-@register_jitable
-def _push(head, tail, following, preceding, degree, k):  # type: ignore[no-untyped-def]
-    last = tail[degree]
-    preceding[k] = last
-    following[k] = -1
-    if last >= 0:
-        following[last] = k
-    else:
-        head[degree] = k
-    tail[degree] = k
-
-
-@register_jitable
-def _unlink(head, tail, following, preceding, degree, k):  # type: ignore[no-untyped-def]
-    before, after = preceding[k], following[k]
-    if before >= 0:
-        following[before] = after
-    else:
-        head[degree] = after
-    if after >= 0:
-        preceding[after] = before
-    else:
-        tail[degree] = before
-
-
 @njit(cache=True)
-def _finish(position, struct_start, struct):  # type: ignore[no-untyped-def]
+def _finish(position, struct_start, struct):
     """Order by branches of the elimination tree, then columns and update targets in that order."""
     n = len(position)
-    owner = np.empty(n, np.int64)
-    for k in range(n):
-        owner[position[k]] = k
-    # Parent: the earliest later row in the pattern (numbers below are elimination steps).
-    parent = np.full(n, -1, np.int64)
+    owner, parent, new = np.empty(n, np.int64), np.full(n, -1, np.int64), np.empty(n, np.int64)
+    owner[position] = np.arange(n)
     for step in range(n):
-        best = n
-        for p in range(struct_start[step], struct_start[step + 1]):
-            other = position[struct[p]]
-            if other < best:
-                best = other
-        if best < n:
-            parent[step] = best
+        later = position[struct[struct_start[step] : struct_start[step + 1]]]
+        if len(later) > 0:
+            parent[step] = later.min()
     step_of, clusters = _interleaved_postorder(parent)
-    new = np.empty(n, np.int64)
-    order = np.empty(n, np.int64)
-    for k in range(n):
-        new[step_of[k]] = k
-        order[k] = owner[step_of[k]]
-
-    start = np.zeros(n + 1, np.int64)
-    target_start = np.zeros(n + 1, np.int64)
+    new[step_of] = np.arange(n)
+    sizes = np.diff(struct_start)[step_of]
+    start, target_start = np.zeros(n + 1, np.int64), np.zeros(n + 1, np.int64)
+    start[1:] = np.cumsum(sizes)
+    target_start[1:] = np.cumsum(sizes * (sizes - 1) // 2)
+    columns, targets = np.empty(start[n], np.uint32), np.empty(target_start[n], np.uint32)
     for k in range(n):
         step = step_of[k]
-        size = struct_start[step + 1] - struct_start[step]
-        start[k + 1] = start[k] + size
-        target_start[k + 1] = target_start[k] + size * (size - 1) // 2
-    columns = np.empty(start[n], np.uint32)
-    targets = np.empty(target_start[n], np.uint32)
-    for k in range(n):
-        step = step_of[k]
-        found = np.empty(start[k + 1] - start[k], np.int64)
-        for p in range(len(found)):
-            found[p] = new[position[struct[struct_start[step] + p]]]
-        found.sort()
-        for p in range(len(found)):
-            columns[start[k] + p] = found[p]
+        found = new[position[struct[struct_start[step] : struct_start[step + 1]]]]
+        columns[start[k] : start[k + 1]] = np.sort(found).astype(np.uint32)
     for k in range(n):
         t = target_start[k]
         for p in range(start[k], start[k + 1]):
@@ -304,11 +233,11 @@ def _finish(position, struct_start, struct):  # type: ignore[no-untyped-def]
                     e += 1
                 targets[t] = e
                 t += 1
-    return order, clusters, start, columns, target_start, targets
+    return owner[step_of], clusters, start, columns, target_start, targets
 
 
 @register_jitable
-def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
+def _interleaved_postorder(parent):
     """Children before parents, branch by branch; neighboring branches of a tree alternate.
 
     A row waits for the pivots of its children, each a division late. So a row is put at least `DISTANCE`
@@ -387,7 +316,7 @@ def number_atoms(
 
 
 @njit(cache=True)
-def _number_atoms(flat, slots, clusters, n_atoms):  # type: ignore[no-untyped-def]
+def _number_atoms(flat, slots, clusters, n_atoms):
     place = np.full(n_atoms, -1, np.int64)
     atoms = np.empty(len(flat), np.uint32)
     numbers = np.empty(len(flat), np.uint32)
@@ -415,7 +344,7 @@ def make_triples(
 
 
 @njit(cache=True)
-def _make_triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyped-def]
+def _make_triples(start, columns, slots, slot_atoms, w):
     begin = np.zeros(len(columns) + 1, np.uint32)
     for fill in range(2):
         if fill == 1:

@@ -1,24 +1,32 @@
 """Rows of mixed kinds, coupled in any way: sparse elimination with general gradients.
 
 The counterpart of `kcons.solvers.sparse.distances` for clusters that also hold angles, dihedrals, planes and other
-compiled rows. Gradients are stored by slot (one atom of one row), as `kcons.solvers.sparse.row_values` says. Rows of
-velocities are solved with the positions where these are the end of a flight, see `row_functions`.
+compiled rows. Rows of velocities are solved with the positions where these are the end of a flight, see
+`row_functions`.
+
+Values are found for one row at a time. Positions are held as ``base + moves`` so that differences of atoms that lie far
+from the origin keep their digits while moves are small; both as quads (x, y, z, any) by atom. A gradient is stored by
+slot (one atom of one row). The line of a slot holds two gradients number by number, now and at the reference, then the
+atom's inverse mass: n0 r0 n1 r1 n2 r2 w -.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint import IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.internal import angle_between
 from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels, address_of, caller_of
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS, at_first, at_piece, halves, integers
-from kcons.solvers.kernels.lattices import OPEN
+from kcons.solvers.kernels.lattices import OPEN, TRICLINIC, lattice_numbers, minimum_image
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
@@ -39,12 +47,12 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
     swapped,
 )
+from kcons.solvers.sparse.distances import factor_serves, hopeless, refines, stalled, update
 from kcons.solvers.sparse.elimination import FAST, make_pattern, make_triples, number_atoms
-from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
-from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, addresses_for, call_evaluate, first_flat, miss
-from kcons.solvers.sparse.substitution import factor_serves, hopeless, refines, stalled, update
+from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, GivenRows, call_row
 from kcons.solvers.tolerances import (
     EPS,
+    FLAT,
     MANY_ITERATIONS,
     NEWTON_TOLERANCE,
     PIVOT_TOLERANCE,
@@ -53,6 +61,19 @@ from kcons.solvers.tolerances import (
     SPEED_TOLERANCE,
 )
 
+DISTANCE = int(RowKind.DISTANCE)
+ANGLE = int(RowKind.ANGLE)
+LINEAR = int(RowKind.LINEAR)
+
+_PLACE, _CELL = types.int64, (types.float64[:, :, ::1], types.boolean)
+# `evaluate` is called by address: it is compiled once, and not into each of its callers. So are functions: where there
+# are none, nothing is compiled for them.
+_EVALUATE = types.none(*(3 * (_PLACE,)), *(3 * (INDICES,)), *(5 * (NUMBERS,)), *_CELL, NUMBERS, NUMBERS, _PLACE)
+_FUNCTION = types.float64(*(3 * (_PLACE,)), INDICES, NUMBERS, _PLACE, *(4 * (NUMBERS,)), *_CELL, NUMBERS, _PLACE)
+call_evaluate, _call_function = caller_of(_EVALUATE), caller_of(_FUNCTION)
+
+#: Which of the two gradients in a slot's line: as numbers of NumPy, for which `evaluate` is compiled once.
+NOW, REFERENCE = np.int64(0), np.int64(1)
 #: How much closer than positions rows of velocities are held: what they are off by is a speed times a short time.
 CLOSER = 16.0
 #: Of the pieces of `SparseRows.tables`, those that are named.
@@ -119,7 +140,7 @@ class SparseRows(AddressableSolver):
                 *(pattern.clusters, atom_numbers, atom_start, slot_atoms, self._given.kinds, links.ravel()),
                 *(pattern.columns, pattern.targets, triple, sides, masses, constraint_set.scale[self.rows]),
                 *(np.where(constraint_set.holonomic, constraint_set.target(0.0), 0.0)[self.rows], lines),
-                # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.substitution`.
+                # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.distances`.
                 *(room(2 * n), room(4 * len(pattern.columns))),
                 *(room(n), room(n), room(n), room(numbers), room(numbers), room(n), room(numbers), room(numbers)),
                 _addresses(self._given.kinds),
@@ -130,9 +151,6 @@ class SparseRows(AddressableSolver):
         placed = [np.full(c.n_rows, not c.relative) for c in constraint_set.constraints] or [np.zeros(0, np.bool_)]
         self._placed = np.flatnonzero(np.repeat(np.concatenate(placed)[self.rows], widths))
         self._placed_atoms = flat[self._placed]
-
-    def __reduce__(self) -> tuple[type[SparseRows], tuple[object, ...]]:
-        return SparseRows, self._made_of  # addresses are of no use elsewhere
 
     @property
     def pivots(self) -> FloatArray:
@@ -146,17 +164,190 @@ class SparseRows(AddressableSolver):
 
 
 def _addresses(kinds: NDArray[np.uint32]) -> IntArray:
-    kernels = (_factor, _FACTOR), (_forward, _FORWARD), (_backward, _BACKWARD)
-    return np.array([*addresses_for(kinds), *(address_of(*each) for each in kernels)], dtype=np.int64)
+    """Of the kernels, in the order of `_FUNCTIONS`; 0 for that of functions where no row is one."""
+    kernels = (evaluate, _EVALUATE), (_function, _FUNCTION), (_factor, _FACTOR), (_forward, _FORWARD)
+    needed = [*kernels, (_backward, _BACKWARD)]
+    some = (kinds >= FUNCTION).any()
+    return np.array([address_of(*each) if some or each[0] is not _function else 0 for each in needed], dtype=np.int64)
+
+
+# -- values and gradients -------------------------------------------------------------------------------------
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _difference(i, j, base, moves, cell, periodic):
+    """Vector from atom j to atom i, as three numbers."""
+    return near(
+        load_quad(base, 4 * i) - load_quad(base, 4 * j),
+        load_quad(moves, 4 * i) - load_quad(moves, 4 * j),
+        cell, periodic,
+    )  # fmt: skip
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _factor(  # type: ignore[no-untyped-def]
-    first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
+def near(whole, change, cell, periodic):
+    # No arrays come here: one that passes a branch costs reference counting.
+    x, y, z = extract(whole, 0), extract(whole, 1), extract(whole, 2)
+    if periodic:
+        x, y, z = minimum_image(x, y, z, cell, TRICLINIC)
+    return x + extract(change, 0), y + extract(change, 1), z + extract(change, 2)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _put(lines, place, x, y, z):
+    store_double(lines, place, x)
+    store_double(lines, place + 2, y)
+    store_double(lines, place + 4, z)
+
+
+_angle = njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")(angle_between)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _function(
+    kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, moved, lattice, periodic, lines, which
 ):
+    """Value of a row that is a function, see `row_functions`; the gradient goes into the lines of its slots.
+
+    A row of velocities is taken at the middle of the way from `origin`, and is zero throughout where it does not count.
+    """
+    cell = lattice_numbers(lattice)
+    size = 3 * (end - slot)
+    rolls = kind >= VELOCITY
+    at, out = ROOM, ROOM + 2 * size
+    if rolls and load_double(parameters, COUNT) == 0.0:
+        for p in range(ROOM, out + size + 1):
+            keep_loop_rolled()
+            store_double(parameters, p, 0.0)
+    else:
+        x, y, z = 0.0, 0.0, 0.0
+        before, change_before = quad(0.0, 0.0, 0.0, 0.0), quad(0.0, 0.0, 0.0, 0.0)
+        for p in range(slot, end):
+            keep_loop_rolled()
+            i = 4 * load_index(slot_atoms, p)
+            here, change = load_quad(base, i), load_quad(moves, i)
+            if rolls:
+                start = load_quad(origin, i)
+                way = (here - start) + change
+                here, change = start, 0.5 * way
+                store_double(parameters, at + size, extract(way, 0))
+                store_double(parameters, at + size + 1, extract(way, 1))
+                store_double(parameters, at + size + 2, extract(way, 2))
+            if kind in (FUNCTION, VELOCITY):
+                r = (here - load_quad(moved, 4 * p)) + change
+                x, y, z = extract(r, 0), extract(r, 1), extract(r, 2)
+            elif p > slot:
+                dx, dy, dz = near(here - before, change - change_before, cell, periodic)
+                x, y, z = x + dx, y + dy, z + dz
+            before, change_before = here, change
+            store_double(parameters, at, x)
+            store_double(parameters, at + 1, y)
+            store_double(parameters, at + 2, z)
+            at += 3
+        time = load_double(parameters, which)
+        if rolls:  # where the reference is asked for, the way is 0, and the time that of the reference
+            time = 0.5 * (time + load_double(parameters, 1))
+        call_row(parameters, offset, ROOM, offset + 2, time, out)
+    at = out
+    for p in range(slot, end):
+        keep_loop_rolled()
+        _put(
+            lines,
+            8 * p + which,
+            load_double(parameters, at + 1),
+            load_double(parameters, at + 2),
+            load_double(parameters, at + 3),
+        )
+        at += 3
+    return load_double(parameters, out)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def evaluate(
+    function, first, last, kinds, links, slot_atoms, parameters, base, moves, origin, moved, lattice, periodic, values,
+    lines, which,
+):  # fmt: skip
+    """Values and gradients of rows first to last; those of velocities for the way from `origin`.
+
+    `function` is where `_function` is. ``links[4 k + 2]`` is the first slot of row k, ``links[4 k + 3]`` its
+    first parameter. `moved` has, as quads by slot, what rows with a place in space take off positions.
+    """
+    cell = lattice_numbers(lattice)
+    for k in range(first, last):
+        kind = load_index(kinds, k)
+        slot = load_index(links, 4 * k + 2)
+        place, offset = 8 * slot + which, load_index(links, 4 * k + 3)
+        i = load_index(slot_atoms, slot)
+        if kind == DISTANCE:
+            x, y, z = _difference(i, load_index(slot_atoms, slot + 1), base, moves, cell, periodic)
+            value = math.sqrt(x * x + y * y + z * z)
+            x, y, z = x / value, y / value, z / value
+            _put(lines, place, x, y, z)
+            _put(lines, place + 8, -x, -y, -z)
+        elif kind == ANGLE:
+            j = load_index(slot_atoms, slot + 1)
+            x, y, z = _difference(i, j, base, moves, cell, periodic)
+            wx, wy, wz = _difference(load_index(slot_atoms, slot + 2), j, base, moves, cell, periodic)
+            value, ax, ay, az, bx, by, bz = _angle(x, y, z, wx, wy, wz)
+            _put(lines, place, ax, ay, az)
+            _put(lines, place + 8, -(ax + bx), -(ay + by), -(az + bz))
+            _put(lines, place + 16, bx, by, bz)
+        elif kind == LINEAR:
+            # sum c . r; small moves and large positions are summed apart.
+            whole, change = 0.0, 0.0
+            for p in range(slot, load_index(links, 4 * k + 6)):
+                i = 4 * load_index(slot_atoms, p)
+                c = quad(
+                    load_double(parameters, offset),
+                    load_double(parameters, offset + 1),
+                    load_double(parameters, offset + 2),
+                    0.0,
+                )
+                _put(lines, 8 * p + which, extract(c, 0), extract(c, 1), extract(c, 2))
+                whole += dot(c, load_quad(base, i) - load_quad(moved, 4 * p))
+                change += dot(c, load_quad(moves, i))
+                offset += 3
+            value = whole + change
+        else:
+            value = _call_function(function, (
+                kind, slot, load_index(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, moved,
+                lattice, periodic, lines, which,
+            ))  # fmt: skip
+        store_double(values, k, value)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def first_flat(first, last, links, lines):
+    """The first row whose gradient has less than `FLAT` of that at the reference along it; -1 if none has."""
+    for k in range(first, last):
+        along, size = 0.0, 0.0
+        for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
+            keep_loop_rolled()
+            g = second_vector(lines, 8 * p)
+            along += dot(first_vector(lines, 8 * p), g)
+            size += dot(g, g)
+        if along < FLAT * size:
+            return k
+    return -1
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def miss(value, target, period):
+    """target - value, where there is a period by the shorter way round."""
+    difference = target - value
+    if period > 0.0:
+        difference -= period * np.rint(difference / period)
+    return difference
+
+
+# -- elimination and substitution ----------------------------------------------------------------------------
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots):
     """Assemble and eliminate rows first to last, with forward substitution, in one sweep.
 
-    Entries are stored as in `kcons.solvers.sparse.substitution`; accumulated changes are left at zero.
+    Entries are stored as in `kcons.solvers.sparse.distances`; accumulated changes are left at zero.
     """
     begin, t, slot = (
         load_index(links, 4 * first),
@@ -208,7 +399,7 @@ def _factor(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _forward(first, last, links, columns, state, entries):  # type: ignore[no-untyped-def]
+def _forward(first, last, links, columns, state, entries):
     begin = load_index(links, 4 * first)
     for k in range(first, last):
         right = load_double(state, 2 * k + 1)
@@ -221,7 +412,7 @@ def _forward(first, last, links, columns, state, entries):  # type: ignore[no-un
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
+def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution):
     """Backward substitution; adds to the multipliers and moves the atoms along the reference gradients."""
     end, slot = load_index(links, 4 * last), load_index(links, 4 * last + 2)
     for back in range(last - first):
@@ -245,7 +436,7 @@ def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pi
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _begin(  # type: ignore[no-untyped-def]
+def _begin(
     first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
     scale, lines, values, inverse_rounding, base, moves, origin, moved, solution, functions,
 ):  # fmt: skip
@@ -277,7 +468,7 @@ def _begin(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state):  # type: ignore[no-untyped-def]
+def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state):
     """Right-hand sides; largest and total error, the row with the largest, and the largest in units of its rounding."""
     error, total, excess = 0.0, 0.0, 0.0
     bad = first
@@ -299,7 +490,7 @@ def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_round
 
 
 @njit(cache=True, inline="always")
-def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
+def _first_not_finite(first, last, state):
     for k in range(first, last):
         if not (abs(state[2 * k + 1]) < np.inf):
             return k
@@ -307,7 +498,7 @@ def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST)
-def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
+def _apply(x, factor, tables):
     """As `kcons.solvers.addressable_solvers` says."""
     h = integers(tables)
     atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
@@ -316,9 +507,7 @@ def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _positions(  # type: ignore[no-untyped-def]
-    alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers
-):
+def _positions(alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers):
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)
@@ -391,7 +580,7 @@ def _positions(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(alone, x, y, wanted, lattice, kind, tables, numbers):  # type: ignore[no-untyped-def]
+def _tangents(alone, y, x, velocities, inv_dt, wanted, lattice, kind, tables, numbers):
     """As `kcons.solvers.addressable_solvers` says."""
     t, h, u = tables, integers(tables), halves(tables)
     clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)

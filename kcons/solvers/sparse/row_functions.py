@@ -29,14 +29,14 @@ import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, is_jitted, register_jitable
+from numba.extending import is_jitted, register_jitable
 
 from kcons.constraints.compilation import cfunc, has_a_file, njit
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.functions.custom import PythonRows
 from kcons.constraints.target import FloatArray
-from kcons.solvers.kernels.any_width import pointer
+from kcons.solvers.kernels.any_width import DOUBLE, INT64, instruction, place
 from kcons.solvers.sparse.elimination import FAST
 
 FUNCTION = int(RowKind.FUNCTION)
@@ -56,23 +56,30 @@ _ROWS = types.void(types.int64, _NUMBERS, _NUMBERS, types.int64, types.float64, 
 _C_ROW = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_double, ctypes.c_void_p)
 
 
-@intrinsic
-def call_row(typingctx, numbers, function, r, p, time, out):
+_INDEX = types.int64
+
+
+@instruction(types.void, None, _INDEX, _INDEX, _INDEX, types.float64, _INDEX)
+def call_row(builder, numbers, function, r, p, time, out):
     """Call the function whose address is number `function`; r, p and out are places among the same numbers."""
+    function, r, p, out = (place(builder, numbers, at) for at in (function, r, p, out))
+    kind = ir.FunctionType(ir.VoidType(), [r.type, r.type, DOUBLE, r.type])
+    address = builder.load(builder.bitcast(function, ir.PointerType(INT64)), align=8)
+    builder.call(builder.inttoptr(address, ir.PointerType(kind)), [r, p, time, out])
 
-    def codegen(context, builder, sig, args):
-        places = [pointer(context, builder, sig.args[0], args[0], args[k]) for k in (1, 2, 3, 5)]
-        integer = ir.IntType(64)
-        address = builder.load(builder.bitcast(places[0], ir.PointerType(integer)), align=8)
-        double = ir.DoubleType()
-        there = ir.PointerType(double)
-        kind = ir.FunctionType(ir.VoidType(), [there, there, double, there])
-        function = builder.inttoptr(address, ir.PointerType(kind))
-        builder.call(function, [places[1], places[2], args[4], places[3]])
-        return context.get_dummy_value()
 
-    place = types.int64
-    return types.void(numbers, place, place, place, types.float64, place), codegen
+@instruction(types.void, None, *(5 * (_INDEX,)), types.float64, _INDEX)
+def call_rows(builder, numbers, address, n, r, p, stride, time, out):
+    """Call the function at `address` for n rows; r, p and out are places among the numbers."""
+    r, p, out = (place(builder, numbers, at) for at in (r, p, out))
+    kind = ir.FunctionType(ir.VoidType(), [INT64, r.type, r.type, INT64, DOUBLE, r.type])
+    builder.call(builder.inttoptr(address, ir.PointerType(kind)), [n, r, p, stride, time, out])
+
+
+@instruction(_NUMBERS, _NUMBERS, _INDEX)
+def _from(builder, numbers, start):
+    """The numbers behind the first `start`."""
+    return place(builder, numbers, start)
 
 
 @functools.cache
@@ -110,71 +117,12 @@ def _of_jitted(value: Any, gradient: Any, width: int, timed: bool) -> Any:
 
 
 @functools.cache
-def _of_jitted_coefficients(coefficients: Any, width: int, timed: bool, step: float) -> Any:
-    """A row of velocities whose coefficients Numba has compiled, or will; `step` is that of differences."""
-    shape, found = (width, 3), _with_time(coefficients, timed)
-
-    @cfunc(ROW)
-    def row(r, p, t, out):
-        x, way = nb.carray(r, shape), 0.0
-        slope = np.ascontiguousarray(found(x, t)).copy()
-        out[0] = 0.0
-        for i in range(width):
-            for j in range(3):
-                d = r[3 * (width + i) + j]
-                out[0] += slope[i, j] * d
-                out[1 + 3 * i + j] = slope[i, j]
-                way += abs(d)
-        if way > 0.0:
-            for k in range(3 * width):
-                middle = r[k]
-                r[k] = middle + step
-                near = found(x, t)
-                change = 0.0
-                for i in range(width):
-                    for j in range(3):
-                        change += (near[i, j] - slope[i, j]) * r[3 * (width + i) + j]
-                r[k] = middle
-                out[1 + k] += 0.5 * change / step
-
-    return row
-
-
-@intrinsic
-def _from(typingctx, numbers, start):  # type: ignore[no-untyped-def]
-    """The numbers behind the first `start`."""
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return builder.gep(args[0], [args[1]], inbounds=True)
-
-    return _NUMBERS(_NUMBERS, types.int64), codegen
-
-
-@intrinsic
-def call_rows(typingctx, numbers, address, n, r, p, stride, time, out):  # type: ignore[no-untyped-def]
-    """Call the function at `address` for n rows; r, p and out are places among the numbers."""
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        r, p, out = (builder.gep(data, [args[k]], inbounds=True) for k in (3, 4, 7))
-        integer, double = ir.IntType(64), ir.DoubleType()
-        pointer = ir.PointerType(double)
-        kind = ir.FunctionType(ir.VoidType(), [integer, pointer, pointer, integer, double, pointer])
-        function = builder.inttoptr(args[1], ir.PointerType(kind))
-        builder.call(function, [args[2], r, p, args[5], args[6], out])
-        return context.get_dummy_value()
-
-    place = types.int64
-    return types.void(numbers, place, place, place, place, place, types.float64, place), codegen
-
-
-@functools.cache
 def rows_at_once(function: Callable[..., None]) -> Any:
     """Of ``row(r, p, t, out)`` for one atom, compiled; has an `address`."""
     # Not compiled apart: what Numba keeps is found again by the function's name, and by no name that it gives itself.
     row = register_jitable(fastmath=FAST, error_model="numpy")(function)
 
-    def rows(n, r, p, stride, t, out):  # type: ignore[no-untyped-def]
+    def rows(n, r, p, stride, t, out):
         if stride == 0:
             for i in range(n):
                 row((r[i], r[BLOCK + i], r[2 * BLOCK + i]), p, t, _from(out, 4 * i))
@@ -269,11 +217,9 @@ def row_function(item: Constraint, numbers: FloatArray) -> Any:
     if item.row is not None:
         return _compiled(item.row)
     assert isinstance(item, PythonRows)
-    if not all(is_jitted(function) for function in item.called):
-        return CalledRows(item, numbers)
-    if item.holonomic:
+    if item.holonomic and all(is_jitted(function) for function in item.called):
         return _of_jitted(*item.called, item.width, item.time_dependent)
-    return _of_jitted_coefficients(*item.called, item.width, item.time_dependent, 1e-6 * item.length)
+    return CalledRows(item, numbers)
 
 
 class GivenRows:

@@ -14,7 +14,7 @@ from ase_systems import FS, TEMPERATURE, dumbbells, pressure
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, PressureReporter, constrain, draw_velocities
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
-from kcons.thermostats.pressure import MonteCarloBarostat
+from kcons.thermostats import MonteCarloBarostat
 
 
 def copper():

@@ -1,8 +1,8 @@
 """Single lines of the package made wrong, and the tests that must notice.
 
 By file in kcons/: its text, with what is made wrong of it as «right→wrong», and the tests that must fail. The text
-occurs once in the file. Tests are named as pytest takes them, by the name of their file where no other has it, several
-parted by blanks; parameters in brackets are left out where any will do.
+occurs once in the file. Tests are written as ``file::name`` for `test_file.py::test_name`, with a folder where another
+file has the name, several parted by blanks; parameters in brackets are left out where any will do.
 """
 
 from pathlib import Path
@@ -46,10 +46,11 @@ def both(text: str) -> tuple[str, str]:
 
 
 def found(test: str) -> str:
-    """The test with the path of its file, from the folder that `tests` is in."""
-    file, sign, name = test.partition("::")
-    (path,) = [TESTS / file] if "/" in file else TESTS.rglob(file)
-    return path.relative_to(TESTS.parent).as_posix() + sign + name
+    """The test as pytest takes it."""
+    place, sign, name = test.partition("::")
+    folder, _, file = place.rpartition("/")
+    (path,) = (TESTS / folder).rglob(f"test_{file}.py")
+    return path.relative_to(TESTS.parent).as_posix() + (sign and f"::test_{name}")
 
 
 #: (file in kcons/, its text, the wrong text, tests that must fail).

@@ -2,242 +2,140 @@
 
 MUTANTS = {
     "openmm/integrator/guard.py": [
-        (
-            "context.getTime()._value if «driven→False» else 0.0",
-            "test_carried_constraints.py::test_time_that_is_set_is_no_way_of_moving_targets",
-        ),
+        ("()._value if «driven→False» else 0.0", "carried_constraints::time_that_is_set_is_no_way_of_moving_targets"),
         (
             "for part in integrator.parts:\n                «part.check_masses(self.system)→pass»",
-            "test_callbacks.py::test_masses_that_change_in_a_run_are_noticed_at_the_next_check",
+            "callbacks::masses_that_change_in_a_run_are_noticed_at_the_next_check",
         ),
-        (
-            "if «squares <= self._explosive→not squares > 1e300»:",
-            "test_steps.py::test_an_explosion_is_told_where_its_call_ends",
-        ),
-        (
-            '("coarse", «precision.name == "single"→False»)',
-            "test_isokinetic_ensemble.py::test_weak_forces_are_not_lost_in_single_precision",
-        ),
-        (
-            "self.integrator.program.recall(«self._memory→{}»)",
-            "test_nose_hoover_ensemble.py::test_a_nan_leaves_the_chain_of_the_last_check",
-        ),
+        ("if «squares <= self._explosive→not squares > 1e300»:", "steps::an_explosion_is_told_where_its_call_ends"),
+        ('", «precision.name == "single"→False»)', "isokinetic_ensemble::weak_forces_are_not_lost_in_single_precision"),
+        (".program.recall(«self._memory→{}»)", "nose_hoover_ensemble::a_nan_leaves_the_chain_of_the_last_check"),
         (
             "any(«map(knows_a_place, applied)→isinstance(force, openmm.CustomExternalForce) for force in applied»)",
-            "test_guard.py::test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place",
+            "guard::a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place",
         ),
-        (
-            "«self._left == self._place(context)→True»",
-            "test_steps.py::test_change_of_the_box",
-        ),
-    ],
-    "openmm/integrator/steps.py": [
-        (
-            "u=select(spread«*delta(v-v_end)→», v_middle, v)",
-            "test_reported_kinetic_energy.py::test_of_velocities_that_others_have_set_it_is_theirs",
-        ),
-        (
-            'step.note_middle("v+per_h*(x-xu)«→+0.5*dt*f/m»")',
-            "test_reported_kinetic_energy.py::test_with_noise_the_temperature_of_the_bath_is_reported",
-        ),
-        (
-            'p.when("«exact+→»1-between != 0", "kicks need it")',
-            "test_isokinetic_ensemble.py::test_calls_of_any_length_make_the_same_motion",
-        ),
-        (
-            'p.let("good_steps", "good_steps+«delta(failed)→1»", "count it")',
-            "test_steps.py::test_a_failed_step_is_taken_back_and_not_counted",
-        ),
-        (
-            '"failed > 0", "a solve failed"):\n        p.each("x", "x«_last→»"',
-            "test_collective_rows.py::test_a_step_too_large_is_taken_back",
-        ),
-        (
-            'p.each("v", "v«_last→»", "back to where the step began")',
-            "test_collective_rows.py::test_a_step_too_large_is_taken_back",
-        ),
-        ('"«select(looked, v_last, u-0.5*dt*f/m)→v_last»"', "test_steps.py::test_failure_where_nobody_looked"),
-        (
-            'ensemble.middle(step, f"«→v+»(x-x_start)/{h}")',
-            "test_langevin_ensemble.py::test_langevin_without_friction_is_the_drift_in_two_halves",
-        ),
-        (
-            'step.kicked("«kick→0.5»*dt", tangent=True, unseen=True)',
-            "test_langevin_ensemble.py::test_langevin_without_friction_is_the_drift_in_two_halves",
-        ),
-        (
-            'asks = "«select(call-1, failed, select(moved, -1, 0))→failed»"',
-            "openmm/integrator/test_edits.py::test_positions_off_the_rows_are_not_pulled_back_in_silence",
-        ),
-        (
-            '"x and v may have been changed"):\n            with p.when("moved+stale«+abs(call-2)→»',
-            "test_steps.py::test_parameters_of_forces_are_used_in_the_next_step",
-        ),
-    ],
-    "openmm/integrator/program.py": [
-        (
-            "in (*self.«settings→idle».items(), *self.idle.items()):",
-            "test_settings.py::test_a_setting_has_a_method_of_its_own",
-        ),
-    ],
-    "openmm/integrator/system_checks.py": [
+        ("«self._left == self._place(context)→True»", "steps::change_of_the_box"),
         (
             "rows = replace(rows, «lengths=given, others=given→others=given»)",
-            "test_system_checks.py::test_lengths_of_rigid_water_are_compared_with_those_of_the_system",
+            "system_checks::lengths_of_rigid_water_are_compared_with_those_of_the_system",
         ),
         (
             "«context.setParameter(name, parameters[name])→pass»",
-            "test_conserved_momenta.py::test_forces_are_looked_at_with_the_parameters_of_the_context",
+            "conserved_momenta::forces_are_looked_at_with_the_parameters_of_the_context",
         ),
-        ("if force.getFrequency() > «→100»0]", "test_system_checks.py::test_two_barostats_are_refused"),
+        ("if force.getFrequency() > «→100»0]", "system_checks::two_barostats_are_refused"),
         (
             "apex = i« if of[j] == of[k] else j if of[j] == sides[j][k] else k→»",
-            "test_system_checks.py::test_triangles_with_unequal_masses_beside_the_apex_are_refused",
+            "system_checks::triangles_with_unequal_masses_beside_the_apex_are_refused",
         ),
         (
             "(«2 * rows == particles * (particles - 1)→rows >= particles - 1»).all()",
-            "test_system_checks.py::test_rigid_bodies_hold_all_their_distances",
+            "system_checks::rigid_bodies_hold_all_their_distances",
+        ),
+        ("        if «→not rows and »_scales_atoms(force):", "projected::what_moves_particles_off_rows_is_refused"),
+    ],
+    "openmm/integrator/program.py": [
+        ("«*delta(v-v_end)→», v_middle, v", "reported_kinetic_energy::of_velocities_that_others_have_set_it_is_theirs"),
+        ("v+per_h*(x-xu)«→+0.5*dt*f/m»", "reported_kinetic_energy::with_noise_the_temperature_of_the_bath_is_reported"),
+        ('«exact+→»1-between != 0", "kicks need it")', "isokinetic_ensemble::calls_of_any_length_make_the_same_motion"),
+        ('", "good_steps+«delta(failed)→1»", "count it")', "steps::a_failed_step_is_taken_back_and_not_counted"),
+        (
+            '"failed > 0", "a solve failed"):\n        p.each("x", "x«_last→»"',
+            "collective_rows::a_step_too_large_is_taken_back",
+        ),
+        ('p.each("v", "v«_last→»", "back to where the step began")', "collective_rows::a_step_too_large_is_taken_back"),
+        ('"«select(looked, v_last, u-0.5*dt*f/m)→v_last»"', "steps::failure_where_nobody_looked"),
+        ('middle(p, f"«→v+»(x-x_start)/', "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
+        (
+            'kick(p, "«kick→0.5»*dt", tangent=',
+            "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves",
         ),
         (
-            "        if «→not rows and »_scales_atoms(force):",
-            "test_projected.py::test_what_moves_particles_off_rows_is_refused",
+            'asks = "«select(call-1, failed, select(moved, -1, 0))→failed»"',
+            "openmm/integrator/edits::positions_off_the_rows_are_not_pulled_back_in_silence",
+        ),
+        (
+            '"x and v may have been changed"):\n            with p.when("moved+stale«+abs(call-2)→»',
+            "steps::parameters_of_forces_are_used_in_the_next_step",
+        ),
+        ("self.recall({**self.«settings→idle», **self.idle})", "settings::a_setting_has_a_method_of_its_own"),
+        (
+            "            kicks[«-1→0»] += operation.fraction",
+            "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves",
         ),
     ],
     "openmm/ensembles/isokinetic_ensemble.py": [
-        (
-            "return (count« - 1→») * GAS_CONSTANT * self.temperature",
-            "test_thermostats_beside_parts.py::test_a_run_has_the_temperature",
-        ),
-        ('"max(qq«-wq→», wq^2/ww)"', "test_isokinetic_ensemble.py::test_two_sums_do_where_velocities_are_not_read"),
+        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "every_ensemble::a_run_has_the_temperature"),
+        ('"max(qq«-wq→», wq^2/ww)"', "isokinetic_ensemble::two_sums_do_where_velocities_are_not_read"),
         (
             'program.set("exact", «float(precision == "double" and not rigid)→0.0»)',
-            "test_isokinetic_ensemble.py::test_calls_of_any_length_make_the_same_motion",
+            "isokinetic_ensemble::calls_of_any_length_make_the_same_motion",
         ),
         (
             '"«select(behind, exact, 1)→exact» != 0"',
-            "test_isokinetic_ensemble.py::test_of_velocities_set_between_calls_only_the_direction_counts",
+            "isokinetic_ensemble::of_velocities_set_between_calls_only_the_direction_counts",
         ),
     ],
     "constraints/constraint.py": [
-        (
-            "if «→not »self.positive and not (target > 0).all():",
-            "test_target.py::test_a_distance_that_moves_below_zero_is_refused_there",
-        ),
+        ("«→not »self.positive and not (target > 0).all(", "target::a_distance_that_moves_below_zero_is_refused_there"),
     ],
     "constraints/target.py": [
-        (
-            "(np.abs(fine - given) > «WRONG→100» * size)",
-            "test_target.py::test_derivatives_that_contradict_a_moving_target_are_refused",
-        ),
-    ],
-    "ase/topology.py": [
-        (
-            "if «→not »guessed and said != stamp:",
-            "ase/test_topology.py::test_guessed_bonds_are_guessed_anew_for_sorted_and_cut_atoms",
-        ),
+        (".abs(fine - given) > «WRONG→100» * size)", "target::derivatives_that_contradict_a_moving_target_are_refused"),
     ],
     "topology/rows_by_name.py": [
-        (
-            "long > «np.minimum(TORN, FAR * radii)→TORN»",
-            "ase/test_topology.py::test_bonds_that_are_far_too_long_are_not_held",
-        ),
+        ("long > «np.minimum(TORN, FAR * radii)→TORN»", "ase/topology::bonds_that_are_far_too_long_are_not_held"),
     ],
     "openmm/ensembles/conserved_momenta.py": [
-        (
-            "if «not removed→True»:  # what a remover takes",
-            "test_conserved_momenta.py::test_a_motion_remover_takes_momentum_beside_particles_without_mass",
-        ),
+        ("«not removed→True»:  #", "conserved_momenta::a_motion_remover_takes_momentum_beside_particles_without_mass"),
         (
             "«turns.keep(turns.fields(x[fixed]))→pass»",
-            "test_conserved_momenta.py::test_particles_without_mass_leave_turns_about_them",
+            "conserved_momenta::particles_without_mass_leave_turns_about_them",
         ),
         (
             "«turns.keep_rows(motion, x[atoms], time)→pass»",
-            "test_conserved_momenta.py::test_angular_momentum_about_the_axes_of_what_is_held_is_said",
+            "conserved_momenta::angular_momentum_about_the_axes_of_what_is_held_is_said",
         ),
-        (
-            "while len(found) < _PLACES« or turns.open→»:",
-            "test_conserved_momenta.py::test_angular_momentum_about_the_axes_of_what_is_held_is_said",
-        ),
-        (
-            "«turns.keep→»(np.tensordot(",
-            "test_conserved_momenta.py::test_a_motion_remover_leaves_turns_about_the_center_of_mass",
-        ),
+        (") < _PLACES« or turns.open→»:", "conserved_momenta::angular_momentum_about_the_axes_of_what_is_held_is_said"),
+        ("«turns.keep→»(np.tensordot(", "conserved_momenta::a_motion_remover_leaves_turns_about_the_center_of_mass"),
     ],
     "openmm/ensembles/langevin_ensemble.py": [
         (
             "«groups_of(force)→{force.getForceGroup()}» - set(steps)",
-            "test_respa_ensemble.py::test_forces_in_reciprocal_space_have_a_number_of_steps_too",
+            "langevin_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
-        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "test_langevin_ensemble.py"),
+        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         (
-            'program.let(name, «_before(name)→name», "the chain is back where the step began")',
-            "test_nose_hoover_ensemble.py::test_a_step_that_fails_leaves_the_chain_where_it_was",
+            'p.let(name, «f"{name}_last"→name», "the chain',
+            "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was",
         ),
-    ],
-    "openmm/integrator/schemes.py": [
-        ("            kicks[«-1→0»] += operation.fraction", "test_programs.py"),
     ],
     "openmm/integrator/projected.py": [
-        (
-            "        «→# »self._write(self._program_type(self))",
-            "test_part.py::test_integrators_in_turn_hold_the_same_part",
-        ),
+        ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),
     ],
     "openmm/collective/collective_rows.py": [
-        (
-            "(*held[:k], *«held[n:]→()») for k",
-            "test_rows_in_context.py::test_row_that_repeats_a_constraint_of_the_system_is_named",
-        ),
-        (
-            "weight{c}*({of('more', i)}«-→+»{of('expected', i)})",
-            "test_row_program.py::test_the_iteration_learns_from_each_push",
-        ),
-        (
-            'p.let(f"back{c}_{i}_{j}", f"«-→»({done})*back{c}_{i}_{i}"',
-            "test_row_program.py::test_the_iteration_learns_from_each_push",
-        ),
-        (
-            'again = f"select({sure}, «3→1», 1)"',
-            "test_row_program.py::test_many_steps_look_less_often",
-        ),
+        ("(*held[:k], *«held[n:]→()») for k", "collective_rows::row_that_repeats_a_constraint_of_the_system_is_named"),
+        ("weight{c}*({of('more', i)}«-→+»{of('expected', i)})", "row_program::the_iteration_learns_from_each_push"),
+        ('let(f"back{c}_{i}_{j}", f"«-→»({done})*back{c}_{i}_{i}"', "row_program::the_iteration_learns_from_each_push"),
+        ('again = f"select({sure}, «3→1», 1)"', "row_program::many_steps_look_less_often"),
     ],
     "openmm/surface_integrator.py": [
-        (
-            "«positions is None→False»:",
-            "test_surface_integrator.py::test_great_circles_at_any_time_step",
-        ),
+        ("«positions is None→False»:", "surface_integrator::great_circles_at_any_time_step"),
     ],
-    "openmm/callback_rows/carried_constraints.py": [
-        (
-            "if self._count == count + «1 > 0→2 > 0»:",
-            "test_callbacks.py::test_an_integrator_that_does_not_hold_the_rows_is_refused",
-        ),
+    "openmm/callback_rows.py": [
+        ("if self._count == count + «1 > 0→2 > 0»:", "callbacks::an_integrator_that_does_not_hold_the_rows_is_refused"),
         (
             "elif self.timed and «self._integrator() is None→False»:",
-            "test_callbacks.py::test_rows_that_need_the_time_are_not_held_without_their_integrator",
+            "callbacks::rows_that_need_the_time_are_not_held_without_their_integrator",
         ),
-        (
-            "self.carries_rest = «not integrator.thermostatted→False»",
-            "test_carried_constraints.py::test_velocities_are_those_of_the_core",
-        ),
+        ("= «not p.integrator.thermostatted→False»", "carried_constraints::velocities_are_those_of_the_core"),
         (
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
-            "test_part.py::test_integrators_in_turn_hold_the_same_part",
+            "part::integrators_in_turn_hold_the_same_part",
         ),
-        (
-            "u * np.cos(w) - d * (w * np.sin(w))« - way→»",
-            "test_surface_integrator.py::test_great_circles_at_any_time_step",
-        ),
-        (
-            '"ij,ij->i", d, way)[:, None] / radius«**2→»)',
-            "test_surface_integrator.py::test_the_steps_are_those_of_the_core",
-        ),
-        (
-            "return self.motion.rank« - 3 * fixed→»",
-            "test_carried_constraints.py::test_particles_without_mass_take_no_degree_of_freedom",
-        ),
+        ("u * np.cos(w) - d * (w * np.sin(w))« - way→»", "surface_integrator::great_circles_at_any_time_step"),
+        ('"ij,ij->i", d, way)[:, None] / radius«**2→»)', "surface_integrator::the_steps_are_those_of_the_core"),
+        ("self.motion.rank« - 3 * fixed→»", "carried_constraints::particles_without_mass_take_no_degree_of_freedom"),
     ],
 }

@@ -55,28 +55,6 @@ def test_a_period_further_nothing_is_different():
     assert there[1] == pytest.approx(here[1], abs=1e-8 * np.abs(here[1]).max())
 
 
-def test_posterior_is_that_of_the_textbook():
-    """Gaussian conditioning by a solver that knows nothing of blocks (Rasmussen and Williams, eq. 2.25, 2.26)."""
-    axes = [AXES["warped line"], AXES["circle"]]
-    known = process(axes, n=5)
-    at = np.random.default_rng(4).uniform(-1, 2, (3, 2))
-    seen, wanted = (known.points, range(2)), (Points(at, axes), [-1])
-    noise = np.zeros((10, 10))
-    for i, block in enumerate(known.covariances):
-        noise[np.ix_([i, 5 + i], [i, 5 + i])] = block
-    prior = known._covariance(seen, seen)
-    prior += 1e-10 * np.trace(prior) / 10 * np.eye(10)
-    cross = known._covariance(wanted, seen)
-    y = np.concatenate([known.gradients[:, 0], known.gradients[:, 1]])
-    mean, covariance = known.posterior((at, [-1]))
-    assert mean == pytest.approx(cross @ np.linalg.solve(prior + noise, y), rel=1e-8)
-    expected = known._covariance(wanted, wanted) - cross @ np.linalg.solve(prior + noise, cross.T)
-    assert covariance == pytest.approx(expected, abs=1e-9 * np.abs(expected).max())
-    sign, log_determinant = np.linalg.slogdet(prior + noise)
-    likelihood = -0.5 * (y @ np.linalg.solve(prior + noise, y) + sign * log_determinant)
-    assert known.log_likelihood() == pytest.approx(likelihood, rel=1e-9)
-
-
 def test_lengths_are_learned():
     """A function that is quick on one side: u' is larger there, and the likelihood higher than with one length."""
     x = np.linspace(0.0, 4.0, 25)[:, None]

@@ -84,7 +84,6 @@ def test_a_grid_without_noise_gives_the_surface(name):
     at = np.random.default_rng(8).uniform(low, high, (200, 2))
     exact = value(at) - value(np.array([[0.1, 0.2]]))
     assert np.abs(surface.free_energy(at)[0] - exact).max() < 0.005 * np.ptp(exact)
-    assert surface.consistency.p_value > 1e-3
     if periods:
         turned, _ = surface.free_energy(at + np.array([TURN, -TURN]))
         assert turned == pytest.approx(surface.free_energy(at)[0], abs=1e-6 * np.ptp(exact))
@@ -124,7 +123,7 @@ def test_vectors_that_are_no_gradient_are_warned_of():
         fit_surface(x, slopes(x) + swirl + drawn, covariances)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert fit_surface(x, slopes(x) + drawn, covariances).consistency.p_value > 1e-3
+        fit_surface(x, slopes(x) + drawn, covariances)
 
 
 def test_one_coordinate_is_a_profile():

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ase.build import molecule
 from scan_systems import ANGLE, LENGTH, chain, threefold
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Dihedral, Distance, FixedAtoms
+from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.errors import ConvergenceError
 from kcons.free_energy.scans import relaxation
 from kcons.free_energy.scans.relaxation import Descent, Internals
-from kcons.motion import minimize
 
 
 def forces_of(atoms):
@@ -45,15 +46,6 @@ def test_the_minimum_is_where_it_is():
     assert angle == pytest.approx(ANGLE, abs=1e-5)
 
 
-def test_it_needs_far_fewer_calls_than_forces_alone():
-    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=8)
-    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-3)
-    evaluate = forces_of(atoms)
-    other = minimize(motion, lambda y, t: evaluate(y)[1], x, tolerance=1e-3, longest=0.2)
-    assert found.energy == pytest.approx(evaluate(other.positions)[0], abs=1e-5)
-    assert 2 * found.evaluations < other.evaluations
-
-
 def test_what_was_learned_goes_along():
     atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=6)
     internals = Internals(atoms.numbers, x)
@@ -69,12 +61,6 @@ def test_fixed_atoms_stay():
     assert np.array_equal(found.positions[[0, 4]], x[[0, 4]])
     forces = motion.project_forces(found.positions, forces_of(atoms)(found.positions)[1])
     assert np.abs(forces[[1, 2, 3]]).max() < 1e-3
-
-
-def test_everything_fixed_is_a_minimum():
-    atoms, motion, x = setting([FixedAtoms(range(5))])
-    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-4)
-    assert found.evaluations == 1 and found.largest == 0.0 and np.array_equal(found.positions, x)
 
 
 def test_forces_that_are_no_gradient_are_told():
@@ -127,3 +113,28 @@ def test_calculators_keep_their_threads_and_matrices_have_one(monkeypatch):
         with pytest.raises(ZeroDivisionError), relaxation.one_thread():
             _ = 1 / 0
         assert threads() == {2}
+
+
+# -- internal coordinates --
+
+
+@pytest.mark.parametrize("name", ["CH3CH2OH", "C2H2", "CH3SiH3", "2-butyne", "H2O"])
+def test_gradients_are_those_of_the_values(name):
+    atoms = molecule(name)
+    rng = np.random.default_rng(1)
+    x, d = atoms.positions, rng.normal(size=atoms.positions.shape)
+    internals = Internals(atoms.numbers, x)
+    h = 1e-5
+    slope = internals.change(internals.values(x + h * d), internals.values(x - h * d)) / (2 * h)
+    np.testing.assert_allclose(internals.jacobian(x) @ d.ravel(), slope, atol=1e-7)
+    assert len(internals.terms) == len(internals.constants) == len(slope)
+
+
+def test_terms_keep_their_images():
+    """Two atoms half a cell apart: the other image is as near, and nearer after a small move."""
+    x = np.array([[0.0, 0, 0], [1.25, 0, 0]])
+    internals = Internals([6, 6], x, lattice_of(np.diag([2.5, 9.0, 9.0]), True))
+    for d in (-1e-3, 1e-3):
+        change = internals.change(internals.values(x + np.array([[0, 0, 0], [d, 0, 0]])), internals.values(x))
+        assert abs(change) == pytest.approx([1e-3])
+        assert np.sign(change) == np.sign(d) * np.sign(internals.jacobian(x)[0, 3])

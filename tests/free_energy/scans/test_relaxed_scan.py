@@ -12,12 +12,13 @@ from ase.constraints import ExternalForce, FixAtoms, Hookean
 from scan_systems import chain, threefold, two_wells
 
 from kcons.ase import constrain
-from kcons.constraints import Angle, Dihedral, Distance
+from kcons.constraints import Angle, Custom, Dihedral, Distance
 from kcons.errors import (
     CalculatorError,
     ConvergenceError,
     InputError,
     OccupiedError,
+    UnreadableError,
 )
 from kcons.free_energy import scan
 
@@ -61,12 +62,38 @@ def test_two_coordinates():
     a, b = np.meshgrid(*grid, indexing="ij")
     np.testing.assert_allclose(found.energies, 0.4 + 0.2 * (np.cos(3 * a) + np.cos(3 * b)), atol=1e-6)
     assert found.energies.shape == (2, 3) and found.failed == {}
+    assert found.grid.neighbors((0, 0)) == [(1, 0), (0, 1)]
 
 
 def lowest(a):
     """Of `two_wells`, over the second dihedral."""
     b = np.linspace(-np.pi, np.pi, 20001)
     return np.min(0.1 * (1 - np.cos(2 * b)) + 0.6 * np.sin(a)[:, None] * np.cos(b - 0.4), axis=1)
+
+
+def test_a_cell_that_cuts_the_molecule_changes_nothing():
+    found = []
+    for cell in (None, [8.0, 9.0, 10.0]):
+        atoms = molecule("H2O2")
+        if cell is not None:
+            atoms.set_cell(cell)
+            atoms.pbc = True
+            atoms.positions += 4.2
+            atoms.positions[:] = atoms.positions % cell
+            atoms.positions[0, 0] -= 8.0
+        atoms.calc = EMT()
+        found.append(scan(atoms, Dihedral([[2, 0, 1, 3]]), [1.0, 1.4]))
+    assert found[0].evaluations == found[1].evaluations
+    np.testing.assert_allclose(found[0].energies, found[1].energies, atol=1e-6)
+
+
+def test_values_that_descend_stay_in_their_order():
+    """The first value, again at the end of a whole turn, is left out, and next to the last one."""
+    values = np.radians(np.arange(180, -181, -30))
+    found = scan(chain(4, threefold, turns=[1.0]), TURN, values, fmax=1e-3)
+    np.testing.assert_allclose(found.energies, 0.2 * (1 + np.cos(3 * values[:-1])), atol=2e-7)
+    assert found.grid.neighbors((0,)) == [(1,), (11,)] and found.attempts[0].point == (4,)
+    assert found.grid.said((1,)) == "Dihedral(0, 1, 2, 3) = 150"
 
 
 def test_both_ways_find_the_lower_of_two_minima():
@@ -220,6 +247,30 @@ def test_a_folder_of_another_scan_is_refused(tmp_path):
     atoms.set_constraint(ExternalForce(0, 3, 0.01))
     with pytest.raises(OccupiedError, match="calculator"):
         scan(atoms, TURN, [0.5], folder=tmp_path)
+
+
+def test_relaxations_in_files_are_whole_and_of_this_scan(tmp_path):
+    atoms, first = chain(4, threefold), tmp_path / "relaxations" / "00000.npz"
+    scan(atoms, TURN, [0.5, 0.6], folder=tmp_path)
+    content, calls = first.read_bytes(), atoms.calc.calls
+    first.with_name("00000.npz.unfinished").write_bytes(b"PK\x03\x04")
+    scan(atoms, TURN, [0.5, 0.6], folder=tmp_path)
+    assert atoms.calc.calls == calls
+    first.write_bytes(b"PK\x03\x04")
+    with pytest.raises(UnreadableError, match=r"00000\.npz cannot be read .*; remove it"):
+        scan(atoms, TURN, [0.5, 0.6], folder=tmp_path)
+    first.write_bytes((tmp_path / "relaxations" / "00001.npz").read_bytes())
+    with pytest.raises(UnreadableError, match=r"relaxation 0 in .* is of another scan"):
+        scan(atoms, TURN, [0.5, 0.6], folder=tmp_path)
+    first.write_bytes(content)
+
+
+def test_python_functions_need_no_folder(tmp_path):
+    row = Custom([[0, 1]], lambda r: r[0, 0] - r[1, 0], lambda r: np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
+    with pytest.raises(InputError, match="Python function"):
+        scan(chain(4, threefold), row, [-1.0], folder=tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+    assert not scan(chain(4, threefold), row, [-1.0]).failed
 
 
 def test_a_value_that_cannot_be_reached_is_a_failure_of_its_point():

@@ -1,4 +1,4 @@
-"""What a scan found in tables, plots and files; its relaxations in files, whole or not at all."""
+"""What a scan found in tables, plots and files."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ import pytest
 from scan_systems import chain, threefold, two_wells
 
 from kcons.cli.terminal import rendered
-from kcons.constraints import Custom, Dihedral, Distance
-from kcons.errors import InputError, UnreadableError
+from kcons.constraints import Dihedral, Distance
 from kcons.free_energy import scan
-from kcons.free_energy.scans.scan_result import KJ, PLACE, Attempt, Attempts, Grid
+from kcons.free_energy.scans.scan_result import KJ
 
 TURN = Dihedral([[0, 1, 2, 3]])
 
@@ -80,39 +79,3 @@ def test_files(tmp_path):
         assert frame.info["dihedral_0_1_2_3"] == pytest.approx(np.degrees(line().grid.at(point)[0]))
         assert np.abs(frame.positions - line().best[point].positions).max() < 1e-7
     assert written[2].read_bytes().startswith(b"\x89PNG")
-
-
-def made(folder, settings=None):
-    atoms = chain(4, threefold)
-    return begun(folder, atoms, Grid([TURN], [[0.1, 0.2]]), [], settings or {"fmax": 0.01})
-
-
-def begun(*arguments):
-    """Attempts whose folder is there."""
-    attempts = Attempts(*arguments)
-    with attempts.taken():
-        return attempts
-
-
-def test_nothing_half_written_is_read(tmp_path):
-    attempts = made(tmp_path)
-    (tmp_path / PLACE / "00000.npz.unfinished").write_bytes(b"PK\x03\x04")
-    assert attempts.kept(0, (0,), None) is None
-    (tmp_path / PLACE / "00000.npz").write_bytes(b"PK\x03\x04")
-    with pytest.raises(UnreadableError, match=r"00000\.npz cannot be read .*; remove it"):
-        attempts.kept(0, (0,), None)
-
-
-def test_an_attempt_of_another_scan_is_refused(tmp_path):
-    made(tmp_path).keep(Attempt(0, (0,), None))
-    with pytest.raises(UnreadableError, match="of another scan"):
-        made(tmp_path).kept(0, (1,), None)
-
-
-def test_python_functions_need_no_folder(tmp_path):
-    row = Custom([[0]], lambda r: r[0, 0], lambda r: np.array([[1.0, 0, 0]]))
-    grid = Grid([row], [[0.1]])
-    Attempts(None, chain(4, threefold), grid, [], {})
-    with pytest.raises(InputError, match="Python function"):
-        Attempts(tmp_path / "new", chain(4, threefold), grid, [], {})
-    assert not (tmp_path / "new").exists()

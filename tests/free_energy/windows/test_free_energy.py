@@ -28,7 +28,7 @@ def of_two_sides(apart):
         name: MeanForce(("a", "b"), np.zeros(2), force, error**2 * np.eye(2), force, 100, 50.0)
         for name, force, error in (("up", np.zeros(2), 0.1), ("down", np.array(apart), 0.2))
     }
-    return combine_sides(0, np.zeros(2), sides, Units(), 0.0)
+    return combine_sides(0, np.zeros(2), sides, Units())
 
 
 def test_sides_that_differ_by_more_than_chance_widen_the_error():
@@ -39,9 +39,7 @@ def test_sides_that_differ_by_more_than_chance_widen_the_error():
 
 
 def result(place, slope, d=1):
-    return WindowResult(
-        0, np.full(d, place), np.full(d, slope), 1e-4 * np.eye(d), {}, float("nan"), np.full(d, slope), 0.0
-    )
+    return WindowResult(0, np.full(d, place), np.full(d, slope), 1e-4 * np.eye(d), {}, np.nan, np.full(d, slope))
 
 
 def found(degrees, names=("torsion",), periods=(PERIOD,)):
@@ -86,23 +84,11 @@ def test_a_turn_with_gaps_of_any_width_is_closed():
 
 def test_surfaces_of_a_part_of_a_turn_have_no_minima_beyond():
     windows = [
-        WindowResult(0, np.radians(p), 9 * np.sin(np.radians(p)), 1e-4 * np.eye(2), {}, np.nan, np.zeros(2), 0.0)
+        WindowResult(0, np.radians(p), 9 * np.sin(np.radians(p)), 1e-4 * np.eye(2), {}, np.nan, np.zeros(2))
         for p in [(a, b) for a in (40, 60, 80, 100) for b in (-40, -15, 15, 40)]
     ]
     surface = FreeEnergy(("a", "b"), np.full(2, PERIOD), windows).surface
     assert surface.periods == (None, None) and surface.minima() == []
-
-
-def test_surfaces_of_torsions_beyond_their_period():
-    pairs = [(a, b) for a in (0, 120, 600) for b in (-60, 60, 180)]
-    windows = [
-        WindowResult(k, np.radians(p), -np.sin(np.radians(p)), 1e-4 * np.eye(2), {}, np.nan, np.zeros(2), 0.0)
-        for k, p in enumerate(pairs)
-    ]
-    both = FreeEnergy(("a", "b"), np.full(2, PERIOD), windows)
-    assert np.degrees(both.surface.windows[:, 0].max()) == pytest.approx(240.0)
-    with pytest.raises(InputError, match="2 coordinates; see surface"):
-        _ = both.profile
 
 
 def test_where_all_windows_failed_a_profile_says_why():
@@ -163,7 +149,7 @@ def test_a_formula_has_its_own_unit(sampled, tmp_path):
 
 
 def test_pulls_beside_windows_that_do_not_reach_their_ends(sampled):
-    pulled = pull_free_energy(np.linspace(0, 1, 20), thermal_energy=2.5)
+    pulled = pull_free_energy(np.linspace(0, 1, 20), np.linspace(-1, 0, 20), thermal_energy=2.5)
     numbers, said = sampled.beside(pulled, np.array([0.1]), np.array([4.0]))
     assert numbers["windows"][0] == pytest.approx(sampled.profile.difference(0.1, 4.0 - 2 * np.pi).value)
     sampled.windows[:] = sampled.windows[:4]

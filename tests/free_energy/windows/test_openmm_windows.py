@@ -11,7 +11,7 @@ import pytest
 from openmm import app
 from openmm_systems import DATA
 
-from kcons.constraints import Angle, Dihedral, Distance, DistanceDifference, Formula
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, DistanceDifference, Formula
 from kcons.errors import InputError, SingularGeometryError, UnsupportedError
 from kcons.free_energy import OpenMMWindows, Series, Settings, Window, mean_force
 from kcons.openmm.device import build
@@ -41,7 +41,6 @@ def test_two_torsions_far_from_the_structure(tmp_path):
     np.testing.assert_allclose(series.value, np.tile([-1.1, 2.0], (32, 1)), atol=1e-10)
     assert np.abs(series.multiplier).max() > 1
     assert np.isfinite(series.turned).all() and series.turned.std() < series.multiplier.std() / 2
-    assert series.seconds > 0
 
 
 @pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
@@ -76,8 +75,9 @@ def test_a_torsion_over_atoms_that_are_not_bonded():
         (Angle([[6, 8, 14]]), 2.0),
         (DistanceDifference([[4, 14], [16, 6]]), -0.016),
         (Formula("sqrt((x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2)", [[4, 14]]), 0.26),
+        (CenterDistance([4, 6], [14, 16]), 0.22),
     ],
-    ids=["distance", "angle", "difference", "formula"],
+    ids=["distance", "angle", "difference", "formula", "centers"],
 )
 def test_other_coordinates(tmp_path, coordinate, target):
     windows = sampler({"q": coordinate})

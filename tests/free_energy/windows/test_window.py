@@ -9,7 +9,7 @@ from ase.calculators.emt import EMT
 
 from kcons.constraints import Dihedral, Distance, Formula
 from kcons.errors import InfeasibleError
-from kcons.free_energy import AseWindows, Settings, Window
+from kcons.free_energy import AseWindows, Window
 from kcons.free_energy.windows.window import Held, digest_of
 
 X = np.array([[0.0, 1.0, 0.1], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.6, 1.0, 0.2], [2.0, -0.6, 0.8]])
@@ -19,12 +19,6 @@ BONDS = [[0, 1], [1, 2], [2, 3], [2, 4]]
 
 def held(coordinates=None, others=()):
     return Held(coordinates or {"turn": TURN}, list(others), X, np.ones(5), None, True, np.array(BONDS), None)
-
-
-def test_settings_are_plain_numbers():
-    assert Settings(production=np.int64(6400), temperature=np.float32(310)) == Settings(
-        production=6400, temperature=310.0
-    )
 
 
 def test_names_and_units():

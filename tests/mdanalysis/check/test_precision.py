@@ -241,22 +241,24 @@ def test_an_atom_that_no_row_has_may_be_anything(tmp_path):
     assert result.status == "kept" and result.gaps == [] and len(result.frames) == 8
 
 
-@pytest.mark.parametrize("what", ["velocity", "cell"])
-def test_velocities_and_cells_that_are_no_numbers(tmp_path, what):
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [("position", "position of atom 4"), ("velocity", "velocity of atom 4"), ("cell", "the cell is (nan")],
+)
+def test_what_is_no_number_ends_what_can_be_read(tmp_path, what, words):
     x, v = whole(), np.zeros((8, 3 * N, 3))
-    if what == "velocity":
-        v[5, 4, 1] = np.nan
-        path = files.write(tmp_path / "a.trr", x, velocities=v)
-    else:
+    if what == "cell":
         path = files.write(tmp_path / "a.dcd", x)
         data = bytearray(path.read_bytes())
         start = len(data) - 3 * (56 + 3 * (8 + 12 * N))
         data[start + 4 : start + 12] = np.array([np.nan]).tobytes()
         path.write_bytes(bytes(data))
+    else:
+        (x if what == "position" else v)[5, 4, 1] = np.nan
+        path = files.write(tmp_path / "a.trr", x, velocities=v)
     result = checked(path)
     assert result.status == "incomplete" and result.broken is not None and result.broken.frame == 5
-    words = "velocity of atom 4" if what == "velocity" else "the cell is (nan"
-    assert words in result.broken.reason and "frame 5 cannot be used" in result.verdict
+    assert words in result.broken.reason and "frame 5 cannot be used, nor what follows" in result.verdict
 
 
 def test_targets_of_the_only_frame_are_no_verdict(tmp_path):
@@ -318,17 +320,6 @@ def test_targets_that_are_means_have_the_mean_rounding_of_their_frames(tmp_path)
     row = rows(result)[FAR]
     assert once[0] > 100 * once[1:].max()
     assert np.isclose(row.allowed, once.mean() + once, rtol=1e-4).any()
-
-
-def test_precision_is_read_from_the_file(tmp_path):
-    x = files.water(N, 8)
-    assert precision_of(files.write(tmp_path / "a.xtc", x, precision=4), "XTC").step == pytest.approx(1e-3)
-    assert precision_of(files.write(tmp_path / "b.xtc", x[:, :9]), "XTC").step == 0.0
-    assert precision_of(files.topology(tmp_path / "c.gro", N, x[0]), "GRO").step == pytest.approx(0.01)
-    single = precision_of("none.dcd", "DCD")
-    assert single.half_step([100.0]) == pytest.approx(2.0**-18)
-    assert precision_of("none.trr", "TRR").half_step([100.0]) > single.half_step([100.0])
-    assert precision_of("none.dcd", "DCD", 0.02).half_step([1.0]) == pytest.approx(0.01, rel=1e-4)
 
 
 def written(path, x, number, columns="x y z", low=0.0, side=40.0):

@@ -8,7 +8,7 @@ from water_files import mda
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis import ConstraintCheck, check_trajectory
-from kcons.mdanalysis.check.targets import TargetFile
+from kcons.mdanalysis.check.targets import read_targets
 
 N = 30
 
@@ -33,7 +33,7 @@ def test_check_from_files(run):
         ({"frames": "a:b"}, "frames are"),
         ({"frames": "3"}, "frames are"),
         ({"frames": "1:5:0"}, "frames are"),
-        ({"workers": 0}, "0 workers"),
+        ({"workers": 0}, "workers is 0"),
         ({"select": "resname NOPE"}, r"(?i)matches no|no atoms"),
         ({"constrain": "hbond"}, r"(?i)hbond"),
     ):
@@ -123,7 +123,7 @@ def test_parameter_files_that_are_wrong(tmp_path, text, match):
     path = tmp_path / "p.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=match) as caught:
-        TargetFile(path)
+        read_targets(path)
     assert "p.toml" in str(caught.value)
 
 
@@ -151,7 +151,7 @@ def test_names_of_rows(named):
 @pytest.mark.parametrize(
     ("given", "elements"),
     [
-        ({"names": ["OW", "HW1", "HW2", "CA", "1HB", "'X", "C"]}, ["O", "H", "H", "C", "H", "X", "C"]),
+        ({"names": ["OW", "HW1", "HW2", "CA", "1HB", "N", "C"]}, ["O", "H", "H", "C", "H", "N", "C"]),
         ({"names": ["CA"] * 7, "elements": ["Ca", "", *"CCCCC"]}, ["Ca", *"CCCCCC"]),
         # As everywhere: a rule for C-C is none for C-Cl.
         (

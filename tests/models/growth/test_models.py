@@ -194,12 +194,6 @@ def test_potentials_are_the_gradient_of_the_excess():
     assert relative[2] == 0.0
 
 
-def test_potentials_of_extinct_species_are_finite():
-    p, mixture = Populations.from_logarithms(0.0, np.array([0.0, -1e4])), Mixture([0.0, 0.0])
-    assert mixture.potentials(p).tolist() == [0.0, -1e4]
-    assert np.isfinite(mixture.gibbs_energy(p))
-
-
 def test_entropy_function_is_accurate_for_all_arguments():
     for u in (1e-12, -1e-5, 0.1, 0.1999, 0.2001, -0.3, 2.0):
         terms = [(k - 1) * u**k / np.prod(np.arange(1.0, k + 1)) for k in range(2, 40)]
@@ -275,10 +269,3 @@ def test_excess_over_a_level_near_equilibrium(size):
 def test_bad_input_is_refused(make, words):
     with pytest.raises((InputError, NonFiniteError), match=words):
         make()
-
-
-def test_a_start_is_kept_as_it_was_given():
-    given = np.array([0.0, -1e6])
-    found = Populations.start(0.0, 2, None, given).log_x
-    assert found.tolist() == given.tolist() and found is not given
-    assert Populations.start(0.0, 2, [1.0, np.e], None).log_x.tolist() == [0.0, 1.0]

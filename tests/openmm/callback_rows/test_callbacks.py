@@ -18,8 +18,8 @@ from openmm_systems import context_of as context_on
 from kcons.constraints import Custom, Distance
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import CarriedConstraints, ProjectedIntegrator, hold
-from kcons.openmm.callback_rows.carried_constraints import CARRY_SCALE, Passage, refuse_single_precision
-from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.callback_rows import CARRY_SCALE, CallbackEngine
+from kcons.openmm.integrator.part import Precision
 
 # -- what passes ------------------------------------------------------------------------------------
 
@@ -31,22 +31,23 @@ CHANGE = 1e-3 * np.random.default_rng(0).normal(size=(3, 3))
 class Messenger:
     """Takes positions down, and gives the change back."""
 
-    def __init__(self, passage):
-        self.passage, self.taken = passage, np.zeros((3, 3))
+    def __init__(self, engine):
+        self.engine, self.taken = engine, np.zeros((3, 3))
 
     def __call__(self, state):
-        self.passage.take(state, self.taken)
-        return 0.0, self.passage.give(self.passage.carried(CHANGE)[0])
+        self.engine.take(state, self.taken)
+        return 0.0, self.engine.give(self.engine.carried(CHANGE)[0])
 
 
 def sent(platform, some, monkeypatch):
     """Where particles are after the change, and what the messenger has seen."""
-    monkeypatch.setattr("kcons.openmm.callback_rows.carried_constraints.hands_over_all", lambda: not some)
+    monkeypatch.setattr("kcons.openmm.callback_rows.hands_over_all", lambda: not some)
     system = openmm.System()
     for _ in X:
         system.addParticle(1.0)
-    passage = Passage(ATOMS, len(X))
-    messenger = Messenger(passage)
+    engine = CallbackEngine((Distance([[1, 3], [3, 4]]),), X, np.ones(len(X)), None, 0.0)
+    assert engine.atoms.tolist() == ATOMS.tolist()
+    messenger = Messenger(engine)
     force = openmm.PythonForce(messenger)
     if some:
         force.setParticles(ATOMS.tolist())
@@ -54,7 +55,7 @@ def sent(platform, some, monkeypatch):
     integrator = openmm.CustomIntegrator(1.0)
     integrator.addComputePerDof("x", f"x+f*{1 / CARRY_SCALE!r}")
     context = context_on(system, integrator, platform)
-    passage.precision = Precision.of(context)
+    engine.precision = Precision.of(context)
     context.setPositions(X)
     integrator.step(1)
     return state_of(context)[0], messenger
@@ -63,17 +64,17 @@ def sent(platform, some, monkeypatch):
 @pytest.mark.parametrize("platform", ["Reference", "CPU", *(p for p in GPUS if "single" not in str(p.id))])
 def test_what_arrives_is_known(platform, monkeypatch):
     there, messenger = sent(platform, False, monkeypatch)
-    passage = messenger.passage
-    rounding = 2 * passage.precision.place * np.abs(X).max()
+    engine = messenger.engine
+    rounding = 2 * engine.precision.place * np.abs(X).max()
     assert np.abs(messenger.taken - X[ATOMS]).max() <= rounding
-    expected = messenger.taken + passage.carried(CHANGE)[1]
+    expected = messenger.taken + engine.carried(CHANGE)[1]
     assert np.abs(there[ATOMS] - expected).max() <= rounding
-    assert passage.same(there[ATOMS], expected)
-    assert not passage.same(there[ATOMS] + 1e-10, expected)
+    assert engine.same(there[ATOMS], expected)
+    assert not engine.same(there[ATOMS] + 1e-10, expected)
     assert np.abs(there - X)[[0, 2]].max() <= rounding
     # A correction keeps the digits of a single number, at least.
-    lost = np.abs(passage.carried(CHANGE)[1] - CHANGE) / np.abs(CHANGE)
-    assert lost.max() < (2.0**-24 if passage.precision.name == "mixed" else 1e-10)
+    lost = np.abs(engine.carried(CHANGE)[1] - CHANGE) / np.abs(CHANGE)
+    assert lost.max() < (2.0**-24 if engine.precision.name == "mixed" else 1e-10)
 
 
 @pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
@@ -145,7 +146,7 @@ def test_energies_and_forces_of_the_context_are_those_of_the_system():
 def test_callbacks_keep_no_memory():
     part, integrator, _ = peptide()
     integrator.step(5)
-    nothing = part._engine.passage._nothing
+    nothing = part._engine._nothing
     before = sys.getrefcount(nothing)
     integrator.step(50)
     assert sys.getrefcount(nothing) == before
@@ -327,7 +328,8 @@ def test_rows_that_cannot_be_held_are_refused(change, rows, x, error, words):
 
 
 def test_gpus_must_carry_positions_of_more_than_single_numbers():
+    integrator = ProjectedIntegrator(0.01, parts=[driven()[1]], device=False)
     for precision in ("mixed", "double"):
-        refuse_single_precision(Precision("CUDA", precision))
+        integrator.take_precision(Precision("CUDA", precision))
     with pytest.raises(UnsupportedError, match=r"CUDA, single precision hands .*'mixed'.* or hold the rows by Coll"):
-        refuse_single_precision(Precision("CUDA", "single"))
+        integrator.take_precision(Precision("CUDA", "single"))

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-import openmm
 import pytest
 from carried_systems import (
-    PEPTIDE,
     begun,
     context_of,
     driven,
     free,
     off_target,
-    peptide,
     pull,
-    started,
     state_of,
 )
-from openmm import app, unit
-from openmm_systems import forces_at, masses_of
+from openmm import unit
 
 from kcons.constraints import Angle, CenterOfMass, Distance, FixedAtoms, RadiusOfGyration, Sphere
-from kcons.errors import ConvergenceError, InputError
+from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator, hold
 from kcons.steppers import System, run
 
@@ -40,30 +35,6 @@ def test_particles_without_mass_take_no_degree_of_freedom():
     integrator.step(5)
     twice = 2 * integrator.kinetic_energy() / (4 * unit.MOLAR_GAS_CONSTANT_R)
     assert integrator.computeSystemTemperature() / unit.kelvin == pytest.approx(twice / unit.kelvin, rel=1e-12)
-
-
-def own_bonds(integrator):
-    """Alanine dipeptide whose bonds OpenMM holds itself."""
-    system = app.ForceField("amber14-all.xml").createSystem(
-        PEPTIDE.topology, constraints=app.AllBonds, rigidWater=False, removeCMMotion=False
-    )
-    return context_of(system, integrator)
-
-
-def test_the_motion_is_that_of_openmm():
-    """VerletIntegrator, whose velocities are half a step behind, has the same positions."""
-    _, integrator, context = peptide(rows=False)
-    verlet = openmm.VerletIntegrator(0.001)
-    verlet.setConstraintTolerance(1e-12)
-    x, v = state_of(context)
-    own = started(own_bonds(verlet), x, v)
-    own.setVelocities(v - 0.0005 * forces_at(own) / masses_of(own.getSystem())[:, None])
-    verlet.step(100)
-    integrator.step(100)
-    assert np.abs(state_of(own)[0] - state_of(context)[0]).max() <= 1e-9
-    with pytest.raises(ConvergenceError, match="step 101"):
-        integrator.setStepSize(0.1 * unit.picosecond)
-        integrator.step(1)
 
 
 @pytest.mark.parametrize("calls", [[40], [1, 2, 3]])
@@ -143,28 +114,6 @@ def in_frame_of_its_center(ratio):
     v = 0.1 * rng.normal(size=(n, 3)) / np.sqrt(masses)[:, None]
     v -= masses @ v / masses.sum()
     return masses, x, v
-
-
-@pytest.mark.parametrize("every", [1, 500], ids=["looked at each step", "looked at now and then"])
-@pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
-@pytest.mark.parametrize("ratio", [10.0, 1e6])
-def test_the_center_of_mass_stays(scheme, every, ratio):
-    """What rounds positions, and velocities on their way, must not add up in the momenta."""
-    masses, x, v = in_frame_of_its_center(ratio)
-    system = free(masses)
-    part = hold(system, Distance([[k, k + 1] for k in range(len(masses) - 1)]), x)
-    integrator = ProjectedIntegrator(0.01, scheme=scheme, parts=[part])
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    context.setVelocities(v)
-    part.apply_velocities(context)
-    for _ in range(1000 // every):
-        integrator.step(every)
-        x, _ = state_of(context)
-    assert np.abs(masses @ x / masses.sum()).max() <= 2e-15
-    held = part.motion.constraint_set
-    v = state_of(context)[1]
-    assert np.abs(held.jacobian(x) @ v.ravel()).max() <= 1e-15
 
 
 @pytest.mark.parametrize("every", [1, 50])

@@ -27,10 +27,10 @@ from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold
 from kcons.openmm.collective.coordinates import (
     as_constraint,
     expression,
+    finite_number,
     formula_rows,
     found_values,
     moved_atoms,
-    number,
     period_of,
     unit_of,
 )
@@ -67,9 +67,11 @@ def torsion(text="theta"):
     ],
 )
 def test_units_of_the_user(value, expected):
-    assert number(value, "target") == pytest.approx(expected, rel=1e-15)
+    assert finite_number(value, "target") == pytest.approx(expected, rel=1e-15)
     if unit.is_quantity(value):
-        assert number(value / unit.femtosecond, "rate", per=unit.picosecond) == pytest.approx(1e3 * expected, rel=1e-15)
+        assert finite_number(value / unit.femtosecond, "rate", per=unit.picosecond) == pytest.approx(
+            1e3 * expected, rel=1e-15
+        )
 
 
 def test_rows_are_in_units_of_openmm():
@@ -78,7 +80,7 @@ def test_rows_are_in_units_of_openmm():
     integrator = ProjectedIntegrator(0.001, parts=[rows])
     settings = integrator.program.settings
     assert [settings["target1_0"], settings["rate1_0"]] == pytest.approx([0.3, 1e-3], rel=1e-15)
-    with pytest.raises(InputError, match="give it in nanometer"):
+    with pytest.raises(InputError, match="give it in nm"):
         rows.set_target(integrator, 0, 3 * unit.degree)
 
 

@@ -14,34 +14,19 @@ from collective_cases import (
     FORCES,
     angle,
     bond,
-    context_of,
     dipeptide,
     energy_of,
     held_chain,
-    state_of,
 )
 from openmm import app, unit
-from openmm_systems import DATA
+from openmm_systems import DATA, started, state_of
 
 from kcons.constraints import Dihedral
 from kcons.errors import ConstraintError, ConvergenceError, InputError
-from kcons.openmm import Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
-from kcons.openmm.collective import CollectiveRows
+from kcons.openmm import CollectiveRows, Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
 from kcons.openmm.collective.coordinates import Row
 
 # -- multipliers ----------------------------------------------------------------------------------------
-
-
-def test_multiplier_of_a_rotor():
-    """A dumbbell of two masses, turning freely: the bond pulls with lambda = -mu omega^2 d."""
-    system = openmm.System()
-    for mass in (2.0, 3.0):
-        system.addParticle(mass)
-    part = CollectiveRows(system, [Row(bond(0, 1), 0.2)])
-    integrator = ProjectedIntegrator(0.001, "suzuki4", parts=[part])
-    context = context_of(system, integrator, [[0, 0, 0], [0.2, 0, 0]], [[0, -3.0, 0], [0, 2.0, 0]])
-    integrator.step(5)
-    assert part.multipliers(context) == pytest.approx([-(2.0 * 3.0 / 5.0) * 5.0**2 / 0.2], rel=1e-9)
 
 
 # -- order, reversibility, energy -----------------------------------------------------------------------
@@ -271,11 +256,11 @@ def test_copies_of_an_integrator_have_its_clock(steps):
     force.addBond(0, 1)
     part = CollectiveRows(system, [Row(force, 0.3, rate=1.0)])
     integrator = ProjectedIntegrator(1e-3, parts=[part])
-    context = context_of(system, integrator, x)
+    context = started(system, integrator, x)
     part.restore(context)
     integrator.step(steps)
     again = copy.copy(integrator)
-    other = context_of(system, again, state_of(context)[0])
+    other = started(system, again, state_of(context)[0])
     again.parts[0].restore(other)
     again.step(1)
     assert again.parts[0].values(other) == pytest.approx(0.3 + 1e-3 * (steps + 1), abs=1e-12)

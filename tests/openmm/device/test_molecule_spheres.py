@@ -11,7 +11,7 @@ from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import IsokineticSpheres, ProjectedIntegrator
 from kcons.openmm.device import build
-from kcons.openmm.device.kernels import Shape
+from kcons.openmm.device.held_rows import Shape
 from kcons.openmm.quantities import GAS_CONSTANT
 from kcons.steppers import State
 from kcons.thermostats import IsokineticSpheres as OnArrays
@@ -58,7 +58,7 @@ def in_order(auxiliary_variables, integrator, layout, auxiliary):
 
     On the device they come by kinds of clusters, the spheres of a cluster one after another; single atoms are last.
     """
-    shapes = [*integrator.rows.shapes, Shape("", np.setdiff1d(np.arange(27), _held(integrator))[:, None])]
+    shapes = [*integrator.rows.shapes, Shape(np.setdiff1d(np.arange(27), _held(integrator))[:, None])]
     found, at = np.zeros(auxiliary_variables.size), 0
     for shape in shapes:
         for atoms in shape.atoms:

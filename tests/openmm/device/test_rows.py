@@ -6,10 +6,11 @@ import pytest
 from kcons.constraints import Angle, CenterDistance, Custom, Distance, Formula, Plane, Sphere
 from kcons.constraints.functions.straight_line import Function
 from kcons.constraints.target import MovingTarget
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import UnsupportedError
 from kcons.openmm.device.c_writer import c_functions
-from kcons.openmm.device.held_rows import molecules_of, refusal
-from kcons.openmm.device.rows import rows_of
+from kcons.openmm.device.device_integrator import refusal
+from kcons.openmm.device.rows import DeviceRows
+from kcons.openmm.integrator.program import ConstantEnergy, to_scheme
 from kcons.plan.clusters_alike import elimination
 from tests.systems.constraint_cases import CASES, MASSES, TIME, scattered
 from tests.systems.device_rows import PlainRows
@@ -25,7 +26,7 @@ MOVED = {"FixedAtoms moving"}
 
 def held(items, x, masses, cell=None, time=TIME, precision="double"):
     """Rows of the device at positions on the rows, and inverse masses."""
-    rows = rows_of(masses, NONE, items, positions=x, cell=cell, time=time)
+    rows = DeviceRows(masses, NONE, items, positions=x, cell=cell, time=time)
     plain = PlainRows(rows, precision)
     w = 1 / masses
     w[rows.fixed] = 0
@@ -48,6 +49,10 @@ def compare(plain, x, w, cell, time, size, tolerance=1e-14, bound=1e-13):
     assert np.abs(v - tangent).max() > 1e-3 or len(plain.rows.fixed)
 
 
+def refused(parts):
+    return refusal(to_scheme("rattle"), parts, ConstantEnergy())
+
+
 def side_by_side(cases, x, masses):
     """Each case on particles of its own: constraints, positions and masses."""
     n, count = len(x), sum(len(items) for items in cases)
@@ -68,18 +73,16 @@ def test_families_are_held_as_the_engine_holds_them():
 @pytest.mark.parametrize("name", sorted(PYTHON))
 def test_functions_of_python_are_refused_with_the_remedy(name):
     item = CASES[name]()
-    assert "device=False" in refusal([item]) and "Formula" in refusal([item])
+    assert "device=False" in refused([item]) and "Formula" in refused([item])
     with pytest.raises(UnsupportedError, match="function of Python"):
-        rows_of(MASSES, NONE, [item], positions=scattered(7), time=TIME)
+        DeviceRows(MASSES, NONE, [item], positions=scattered(7), time=TIME)
 
 
 def test_what_else_is_refused():
-    assert refusal([Distance([[0, 1]])]) == ""
-    assert "not held on the device" in refusal([object()])
+    assert refused([Distance([[0, 1]])]) == ""
+    assert "not held on the device" in refused([object()])
     with pytest.raises(UnsupportedError, match="moves, which the device does not"):
-        rows_of(MASSES, NONE, [CASES["FixedAtoms moving"]()], positions=scattered(7), time=TIME)
-    with pytest.raises(InputError, match="positions, which are not known"):
-        rows_of(MASSES, NONE, [Distance([[0, 1]])])
+        DeviceRows(MASSES, NONE, [CASES["FixedAtoms moving"]()], positions=scattered(7), time=TIME)
 
 
 @pytest.mark.parametrize("cell", [np.diag([7.0, 8.0, 9.0]), np.array([[7.0, 0, 0], [1.5, 8.0, 0], [-2.0, 1.3, 9.0]])])
@@ -98,7 +101,7 @@ def test_targets_move_between_their_knots():
     )
     bond = Distance([[0, 1]], swings)
     x = np.array([[0.0, 0, 0], [1.5 + 0.1 * np.sin(7.0), 0, 0]])
-    rows = rows_of(np.ones(2), NONE, [bond], positions=x, time=1.0)
+    rows = DeviceRows(np.ones(2), NONE, [bond], positions=x, time=1.0)
     plain = PlainRows(rows)
     plain.write(rows.renew(1.0, STEP, rows.block))
     for time in (1.0, 1.0037, 2.5, 1.0 + STEP * rows.block):
@@ -173,7 +176,7 @@ def test_clusters_that_look_alike_share_their_code():
     pairs = np.array([[3 * k + i, 3 * k + j] for k in range(20) for i, j in ((0, 1), (0, 2), (1, 2))])
     lengths = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
     masses = np.tile([16.0, 1.0, 1.0], 20)
-    rows = rows_of(masses, (pairs, lengths), [Distance([[0, 3]])], positions=x)
+    rows = DeviceRows(masses, (pairs, lengths), [Distance([[0, 3]])], positions=x)
     assert sorted((s.together, s.atoms.shape, s.n_rows) for s in rows.shapes) == [
         (False, (18, 3), 3),
         (True, (1, 6), 7),
@@ -182,10 +185,6 @@ def test_clusters_that_look_alike_share_their_code():
     d = 0.002 * rng.normal(size=x.shape)
     flown = plain.positions(x, d, 1 / masses, tolerance=1e-14)
     assert np.abs(x + flown - rows.motion.project_positions(x + d, x)).max() < 1e-14
-    assert len(molecules_of(pairs, [Distance([[0, 3]])])) == 61
-    # Without positions the clusters are the same.
-    again = rows_of(masses, (pairs, lengths), [Distance([[0, 3]], 0.5)])
-    assert [shape.atoms.tolist() for shape in again.shapes] == [shape.atoms.tolist() for shape in rows.shapes]
 
 
 def test_levels_have_rows_that_share_no_entry():
@@ -209,7 +208,7 @@ def test_impulses_are_those_of_the_engine():
     x, masses, items = chain_of(12, True)
     x = np.concatenate([x, [[0, 0.8, 0], [0.1, 0.8, 0], [0, 1.8, 0], [0.1, 1.8, 0]]])
     masses = np.concatenate([masses, [2.0, 3.0, 4.0, 5.0]])
-    rows = rows_of(masses, (np.array([[12, 13]]), np.array([0.1])), [*items, Distance([[14, 15]])], positions=x)
+    rows = DeviceRows(masses, (np.array([[12, 13]]), np.array([0.1])), [*items, Distance([[14, 15]])], positions=x)
     plain, rng = PlainRows(rows), np.random.default_rng(4)
     d, v, h = 2e-4 * rng.normal(size=x.shape), rng.normal(size=x.shape), 0.002
     plain.positions(x, d, 1 / masses, h, tolerance=1e-14)
@@ -251,7 +250,7 @@ def test_a_bond_that_has_turned_over_is_no_solution():
 
 
 def test_places_in_space_are_named():
-    rows = rows_of(MASSES, NONE, [Plane(2, [0, 0, 1.0]), Distance([[4, 5]]), Sphere(3, [0, 0, 0.0])], scattered(7))
+    rows = DeviceRows(MASSES, NONE, [Plane(2, [0, 0, 1.0]), Distance([[4, 5]]), Sphere(3, [0, 0, 0.0])], scattered(7))
     assert rows.placed.tolist() == [2, 3]
 
 
@@ -286,5 +285,5 @@ def test_whole_numbers_are_not_divided_as_such():
 def test_formulas_beside_custom_functions():
     """The remedy that a refusal names: the same coordinate as a Formula is taken."""
     item = Custom([0, 1], lambda r: float(np.sum((r[0] - r[1]) ** 2)))
-    assert refusal([item]) and not refusal([Formula("(x1-x2)**2+(y1-y2)**2+(z1-z2)**2", [[0, 1]], target=None)])
-    assert not refusal([CenterDistance([0, 1], [2, 3])])
+    assert refused([item]) and not refused([Formula("(x1-x2)**2+(y1-y2)**2+(z1-z2)**2", [[0, 1]], target=None)])
+    assert not refused([CenterDistance([0, 1], [2, 3])])

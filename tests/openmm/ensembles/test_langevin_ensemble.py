@@ -1,13 +1,20 @@
-"""Langevin dynamics on the constraints in OpenMM."""
+"""Langevin dynamics on the constraints in OpenMM, with one time step and with several."""
 
 import numpy as np
+import openmm
 import pytest
-from ensemble_runs import run, twice_kinetic
-from openmm_systems import alanine, context_of, state_of, water_box
+from ensemble_runs import run
+from openmm import unit
+from openmm_parts import HeldCoordinates
+from openmm_systems import GPUS, PLATFORMS, alanine, context_of, started, state_of, water_box
 
-from kcons.errors import UnsupportedError
-from kcons.openmm import Langevin, ProjectedIntegrator
-from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
+from kcons import ConstraintSet, Motion, State, System
+from kcons import run as steps_of
+from kcons.constraints import Distance
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm import Langevin, LangevinRespa, ProjectedIntegrator
+from kcons.thermostats import ForceGroups
+from kcons.thermostats import LangevinRespa as CoreRespa
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 
@@ -27,26 +34,153 @@ def test_langevin_without_friction_is_the_drift_in_two_halves():
     assert slope == pytest.approx(2, abs=0.15)
 
 
-def test_langevin_is_refused_where_it_cannot_be():
-    for scheme in ("suzuki4", "blanes-moan4", "isokinetic4"):
-        with pytest.raises(UnsupportedError):
-            ProjectedIntegrator(1e-3, scheme, ensemble=Langevin(300.0, 1.0))
+# -- several time steps ---------------------------------------------------------------------------
 
 
-def test_langevin_velocities_have_the_temperature_of_the_tangent_plane():
-    """A chain of rigid waters without forces: <v A> = 0 exactly, and <2K> = g kT within three standard errors."""
-    system, x = water_box()
-    system.removeForce(0)
-    integrator = ProjectedIntegrator(2e-3, ensemble=Langevin(300.0, 200.0))
-    integrator.setRandomNumberSeed(11)
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    integrator.setVelocitiesToTemperature(context, 300, 7)
-    values = []
-    for _ in range(400):
-        integrator.step(5)  # friction x time = 2: independent draws
-        values.append(twice_kinetic(system, state_of(context)[1]) / GAS_CONSTANT / (6 * 27))
-    error = np.std(values) / 20
-    assert abs(np.mean(values) - 300) <= 3 * error
-    # The variance of a chi-square distribution with g degrees of freedom.
-    assert np.var(values) == pytest.approx(300**2 * 2 / (6 * 27), rel=0.3)
+TWO = {0: 1, 1: 4}
+KT = 300 * unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+
+
+def grouped(**options):
+    """Alanine dipeptide: bonds held, angles and torsions fast (group 1), the rest slow (group 0)."""
+    system, x, v = alanine(**options)
+    for force in system.getForces():
+        force.setForceGroup(0 if isinstance(force, openmm.NonbondedForce | openmm.CustomNonbondedForce) else 1)
+    return system, x, v
+
+
+def trapped(n=4, constraints=0):
+    """Free atoms in a trap with a softer slow force."""
+    system, fast, slow = openmm.System(), openmm.CustomExternalForce("40*(x^2+2*y^2+z^2)"), None
+    slow = openmm.CustomExternalForce("10*(cos(3*x)+y^4+z*y)")
+    for k in range(n):
+        system.addParticle(10.0 + k)
+        fast.addParticle(k)
+        slow.addParticle(k)
+    for k in range(constraints):
+        system.addConstraint(2 * k, 2 * k + 1, 0.1)
+    fast.setForceGroup(1)
+    system.addForce(fast)
+    system.addForce(slow)
+    rng = np.random.default_rng(2)
+    return system, 0.1 * rng.normal(size=(n, 3)), 0.3 * rng.normal(size=(n, 3))
+
+
+@pytest.mark.parametrize("slow_kicks", ["ends", "middle"])
+@pytest.mark.parametrize("steps", [TWO, {0: 1, 2: 2, 1: 4}], ids=["two groups", "three groups"])
+@pytest.mark.usefixtures("without_device")
+def test_it_makes_the_steps_of_the_core(steps, slow_kicks):
+    """Without friction."""
+    system, x, v = grouped()
+    if 2 in steps:
+        system.getForces()[1].setForceGroup(2)
+    probe = context_of(system, openmm.VerletIntegrator(1e-3))
+
+    def of(group):
+        def force(x, time):
+            probe.setPositions(x)
+            state = probe.getState(forces=True, groups={group})
+            return np.array(state.getForces(asNumpy=True)._value)
+
+        return force
+
+    pairs = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    rows = Distance([p[:2] for p in pairs], [p[2]._value for p in pairs])
+    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
+    held = System(Motion(ConstraintSet(rows, x, masses), x), ForceGroups({str(g): of(g) for g in steps}))
+    named = {str(group): count for group, count in steps.items()}
+    core = CoreRespa(KT, 0.0, 3, steps=named, substeps=1, slow_kicks=slow_kicks)
+    end = steps_of(held, State(x, held.motion.project_velocities(x, v)), 2e-3, 5, stepper=core)
+    integrator = ProjectedIntegrator(2e-3, tolerance=1e-13, ensemble=LangevinRespa(300, 0.0, steps, slow_kicks))
+    found = state_of(run(system, integrator, x, v, 5))
+    np.testing.assert_allclose(found[0], end.positions, rtol=0, atol=2e-11)
+    np.testing.assert_allclose(found[1], end.velocities, rtol=0, atol=1e-8)
+    assert "forces of group 1 act" in integrator.listing()
+
+
+@pytest.mark.parametrize("platform", [*PLATFORMS, *GPUS[-2:-1]])
+def test_constraints_are_held_and_a_seed_repeats(platform):
+    system, x, v = grouped()
+    ends = []
+    for _ in range(1 if "OpenCL" in platform else 2):  # where kernels are compiled for each Context
+        integrator = ProjectedIntegrator(4e-3, ensemble=LangevinRespa(300, 5.0, TWO))
+        integrator.setRandomNumberSeed(5)
+        context = run(system, integrator, x, v, 10, platform)
+        integrator.check()
+        ends.append(state_of(context))
+    assert np.abs(ends[0][0] - ends[-1][0]).max() <= 1e-6
+    assert np.abs(ends[0][0] - x).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"steps": 4}, "steps must name each force group"),
+        ({"steps": {0: 1}}, "give two or more"),
+        ({"steps": {0: 1, 32: 4}}, "force group 32 is no number from 0 to 31"),
+        ({"steps": {0: 1, "fast": 4}}, "force group 'fast' is no number"),
+        ({"steps": {0: 1, 1: 0}}, "steps is 0"),
+        ({"steps": {0: 1, 1: 4, 2: 6}}, "does not divide"),
+        ({"friction": -1.0}, "friction"),
+        ({"slow_kicks": "middle", "steps": {0: 1, 1: 3}}, "no middle"),
+    ],
+)
+def test_bad_input(options, words):
+    with pytest.raises(InputError, match=words):
+        LangevinRespa(**{"temperature": 300, "friction": 1.0, "steps": TWO, **options})
+
+
+def test_forces_of_other_groups_and_virtual_sites_and_parts():
+    system, x, v = trapped()
+    system.getForces()[0].setForceGroup(7)
+    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, TWO))
+    with pytest.raises(InputError, match="CustomExternalForce is in force group 7, which has no number of steps"):
+        run(system, integrator, x, v, 1)
+    system, x, v = trapped()
+    system.addParticle(0.0)
+    system.setVirtualSite(4, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
+    for force in system.getForces():
+        force.addParticle(3)
+    sites = np.vstack([x, 0.5 * (x[0] + x[1])]), np.vstack([v, 0 * v[0]])
+    with pytest.raises(UnsupportedError, match="virtual sites"):
+        run(system, ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, TWO)), *sites, 1)
+    with pytest.raises(UnsupportedError, match="and no parts"):
+        ProjectedIntegrator(1e-3, parts=[HeldCoordinates([0], 0, 0.0, 5)], ensemble=LangevinRespa(300, 1.0, TWO))
+
+
+def test_temperature_and_friction():
+    ensemble = LangevinRespa(300, 1.0, TWO, "middle")
+    assert ensemble == LangevinRespa(300, 1.0, {1: 4, 0: 1}, "middle") != LangevinRespa(300, 1.0, TWO)
+    assert repr(ensemble) == "LangevinRespa(300 K, 1/ps, steps {0: 1, 1: 4}, slow kicks in the middle)"
+    integrator = ProjectedIntegrator(2e-3, ensemble=ensemble)
+    integrator.setTemperature(310)
+    integrator.setFriction(2.0)
+    assert integrator.ensemble == LangevinRespa(310, 2.0, TWO, "middle")
+    assert isinstance(ensemble, Langevin)
+
+
+def test_forces_in_reciprocal_space_have_a_number_of_steps_too():
+    """Those of a group of their own would be left out."""
+    system, x = water_box(8, spacing=0.4)
+    force = next(force for force in system.getForces() if isinstance(force, openmm.NonbondedForce))
+    force.setNonbondedMethod(openmm.NonbondedForce.PME)
+    force.setReciprocalSpaceForceGroup(2)
+    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, {0: 1, 1: 2}))
+    context = started(system, integrator, x)
+    with pytest.raises(InputError, match="force group 2"):
+        integrator.step(1)
+    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, {0: 2, 2: 1}))
+    context = started(system, integrator, x)
+    integrator.step(1)
+    assert np.isfinite(context.getState(energy=True).getPotentialEnergy()._value)
+
+
+def test_groups_that_are_left_out_are_refused():
+    """They acted all the same."""
+    system, x, v = trapped()
+    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, TWO))
+    integrator.setIntegrationForceGroups({1})
+    context = started(system, integrator, x, v)
+    with pytest.raises(InputError, match="group 0 is left out by setIntegrationForceGroups"):
+        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context), (x, v))

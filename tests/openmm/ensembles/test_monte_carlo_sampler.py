@@ -16,8 +16,8 @@ from openmm_systems import GPUS, alanine, context_of, loose_alanine, potential_e
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, hold
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
-from kcons.thermostats.langevin import noise_generator
 from kcons.thermostats.monte_carlo import POTENTIAL, PROPOSAL
+from kcons.thermostats.noise import noise_generator
 
 reversing = HamiltonianMonteCarlo.reversing_integrator
 

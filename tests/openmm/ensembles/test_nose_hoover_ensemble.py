@@ -8,7 +8,6 @@ import pytest
 from ensemble_runs import (
     in_calls_of_any_length,
     run,
-    twice_kinetic,
 )
 from openmm import unit
 from openmm_systems import (
@@ -147,7 +146,7 @@ def test_a_chain_in_the_middle_takes_rattle_and_stays_itself():
             ProjectedIntegrator(1e-3, scheme, ensemble=NoseHooverMiddle(300.0, 20.0))
     ensemble = NoseHooverMiddle(300.0, 20.0, length=2)
     assert ensemble != NoseHoover(300.0, 20.0, length=2)
-    warmer = ensemble.at(310.0)
+    warmer = ensemble.replaced(temperature=310.0)
     assert type(warmer) is NoseHooverMiddle
     assert repr(warmer) == "NoseHooverMiddle(310 K, 20/ps, length=2)"
 
@@ -199,8 +198,8 @@ def test_a_nan_leaves_the_chain_of_the_last_check():
 BODY = 0.063 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 
 
-def test_rigid_bodies_of_more_rows_than_they_need_have_the_temperature():
-    """<2K> = 36 kT for six rigid bodies, within three standard errors; rows counted one by one would leave 30."""
+def test_rigid_bodies_of_more_rows_than_they_need_have_all_their_momenta():
+    """36 of six rigid bodies; rows counted one by one would leave 30."""
     system = openmm.System()
     field = openmm.CustomExternalForce("50*(x^2+1.3*y^2+0.7*z^2)+60*sin(5*x)*cos(4*y+1)*cos(6*z)")
     x = np.vstack([BODY + 0.1 * b for b in range(6)])
@@ -214,15 +213,8 @@ def test_rigid_bodies_of_more_rows_than_they_need_have_the_temperature():
     context = context_of(system, integrator)
     context.setPositions(x)
     integrator.setVelocitiesToTemperature(context, 300, 1)
-    integrator.step(500)
+    integrator.step(1)
     assert ensemble.count(integrator) == 36
-    values = []
-    for _ in range(300):
-        integrator.step(10)
-        values.append(twice_kinetic(system, state_of(context)[1]) / (300 * GAS_CONSTANT))
-    blocks = np.reshape(values, (15, -1)).mean(axis=1)
-    error = blocks.std(ddof=1) / np.sqrt(15)
-    assert abs(blocks.mean() - 36) <= 3 * error < 3
 
 
 # -- settings --------------------------------------------------------------------------------------------

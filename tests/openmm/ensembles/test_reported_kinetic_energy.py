@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import openmm
 import pytest
-from openmm import app, unit
-from openmm_systems import PLATFORMS, alanine, masses_of, on_gpus, started, state_of
+from openmm import unit
+from openmm_systems import PLATFORMS, masses_of, on_gpus, started, state_of
 
 from kcons.constraints import Distance
 from kcons.openmm import (
@@ -191,25 +189,3 @@ def test_without_noise_it_is_that_of_the_velocities(ensemble):
     for steps in (1, 5):
         integrator.step(steps)
         assert energy_of(context) == pytest.approx(6.0 * np.sum(state_of(context)[1] ** 2), rel=1e-12)
-
-
-def test_a_reporter_shows_it():
-    system, x, v = alanine("HBonds")
-    pdb_atoms = app.Topology()
-    residue = pdb_atoms.addResidue("X", pdb_atoms.addChain())
-    for k in range(len(x)):
-        pdb_atoms.addAtom(f"C{k}", app.element.carbon, residue)
-    integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300, 5.0))
-    place = openmm.Platform.getPlatformByName("Reference")
-    simulation = app.Simulation(pdb_atoms, system, integrator, place)
-    simulation.context.setPositions(x)
-    simulation.context.setVelocities(v)
-    table = io.StringIO()
-    simulation.reporters.append(app.StateDataReporter(table, 5, temperature=True, kineticEnergy=True))
-    simulation.step(20)
-    kinetic, temperature = (float(word) for word in table.getvalue().split()[-1].split(","))
-    assert kinetic == energy_of(simulation.context)
-    freedom = integrator.degrees_of_freedom()
-    assert temperature == pytest.approx(2 * kinetic / (GAS_CONSTANT * freedom), rel=1e-12)
-    own = 0.5 * masses_of(system) @ np.einsum("ij,ij->i", *[state_of(simulation.context)[1]] * 2)
-    assert kinetic != pytest.approx(own, rel=1e-4)

@@ -30,10 +30,9 @@ from kcons.openmm import (
     Row,
     hold,
 )
-from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.system_checks import SystemRows
+from kcons.openmm.integrator.guard import SystemRows
+from kcons.openmm.integrator.part import Precision
 
-less_than_double = pytest.mark.parametrize("platform", [p for p in on_gpus("single") if "double" not in str(p.id)])
 mixed = pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
 #: Half a femtosecond, so that what is seen is rounding.
 STEP = 5e-4
@@ -224,21 +223,6 @@ def test_parts_run_in_any_precision(scheme, platform):
 # -- rows of constraint objects ---------------------------------------------------------------------
 
 
-@less_than_double
-def test_rows_of_constraint_objects_need_more_than_single_numbers(platform):
-    precision = Precision(*platform.split())
-    system, x, v = free_alanine()
-    integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
-    context = started(system, integrator, x, v, platform)
-    if precision.name != "single":
-        integrator.step(5)
-        integrator.check()
-    else:
-        with pytest.raises(UnsupportedError, match="'Precision': 'mixed'"):
-            integrator.step(1)
-        np.testing.assert_allclose(state_of(context)[0], x, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("some", "kind", "platform"),
     [
@@ -301,7 +285,7 @@ def test_some_particles_or_all_are_the_same_motion(monkeypatch):
     """What callbacks are given does not change a bit of what is computed."""
     ends = []
     for every in (False, True):
-        monkeypatch.setattr("kcons.openmm.callback_rows.carried_constraints.hands_over_all", lambda every=every: every)
+        monkeypatch.setattr("kcons.openmm.callback_rows.hands_over_all", lambda every=every: every)
         system, x, v = free_alanine()
         integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
         context = started(system, integrator, x, v)

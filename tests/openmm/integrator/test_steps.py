@@ -36,7 +36,7 @@ from kcons.openmm import (
     Row,
     hold,
 )
-from kcons.openmm.integrator.ensemble import Ensemble
+from kcons.openmm.integrator.program import Ensemble
 
 #: The trap of `tied_cluster` is round.
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -128,11 +128,11 @@ def test_parameters_of_forces_are_used_in_the_next_step(kind):
 class Friction(Ensemble):
     """An ensemble that is seen to be right: v falls exponentially during kicks."""
 
-    def declare(self, program):
-        program.number("rate", "of the friction", 1e3 * np.log(4.0))
+    def declare(self, p):
+        p.number("rate", "of the friction", 1e3 * np.log(4.0))
 
-    def kick(self, step, h, impulse="", tangent=False, unseen=False):
-        step.project()
+    def kick(self, p, h, impulse="", tangent=False, unseen=False):
+        p.project()
         return f"(v+{impulse or 0})*exp(-rate*{h})"
 
 
@@ -270,46 +270,6 @@ def test_failure_where_nobody_looked():
     integrator.step(20)
     other.step(20)
     assert np.abs(state_of(twin)[0] - state_of(context)[0]).max() <= 1e-12
-
-
-@pytest.mark.parametrize("agent", ["barostat", "thermostat", "momentum"])
-def test_agents_of_the_system(agent):
-    """A carried row stays exact where a barostat moves x between steps; a thermostat meets complete velocities."""
-    system = openmm.System()
-    force = openmm.NonbondedForce()
-    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
-    force.setCutoffDistance(0.9)
-    grid = np.array(list(np.ndindex(4, 4, 4))) * 0.5
-    x = np.concatenate([grid, grid + np.array([0.15, 0, 0])])
-    for _ in x:
-        force.addParticle(0, 0.2, 0.5)
-        system.addParticle(20.0)
-    for k in range(64):
-        force.addException(k, 64 + k, 0, 1, 0)
-        system.addConstraint(k, 64 + k, 0.15)
-    system.addForce(force)
-    system.setDefaultPeriodicBoxVectors(*(2.0 * np.eye(3)))
-    part = hold(system, [], x, take="all")
-    if agent == "barostat":
-        system.addForce(openmm.MonteCarloBarostat(50, 300, 3))
-    elif agent == "thermostat":
-        system.addForce(openmm.AndersenThermostat(300, 5))
-    else:
-        system.addForce(openmm.CMMotionRemover(1))
-    integrator = ProjectedIntegrator(2e-3, parts=[part])
-    context = started(system, integrator, x)
-    integrator.setVelocitiesToTemperature(context, 300, 1)
-    for _ in range(5):
-        integrator.step(20)
-        report = part.report(context)
-        assert report.residual <= 1e-13
-        assert report.velocity_residual <= 1e-13
-    if agent == "barostat":
-        edge = context.getState().getPeriodicBoxVectors(asNumpy=True)._value[0, 0]
-        assert edge != 2.0
-    if agent == "momentum":
-        momentum = masses_of(system) @ state_of(context)[1]
-        assert np.abs(momentum).max() <= 1e-3
 
 
 @pytest.mark.parametrize("kind", ["constant energy", "carried"])

@@ -14,7 +14,7 @@ from openmm_systems import (
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Langevin, ProjectedIntegrator, worst_length
-from kcons.openmm.integrator.system_checks import SystemRows
+from kcons.openmm.integrator.guard import SystemRows
 
 # -- what cannot be propagated ----------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from kcons.constraints import Angle, Cylinder, Dihedral, Distance, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.sparse.mixed_rows import SparseRows
+from kcons.solvers.sparse.mixed_rows import SparseRows, miss
 
 CONSTRAINTS = [
     Distance([[0, 1], [1, 2], [2, 3], [3, 4], [6, 7]]),
@@ -180,3 +180,13 @@ def test_a_dihedral_that_turns_over_has_no_solution_far_away(seed):
         changed = x_new.copy()
         assert not solver.positions(Request(changed, x)).converged
         assert np.array_equal(changed, x_new)
+
+
+def test_rows_with_a_period_miss_by_the_shorter_way():
+    turn = 2 * np.pi
+    assert miss(3.1, -3.1, turn) == pytest.approx(2 * np.pi - 6.2)
+    # More than a quarter of a turn is nothing to go round for.
+    assert miss(-1.0, 1.9, turn) == pytest.approx(2.9)
+    assert miss(1.0, -1.9, turn) == pytest.approx(-2.9)
+    assert miss(-1.0, 2.4, turn) == pytest.approx(3.4 - 2 * np.pi)
+    assert miss(3.1, 0.1, 0.0) == pytest.approx(-3.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import ctypes
 import pickle
 
 import numba
@@ -12,12 +11,11 @@ import pytest
 from constraint_cases import CASES, MASSES, TIME, scattered
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Custom, CustomVelocity, Distance, RowKind
+from kcons.constraints import Custom, Distance, RowKind
 from kcons.errors import InputError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.sparse.mixed_rows import SparseRows
-from kcons.solvers.sparse.row_functions import ROOM
 
 FUNCTIONS = [name for name in CASES if CASES[name]().kind == RowKind.FUNCTION]
 VELOCITIES = [name for name in CASES if CASES[name]().kind == RowKind.VELOCITY]
@@ -85,9 +83,9 @@ def test_rows_of_velocities_agree_with_the_dense_solver(name, flight):
     found = []
     for solver in (fast, dense):
         positions, multipliers = new.copy(), np.empty((2, whole.n_rows))
-        assert solver.positions(
-            Request(positions, x, wanted, None, later, TIME, flight=flight != 0), multipliers[0]
-        ).converged
+        outcome = solver.positions(Request(positions, x, wanted, None, later, TIME, flight=flight != 0), multipliers[0])
+        # Kernels know how coefficients change on the way: Newton's method, which rows of Python are not.
+        assert outcome.converged and (outcome.iterations <= 5 or solver is dense or fast._given.python)
         tangents = y.copy()
         assert solver.tangents(Request(tangents, x, whole.target(TIME), None, TIME), multipliers[1]).converged
         found.append((positions, tangents, multipliers[:, np.argsort(solver.rows)]))
@@ -98,64 +96,6 @@ def test_rows_of_velocities_agree_with_the_dense_solver(name, flight):
     slip = (whole.jacobian(middle, TIME + 0.5 * flight) @ way.ravel() - wanted)[~whole.holonomic]
     assert np.abs(slip).max() <= 1e-14 if flight else np.abs(slip).max() > 1e-3
     assert (np.abs(pushes[~whole.holonomic]) > 0).all() == (flight != 0)
-
-
-@pytest.mark.parametrize("name", VELOCITIES)
-def test_gradients_of_rows_of_velocities(name):
-    """What a family gives for a flight is the derivative of a((x0 + x1)/2) . (x1 - x0) by x1, but for Python's."""
-    item = CASES[name]()
-    x, rng = scattered(3), np.random.default_rng(4)
-    fast, _, _ = both([item], x)
-    width, given = 3 * item.width, fast._given
-    count = item.n_rows
-    for k, start in zip(range(count), given.starts, strict=True):
-        place, way = x[item.atoms[fast.rows[k]]].ravel(), rng.normal(size=width)
-        address = int(given.numbers.view(np.int64)[start])
-        row = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, ctypes.c_double, ctypes.c_void_p)(address)
-        room = given.numbers.ctypes.data + 8 * ROOM
-
-        def called(middle, way, row=row, start=start, room=room):
-            given.numbers[ROOM : ROOM + 2 * width] = [*middle, *way]
-            row(room, given.numbers.ctypes.data + 8 * (int(start) + 2), TIME, room + 16 * width)
-            return given.numbers[ROOM + 2 * width : ROOM + 3 * width + 1].copy()
-
-        coefficients = item.gradient(x[item.atoms], TIME)[fast.rows[k]].ravel()
-        np.testing.assert_allclose(called(place, 0 * way), [0.0, *coefficients], rtol=1e-14, atol=1e-15)
-        found = called(place, way)
-        assert found[0] == pytest.approx(coefficients @ way, rel=1e-13)
-        step = 1e-5 * np.eye(width)
-        slope = [(called(place + 0.5 * s, way + s)[0] - called(place - 0.5 * s, way - s)[0]) / 2e-5 for s in step]
-        if given.python:
-            slope = coefficients
-        np.testing.assert_allclose(found[1:], slope, rtol=1e-8, atol=1e-8)
-
-
-@numba.njit
-def leaning(r):
-    return np.array([[-r[0, 1], r[0, 0] + r[1, 2], 0.3], [0.0, r[0, 1] * r[1, 0], 1.0]])
-
-
-@numba.njit
-def leaning_with_time(r, t):
-    return np.cos(t) * np.array([[-r[0, 1], r[0, 0] + r[1, 2], 0.3], [0.0, r[0, 1] * r[1, 0], 1.0]])
-
-
-@pytest.mark.parametrize("function", [leaning, leaning_with_time], ids=["at rest", "moving"])
-def test_coefficients_of_numba_are_called_without_python(function):
-    x, timed = scattered(4), function is leaning_with_time
-    fast, _, _ = both([CustomVelocity([[0, 1], [5, 2]], function, time_dependent=timed)], x)
-    slow, _, _ = both([CustomVelocity([[0, 1], [5, 2]], function.py_func, time_dependent=timed)], x)
-    assert not fast._given.python and len(slow._given.python) == 1
-    ends, iterations = [], []
-    for solver in (fast, slow):
-        y = x + 0.1 * np.random.default_rng(1).normal(size=x.shape)
-        found = solver.positions(Request(y, x, np.zeros(2), None, TIME + 0.1, TIME, flight=True))
-        assert found.converged
-        ends.append(y)
-        iterations.append(found.iterations)
-    np.testing.assert_allclose(*ends, rtol=0, atol=1e-14)
-    # The kernel knows how the coefficients change on the way: Newton's method, which Python's rows are not.
-    assert iterations[0] <= 4 < iterations[1]
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["gradient", "differences"])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from kcons.constraints import Custom, Cylinder, Ellipsoid, Formula, Plane, Spher
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse import row_functions
-from kcons.solvers.sparse.row_functions import BLOCK, FEWEST, GivenRows, row_function, rows_at_once
+from kcons.solvers.sparse.row_functions import BLOCK, FEWEST, GivenRows
 
 AXIS, OFF = np.array([0.0, 0.6, 0.8]), np.array([0.1, 0.0, 0.0])
 #: More than one block, of which the last one is not full.
@@ -38,29 +36,6 @@ ITEMS = {
 
 def owned(own: bool, n: int) -> np.ndarray:
     return 0.01 * np.random.default_rng(3).normal(size=(n, 3)) if own else np.zeros(3)
-
-
-@pytest.mark.parametrize("own", [False, True], ids=["shared", "own"])
-@pytest.mark.parametrize("name", ITEMS)
-def test_values_and_gradients_are_those_of_one_row(name, own):
-    n, time = len(MANY[:BLOCK]), 0.3
-    item, x = ITEMS[name](MANY[:BLOCK], owned(own, n)), scattered(n)
-    table = np.ascontiguousarray(item.parameters().reshape(n, -1))
-    assert own == (not np.all(table == table[0]))
-    size, together, alone = table.shape[1], np.zeros((n, 4)), np.zeros((n, 4))
-    numbers, integer = ctypes.c_void_p, ctypes.c_int64
-    rows = ctypes.CFUNCTYPE(None, integer, numbers, numbers, integer, ctypes.c_double, numbers)
-    row = ctypes.CFUNCTYPE(None, numbers, numbers, ctypes.c_double, numbers)
-    columns = np.ascontiguousarray(x.T)
-    function = rows(rows_at_once(item.row).address)
-    function(n, columns.ctypes.data, table.ctypes.data, size if own else 0, time, together.ctypes.data)
-    function = row(row_function(item, np.zeros(1)).address)
-    for k in range(n):
-        place = x[k].copy()
-        function(place.ctypes.data, table[k].ctypes.data, time, alone[k].ctypes.data)
-    np.testing.assert_allclose(together, alone, rtol=1e-14, atol=1e-15)
-    np.testing.assert_allclose(together[:, 0], item.measure(x[:, None], time), rtol=1e-14, atol=1e-15)
-    np.testing.assert_allclose(together[:, 1:], item.gradient(x[:, None], time)[:, 0], rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.parametrize("own", [False, True], ids=["shared", "own"])

@@ -12,8 +12,16 @@ from thermostat_systems import dumbbells
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, Suzuki4, run
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, mean, thermal_velocities
-from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCarloBarostat
+from kcons.thermostats import (
+    CellRescaling,
+    ConstantPressure,
+    Isokinetic,
+    Langevin,
+    MonteCarloBarostat,
+    NoseHooverChain,
+    mean,
+    thermal_velocities,
+)
 
 N, SIDE = 40, 12.0
 PRESSURE = (N + 1) / SIDE**3

@@ -1,17 +1,79 @@
-"""What moves as one."""
+"""Systems whose cell can change, and what moves as one."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from pressure_systems import METHANE, gas, placed
+from pressure_systems import METHANE, gas, no_force, placed
 
 from kcons.constraints import CenterOfMass, Distance, DistanceDifference, FixedAtoms, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
-from kcons.thermostats.pressure import CellSystem
-from kcons.thermostats.pressure.pieces import find_pieces, lattice_of, require_periodic
+from kcons.thermostats import CellSystem
+from kcons.thermostats.cells import find_pieces, require_periodic
+
+
+def test_functions_see_the_present_cell():
+    system, x = gas(n=3, force=lambda x, t, h: x * h[0, 0], potential=lambda x, t, h: h[2, 2], stress=lambda x, t, h: h)
+    assert system.forces(x, x, 0.0, 0) == pytest.approx(12 * x)
+    cell = np.diag([11.0, 12, 13])
+    cell[1, 0] = 2.0
+    system.set_cell(cell, x)
+    assert np.array_equal(system.motion.lattice[0], cell)
+    assert np.array_equal(system.cell, cell)
+    assert system.forces(x, x, 0.0, 0) == pytest.approx(11 * x)
+    assert system.energy(x, 0.0, 0) == 13
+    assert system.stress(x, 0.0)[0, 1] == system.stress(x, 0.0)[1, 0] == 1.0
+
+
+def test_a_pressure_is_an_energy_over_an_area_in_a_slab():
+    """Whatever length the vector has that is not periodic."""
+    x = np.array([[0.0, 0, 0], [1, 0, 0]])
+    held = ConstraintSet(Distance([[0, 1]]), x, [1.0, 1.0], cell=[10.0, 10, 30], pbc=[True, True, False])
+    system = CellSystem(Motion(held, x))
+    state = system.initial_state(x)
+    assert system.volume == pytest.approx(100)
+    system.set_cell(np.diag([11.0, 10, 30]), x)
+    assert system.volume == pytest.approx(110)
+    system.enter(state)
+    assert system.volume == pytest.approx(100)
+
+
+def test_an_energy_that_is_none():
+    for energy, error in ((None, InputError), ("-1", InputError), ([1.0], InputError), (1j, InputError)):
+        system, x = gas(n=2, force=no_force, potential=lambda x, t, h, energy=energy: energy)
+        with pytest.raises(error, match="potential"):
+            system.energy(x, 0.0, 3)
+    system, x = gas(n=2, force=no_force, potential=lambda x, t, h: -np.inf)  # every trial there was accepted
+    with pytest.raises(NonFiniteError, match="-inf at step 3"):
+        system.energy(x, 0.0, 3)
+
+
+def test_a_cell_that_is_refused_changes_nothing():
+    system, x = gas(n=3)
+    with pytest.raises(InputError, match="half the box"):
+        system.set_cell(np.eye(3) * 1.5, x)
+    assert np.array_equal(system.cell, 12 * np.eye(3))
+    assert np.array_equal(system.motion.lattice[0], 12 * np.eye(3))
+
+
+def test_what_is_refused():
+    x = np.array([[0.0, 0, 0], [1, 0, 0]])
+    with pytest.raises(InputError, match="no cell"):
+        CellSystem(Motion(ConstraintSet(Distance([[0, 1]]), x, [1.0, 1.0]), x))
+    with pytest.raises(InputError, match="force and potential"):
+        gas(n=2, force=no_force)
+    system, x = gas(n=2, force=no_force, potential=lambda x, t, h: np.nan)
+    with pytest.raises(UnsupportedError, match="MonteCarloBarostat"):
+        system.stress(x, 0.0)
+    with pytest.raises(NonFiniteError, match="step 7") as found:
+        system.energy(x, 0.0, 7)
+    assert found.value.step == 7
+    system, x = gas(n=2, force=no_force, potential=lambda x, t, h: 0.0, stress=lambda x, t, h: h * np.nan)
+    with pytest.raises(NonFiniteError, match="stress"):
+        system.stress(x, 0.0)
+
 
 ALL = np.ones(3, bool)
 
@@ -28,12 +90,12 @@ def test_pieces_move_by_their_centers_and_keep_their_shape():
     assert pieces.label.tolist() == np.repeat(np.arange(8), 5).tolist()
     assert pieces.moving.tolist() == [8, 8, 8]
     change = 0.1 * np.random.default_rng(1).standard_normal((3, 3))
-    lattice = lattice_of(system)
+    lattice = system.lattice
     y = x + pieces.moved(x, change, lattice)
     system.set_cell(lattice[0] @ (np.eye(3) + change), y)
     assert system.motion.constraint_set.value(y, 0.0) == pytest.approx(np.zeros(80), abs=1e-13)
     # Differences of centers scale, up to cell vectors.
-    before, after = pieces.whole(x, lattice), pieces.whole(y, lattice_of(system))
+    before, after = pieces.whole(x, lattice), pieces.whole(y, system.lattice)
     d = pieces.centers(after) - pieces.centers(before) @ (np.eye(3) + change)
     assert d == pytest.approx(np.zeros((8, 3)), abs=1e-13)
     m = system.masses.reshape(8, 5, 1)
@@ -47,7 +109,7 @@ def test_images_shift_with_the_cell():
     far = x + np.array([3, -2, 0]) * 12.0 * (np.arange(8) % 3 == 0)[:, None]
     pieces = find_pieces(system, x, ALL)
     change = np.diag([0.05, -0.02, 0.01])
-    lattice = lattice_of(system)
+    lattice = system.lattice
     moved = far + pieces.moved(far, change, lattice) - x - pieces.moved(x, change, lattice)
     cells = moved @ np.linalg.inv(lattice[0] @ (np.eye(3) + change))
     assert cells == pytest.approx(np.round(cells), abs=1e-12)
@@ -60,8 +122,8 @@ def test_what_stays_is_not_stored_across_a_face_that_moves():
     x[1] += [0.0, 12.0, 0.0]
     pieces = find_pieces(system, x, ALL, held="stay")
     with pytest.raises(UnsupportedError, match="atom 1 is held in its place across a face of the cell"):
-        pieces.moved(x, 0.1 * np.eye(3), lattice_of(system))
-    assert not pieces.moved(x, np.diag([0.1, 0.0, 0.1]), lattice_of(system))[:2].any()
+        pieces.moved(x, 0.1 * np.eye(3), system.lattice)
+    assert not pieces.moved(x, np.diag([0.1, 0.0, 0.1]), system.lattice)[:2].any()
 
 
 def test_bonds_tie_what_constraints_do_not():
@@ -109,7 +171,7 @@ def test_what_is_held_in_space_is_refused_or_stays(row):
     pieces = find_pieces(system, x, ALL, held="stay")
     left = 7 if isinstance(row, CenterOfMass) else 8
     assert pieces.moving.tolist() == [left] * 3
-    d = pieces.moved(x, 0.1 * np.eye(3), lattice_of(system))
+    d = pieces.moved(x, 0.1 * np.eye(3), system.lattice)
     assert not d[0].any()
     assert d[5].any()
 

@@ -41,10 +41,8 @@ public:
     }
     vector<double> read(const string& name) override {
         ContextSelector selector(cc);
-        auto it = arrays.find(name);
-        if (it == arrays.end()) throw OpenMMException("kcons: no array is called '"+name+"'");
-        if (it->second.getElementSize() == sizeof(double)) return downloaded<double>(it->second);
-        return declared(name, it->second.getSize()).whole ? downloaded<int>(it->second) : downloaded<float>(it->second);
+        if (declared(name).whole) return downloaded<int>(name);
+        return wide ? downloaded<double>(name) : downloaded<float>(name);
     }
     void write(const string& name, const vector<double>& values) override {
         ContextSelector selector(cc);
@@ -70,16 +68,17 @@ private:
     private:
         CommonStep& step;
     };
-    template <class T> static vector<double> downloaded(ComputeArray& array) {
+    template <class T> vector<double> downloaded(const string& name) {
         vector<T> values;
-        array.download(values);
+        arrays.at(name).download(values);
         return vector<double>(values.begin(), values.end());
     }
     void follow() {
         const vector<int>& index = cc.getAtomIndex();
-        vector<int> place(index.size()), now(plan.order.size());
+        vector<int> place(index.size()), now;
         for (int k = 0; k < cc.getNumAtoms(); k++) place[index[k]] = k;
-        for (size_t k = 0; k < now.size(); k++) now[k] = plan.order[k] < 0 ? -1-place[-1-plan.order[k]] : place[plan.order[k]];
+        // Of particles that rest -1-k, as at first.
+        for (int k : declared("atoms").values) now.push_back(k < 0 ? -1-place[-1-k] : place[k]);
         arrays.at("atoms").upload(now);
         if (arrays.count("cells") == 0) return;
         vector<int> cells;

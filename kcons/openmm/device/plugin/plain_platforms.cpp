@@ -12,7 +12,7 @@ using namespace std;
 namespace kcons {
 
 // Where kernels find pointers, see `kernels.py`.
-typedef void (*PlainKernel)(void** pointers, const double* reals, const int* integers, int group, int groups);
+typedef void (*PlainKernel)(void** pointers, const void* numbers, int group, int groups);
 
 class PlainStep : public StepKernel {
 public:
@@ -30,19 +30,14 @@ public:
         return sum/2;
     }
     vector<double> read(const string& name) override {
-        if (const vector<int>* found = find(integers, name)) return vector<double>(found->begin(), found->end());
-        if (const vector<double>* found = find(reals, name)) return *found;
-        throw OpenMMException("kcons: no array is called '"+name+"'");
+        if (!declared(name).whole) return reals[name];
+        return vector<double>(integers[name].begin(), integers[name].end());
     }
     void write(const string& name, const vector<double>& values) override {
         if (declared(name, values.size()).whole) copy(values.begin(), values.end(), integers[name].begin());
         else copy(values.begin(), values.end(), reals[name].begin());
     }
 protected:
-    template <class T> static const vector<T>* find(const map<string, vector<T>>& arrays, const string& name) {
-        auto it = arrays.find(name);
-        return it == arrays.end() ? nullptr : &it->second;
-    }
     void prepare(ContextImpl& c) override {
         forces.resize(plan.slots);
         for (auto& array : plan.arrays) {
@@ -61,13 +56,12 @@ protected:
             pointers.push_back(plan.slots == 1 ? data.forces->data() : forces[slot].data());
         for (auto& array : plan.arrays)
             pointers.push_back(array.whole ? (void*) integers[array.name].data() : (void*) reals[array.name].data());
-        double given[12] = {numbers.dt, numbers.time, numbers.tolerance};
-        for (int k = 0; k < 9; k++) given[3+k] = numbers.box[k/3][k%3];
-        int whole[] = {numbers.step, numbers.launch++};
+        const Numbers given = numbers;
+        numbers.launch++;
         // A sum of few shares does not depend on the number of threads more than one of many.
         int groups = parallel && kernel != "look" ? min(data.threads.getNumThreads(), 256) : 1;
-        if (groups == 1) { code(pointers.data(), given, whole, 0, 1); return; }
-        data.threads.execute([&](ThreadPool&, int thread) { if (thread < groups) code(pointers.data(), given, whole, thread, groups); });
+        if (groups == 1) { code(pointers.data(), &given, 0, 1); return; }
+        data.threads.execute([&](ThreadPool&, int thread) { if (thread < groups) code(pointers.data(), &given, thread, groups); });
         data.threads.waitForThreads();
     }
     void keepForces(int slot) override { forces[slot] = *data.forces; }

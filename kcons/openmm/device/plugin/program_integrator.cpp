@@ -25,14 +25,12 @@ void ProgramIntegrator::initialize(ContextImpl& c) {
     // The base class tells the Context when the integrator goes first.
     owner = &c.getOwner();
     context = &c;
-    Plan first = planned(false);
     handle = c.getPlatform().createKernel(StepKernel::Name(), c);
-    handle.getAs<StepKernel>().begin(c, first.clusters);
+    handle.getAs<StepKernel>().begin(c, clusters);
     middleKinetic = -1;
 }
-Plan ProgramIntegrator::planned(bool whole) const {
+Plan ProgramIntegrator::planned() const {
     const System& system = context->getSystem();
-    const Platform& platform = context->getPlatform();
     vector<double> masses, lengths;
     vector<int> pairs;
     for (int k = 0; k < system.getNumParticles(); k++) masses.push_back(system.getParticleMass(k));
@@ -43,15 +41,12 @@ Plan ProgramIntegrator::planned(bool whole) const {
         lengths.push_back(length);
     }
     vector<Vec3> positions, box(3);
-    if (whole) {
-        context->getPositions(positions);
-        context->getPeriodicBoxVectors(box[0], box[1], box[2]);
-        if (!system.usesPeriodicBoundaryConditions()) box.assign(3, Vec3());
-    }
+    context->getPositions(positions);
+    if (system.usesPeriodicBoundaryConditions()) context->getPeriodicBoxVectors(box[0], box[1], box[2]);
     Plan plan;
-    Given given = {static_cast<const Integrator*>(this), description.c_str(), platform.getName().c_str(), getIntegrationForceGroups(),
-                   (int) masses.size(), (int) lengths.size(), masses.data(), pairs.data(), lengths.data(),
-                   whole ? &positions[0][0] : nullptr, &box[0][0], whole ? context->getTime() : 0};
+    Given given = {static_cast<const Integrator*>(this), description.c_str(), context->getPlatform().getName().c_str(),
+                   getIntegrationForceGroups(), (int) masses.size(), (int) lengths.size(), masses.data(), pairs.data(),
+                   lengths.data(), &positions[0][0], &box[0][0], context->getTime()};
     if (!planner(&plan, &given)) throw OpenMMException(failure);
     return plan;
 }
@@ -60,12 +55,12 @@ vector<string> ProgramIntegrator::getKernelNames() { return {StepKernel::Name()}
 StepKernel& ProgramIntegrator::kernel() const {
     if (context == nullptr) throw OpenMMException("This Integrator is not bound to a context!");
     StepKernel& k = handle.getAs<StepKernel>();
-    if (!k.built) k.build(*context, planned(true));
+    if (!k.built) k.build(*context, planned());
     return k;
 }
 void ProgramIntegrator::step(int steps) {
     StepKernel& k = kernel();
-    told.assign(7, 0);
+    fill_n(shared.told, 7, 0);
     try {
         k.execute(*context, *this, steps);
     } catch (...) {
@@ -74,20 +69,21 @@ void ProgramIntegrator::step(int steps) {
         if (k.read("failure")[0] == 0) throw;
         k.lookBack();                              // it came of a failure, which is told
     }
-    moved = false;                             // by barostats, which keep to the constraints
-    told = k.read("looked");                   // the only wait of a call
+    shared.moved = 0;                          // by barostats, which keep to the constraints
+    vector<double> told = k.read("looked");    // the only wait of a call
+    copy(told.begin(), told.end(), shared.told);
     if (told[2] != 0) {
         k.write("failure", {0, 0, 0});
         k.valid = false;
         throw OpenMMException("kcons: row "+to_string((int) told[4])+" could not be solved at step "+to_string((int) told[3]));
     }
-    middleKinetic = noisy && steps > 0 ? told[1]/2 : -1;
+    middleKinetic = shared.noisy && steps > 0 ? told[1]/2 : -1;
     endKinetic = told[6]/2;
 }
 void ProgramIntegrator::stateChanged(State::DataType changed) {
     if (context == nullptr) return;
     if (changed != State::Velocities) handle.getAs<StepKernel>().valid = false;
-    moved = moved || changed == State::Positions || changed == State::Velocities;
+    if (changed == State::Positions || changed == State::Velocities) shared.moved = 1;
 }
 double ProgramIntegrator::computeKineticEnergy() {
     if (middleKinetic < 0) return handle.getAs<StepKernel>().kineticEnergy();
@@ -100,51 +96,45 @@ void ProgramIntegrator::write(const string& name, const vector<double>& values) 
 
 // -- what belongs to a state ------------------------------------------------------------------------------
 
-vector<string> ProgramIntegrator::savedNames() const {
-    vector<string> names;
-    for (auto& array : kernel().plan.arrays) if (array.saved) names.push_back(array.name);
-    return names;
+vector<double> ProgramIntegrator::saved() const {
+    vector<double> all = {middleKinetic, endKinetic};
+    for (auto& array : kernel().plan.arrays) if (array.saved) {
+        vector<double> values = read(array.name);
+        all.insert(all.end(), values.begin(), values.end());
+    }
+    return all;
+}
+void ProgramIntegrator::restore(const vector<double>& all) {
+    auto next = all.begin()+2;
+    for (auto& array : kernel().plan.arrays) if (array.saved) {
+        size_t size = array.values.size();
+        if (all.end()-next < (long) size) throw OpenMMException("kcons: this state belongs to other steps or rows");
+        write(array.name, vector<double>(next, next+size));
+        next += size;
+    }
+    middleKinetic = all[0]; endKinetic = all[1];
 }
 void ProgramIntegrator::createCheckpoint(ostream& out) const {
-    double kinetic[] = {middleKinetic, endKinetic};
-    out.write((const char*) kinetic, sizeof(kinetic));
-    for (auto& name : savedNames()) {
-        vector<double> values = read(name);
-        out.write((const char*) values.data(), values.size()*sizeof(double));
-    }
+    vector<double> all = saved();
+    out.write((const char*) all.data(), all.size()*sizeof(double));
 }
 void ProgramIntegrator::loadCheckpoint(istream& in) {
-    double kinetic[2];
-    in.read((char*) kinetic, sizeof(kinetic));
-    for (auto& name : savedNames()) {
-        vector<double> values = read(name);
-        in.read((char*) values.data(), values.size()*sizeof(double));
-        write(name, values);
-    }
-    middleKinetic = kinetic[0]; endKinetic = kinetic[1];
+    vector<double> all = saved();
+    in.read((char*) all.data(), all.size()*sizeof(double));
+    restore(all);
     kernel().valid = false;
 }
-static string text(const vector<double>& values) {
-    ostringstream out;
-    out.precision(17);
-    for (double v : values) out << v << ' ';
-    return out.str();
-}
-static vector<double> parsed(const string& text) {
-    istringstream in(text);
-    vector<double> values;
-    for (double v; in >> v;) values.push_back(v);
-    return values;
-}
 void ProgramIntegrator::serializeParameters(SerializationNode& node) const {
-    node.setIntProperty("version", 1).setDoubleProperty("middleKinetic", middleKinetic);
-    node.setDoubleProperty("endKinetic", endKinetic);
-    for (auto& name : savedNames()) node.setStringProperty(name, text(read(name)));
+    ostringstream text;
+    text.precision(17);
+    for (double value : saved()) text << value << ' ';
+    node.setIntProperty("version", 1).setStringProperty("state", text.str());
 }
 void ProgramIntegrator::deserializeParameters(const SerializationNode& node) {
-    for (auto& name : savedNames()) if (node.hasProperty(name)) write(name, parsed(node.getStringProperty(name)));
-    middleKinetic = node.getDoubleProperty("middleKinetic", -1);
-    endKinetic = node.getDoubleProperty("endKinetic", -1);
+    istringstream text(node.getStringProperty("state", ""));
+    vector<double> all;
+    for (double value; text >> value;) all.push_back(value);
+    if (!all.empty()) restore(all);            // else it is the state of another integrator
 }
 
 class Proxy : public SerializationProxy {
@@ -154,7 +144,7 @@ public:
         auto& i = *static_cast<const ProgramIntegrator*>(static_cast<const Integrator*>(object));
         node.setIntProperty("version", 1).setDoubleProperty("stepSize", i.getStepSize());
         node.setDoubleProperty("constraintTolerance", i.getConstraintTolerance());
-        node.setIntProperty("forceGroups", i.getIntegrationForceGroups()).setBoolProperty("noisy", i.noisy);
+        node.setIntProperty("forceGroups", i.getIntegrationForceGroups()).setBoolProperty("noisy", i.shared.noisy);
         node.setStringProperty("description", i.description);
     }
     void* deserialize(const SerializationNode& node) const override {
@@ -162,7 +152,7 @@ public:
         i->setStepSize(node.getDoubleProperty("stepSize"));
         i->setConstraintTolerance(node.getDoubleProperty("constraintTolerance"));
         i->setIntegrationForceGroups(node.getIntProperty("forceGroups", -1));
-        i->noisy = node.getBoolProperty("noisy", false);
+        i->shared.noisy = node.getBoolProperty("noisy", false);
         i->description = node.getStringProperty("description");
         return static_cast<Integrator*>(i);
     }
@@ -185,16 +175,15 @@ void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int step
         if (!valid || (plan.slots == 1 && c.getLastForceGroups() != plan.parts[0].back().groups)) {
             positionsMoved();
             vector<bool> known(plan.slots);
-            for (auto& action : plan.parts[0])
-                if (action.verb == Verb::Evaluate && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
-            for (auto& action : plan.parts[1])
-                if (action.verb == Verb::Evaluate && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
+            for (int part : {0, 1}) for (auto& action : plan.parts[part])
+                if (action.kernel.empty() && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
         }
         run(c, ended ? 0 : 1);
         c.setTime(numbers.time+numbers.dt);
         c.setStepCount(c.getStepCount()+1);
-        bool recorded = integrator.every > 0 && (c.getStepCount()-integrator.since) % integrator.every == 0;
-        ended = k == steps-1 || integrator.whole || recorded;
+        const Shared& shared = integrator.shared;
+        bool recorded = shared.every > 0 && (c.getStepCount()-shared.since) % shared.every == 0;
+        ended = k == steps-1 || shared.whole || recorded;
         if (ended) run(c, 2);
         if (recorded) launch("record");
     }
@@ -205,7 +194,7 @@ void StepKernel::run(ContextImpl& c, int part) {
     numbers.step = (int) c.getStepCount();
     bool moved = false;
     for (auto& action : plan.parts[part]) {
-        if (action.verb == Verb::Launch) { launch(action.kernel); moved = true; }
+        if (!action.kernel.empty()) { launch(action.kernel); moved = true; }
         else {
             // Atoms may take new places only where no forces are kept that are still needed.
             if (moved) { c.computeVirtualSites(); positionsMoved(); }
@@ -219,9 +208,9 @@ void StepKernel::evaluate(ContextImpl& c, const Action& action) {
     if (plan.slots > 1) keepForces(action.slot);
     valid = true;
 }
-const Array& StepKernel::declared(const string& name, size_t size) const {
+const Array& StepKernel::declared(const string& name, long size) const {
     for (auto& array : plan.arrays) if (array.name == name) {
-        if (size != array.values.size())
+        if (size >= 0 && size != (long) array.values.size())
             throw OpenMMException("kcons: '"+name+"' has "+to_string(array.values.size())+" values, not "+to_string(size));
         return array;
     }
@@ -245,27 +234,26 @@ extern "C" {
 const char* kcons_error() { return failure.c_str(); }
 void kcons_set_error(const char* text) { failure = text; }
 void kcons_set_planner(Planner p) { planner = p; }
-void kcons_describe(void* integrator, const char* description, int noisy) {
+// `clusters`: of each its number of atoms, and these.
+void kcons_describe(void* integrator, const char* description, const int* clusters, int n) {
     own(integrator).description = description;
-    own(integrator).noisy = noisy;
+    own(integrator).clusters.clear();
+    for (const int* each = clusters; each < clusters+n; each += 1+*each)
+        own(integrator).clusters.emplace_back(each+1, each+1+*each);
 }
-void kcons_set_whole(void* integrator, int whole) { own(integrator).whole = whole; }
-void kcons_record_every(void* integrator, int steps, int since) {
-    own(integrator).every = steps;
-    own(integrator).since = since;
-}
-int kcons_was_moved(void* integrator) { return own(integrator).moved; }
+Shared* kcons_shared(void* integrator) { return &own(integrator).shared; }
 int kcons_is_bound(void* integrator) { return own(integrator).bound(); }
-int kcons_read(void* integrator, const char* name, double* out, int room) try {
-    auto values = own(integrator).read(name);
-    memcpy(out, values.data(), min<size_t>(room, values.size())*sizeof(double));
-    return values.size();
-} catch (exception& e) { failure = e.what(); return -1; }
+// The values of an array, until the next is read; null where that fails.
+const double* kcons_read(void* integrator, const char* name, int* n) try {
+    static thread_local vector<double> values;
+    values = own(integrator).read(name);
+    *n = values.size();
+    return values.data();
+} catch (exception& e) { failure = e.what(); return nullptr; }
 int kcons_write(void* integrator, const char* name, const double* values, int n) try {
     own(integrator).write(name, vector<double>(values, values+n));
     return n;
 } catch (exception& e) { failure = e.what(); return -1; }
-void kcons_told(void* integrator, double* out) { memcpy(out, own(integrator).told.data(), 7*sizeof(double)); }
 void kcons_plan_source(Plan* plan, const char* source, const char* library, int items, int workGroup, int slots) {
     plan->source = source; plan->library = library;
     plan->items = items; plan->workGroup = workGroup; plan->slots = slots;
@@ -273,9 +261,7 @@ void kcons_plan_source(Plan* plan, const char* source, const char* library, int 
 void kcons_plan_array(Plan* plan, const char* name, int whole, int saved, const double* values, int n) {
     plan->arrays.push_back({name, whole != 0, saved != 0, vector<double>(values, values+n)});
 }
-void kcons_plan_action(Plan* plan, int part, int verb, const char* kernel, int groups, int slot) {
-    plan->parts[part].push_back({(Verb) verb, kernel, groups, slot});
+void kcons_plan_action(Plan* plan, int part, const char* kernel, int groups, int slot) {
+    plan->parts[part].push_back({kernel, groups, slot});
 }
-void kcons_plan_cluster(Plan* plan, const int* atoms, int n) { plan->clusters.emplace_back(atoms, atoms+n); }
-void kcons_plan_order(Plan* plan, const int* atoms, int n) { plan->order.assign(atoms, atoms+n); }
 }

@@ -18,10 +18,8 @@ struct Array {
     std::vector<double> values;    // that it begins with
 };
 
-enum class Verb { Launch, Evaluate };
-
+// Launches a kernel, or, where it has no name, evaluates forces.
 struct Action {
-    Verb verb;
     std::string kernel;
     int groups;                    // of forces, a bit mask
     int slot;                      // where these forces are, among those of all groups
@@ -33,13 +31,10 @@ struct Plan {
     std::string source, library;   // of the kernels; for plain C++ the file that they were compiled to
     std::vector<Array> arrays;
     std::vector<Action> parts[3];
-    std::vector<std::vector<int>> clusters;   // atoms that stay together
-    std::vector<int> order;        // of atoms in the array `atoms`, which follows them where OpenMM moves them; -1-k
-                                   // for those that rest
     int items = 0, workGroup = 64, slots = 1;
 };
 
-// Python's part in the making: fills the plan, or returns 0. Without positions only the clusters are asked for.
+// Python's part in the making: fills the plan, or returns 0.
 struct Given {
     const void* integrator;        // an OpenMM::Integrator*, as Python has it
     const char *description, *platform;
@@ -51,20 +46,26 @@ struct Given {
 };
 typedef int (*Planner)(Plan* plan, const Given* given);
 
+// What Python reads and writes directly.
+struct Shared {
+    int whole = 1;                 // whether others look at velocities between steps, which must then end
+    int noisy = 0;                 // whether the kinetic energy is that of the middle of the last step
+    int every = 0, since = 0;      // steps from one record to the next, 0 for none, and the step that they count from
+    int moved = 0;                 // whether others have set positions or velocities since the last step
+    double told[7] = {};           // by the kernel `look`, at the end of the last call
+};
+
 class StepKernel;
 
 class ProgramIntegrator : public OpenMM::Integrator {
 public:
     std::string description;       // what Python makes the plan of
-    bool whole = true;             // whether others look at velocities between steps, which must then end
-    bool noisy = false;            // whether the kinetic energy is that of the middle of the last step
-    int every = 0, since = 0;      // steps from one record to the next, 0 for none, and the step that they count from
-    bool moved = false;            // whether others have set positions or velocities since the last step
+    std::vector<std::vector<int>> clusters;   // atoms that stay together, beside those of constraints of the System
+    Shared shared;
     void step(int steps) override;
     std::vector<double> read(const std::string& name) const;
     void write(const std::string& name, const std::vector<double>& values);
     bool bound() const { return context != nullptr; }
-    std::vector<double> told;      // by the kernel `look`, at the end of the last call
 protected:
     void initialize(OpenMM::ContextImpl& c) override;
     void cleanup() override;
@@ -78,8 +79,9 @@ protected:
     void deserializeParameters(const OpenMM::SerializationNode& node) override;
 private:
     StepKernel& kernel() const;    // with all that it needs, which is made when it is used first
-    Plan planned(bool whole) const;
-    std::vector<std::string> savedNames() const;
+    Plan planned() const;
+    std::vector<double> saved() const;         // all that belongs to a state beside x and v
+    void restore(const std::vector<double>& all);
     mutable OpenMM::Kernel handle;
     // Of the middle of the last step, and of the velocities that it ended with: those of others have another. -1: none.
     double middleKinetic = -1, endKinetic = -1;
@@ -90,7 +92,7 @@ class StepKernel : public OpenMM::KernelImpl {
 public:
     static std::string Name() { return "KconsStep"; }
     StepKernel(const std::string& name, const OpenMM::Platform& platform) : KernelImpl(name, platform) {}
-    virtual void begin(OpenMM::ContextImpl& c, const std::vector<std::vector<int>>& clusters) {}
+    virtual void begin(OpenMM::ContextImpl& c, const std::vector<std::vector<int>>& clusters) = 0;
     void build(OpenMM::ContextImpl& c, const Plan& made) { plan = made; prepare(c); built = true; }
     virtual void execute(OpenMM::ContextImpl& c, ProgramIntegrator& integrator, int steps);
     virtual double kineticEnergy() = 0;
@@ -102,7 +104,7 @@ public:
 protected:
     struct Numbers { int step, launch; double dt, time, tolerance; OpenMM::Vec3 box[3]; };
     Numbers numbers = {};
-    const Array& declared(const std::string& name, size_t size) const;
+    const Array& declared(const std::string& name, long size = -1) const;   // refuses values of another number
     virtual void prepare(OpenMM::ContextImpl& c) = 0;
     virtual void launch(const std::string& kernel) = 0;
     virtual void positionsMoved() {}           // before the first evaluation at new positions

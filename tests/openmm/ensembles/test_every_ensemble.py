@@ -1,0 +1,149 @@
+"""Every ensemble has its temperature, also beside rows that parts hold, and a barostat of another is told of."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import warnings
+
+import numpy as np
+import openmm
+import pytest
+from ensemble_runs import on_their_rows, run, twice_kinetic, two_parts, warm
+from openmm_ensembles import ENSEMBLES
+from openmm_systems import context_of, loose_alanine, started, state_of, water_box
+
+from kcons.errors import InputError
+from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, hold
+from kcons.openmm.quantities import GAS_CONSTANT
+
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
+#: Noise differs between programs.
+WITHOUT_NOISE = [name for name, make in ENSEMBLES.items() if not make(300).noisy]
+
+
+@pytest.mark.parametrize("bath", ENSEMBLES)
+def test_a_run_has_the_temperature(bath):
+    """From 200 K to 300 K, within three standard errors: rigid waters in a weak well, none of whose momenta last."""
+    system, x = water_box(8)
+    well = openmm.CustomExternalForce("20*(x^2+y^2+1.5*z^2)")
+    for k in range(0, 24, 3):
+        well.addParticle(k)
+    system.addForce(well)
+    integrator = ProjectedIntegrator(2e-3, ensemble=ENSEMBLES[bath](300.0, 50.0))
+    integrator.setRandomNumberSeed(3)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, 200, 1)
+    integrator.step(1000)
+    values = []
+    for _ in range(400):
+        integrator.step(10)
+        values.append(integrator.computeSystemTemperature()._value)
+    blocks = np.reshape(values, (20, -1)).mean(axis=1)
+    error = blocks.std(ddof=1) / np.sqrt(20)
+    assert error < 6
+    assert abs(blocks.mean() - 300) <= max(3 * error, 1e-6)
+
+
+@pytest.mark.parametrize("bath", WITHOUT_NOISE)
+@pytest.mark.usefixtures("without_device")
+def test_rows_that_are_carried_move_as_those_of_the_system(bath):
+    """The same bonds held by OpenMM and by kcons: one trajectory of atoms and bath, although others move x."""
+    system, x, v = loose_alanine()
+    other = copy.deepcopy(system)
+    carried = hold(other, [], positions=x, take="all")
+    ends = []
+    for this, parts in ((system, ()), (other, (carried,))):
+        integrator = ProjectedIntegrator(
+            1e-3, parts=parts, tolerance=1e-13, ensemble=ENSEMBLES[bath](300.0, 20.0, momentum="free")
+        )
+        context = run(this, integrator, x, v, 10)
+        r, u = state_of(context)
+        context.setPositions(r + 0.7)
+        context.setVelocities(u)
+        integrator.step(10)
+        ends.append((*state_of(context), integrator.program.remembered()))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=3e-12)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=3e-9)
+    assert ends[0][2] == pytest.approx(ends[1][2], rel=1e-7)
+
+
+@pytest.mark.parametrize("bath", ["Isokinetic", "NoseHoover"])
+def test_parts_keep_their_rows(bath):
+    system, x, parts = two_parts()
+    ensemble = ENSEMBLES[bath](300.0)
+    integrator = ProjectedIntegrator(1e-3, parts=parts, ensemble=ensemble)
+    context = warm(system, integrator, x, 4)
+    values = []
+    for block in range(20):
+        integrator.step(10)
+        integrator.check()
+        values.append(ensemble.conserved_energy(integrator))
+        r, u = on_their_rows(*state_of(context))
+        # 18 coordinates, three rows; the sphere stands in space, so that momentum is not conserved.
+        if bath == "Isokinetic":
+            assert abs(twice_kinetic(system, u) / ((18 - 3 - 1) * GAS_CONSTANT * 300) - 1) <= 1e-13
+        if block == 1:  # somebody moves x between steps
+            context.setPositions(r + 0.0)
+            integrator.applyConstraints(context)
+    assert ensemble.count(integrator) == 15
+    if bath == "NoseHoover":
+        assert np.ptp(values) < 0.05 < abs(integrator.getGlobalVariableByName("chain_place"))
+
+
+# -- barostats ------------------------------------------------------------------------------------
+
+
+BAROSTATS = [
+    lambda t: openmm.MonteCarloBarostat(1.0, t, 5),
+    lambda t: openmm.MonteCarloAnisotropicBarostat(openmm.Vec3(1, 1, 1), t),
+    lambda t: openmm.MonteCarloMembraneBarostat(1.0, 0.0, t, 0, 0),
+    lambda t: openmm.MonteCarloFlexibleBarostat(1.0, t),
+]
+
+
+def pressed(barostat, ensemble):
+    system, x = water_box(27)
+    system.addForce(barostat)
+    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+    context = started(system, integrator, x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    return integrator, context
+
+
+@pytest.mark.parametrize(
+    ("ensemble", "barostat"), list(zip(ENSEMBLES.values(), itertools.cycle(BAROSTATS), strict=False))
+)
+def test_a_barostat_of_another_temperature(ensemble, barostat):
+    integrator, context = pressed(barostat(310), ensemble(300, momentum="free"))
+    with pytest.warns(UserWarning, match=r"temperature of 310 K, and the integrator one of 300 K") as told:
+        integrator.step(1)
+    assert told[0].filename == __file__
+    name = str(told[0].message).split("'")[1]
+    context.setParameter(name, 300)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        integrator.step(1)
+        integrator.setTemperature(300)
+    with pytest.warns(UserWarning, match=r"temperature of 300 K, and the integrator one of 350 K") as told:
+        integrator.setTemperature(350)
+    assert told[0].filename == __file__
+
+
+def test_without_a_temperature_there_is_nothing_to_compare():
+    integrator, _ = pressed(openmm.MonteCarloBarostat(1.0, 310), Isokinetic(momentum="free"))
+    integrator.step(1)
+
+
+@pytest.mark.parametrize(
+    "barostat",
+    [
+        openmm.MonteCarloBarostat(float("nan"), 300),
+        openmm.MonteCarloAnisotropicBarostat(openmm.Vec3(1, float("inf"), 1), 300),
+    ],
+)
+def test_a_pressure_that_is_none(barostat):
+    """OpenMM accepts every trial then, and the box wanders."""
+    with pytest.raises(InputError, match=r"Barostat has a pressure of .*; give a finite one"):
+        pressed(barostat, Langevin(300, 1))

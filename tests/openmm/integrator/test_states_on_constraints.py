@@ -1,0 +1,200 @@
+"""States brought onto constraints outside of steps, temperatures of what is left free, minima."""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+import pytest
+from collective_cases import CHAIN, angle, bond, chain_system, held_chain
+from openmm import app, unit
+from openmm_systems import (
+    DATA,
+    PLATFORMS,
+    alanine,
+    context_of,
+    dumbbell,
+    forces_at,
+    holding,
+    loose_alanine,
+    masses_of,
+    on_gpus,
+    potential_energy,
+    residuals,
+    started,
+    state_of,
+    water_box,
+)
+
+from kcons.errors import InputError, KconsError
+from kcons.openmm import CollectiveRows, ProjectedIntegrator
+
+
+def test_constraints_applied_by_the_integrator():
+    context, integrator, part = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=True)
+    rng = np.random.default_rng(4)
+    context.setPositions(state_of(context)[0] + 0.002 * rng.normal(size=CHAIN.shape))
+    context.setVelocities(rng.normal(size=CHAIN.shape))
+    integrator.applyConstraints(context)
+    integrator.applyVelocityConstraints(context)
+    assert np.abs(part.residuals(context)).max() <= 1e-12
+    assert np.abs(part.rates(context)).max() <= 1e-12
+    part.check(context)
+
+
+def test_what_cannot_be_applied_changes_nothing():
+    context, integrator, _ = held_chain([bond(0, 3)])
+    integrator.step(1)
+    x, v = state_of(context)
+    broken = x.copy()
+    broken[2, 1] = np.nan
+    context.setPositions(broken)
+    with pytest.raises(KconsError):
+        integrator.applyConstraints(context)
+    after, w = state_of(context)
+    assert np.array_equal(after, broken, equal_nan=True) and np.array_equal(w, v)
+
+
+def test_temperature_is_that_of_the_degrees_of_freedom():
+    context, integrator, _ = held_chain([bond(0, 3)], constrained=True)
+    v = state_of(context)[1]
+    kinetic = 0.5 * masses_of(context.getSystem()) @ np.sum(v * v, axis=1)
+    assert integrator.kinetic_energy()._value == pytest.approx(kinetic, rel=1e-12)
+    warmth = 2 * kinetic / (8.31446261815324e-3 * integrator.degrees_of_freedom())
+    assert integrator.computeSystemTemperature()._value == pytest.approx(warmth, rel=1e-9)
+
+
+def test_no_degree_of_freedom_no_temperature():
+    system = openmm.System()
+    system.addParticle(0.0)
+    integrator = ProjectedIntegrator(1e-3)
+    context = context_of(system, integrator)
+    context.setPositions([[0, 0, 0]])
+    assert integrator.degrees_of_freedom(context) == 0
+    with pytest.raises(InputError, match="no degree of freedom"):
+        integrator.computeSystemTemperature()
+
+
+@pytest.mark.parametrize("platform", on_gpus("mixed"))
+def test_before_the_first_step_forces_tell_what_they_tell(platform):
+    """Where Forces have single numbers, an open tolerance is known before anything is brought onto rows."""
+    system = chain_system()
+    part = CollectiveRows(system, [bond(0, 3), angle(2, 3, 4)], positions=CHAIN)
+    integrator = ProjectedIntegrator(0.002, parts=[part])
+    context = context_of(system, integrator, platform)
+    context.setPositions(CHAIN + 0.002 * np.random.default_rng(4).normal(size=CHAIN.shape))
+    integrator.applyConstraints(context)
+    assert np.abs(part.residuals(context)).max() < 5e-6
+
+
+# -- temperatures ---------------------------------------------------------------------------------
+
+
+def test_velocities_of_a_temperature_are_tangent():
+    system, x = water_box()[:2]
+    integrator = ProjectedIntegrator(0.001)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.applyConstraints(context)
+    integrator.setVelocitiesToTemperature(context, 300 * openmm.unit.kelvin, 5)
+    positions, v = state_of(context)
+    pairs = np.array([system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())])
+    d = positions[pairs[:, 0]] - positions[pairs[:, 1]]
+    along = np.einsum("ij,ij->i", d, v[pairs[:, 0]] - v[pairs[:, 1]])
+    assert np.abs(along).max() < 1e-12
+    # 27 molecules of six degrees of freedom: 20 % are three standard deviations.
+    warmth = masses_of(system) @ np.sum(v * v, axis=1) / (8.314462618e-3 * integrator.degrees_of_freedom(context))
+    assert warmth == pytest.approx(300.0, rel=0.35)
+    integrator.setVelocitiesToTemperature(context, 300, 5)
+    assert np.array_equal(state_of(context)[1], v)  # the same seed, and kelvins without a unit
+    with pytest.raises(InputError, match="temperature"):
+        integrator.setVelocitiesToTemperature(context, 300 * openmm.unit.nanometer)
+    assert np.array_equal(state_of(context)[1], v)
+
+
+def test_degrees_of_freedom_are_counted_by_rank():
+    """Five particles by all ten distances, nine of them independent: six, and three less with a motion remover."""
+    system, x = openmm.System(), 0.1 * np.random.default_rng(1).normal(size=(5, 3))
+    for i in range(5):
+        system.addParticle(12.0)
+        for j in range(i):
+            system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
+    integrator = ProjectedIntegrator(0.001)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    assert integrator.degrees_of_freedom(context) == integrator.independent_momenta(context) == 6
+    other = openmm.XmlSerializer.clone(system)
+    other.addForce(openmm.CMMotionRemover())
+    integrator = ProjectedIntegrator(0.001)
+    context = context_of(other, integrator)
+    context.setPositions(x)
+    assert integrator.degrees_of_freedom(context) == 3 and integrator.independent_momenta(context) == 6
+
+
+@pytest.mark.parametrize(
+    ("call", "given"),
+    [
+        ("setVelocitiesToTemperature", {"temperature": -5}),
+        ("setVelocitiesToTemperature", {"temperature": float("nan")}),
+        ("setVelocitiesToTemperature", {"temperature": 300, "rng": 2.7}),
+        ("setVelocitiesToTemperature", {"temperature": 300, "rng": 2**31}),
+        ("minimizeEnergy", {"tolerance": float("nan")}),
+        ("minimizeEnergy", {"tolerance": -1}),
+        ("minimizeEnergy", {"maxIterations": 2.5}),
+        ("applyConstraints", {"tolerance": -1}),
+        ("applyVelocityConstraints", {"tolerance": "small"}),
+    ],
+)
+def test_what_is_no_number_for_it_is_refused(call, given):
+    """Velocities of a negative temperature were no numbers."""
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x, v)
+    with pytest.raises(InputError):
+        getattr(integrator, call)(context=context, **given)
+    np.testing.assert_array_equal(state_of(context), (x, v))
+
+
+platforms = pytest.mark.parametrize("platform", PLATFORMS)
+
+
+# -- minimization -----------------------------------------------------------------------------------
+
+
+@platforms
+def test_minimizer_of_openmm_keeps_the_constraints(platform):
+    system, _, _ = alanine()
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    made = app.Simulation(
+        pdb.topology, system, integrator := ProjectedIntegrator(1e-3), openmm.Platform.getPlatformByName(platform)
+    )
+    made.context.setPositions(pdb.positions)
+    made.minimizeEnergy()
+    made.step(1)
+    assert residuals(system, made.context)[0] < 1e-9
+    integrator.minimizeEnergy(tolerance=1.0)
+    assert residuals(system, made.context)[0] < 1e-9
+
+
+def test_minimizer_keeps_parts():
+    """The lowest energy on the constraints: forces along them vanish, and it lies above the free minimum."""
+    system, x, v = loose_alanine()
+    integrator = ProjectedIntegrator(1e-3, parts=[holding()], tolerance=1e-12)
+    context = started(system, integrator, x, v)
+    before = potential_energy(context)
+    integrator.minimizeEnergy(context, tolerance=1.0)
+    now, speed = state_of(context)
+    np.testing.assert_array_equal(speed, v)
+    assert abs(now[0, 2] - x[0, 2]) < 1e-12
+    assert residuals(system, context)[0] < 1e-11
+    assert potential_energy(context) < before - 15
+    context.setVelocities(forces_at(context) / masses_of(system)[:, None])
+    integrator.applyVelocityConstraints(context)
+    left = masses_of(system)[:, None] * state_of(context)[1]
+    assert np.sqrt(np.mean(left**2)) <= 1.0
+    assert context.getStepCount() == 0
+    held = potential_energy(context)
+    free = ProjectedIntegrator(1e-3, tolerance=1e-12)
+    other = started(system, free, now)
+    free.minimizeEnergy(other, tolerance=1.0 * unit.kilojoule_per_mole / unit.nanometer)
+    assert potential_energy(other) <= held + 1e-3
+    integrator.step(5)
