@@ -232,7 +232,7 @@ def _water_sites(
             atoms=parents[flat[0]].tolist(),
         )
     frame = np.stack([u, w, np.cross(u, w)], axis=-1)
-    found: FloatArray = np.linalg.solve(frame, to_site[..., None])[..., 0]
+    found = np.asarray(np.linalg.solve(frame, to_site[..., None])[..., 0], dtype=np.float64)
     key = np.char.add(np.char.add(topology.residue_names[residue], "/"), topology.names[sites])
     for name in np.unique(key):
         these = key == name
