@@ -1,6 +1,6 @@
 """Several time steps in OpenMM: near forces of water every 2 fs, the whole Ewald sum every 8 fs, molecules rigid.
 
-Run with ``python examples/several_time_steps.py``; some ten seconds. The fast forces have a short cutoff and a coarse
+Run with ``python examples/several_time_steps.py``; some seconds. The fast forces have a short cutoff and a coarse
 mesh; the slow ones are what the whole sum has beyond them. In so small a box that saves sums and no time. How to divide
 forces: docs/long_steps.md.
 """
@@ -38,11 +38,11 @@ def divided(system):
 
 respa = LangevinRespa(300, 5.0, {0: 1, 1: 4}, slow_kicks="middle")  # K, 1/ps, steps of each group
 runs = {
-    "one step, 2 fs": (system, ProjectedIntegrator(0.002, ensemble=Langevin(300, 5.0)), 500),
-    "8 fs outside, 2 fs inside": (divided(system), ProjectedIntegrator(0.008, ensemble=respa), 125),
+    "one step, 2 fs": (system, ProjectedIntegrator(0.002, ensemble=Langevin(300, 5.0)), 200),
+    "8 fs outside, 2 fs inside": (divided(system), ProjectedIntegrator(0.008, ensemble=respa), 50),
 }
 x = box.positions
-print("steps                        whole sums in 1 ps   potential energy/(kJ/mol)   temperature/K   off   seconds")
+print("steps                        whole sums in 0.4 ps  potential energy/(kJ/mol)   temperature/K   off   seconds")
 for name, (given, integrator, steps) in runs.items():
     simulation = app.Simulation(box.topology, given, integrator, openmm.Platform.getPlatformByName("CPU"))
     simulation.context.setPositions(x)

@@ -170,13 +170,16 @@ class Constraints(FixConstraint):
         bound, accepted = self._bound(atoms), self._accepted
         x = bound.kernel_array(new, "position")
         motion, old, cell = bound.motion, atoms.arrays["positions"], atoms.cell.array
-        if accepted.in_another(cell):
+        changed = accepted.in_another(cell)
+        if changed:
             accepted.refuse_taken_along(motion, old, cell)
         found = accepted.ask(motion.constraint_set, old, x)
         frame = found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched)
         if not frame:
             try:
-                accepted.look(motion, old, cell, elsewhere=bool(found & ELSEWHERE))
+                if changed or found & ELSEWHERE:
+                    accepted.look(motion, old, cell, elsewhere=True)
+                accepted.between_steps = False
                 motion.project_positions(x, old, out=x)
             except (ConvergenceError, InputError, UnsupportedError) as error:
                 refuse_not_finite(x, "position")

@@ -86,7 +86,7 @@ class AcceptedPositions:
         """Accept positions that are on the constraints."""
         self._positions[...], self._cell = x, cell.tobytes()
 
-    def look(self, motion: Motion, x: FloatArray, cell: FloatArray, *, elsewhere: bool | None = None) -> bool:
+    def look(self, motion: Motion, x: FloatArray, cell: FloatArray, *, elsewhere: bool = False) -> bool:
         """Whether positions before a step, or where momenta are set, may stay: near enough to the constraints.
 
         What they are off by less than START_TOLERANCE the next step puts right, along the rows, which momenta then
@@ -101,7 +101,7 @@ class AcceptedPositions:
             They are, and were moved within a step; or they were scaled, and a row holds them in space.
         """
         changed = self.in_another(cell)
-        good = not (changed or (differ(self._positions, x) if elsewhere is None else elsewhere))
+        good = not (changed or elsewhere or differ(self._positions, x))
         if not good:
             scaled = changed and self._scaled(motion, x, cell)
             worst = _worst_row(motion.constraint_set, x)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from inspect import signature
-from typing import Any, Literal, NoReturn, cast
+from typing import Any, Literal
 
 import numpy as np
 from ase import Atoms, units
@@ -118,10 +118,21 @@ class ThermostattedDynamics(ConstrainedDynamics):
         return 2 * self.get_kinetic_energy() / (count * units.kB) if count else 0.0
 
     def get_conserved_energy(self) -> float:
-        """The quantity in eV that the exact motion conserves, where targets rest; see the thermostat in the core."""
-        stepper = cast(Isokinetic | Langevin | NoseHooverChain | ConstantPressure, self._mover)
+        """The quantity in eV that the exact motion conserves, where targets rest; see the thermostat in the core.
+
+        Raises
+        ------
+        UnsupportedError
+            On spheres, whose bath does work, and of Monte Carlo.
+        """
+        conserved = getattr(self._mover, "conserved_energy", None)
+        if conserved is None:
+            raise UnsupportedError(
+                f"{type(self.stepper).__name__} conserves nothing like an energy; look at averages, or at "
+                "counts.mean_square of Monte Carlo, that of the change of energy over kT"
+            )
         system = self._systems()
-        return float(stepper.conserved_energy(system, self._start(system)))
+        return float(conserved(system, self._start(system)))
 
 
 class IsokineticDynamics(ThermostattedDynamics):
@@ -299,12 +310,6 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         """What became of the proposals."""
         return Counts.of(self._start(self._systems()))
 
-    def get_conserved_energy(self) -> NoReturn:
-        """`UnsupportedError`: nothing is conserved."""
-        raise UnsupportedError(
-            "Monte Carlo conserves no energy; look at counts.mean_square, that of its change over kT"
-        )
-
 
 class MultipleTimeSteps(ThermostattedDynamics):
     """Constant temperature with the forces of a cheap calculator in small steps, of an expensive one in large ones.
@@ -441,12 +446,6 @@ class MultipleTimeSteps(ThermostattedDynamics):
             return super().get_temperature()
         expected = stepper.kinetic_energy(self._systems(), self.atoms.positions)
         return float(kinetic_energy_of(self.atoms) / expected * stepper.thermal_energy / units.kB)
-
-    def get_conserved_energy(self) -> float:
-        """Total energy less the heat in eV; `UnsupportedError` on spheres, whose bath does work."""
-        if isinstance(self.stepper, IsokineticSpheres):
-            raise UnsupportedError("nothing like an energy is conserved on spheres; look at averages instead")
-        return super().get_conserved_energy()
 
     def _ask_calculators(self) -> None:
         """A step ends with both forces where the atoms are, which are added up for someone who looks."""

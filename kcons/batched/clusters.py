@@ -104,7 +104,7 @@ class Clusters:
         for k, row in enumerate(pattern.rows):
             ends = image + 3 * (len(row.atoms) - 1) * row.relative, parameter + row.parameters
             coordinates = [3 * atom + c for atom in row.atoms for c in range(3)]
-            self.kinds.append((row, k, coordinates, range(image, ends[0]), range(parameter, ends[1])))
+            self.kinds.append((row, k, coordinates, [*range(image, ends[0])], [*range(parameter, ends[1])]))
             image, parameter = ends
 
     def weights(self, w: Tensor) -> Vector:

@@ -74,29 +74,24 @@ def version(package: str) -> str | None:
 
 
 def _platforms(wrong: list[str]) -> dict[str, str]:
-    """Each platform of OpenMM: the precisions in which a step was made on it, or why none was."""
+    """Whether a step was made on each platform of OpenMM, or why none was."""
     import openmm
 
     found = {}
     for k in range(openmm.Platform.getNumPlatforms()):
-        chosen = openmm.Platform.getPlatform(k)
-        running, failure = [], ""
-        for precision in ("single", "mixed", "double") if "Precision" in chosen.getPropertyNames() else ("",):
-            system = openmm.System()
-            system.addParticle(1.0)
-            given = {"Precision": precision} if precision else {}
-            try:
-                context = openmm.Context(system, openmm.VerletIntegrator(0.001), chosen, given)
-                context.setPositions([[0.0, 0.0, 0.0]])
-                context.getIntegrator().step(1)
-                running.append(precision or {"Reference": "double", "CPU": "mixed"}.get(chosen.getName(), "its own"))
-                del context
-            except openmm.OpenMMException as error:
-                failure = " ".join(str(error).split())[:120]
-        found[chosen.getName()] = f"runs: {', '.join(running)}" if running else f"does not run: {failure}"
+        chosen, system = openmm.Platform.getPlatform(k), openmm.System()
+        system.addParticle(1.0)
+        try:
+            context = openmm.Context(system, openmm.VerletIntegrator(0.001), chosen)
+            context.setPositions([[0.0, 0.0, 0.0]])
+            context.getIntegrator().step(1)
+            found[chosen.getName()] = "runs"
+            del context
+        except openmm.OpenMMException as error:
+            found[chosen.getName()] = f"does not run: {' '.join(str(error).split())[:120]}"
     for failure in openmm.Platform.getPluginLoadFailures():
         found[f"plugin {len(found)}"] = f"not loaded: {' '.join(failure.split())[:120]}"
-    if not any(said.startswith("runs") for said in found.values()):
+    if "runs" not in found.values():
         wrong.append("no platform of OpenMM runs; install it again: python -m pip install --force-reinstall openmm")
     return found
 

@@ -121,7 +121,7 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
     titles = [str(title)[:40] for title in shown.title]
     width = max(map(len, titles))
     cells = {
-        "": [f"{p}{'=' if tie else ''}" for p, tie in zip(shown.place, tied, strict=False)] or [""] * len(shown),
+        "": [f"{p}{'=' if tie else ' '}" for p, tie in zip(shown.place, tied, strict=False)] or [""] * len(shown),
         "method".ljust(width): [title.ljust(width) for title in titles],
         "at": [shown_setting(row, about) for row in shown.itertuples()],
         found.what.split()[0]: [f"{error:.1e}" for error in shown.error],
@@ -131,7 +131,9 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
     }
     if found.cost == "evaluations" or "what" in about:
         del cells["timed"]
-    lines = [pd.DataFrame(cells).to_string(index=False)]
+    lines = [
+        pd.DataFrame({f" {name}": [f" {c}" for c in column] for name, column in cells.items()}).to_string(index=False)
+    ]
     if len(ranked) > PLACES:
         lines.append(f"... and {len(ranked) - PLACES} more")
     same = f"{100 * found.scatter:.0f} %"

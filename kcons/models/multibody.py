@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import lapack, qr
+from scipy.linalg import lapack
 
 from kcons.constraints.arguments import (
     FloatArray,
@@ -271,7 +271,7 @@ class Multibody:
         M, G = self._M(q), self._G(q)
         size = np.sqrt(np.einsum("ij,ij->i", G, G))
         size[size == 0] = 1.0
-        Q, R, rows = qr((G / size[:, None]).T, pivoting=True) if len(G) else (np.eye(n), np.zeros((n, 0)), np.arange(0))
+        Q, R, rows = _factors(G / size[:, None])
         left = np.abs(R.diagonal())
         if rank is None or (rank and not left[rank - 1] > DEPENDENT * left[0]):
             found = int(np.sum(left > DEPENDENT * left[:1]))
@@ -434,6 +434,18 @@ class Multibody:
                     rounding=WRONG * unit * slope,
                     remedy="or give the length over which they bend (length=...)",
                 )
+
+
+def _factors(A: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Q, shape (n, n), and R of A^T with its columns exchanged, and their order: QR in two calls of LAPACK."""
+    m, n = A.shape
+    if m == 0:
+        return np.eye(n), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
+    R, order, tau, _, _ = lapack.dgeqp3(A.T)
+    k = min(m, n)
+    Q = np.zeros((n, n), order="F")
+    Q[:, :k] = R[:, :k]
+    return lapack.dorgqr(Q, tau)[0], R[:k], order - 1
 
 
 def _check_symmetric(M: FloatArray) -> None:

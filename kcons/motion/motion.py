@@ -24,7 +24,7 @@ from kcons.motion.report import Report, make_report
 from kcons.motion.restoring.kept_geometry import Bonds
 from kcons.motion.restoring.moved_groups import restored
 from kcons.motion.restoring.nearest_point import LEFT_OVER, FarStart
-from kcons.motion.solver_sequence import IterationBudget, SolverSequence
+from kcons.motion.solver_sequence import SolverSequence
 from kcons.plan.independent_blocks import fixed_atoms
 from kcons.plan.plan import Plan, make_plan
 from kcons.plan.second_order import MISFIT, FlatBody, without_second_order_rows
@@ -237,7 +237,7 @@ class Motion:
         """
         x = as_array(x_new, self._shape, "x_new")
         ref = as_array(x_ref, self._shape, "x_ref")
-        if out is not None:
+        if out is not None and out is not x:
             check_out(out, self._shape)
         inv_dt = 0.0
         if velocities is not None:
@@ -295,7 +295,7 @@ class Motion:
             time = finite_number(time, "time")
         y = as_array(v, self._shape, "velocities")
         here = as_array(x, self._shape, "positions")
-        if out is not None:
+        if out is not None and out is not y:
             check_out(out, self._shape)
         if multipliers is not None:
             check_out(multipliers, (self.constraint_set.n_rows,), "multipliers")
@@ -376,24 +376,22 @@ class Motion:
             def pairs() -> IntArray:
                 return table
 
-        budget = IterationBudget(self.plan)
-        left = 0.0
+        search = FarStart(self._solve, time)
 
         def nearest(y: FloatArray) -> FloatArray:
-            nonlocal left
             result = y.copy()
             local = result if self._atoms is None else result[self._atoms]
-            left = FarStart(self._solve, budget, time).restore(local)
+            search.restore(local)
             if self._atoms is not None:
                 result[self._atoms] = local
             return result
 
         result = restored(self.constraint_set, self.plan, start, time, pairs, nearest)
-        if left > LEFT_OVER and nearest_only:
+        if search.left > LEFT_OVER and nearest_only:
             warnings.warn(
-                f"these positions fulfil all rows, but are not the nearest that do: {left:.1g} of the way from the "
-                "start leads along the rows, and the search has done what it may. Start nearer to the rows, or bring "
-                "targets there in several parts",
+                f"these positions fulfil all rows, but are not the nearest that do: {search.left:.1g} of the way from "
+                "the start leads along the rows, and the search has done what it may. Start nearer to the rows, or "
+                "bring targets there in several parts",
                 stacklevel=2,
             )
         if out is None:

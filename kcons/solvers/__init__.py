@@ -7,7 +7,7 @@
 - `distance_clusters`: what the solvers of held distances share
 - `rigid_triangles`, `small_clusters`, `chains`, `sparse`: held distances by shape, and rows of mixed kinds
 - `single_rows`: functions that share no atom
-- `rank_revealing`: which rows are independent
+- `rank_revealing`: clusters as dense matrices, and which of their rows are independent
 - `general_clusters`: any rows whatever
 """
 

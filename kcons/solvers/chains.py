@@ -499,7 +499,7 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
     return True, worst, most, worst_row
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _positions(alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
     """As `kcons.solvers.addressable_solvers` says, with a last look at the positions themselves.
 
@@ -518,7 +518,7 @@ def _positions(alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, number
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _tangents(alone, y, x, v, inv_dt, wanted, lattice, kind, tables, numbers):
     numbers[:] = 0.0
     return _project((), y, x, v, inv_dt, wanted, lattice, kind, tables, numbers)

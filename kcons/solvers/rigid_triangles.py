@@ -218,14 +218,14 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
     return True, worst if tangent is None else np.sqrt(worst), most, worst_at
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _positions(alone, x, x_ref, v, inv_dt, wanted, lattice, kind, tables, numbers):
     """This and the next two as `kcons.solvers.addressable_solvers` says."""
     sides = wanted if wanted.size else table_array(tables, integers(tables), _SIDES)
     return _project(None, x, x_ref, v, inv_dt, sides, lattice, kind, tables, numbers)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _tangents(alone, y, x, v, inv_dt, wanted, lattice, kind, tables, numbers):
     return _project((), y, x, v, inv_dt, wanted, lattice, kind, tables, numbers)
 

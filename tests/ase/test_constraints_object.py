@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 from ase import Atoms, units
@@ -13,7 +11,6 @@ from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, Free, off, rigid, slip
 
 from kcons.ase import Constraints, constrain
-from kcons.ase.topology import bonds_of
 from kcons.constraints import CenterDistance, Dihedral, Distance
 from kcons.errors import InfeasibleError, InputError
 
@@ -166,24 +163,6 @@ def test_what_is_known_of_one_image_says_nothing_of_another():
 
 
 # -- `constrain(project=True)` and `Constraints.restore` with far targets: whole groups move, bonds stay --
-
-
-def lengths(atoms: Atoms) -> np.ndarray:
-    """All distances within three bonds' reach of each other that no torsion changes: bonds and ends of angles."""
-    bonds = {tuple(b) for b in bonds_of(atoms).tolist()}
-    near = {a: {y for b in bonds for y in b if a in b and y != a} for a in range(len(atoms))}
-    ends = {tuple(sorted(pair)) for a in near for pair in combinations(near[a], 2)}
-    return np.array([atoms.get_distance(i, j, mic=True) for i, j in sorted(bonds | ends)])
-
-
-@pytest.mark.parametrize("degrees", range(-180, 181, 15))
-def test_a_torsion_at_any_target(degrees: int) -> None:
-    atoms = molecule("CH3CH2OH")
-    before = lengths(atoms)
-    held = constrain(atoms, Dihedral([[3, 2, 1, 0]], np.radians(degrees)), project=True)
-    assert abs((atoms.get_dihedral(3, 2, 1, 0) - degrees + 180) % 360 - 180) < 1e-9
-    np.testing.assert_allclose(lengths(atoms), before, rtol=0, atol=0.01)
-    assert held.report(atoms).residual < 1e-14 * 4
 
 
 def test_bonds_that_are_given_are_taken() -> None:

@@ -29,8 +29,7 @@ def test_a_healthy_machine(found):
 def test_platforms_are_tried_not_listed(found):
     names = {openmm.Platform.getPlatform(k).getName() for k in range(openmm.Platform.getNumPlatforms())}
     assert set(found["OpenMM platforms"]) >= names
-    assert found["OpenMM platforms"]["Reference"] == "runs: double"
-    assert found["OpenMM platforms"]["CPU"] == "runs: mixed"
+    assert found["OpenMM platforms"]["Reference"] == found["OpenMM platforms"]["CPU"] == "runs"
 
 
 def test_whether_there_can_be_steps_on_the_device(found, monkeypatch):

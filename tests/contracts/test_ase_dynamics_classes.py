@@ -19,22 +19,7 @@ from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from ase.optimize import BFGS
 from ase.optimize.optimize import Dynamics
-from ase_systems import (
-    FS,
-    TEMPERATURE,
-    Free,
-    classes_in,
-    dumbbells,
-    ethanol,
-    follow,
-    mean_and_error,
-    off,
-    random,
-    slip,
-)
-
-# -- dynamics ---------------------------------------------------------------------------------------
-
+from ase_systems import FS, TEMPERATURE, Free, classes_in, dumbbells, ethanol, follow, mean_and_error, off, random, slip
 
 #: Canonical classes whose mean temperature is right to their standard error.
 CANONICAL = {

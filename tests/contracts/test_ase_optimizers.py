@@ -16,18 +16,11 @@ from ase.filters import FrechetCellFilter
 from ase.optimize import BFGS, CellAwareBFGS
 from ase.optimize.minimahopping import MinimaHopping
 from ase.optimize.optimize import Dynamics
-from ase_systems import (
-    classes_in,
-    ethanol,
-    off,
-    random,
-)
+from ase_systems import classes_in, ethanol, off, random
 
 from kcons.ase import constrain
 from kcons.constraints import Distance
 from kcons.errors import ConvergenceError
-
-# -- optimizers -------------------------------------------------------------------------------------
 
 PLAIN = {
     "BFGS", "BFGSLineSearch", "FIRE", "FIRE2", "GPMin", "GoodOldQuasiNewton", "LBFGS", "LBFGSLineSearch", "MDMin",

@@ -7,17 +7,7 @@ import pytest
 from stepper_systems import gravity, system_of
 
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge
-from kcons.steppers import (
-    Geodesic,
-    KahanLi6,
-    Rattle,
-    ReversibilityCheck,
-    State,
-    Suzuki4,
-    System,
-    Yoshida4,
-    run,
-)
+from kcons.steppers import Geodesic, KahanLi6, Rattle, ReversibilityCheck, State, Suzuki4, System, Yoshida4, run
 
 MASSES = np.array([1.0, 2.0, 0.5])
 

@@ -15,8 +15,6 @@ from kcons.errors import NonFiniteError
 from kcons.steppers import State, run
 from kcons.thermostats import Isokinetic, thermal_velocities
 
-# -- parts, times, restarts -------------------------------------------------------------------------
-
 
 def test_a_run_goes_on_from_positions_and_velocities_alone():
     held, x = dumbbells(2)
@@ -46,9 +44,6 @@ def test_velocities_off_the_constraints_are_projected_and_scaled():
     ratio = begun.velocities / tangent
     np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-12)
     assert 2 * held.kinetic_energy(begun.velocities) == pytest.approx((12 - 2 - 1) * 0.5, rel=1e-14)
-
-
-# -- bad input --------------------------------------------------------------------------------------
 
 
 def test_one_degree_of_freedom():

@@ -7,17 +7,7 @@ import pytest
 from stepper_systems import SYMMETRIC, planar_pendulum, system_of
 
 from kcons.constraints import Distance
-from kcons.steppers import (
-    BlanesMoan6,
-    KahanLi6,
-    Rattle,
-    State,
-    Stepper,
-    System,
-    run,
-)
-
-# -- free flight ------------------------------------------------------------------------------------
+from kcons.steppers import BlanesMoan6, KahanLi6, Rattle, State, Stepper, System, run
 
 SHAPES = {
     "dumbbell": [[0.0, 0.0, 0.0], [0.0, 0.0, 1.1]],
@@ -80,9 +70,6 @@ FREE = {2: 0.02, 4: 0.02, 6: 0.04}
 )
 def test_free_flight_keeps_energy_and_momenta(shape, stepper, steps) -> None:
     check_free_flight(shape, stepper, steps)
-
-
-# -- the slope of the energy ------------------------------------------------------------------------
 
 
 def energy_slope(stepper: Stepper, dt: float, steps: int) -> float:

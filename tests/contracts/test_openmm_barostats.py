@@ -16,13 +16,7 @@ from pressure_systems import TRIANGLE, p_value, placed
 from scipy import stats
 
 from kcons.constraints import Distance
-from kcons.openmm import (
-    Isokinetic,
-    Langevin,
-    NoseHoover,
-    ProjectedIntegrator,
-    hold,
-)
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold
 from kcons.thermostats import mean
 
 BAROSTATS = {

@@ -12,8 +12,6 @@ from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.callback_rows import hold
 
-# -- periodic boxes -------------------------------------------------------------------------------
-
 
 def pair(x, cutoff=1.0):
     """Two particles in a cube of 2 nm, their distance held."""
@@ -48,9 +46,6 @@ def test_a_box_too_small_stops_the_step():
     with pytest.raises(InputError, match="half the box"):
         context.getIntegrator().step(1)
     assert all(np.array_equal(a, b) for a, b in zip(before, state_of(context), strict=True))
-
-
-# -- multipliers ----------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("without_device")

@@ -1,4 +1,4 @@
-"""Ensembles in OpenMM: degrees of freedom, refusals, copies and files."""
+"""Ensembles in OpenMM and targets that move."""
 
 import numpy as np
 import pytest
@@ -7,17 +7,9 @@ from openmm_systems import context_of, dumbbell, state_of
 
 from kcons.constraints import Distance
 from kcons.errors import UnsupportedError
-from kcons.openmm import (
-    Isokinetic,
-    Langevin,
-    ProjectedIntegrator,
-    hold,
-)
+from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, hold
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
-
-
-# -- isokinetic: g, refusals, settings -----------------------------------------------------------------
 
 
 def test_moving_targets_are_refused_and_held_by_langevin():

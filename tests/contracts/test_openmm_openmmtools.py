@@ -18,13 +18,7 @@ from openmm import unit
 from openmm_ensembles import ENSEMBLES
 from openmm_systems import water_box
 
-from kcons.openmm import (
-    CollectiveRows,
-    Langevin,
-    LangevinRespa,
-    NoseHoover,
-    ProjectedIntegrator,
-)
+from kcons.openmm import CollectiveRows, Langevin, LangevinRespa, NoseHoover, ProjectedIntegrator
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -13,18 +13,7 @@ from openmm import Vec3, unit
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, constrain, draw_velocities
 from kcons.constraints import FAMILIES, CustomVelocity, Distance, from_dict
-from kcons.constraints.arguments import (
-    ANGLE,
-    ANY,
-    DIRECTION,
-    HELD,
-    LENGTH,
-    MD_UNITS,
-    NUMBER,
-    SPEED,
-    TIME,
-    rules_of,
-)
+from kcons.constraints.arguments import ANGLE, ANY, DIRECTION, HELD, LENGTH, MD_UNITS, NUMBER, SPEED, TIME, rules_of
 from kcons.errors import InputError
 
 nm, angstrom, fs = unit.nanometer, unit.angstrom, unit.femtosecond

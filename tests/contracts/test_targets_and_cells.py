@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
@@ -59,6 +60,23 @@ def test_dependent_rows_on_fixed_atoms_share_their_multiplier() -> None:
     lam = motion.multipliers(x, np.zeros((3, 3)), f)
     np.testing.assert_allclose(lam[6:], [-2.0, -2.0], rtol=1e-14)
     np.testing.assert_allclose(motion.constraint_force(x, np.zeros((3, 3)), f).sum(axis=0), [-4.0, 0, 0], atol=1e-14)
+
+
+@pytest.mark.parametrize("extra", [0, 400])
+@pytest.mark.parametrize("row", [held.Distance([0, 1]), held.CenterDistance([[0]], [[1]])])
+def test_a_cell_that_changes(extra: int, row: held.Constraint) -> None:
+    """A barostat sets the cell of the set it gave; every solver sees it, on a compact copy as well."""
+    x = np.vstack([[[0.5, 0, 0], [9.5, 0, 0]], np.random.default_rng(0).uniform(0, 9, (extra, 3))])
+    whole = ConstraintSet(row, x, np.ones(len(x)), cell=[10.0, 10, 10])
+    motion = Motion(whole, x)
+    motion.project_positions(x, x)
+    whole.with_cell([10.5, 10, 10])
+    y = motion.project_positions(x, x)
+    np.testing.assert_allclose(y[1, 0] - y[0, 0], 9.5, rtol=0, atol=1e-14)
+    assert motion.report(y).residual < 1e-14
+    v = np.zeros_like(x)
+    v[0, 1] = 1.0
+    np.testing.assert_allclose(motion.project_velocities(y, v), v, rtol=0, atol=1e-15)
 
 
 def test_no_cell_any_more():

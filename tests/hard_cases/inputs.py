@@ -194,33 +194,6 @@ def late_force(program: Program, quick: bool) -> Outcome:
         def has_forces(self) -> bool:
             return True
 
-    if program.name in ("OpenMM", "kcons in OpenMM"):
-        # Atom 0 flies into the region where the potential is not defined.
-        import openmm
-
-        from hard_cases.programs import PlainOpenMM
-
-        assert isinstance(program, PlainOpenMM)
-        problem = moving_chain(4)
-        problem = problem.but(velocities=problem.v + np.array([1.0, 0, 0]))
-        bare = program.bare_system
-
-        def spoiled(problem: Problem) -> Any:
-            system = bare(problem)
-            force = openmm.CustomExternalForce(f"1e-9*sqrt({float(problem.x[:, 0].max()) + 0.3!r}-x)")
-            for k in range(4):
-                force.addParticle(k, [])
-            system.addForce(force)
-            return system
-
-        program.bare_system = spoiled  # type: ignore[method-assign]
-        end = program.run(problem, 0.01, 100)
-    else:
-        base = moving_chain(4)
-        end = program.run(base.of_kind(Late), 0.01, 100)
-    return outcome(("residual", base_residual(end.x), 1e-10))
-
-
-def base_residual(x: Any) -> float:
-    """Of the chain of four."""
-    return moving_chain(4).residual(x)
+    base = moving_chain(4)
+    end = program.run(base.of_kind(Late), 0.01, 100)
+    return outcome(("residual", base.residual(end.x), 1e-10))

@@ -333,15 +333,14 @@ class PlainOpenMM(Program):
             periodic = openmm.CustomBondForce("0")
             periodic.setUsesPeriodicBoundaryConditions(True)
             system.addForce(periodic)
-        if problem.push is not None or problem.tether:
-            spring = f"{0.5 * problem.tether!r}*((x-a)^2+(y-b)^2+(z-c)^2)"
-            force = openmm.CustomExternalForce(f"-(fx*x+fy*y+fz*z)+{spring}")
-            for name in ("fx", "fy", "fz", "a", "b", "c"):
-                force.addPerParticleParameter(name)
-            push = np.zeros_like(problem.x) if problem.push is None else np.asarray(problem.push, dtype=float)
-            for k, row in enumerate(np.hstack([push, problem._anchors])):
-                force.addParticle(k, row.tolist())
-            system.addForce(force)
+        alone = problem.but(springs=())
+        if alone.has_forces:
+
+            def forces(state: Any) -> tuple[float, Array]:
+                x = np.asarray(state.getPositions(asNumpy=True)._value)
+                return alone.potential(x), alone.forces(x)
+
+            system.addForce(openmm.PythonForce(forces))
         if problem.springs:
             bonds = openmm.HarmonicBondForce()
             for i, j, constant, rest in problem.springs:

@@ -8,14 +8,7 @@ import openmm
 from openmm_systems import context_of
 
 from kcons.constraints import Distance
-from kcons.openmm import (
-    CollectiveRows,
-    Isokinetic,
-    Langevin,
-    ProjectedIntegrator,
-    Row,
-    hold,
-)
+from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
 
 X = np.random.default_rng(3).random((8, 3)) * 0.3
 

@@ -193,8 +193,7 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
     place, force, error = arrays
     if (error < 0).any():
         raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
-    count = len(np.unique(place))
-    if period is not None and count:
+    if period is not None and place.size:
         positive(period, "period")
         if np.ptp(place) > period * (1 + _SAME):
             raise InputError(
@@ -203,16 +202,14 @@ def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> 
             )
         place = place.min() + (place - place.min()) % period
         place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
-    if count >= 3:
-        # Places that differ by rounding are one.
-        order = np.argsort(place, kind="stable")
-        new = np.diff(place[order], prepend=-np.inf) > _SAME * np.ptp(place)
-        places, which = place[order][new], np.zeros(len(place), dtype=np.int64)
-        which[order] = np.cumsum(new) - 1
-        count = len(places)
-    if count < 3:
-        raise InputError(f"{count} different windows are too few for a profile; give 3 or more", item="x")
-    for k in np.flatnonzero(np.bincount(which[error == 0], minlength=count) > 1):
+    # Places that differ by rounding are one.
+    order = np.argsort(place, kind="stable")
+    new = np.diff(place[order], prepend=-np.inf) > _SAME * (np.ptp(place) if place.size else 0.0)
+    places, which = place[order][new], np.zeros(len(place), dtype=np.int64)
+    which[order] = np.cumsum(new) - 1
+    if len(places) < 3:
+        raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
+    for k in np.flatnonzero(np.bincount(which[error == 0]) > 1):
         exact = force[(which == k) & (error == 0)]
         if np.ptp(exact) > 1e-9 * np.abs(exact).max():
             raise InputError(

@@ -20,7 +20,7 @@ from ase import units
 from kcons.constraints import Angle, Constraint, Dihedral, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import lined_up, minimum_image
-from kcons.constraints.target import FloatArray
+from kcons.constraints.target import FloatArray, nearest_image
 from kcons.constraints.vectors import cross, dot, norm
 from kcons.errors import ConvergenceError, KconsError
 from kcons.motion.motion import Motion
@@ -70,6 +70,7 @@ class Internals:
         turns = turns[self._sines(x, turns[:, 1:]) >= STRAIGHT]
         self._straight = table[sine < STRAIGHT]
         self._families: list[Constraint] = [Distance(pairs), Angle(bent), Dihedral(turns)]
+        self._periods = np.repeat([0.0, 2 * np.pi, 0.0], [len(pairs) + len(bent), len(turns), 2 * len(self._straight)])
         # From now on each term keeps its images: in a small cell, others may come as near.
         tables = [*(item.atoms for item in self._families), self._straight]
         self._images = [lined_up(x[atoms], lattice) - x[atoms] for atoms in tables]
@@ -123,11 +124,7 @@ class Internals:
 
     def change(self, after: FloatArray, before: FloatArray) -> FloatArray:
         """Difference of two sets of values, dihedrals by the shorter way."""
-        d = after - before
-        first = self._families[0].n_rows + self._families[1].n_rows
-        turns = slice(first, first + self._families[2].n_rows)
-        d[turns] -= 2 * np.pi * np.round(d[turns] / (2 * np.pi))
-        return d
+        return nearest_image(after - before, self._periods)
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """dq/dx, shape (n, 3 n_atoms)."""

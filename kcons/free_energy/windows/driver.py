@@ -310,8 +310,8 @@ class Windows:
     rng : int, numpy.random.Generator or None
         A folder goes on with the same number only.
     executor : Executor, optional
-        Anything with the interface of `concurrent.futures`: of Dask, ``Client(address).get_executor()``. By default
-        processes of this machine.
+        Anything with the interface of `concurrent.futures`, such as ``Client(address).get_executor(pure=False)`` of
+        Dask. By default processes of this machine.
     workers : int, optional
         How many of these; by default one for each core.
     progress : callable, optional

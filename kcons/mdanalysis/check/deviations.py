@@ -40,10 +40,12 @@ _ROOT_THREE = np.sqrt(3.0)
 _UNSIGNED, _EXPONENT = np.int32(0x7FFFFFFF), np.int32(0x7F800000)
 
 #: What is held: atoms of a length (-1 of other rows), target, what the row may be off by besides rounding, its size.
-_HELD = np.dtype([("i", "i8"), ("j", "i8"), ("target", "f8"), ("slack", "f8"), ("size", "f8")])
+_HELD = np.dtype([("i", "i4"), ("j", "i4"), ("target", "f8"), ("slack", "f8"), ("size", "f8")])
 #: Over all frames, by row: the largest excess over what was allowed (negative where there was none), the absolute
 #: deviation in that frame and its number; sums of deviations, of what rounding makes of them, and of frames that count.
-_BY_ROW = np.dtype([(name, "f8") for name in ("margin", "largest", "total", "rounded", "counted")] + [("frame", "i8")])
+_BY_ROW = np.dtype(
+    [(name, "f8") for name in ("margin", "largest", "total", "rounded")] + [("counted", "i4"), ("frame", "i4")]
+)
 #: By frame and unit: of deviations; the largest excess and the largest rounding; rows that count; of A v.
 _BY_UNIT = np.dtype(
     [(name, "f8") for name in ("sum", "squares", "largest", "excess", "rounding", "seen", "rate_squares", "rate")]
@@ -344,7 +346,7 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
                 mine.margin, mine.largest, mine.frame = margin, size, frame
             mine.total += off
             mine.rounded += rounding
-            mine.counted += 1.0
+            mine.counted += 1
         all_rows = by_unit[unit]
         all_rows.sum += total
         all_rows.squares += squares

@@ -44,13 +44,18 @@ class FarStart:
     Parameters
     ----------
     sequence : SolverSequence
-    budget : IterationBudget
-        What the search may cost. A point on the constraints is returned as it is when this is used up.
     time : float
+
+    Attributes
+    ----------
+    left : float
+        Of the last search, the part of the way that leads along the constraints: 0 where it has found the nearest
+        point, and not where all searches have cost what they may.
     """
 
-    def __init__(self, sequence: SolverSequence, budget: IterationBudget, time: float) -> None:
-        self._sequence, self._budget, self._time = sequence, budget, time
+    def __init__(self, sequence: SolverSequence, time: float) -> None:
+        self._sequence, self._budget, self._time = sequence, IterationBudget(sequence.plan), time
+        self.left = 0.0
         self._rows, self._plan, self._failures = sequence.rows, sequence.plan, sequence.failures
 
     def _positions(self, x: FloatArray, reference: FloatArray) -> None:
@@ -62,24 +67,18 @@ class FarStart:
     def _tangents(self, x: FloatArray, y: FloatArray, rates: FloatArray | None = None) -> None:
         self._sequence.tangents(x, y, rates, self._time, None, "position")
 
-    def restore(self, x: FloatArray) -> float:
-        """Bring `x` onto the constraints in place, or raise `InfeasibleError`.
-
-        Returns
-        -------
-        float
-            The part of the way that leads along the constraints: 0 where the search has found the nearest point.
-        """
+    def restore(self, x: FloatArray) -> None:
+        """Bring `x` onto the constraints in place, or raise `InfeasibleError`."""
         plan, fallback = self._plan, self._sequence.fallback
         if len(plan.pinned):
             x[plan.pinned] = plan.pinned_targets(self._rows.target(self._time) if self._rows.moving else None)
         fallback.budget = self._budget
         try:
-            return self._search(x)
+            self._search(x)
         finally:
             fallback.budget = None
 
-    def _search(self, x: FloatArray) -> float:
+    def _search(self, x: FloatArray) -> None:
         start, here = x.copy(), x.copy()
         try:
             self._positions(here, start)
@@ -92,7 +91,7 @@ class FarStart:
         size = float(np.max(np.abs(along), initial=0.0))
         self._tangents(x, along)
         left = float(np.max(np.abs(along), initial=0.0))
-        return left / size if left > max(_STILL * extent(start[held]), _rounding(start[held])) else 0.0
+        self.left = left / size if left > max(_STILL * extent(start[held]), _rounding(start[held])) else 0.0
 
     def _reach(self, x: FloatArray) -> None:
         """Some point on the constraints, for starts too far off for one projection, in place."""

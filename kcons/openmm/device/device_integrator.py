@@ -433,14 +433,14 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     rows = part.rows_at(masses, (pairs, lengths), positions, box if box.any() else None, given.time)
     if integrator is not None:
         integrator.rows = rows
-    done = plan(described, platform, masses, given.groups, rows)
-    compiled = str(build.kernels_library(done.source)) if platform in PLAIN else ""
-    library.kcons_plan_source(made, done.source.encode(), compiled.encode(), done.items, done.work_group, done.slots)
-    for array in done.arrays:
+    source, arrays, parts, sizes = plan(described, platform, masses, given.groups, rows)
+    compiled = str(build.kernels_library(source)) if platform in PLAIN else ""
+    library.kcons_plan_source(made, source.encode(), compiled.encode(), *sizes)
+    for array in arrays:
         values = np.ascontiguousarray(array.values, dtype=np.float64)
         about = array.name.encode(), int(array.kind == "int"), int(array.saved)
         library.kcons_plan_array(made, *about, values.ctypes.data_as(_DOUBLES), values.size)
-    for number, actions in enumerate(done.parts):
+    for number, actions in enumerate(parts):
         for kernel, groups, slot in actions:
             library.kcons_plan_action(made, number, kernel.encode(), ctypes.c_int32(groups), slot)
 

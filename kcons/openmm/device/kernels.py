@@ -416,21 +416,8 @@ def _with(text: str, words: Mapping[str, object]) -> str:
     return text
 
 
-class Action(NamedTuple):
-    """What the plugin does: launch a kernel, or, where it has no name, evaluate forces of some groups for a slot."""
-
-    kernel: str
-    groups: int = -1
-    slot: int = 0
-
-
-class _Place(NamedTuple):
-    """Where the clusters of a shape are: among the items of a kernel or its groups, in `atoms` and in `work`."""
-
-    shape: Shape
-    begin: int
-    atoms: int
-    work: int
+#: A kernel to launch; or, without a name, the bit mask of groups whose forces are evaluated, and where they are kept.
+Action = tuple[str, int, int]
 
 
 class Kernels:
@@ -449,14 +436,15 @@ class Kernels:
         self.spheres, self.per_sphere = described["spheres"]
         self.sphere_of: list[tuple[tuple[int, ...], list[int], int]] = []
         self.auxiliary = self.items = self.crowds = self.work = self.particles = 0
-        self.places: list[_Place] = []
+        #: Shapes, and where their clusters are: among the items of a kernel or its groups, in `atoms` and in `work`.
+        self.places: list[tuple[Shape, int, int, int]] = []
         self.order: list[IntArray] = []
         everything = np.arange(len(masses))
         moving = (masses > 0) & ~np.isin(everything, held.fixed)
         free = np.setdiff1d(everything, np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
         for shape in [*held.shapes, *([Shape(free[:, None])] if len(free) else [])]:
             clusters = len(shape.atoms)
-            self.places.append(_Place(shape, self.crowds if shape.together else self.items, self.particles, self.work))
+            self.places.append((shape, self.crowds if shape.together else self.items, self.particles, self.work))
             atoms = (shape.atoms if shape.together else shape.atoms.T).ravel()
             self.order.append(np.where(np.isin(atoms, held.fixed), -1 - atoms, atoms))
             self.crowds += clusters * shape.together
@@ -474,13 +462,12 @@ class Kernels:
 
     def _reset(self) -> None:
         self._code = ["" for _ in self.places]
-        self._before, self._moves, self._sums, self._noted, self._used = "", False, 0, False, False
+        self._before, self._moves, self._sums, self._noted = "", False, 0, False
 
     def _add(self, code: str, rows: str | None = None) -> None:
         """Code for each cluster; another where rows are held in it."""
-        self._used = self._used or any(code if rows is None or not place.shape.name else rows for place in self.places)
-        for k, place in enumerate(self.places):
-            self._code[k] += code if rows is None or not place.shape.name else rows
+        for k, (shape, *_) in enumerate(self.places):
+            self._code[k] += code if rows is None or not shape.name else rows
 
     def write(self, name: str, operations: Sequence[Op]) -> list[Action]:
         """Kernels for some operations; returns what is to be done with them."""
@@ -581,7 +568,6 @@ class Kernels:
 
     def _rescale(self, op: Op) -> None:
         """Velocities back to their spheres; `restore` and `turn` move auxiliary variables, too."""
-        self._used = True
         for k, (of, freedom, start) in enumerate(self.sphere_of):
             if freedom:
                 number = self.per_sphere
@@ -599,7 +585,7 @@ class Kernels:
     _restore = _rescale
 
     def _evaluate(self, op: Op) -> None:
-        self._close(Action("", self.groups[op.group], list(self.groups).index(op.group)))
+        self._close(("", self.groups[op.group], list(self.groups).index(op.group)))
 
     def _note(self, op: Op) -> None:
         self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc3 += v[3*a+c]*v[3*a+c]/w[a];\n")
@@ -618,9 +604,9 @@ class Kernels:
 
     def _close(self, action: Action | None = None) -> None:
         """A kernel of what was written since the last; `action` comes after it."""
-        if self._used or self._before:
+        if any(self._code) or self._before:
             name = f"{self._name}{len(self._actions)}"
-            self._actions.append(Action(name))
+            self._actions.append((name, -1, 0))
             ends = accumulators = ""
             places = {f"acc{k}": self._bank + k for k in range(self._sums)} | ({"acc3": 6} if self._noted else {})
             if places:
@@ -645,26 +631,26 @@ class Kernels:
             (True, ""),
             (False, f"for (int item = GLOBAL_ID; item < {self.items}; item += GLOBAL_SIZE)"),
         ):
-            kinds = [each for each in zip(self.places, self._code, strict=True) if each[0].shape.together is together]
+            kinds = [each for each in zip(self.places, self._code, strict=True) if each[0][0].together is together]
             if found := "".join(self._cluster(place, code) for place, code in kinds if code):
                 text += f" {loop} {{\n{found} }}\n"
         return text
 
-    def _cluster(self, place: _Place, code: str) -> str:
-        shape = place.shape
+    def _cluster(self, place: tuple[Shape, int, int, int], code: str) -> str:
+        shape, begin, atoms, work = place
         clusters, n = shape.atoms.shape
-        cluster = f"item-{place.begin}"
+        cluster = f"item-{begin}"
         if shape.together:
-            room = f" GLOBAL mixed *x = work+{place.work}+({cluster})*{10 * n}, "
+            room = f" GLOBAL mixed *x = work+{work}+({cluster})*{10 * n}, "
             room += f"*v = x+{3 * n}, *d = v+{3 * n}, *w = d+{3 * n};\n"
             words = {"EACH": f"for (int a = LOCAL_ID; a < {n}; a += LOCAL_SIZE)", "ROOM": "", "SYNC": "SYNC_THREADS;"}
-            atom = f"atoms[{place.atoms}+({cluster})*{n}+a]"
+            atom = f"atoms[{atoms}+({cluster})*{n}+a]"
             words["AT"] = f"RESTS({atom})" if self.resting else atom
             load = " SYNC\n"
         else:
             room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n"
             words = {"EACH": f"for (int a = 0; a < {n}; a++)", "ROOM": f"mixed d[{3 * n}];", "SYNC": "", "AT": "at[a]"}
-            atom = f"atoms[{place.atoms}+a*{clusters}+{cluster}]"
+            atom = f"atoms[{atoms}+a*{clusters}+{cluster}]"
             load = f" EACH at[a] = {f'RESTS({atom})' if self.resting else atom};\n"
         away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
         load += (
@@ -677,27 +663,18 @@ class Kernels:
         words |= {"NAME": shape.name, "CLUSTER": f"{cluster}+{shape.first}", "ITEM": cluster}
         words |= {"EVERY": f"for (int a = 0; a < {n}; a++)", "FIRST": "LOCAL_ID == 0" if shape.together else "1"}
         text = _with(text, words)
-        end = place.begin + clusters
+        end = begin + clusters
         if shape.together:  # barriers are inside, which no condition may be about
-            loop = f"for (int item = {place.begin}+GROUP_ID; item < {end}; item += NUM_GROUPS)"
+            loop = f"for (int item = {begin}+GROUP_ID; item < {end}; item += NUM_GROUPS)"
         else:
-            loop = f"if (item >= {place.begin} && item < {end})"
+            loop = f"if (item >= {begin} && item < {end})"
         return f" {loop} {{\n{room}{text} }}\n"
 
 
-class Plan(NamedTuple):
-    """What the plugin needs for a Context, see `Plan` in `plugin/program_integrator.h`."""
-
-    source: str
-    arrays: list[Array]
-    parts: tuple[list[Action], list[Action], list[Action]]
-    items: int
-    work_group: int
-    slots: int
-
-
-def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, held: Any) -> Plan:
-    """The plan for a platform.
+def plan(
+    described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, held: Any
+) -> tuple[str, list[Array], list[list[Action]], tuple[int, int, int]]:
+    """What the plugin needs for a Context, see `Plan` in `plugin/program_integrator.h`.
 
     Parameters
     ----------
@@ -706,6 +683,15 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     groups : int
         Bit mask of the force groups that act.
     held : DeviceRows
+
+    Returns
+    -------
+    source : str
+    arrays : list of Array
+    parts : list of list of Action
+        Head, middle and tail of a step.
+    sizes : (int, int, int)
+        Work-items that there is work for, their number in a group, and how many groups of forces are kept.
     """
     operations = [Op._make(tuple(v) if isinstance(v, list) else v for v in op) for op in described["operations"]]
     names_of_groups = dict.fromkeys(op.group for op in operations if op.verb == "evaluate")
@@ -713,8 +699,8 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     seed = described["seed"] or int(np.random.default_rng().integers(1, 2**31 - 1))
     parameters, memory, particles = described["settings"], described["memory"], len(masses)
     kernels = Kernels(described, masses, masks, held)
-    parts = divided(operations, described["noisy"])
-    head, middle, tail = (kernels.write(name, ops) for name, ops in zip(("head", "middle", "tail"), parts, strict=True))
+    parts = zip(("head", "middle", "tail"), divided(operations, described["noisy"]), strict=True)
+    actions = [kernels.write(name, each) for name, each in parts]
     recorded, room = described["recorded"], room_for(len(described["recorded"]))
     order = np.concatenate([*kernels.order, np.array(recorded, dtype=np.int64)])
     arrays = standard_arrays([*parameters.values()], len(memory), seed, particles)
@@ -740,7 +726,7 @@ def plan(described: Mapping[str, Any], platform: str, masses: FloatArray, groups
     source += "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
     items = kernels.items + kernels.crowds * work_group
-    return Plan(source, arrays, (head, middle, tail), items, work_group, len(masks))
+    return source, arrays, actions, (items, work_group, len(masks))
 
 
 def room_for(particles: int) -> int:

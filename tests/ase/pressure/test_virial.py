@@ -40,9 +40,6 @@ def test_ideal_gas_of_rigid_water():
     assert error < 0.02 * expected
 
 
-# -- long statistics --------------------------------------------------------------------------------
-
-
 # -- cells are relaxed with molecules that stay rigid; what would break them is refused ------------
 
 

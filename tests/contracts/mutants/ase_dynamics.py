@@ -52,8 +52,7 @@ MUTANTS = {
     "ase/respect.py": [
         ("scaled = «changed and self._scaled(motion, x, cell)→True»", "ase/edits::an_edit_between_runs_is_refused"),
         (
-            "«not (changed or (differ(self._positions, x) if elsewhere is None else elsewhere))→"
-            "self._cell is not None»",
+            "«not (changed or elsewhere or differ(self._positions, x))→self._cell is not None»",
             "ase/edits::an_edit_between_runs_is_refused",
         ),
         ("        if «along < stayed→False»:", "virial::filters_beside_atoms_that_stay_are_refused"),
@@ -79,9 +78,6 @@ MUTANTS = {
         ),
     ],
     "steppers/stepper.py": [
-        (
-            '{name: «None if name in ("_known", "_left") else →»value',
-            "stepper::copies_leave_behind_what_was_found_for_a_system",
-        ),
+        (': «None if name in ("_known", "_left") else →»', "stepper::copies_leave_behind_what_was_found_for_a_system"),
     ],
 }

@@ -3,10 +3,7 @@
 MUTANTS = {
     "batched/clusters.py": [
         ("torch.where(d > «0→-9e99», 0.0, torch.inf)", "batched/batch::a_bond_that_has_turned_is_no_solution"),
-        (
-            "back = _each(operator.«neg→pos», self.spread(slope, a))",
-            "batched/gradients::derivatives_are_those_of_the_solution",
-        ),
+        ("_each(operator.«neg→pos», self.spread(slope, a)", "batched/gradients::derivatives_are_those_of_the_solution"),
         ("start=of.start «+→-» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
         ("d, rest), «rest.T→0 * rest.T»])", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
     ],
@@ -31,7 +28,6 @@ MUTANTS = {
             "torch.where(self._is_position, held, «flight→1.0» * middle)",
             "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-LinearVelocity]",
         ),
-        ("made._lattice = self._lattice[«numbers→:1»]", "batched/batch::systems_are_selected_with_their_cells"),
     ],
     "batched/steps.py": [
         ("if «given.shape != x.shape→False»:", "batched/batch::what_is_refused"),

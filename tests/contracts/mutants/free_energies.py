@@ -44,10 +44,7 @@ MUTANTS = {
         ),
     ],
     "openmm/integrator/guard.py": [
-        (
-            "force.getForceGroup() not in «row_groups→range(32)»:",
-            "openmm/integrator/edits::forgotten_parts_are_refused",
-        ),
+        ("force.getForceGroup() not in «row_groups→range(32)»", "openmm/integrator/edits::forgotten_parts_are_refused"),
     ],
     "free_energy/averages.py": [
         ("covariance *= «np.outer(widening, widening)→1.0»", "correlated_series::errors_are_as_large_as_they_say"),

@@ -2,7 +2,7 @@
 
 MUTANTS = {
     "openmm/integrator/guard.py": [
-        ("()._value if «driven→False» else 0.0", "carried_constraints::time_that_is_set_is_no_way_of_moving_targets"),
+        ("()._value if «driven→False» else 0.0", "hold::time_that_is_set_is_no_way_of_moving_targets"),
         (
             "for part in integrator.parts:\n                «part.check_masses(self.system)→pass»",
             "callbacks::masses_that_change_in_a_run_are_noticed_at_the_next_check",
@@ -46,10 +46,7 @@ MUTANTS = {
         ('p.each("v", "v«_last→»", "back to where the step began")', "collective_rows::a_step_too_large_is_taken_back"),
         ('"«select(looked, v_last, u-0.5*dt*f/m)→v_last»"', "steps::failure_where_nobody_looked"),
         ('middle(p, f"«→v+»(x-x_start)/', "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
-        (
-            'kick(p, "«kick→0.5»*dt", tangent=',
-            "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves",
-        ),
+        ('kick(p, "«kick→0.5»*dt", tangent', "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
         (
             'asks = "«select(call-1, failed, select(moved, -1, 0))→failed»"',
             "openmm/integrator/edits::positions_off_the_rows_are_not_pulled_back_in_silence",
@@ -59,10 +56,7 @@ MUTANTS = {
             "steps::parameters_of_forces_are_used_in_the_next_step",
         ),
         ("self.recall({**self.«settings→idle», **self.idle})", "settings::a_setting_has_a_method_of_its_own"),
-        (
-            "            kicks[«-1→0»] += operation.fraction",
-            "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves",
-        ),
+        ("[«-1→0»] += operation.fraction", "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
     ],
     "openmm/ensembles/isokinetic_ensemble.py": [
         ("(count« - 1→») * GAS_CONSTANT * self.temperature", "every_ensemble::a_run_has_the_temperature"),
@@ -106,10 +100,7 @@ MUTANTS = {
         ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
-        (
-            'p.let(name, «f"{name}_last"→name», "the chain',
-            "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was",
-        ),
+        ('(name, «f"{name}_last"→name», "the', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),
     ],
     "openmm/integrator/projected.py": [
         ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),
@@ -129,13 +120,13 @@ MUTANTS = {
             "elif self.timed and «self._integrator() is None→False»:",
             "callbacks::rows_that_need_the_time_are_not_held_without_their_integrator",
         ),
-        ("= «not p.integrator.thermostatted→False»", "carried_constraints::velocities_are_those_of_the_core"),
+        ("= «not p.integrator.thermostatted→False»", "hold::velocities_are_those_of_the_core"),
         (
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "part::integrators_in_turn_hold_the_same_part",
         ),
         ("u * np.cos(w) - d * (w * np.sin(w))« - way→»", "surface_integrator::great_circles_at_any_time_step"),
         ('"ij,ij->i", d, way)[:, None] / radius«**2→»)', "surface_integrator::the_steps_are_those_of_the_core"),
-        ("self.motion.rank« - 3 * fixed→»", "carried_constraints::particles_without_mass_take_no_degree_of_freedom"),
+        ("self.motion.rank« - 3 * fixed→»", "hold::particles_without_mass_take_no_degree_of_freedom"),
     ],
 }

@@ -46,10 +46,7 @@ MUTANTS = {
         ),
     ],
     "constraints/velocity.py": [
-        (
-            "half = «→-»0.5 * (bx * gx",
-            "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
-        ),
+        ("half = «→-»0.5 * (bx *", "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]"),
     ],
     "steppers/program.py": [
         ("kick.fraction, group, time, «end→1.0»", "langevin::each_substep_meets_targets_at_its_own_time"),

@@ -144,15 +144,6 @@ def test_an_input_for_openmm(folder):
     assert found.sampler.begin()[0] == pytest.approx([first, first - second])
 
 
-def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
-    assert read(folder, INPUT.replace("rng = 4", "approach = 6")).options["approach"] == pytest.approx(np.radians(6))
-    more = INPUT.replace("[held]", "[[coordinate]]\ndistance = [1, 4]\nvalues = [2.0]\n[held]").replace(IMPROVE, "")
-    found = read(folder, more.replace("rng = 4", "approach = [6, 0.2]")).options["approach"]
-    assert found == pytest.approx([np.radians(6), 0.2])
-    with pytest.raises(InputError, match="approach has 3 values; give one for each of turn, distance-1-4"):
-        read(folder, more.replace("rng = 4", "approach = [6, 0.2, 1]"))
-
-
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
@@ -200,6 +191,7 @@ def test_the_way_to_a_window_is_in_degrees_as_all_angles_are(folder):
             "there is no atom 0; atoms are counted from 1",
         ),
         ("sigma = 1.0", "sgima = 1.0", r"lj has no setting 'sgima' .did you mean 'sigma'"),
+        ("rng = 4", "approach = [6, 0.2, 1]", "approach has 3 values; give one for each of turn"),
         ("rng = 4", 'approach = "x"', "approach of .sampling. is 'x'; give a number, or numbers"),
         ("[improve]", "[pull]\ncount = 5\n[improve]", r"unknown key 'pull' .did you mean 'pulls'"),
         (
