@@ -65,10 +65,10 @@ def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray) -> IntArray:
     row = np.repeat(np.arange(n_rows), np.diff(incidence.indptr))
     inside = free[incidence.indices]
     links = np.stack([row[inside], n_rows + incidence.indices[inside]], axis=1)
-    found = connected(links, n_rows + n_atoms)[0][:n_rows]
     movable = np.bincount(row[inside], minlength=n_rows) > 0
+    found = connected(links, n_rows + n_atoms)[0][:n_rows][movable]
     labels = np.full(n_rows, -1, dtype=np.int64)
-    labels[movable] = np.unique(found[movable], return_inverse=True)[1]
+    labels[movable] = (np.cumsum(np.bincount(found) > 0) - 1)[found]
     return labels
 
 

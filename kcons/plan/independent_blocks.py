@@ -16,7 +16,7 @@ import numpy as np
 from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import connected, spanning_tree
+from kcons.constraints.periodic.one_piece import spanning_tree
 
 _GROUND = -1
 
@@ -36,7 +36,7 @@ def row_blocks(
     ``members[starts[k]:starts[k + 1]]``, sorted; nothing for forests.
     """
     ground = fixed_atoms(constraint_set)
-    ends: list[tuple[IntArray, IntArray, IntArray, bool]] = []
+    ends: list[tuple[IntArray, IntArray, IntArray]] = []
     for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
         if not item.holonomic or item.fixes_atoms or not accept(item) or item.n_rows == 0:
             continue
@@ -50,23 +50,15 @@ def row_blocks(
             nodes = np.where(np.isin(nodes, ground), _GROUND, nodes)
         if not item.translation_invariant:
             nodes = np.hstack([nodes, np.full((len(nodes), 1), _GROUND)])
-        ends.append((nodes[:, :-1].ravel(), nodes[:, 1:].ravel(), np.repeat(numbers, nodes.shape[1] - 1), False))
-        if nodes.shape[1] > 2:
-            ends.append((nodes[:, -1], nodes[:, 0], numbers, True))
-    nothing = np.zeros(0, np.int64), np.zeros(1, np.int64)
+        # A row of several atoms is a cycle through them.
+        sides, ahead = (nodes.shape[1] if nodes.shape[1] > 2 else 1), np.roll(nodes, -1, axis=1)
+        ends.append((nodes[:, :sides].ravel(), ahead[:, :sides].ravel(), np.repeat(numbers, sides)))
     if not ends:
-        return nothing
-    u = np.concatenate([e[0] for e in ends])
-    v = np.concatenate([e[1] for e in ends])
-    row = np.concatenate([e[2] for e in ends])
-    closing = np.concatenate([np.full(len(e[0]), e[3]) for e in ends])
-    proper = u != v
-    u, v, row, closing = u[proper], v[proper], row[proper], closing[proper]
+        return np.zeros(0, np.int64), np.zeros(1, np.int64)
+    u, v, row = (np.concatenate(parts) for parts in zip(*ends, strict=True))
+    u, v, row = u[u != v], v[u != v], row[u != v]
     vertices, index = np.unique(np.concatenate([u, v]), return_inverse=True)
     u, v = index[: len(u)], index[len(u) :]
-    n_parts = connected(np.stack([u, v], axis=1), len(vertices))[1]
-    if np.sum(~closing) == len(vertices) - n_parts:  # no edge closes a cycle
-        return nothing
     block = edge_blocks(u, v, len(vertices))
     # A wide row has several edges, all in one block.
     keys = np.unique(block * constraint_set.n_rows + row)
