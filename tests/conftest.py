@@ -29,12 +29,10 @@ hypothesis.settings.load_profile("kcons")
 
 HERE = Path(__file__).parent
 LOCALE = locale.setlocale(locale.LC_ALL)
-#: How long comparisons run what is to be timed, and how fast compilers make kernels, less than usual: no test looks at
-#: a time. What else they do stays.
+#: How long comparisons run what is to be timed, less than usual: no test looks at a time. What else they do stays.
 LITTLE = {
     "bare_solvers": {"SAMPLING": 0.01},
     "kcons.comparison.measure": {"MORE_SECONDS": 0.01, "PASS_SECONDS": 1e-3},
-    "kcons.openmm.device.build": {"KERNEL_FLAGS": ("-std=c++17", "-O0", "-fPIC", "-shared", "-w")},
 }
 #: The same of the package, of modules that were imported.
 USUAL: dict[str, dict[str, object]] = {}

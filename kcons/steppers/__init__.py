@@ -8,17 +8,16 @@ A stepper never changes its input. Where it raises, nothing has happened.
 - `program`, `interpreter`: operations as rows of numbers, and who makes them
 - `compiled_operations`: as many as there are in one compiled call
 - `packed_system`: what compiled operations know of a system
-- `stepper`: what a stepper is
+- `stepper`: what a stepper is, and a check that each step can be taken back
 - `splitting`: kicks and drifts in turn, of orders 2, 4 and 6
-- `running`, `reversibility_check`: steps one after another, and taken back
+- `running`: steps one after another
 """
 
 from kcons.steppers import splitting
-from kcons.steppers.reversibility_check import ReversibilityCheck
 from kcons.steppers.running import Observer, Trajectory, run
 from kcons.steppers.splitting import *
 from kcons.steppers.state import State, System
-from kcons.steppers.stepper import Stepper
+from kcons.steppers.stepper import ReversibilityCheck, Stepper
 
 __all__ = ["Observer", "ReversibilityCheck", "State", "Stepper", "System", "Trajectory", "run"]
 __all__ += splitting.__all__

@@ -1,16 +1,20 @@
-"""What a stepper is."""
+"""What a stepper is, and a check of any of them: every step is reversed and compared with its start."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from kcons.errors import ConvergenceError, InputError, KconsError
+from kcons.constraints.arguments import Positive, checked
+from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import extent
+from kcons.errors import ConvergenceError, InputError, KconsError, ReversibilityError, UnsupportedError
 from kcons.steppers.operations import Operation
-from kcons.steppers.state import State, System
+from kcons.steppers.state import KICK_ROUNDING, State, System
 
 Error = TypeVar("Error", bound=KconsError)
 
@@ -129,3 +133,116 @@ def retold(error: Error, message: str, kind: type[Error], step: int) -> Error:
     told = kind(message)
     vars(told).update(vars(error), step=step)
     return told
+
+
+class ReversibilityCheck(Listed):
+    """A stepper that reverses every step and compares with its start, to find solves that fail silently.
+
+    Projections have more than one solution when a step is large; a step that lands on another branch than the
+    one it came from is no longer reversible, and long runs with such steps are wrong without any other sign.
+
+    Parameters
+    ----------
+    stepper : Stepper
+        The scheme; must be reversible.
+    tolerance : float
+        Largest allowed difference after a step forward and back: of positions relative to the distance traveled
+        or the size of the system, whichever is larger, and of velocities relative to the fastest one. What rounding
+        leaves of positions, and of the kick of a step, is allowed besides: at rest there is nothing else.
+
+    Raises
+    ------
+    UnsupportedError
+        The scheme is not reversible at all.
+    """
+
+    @checked
+    def __init__(self, stepper: Stepper, tolerance: Positive = 1e-9) -> None:
+        require_stepper(stepper)
+        if not stepper.reversible:
+            raise UnsupportedError(
+                f"{stepper!r} is not reversible, so there is nothing to check; use Rattle, Geodesic, a Composition "
+                "or a RungeKuttaNystrom stepper"
+            )
+        self.stepper = stepper
+        self.tolerance = tolerance
+        self.order = stepper.order
+        self.reversible = True
+        self.symplectic = stepper.symplectic
+        self.force_evaluations = 2 * stepper.force_evaluations
+        self.holds = getattr(stepper, "holds", True)
+
+    def __repr__(self) -> str:
+        return f"ReversibilityCheck({self.stepper!r})"
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        """Those of the stepper, whose step is then taken back and compared."""
+        if not isinstance(self.stepper, Listed):
+            raise UnsupportedError(f"{self.stepper!r} does not say what its step consists of")
+        return self.stepper.operations(system)
+
+    def parts(self, system: System | None = None) -> tuple[Operation, ...]:
+        return self.stepper.parts(system) if isinstance(self.stepper, Listed) else self.operations(system)
+
+    def check(self, system: System) -> None:
+        self.stepper.check(system)
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`.
+
+        Raises
+        ------
+        ReversibilityError
+            The step back does not end where the step began; carries `step` and `residual`.
+        KconsError
+            Whatever the stepper raises, forward or back.
+        """
+        after = self.stepper.step(system, state, dt)
+        if dt != 0:
+            self.take_back(system, state, after, dt, lambda: [system.with_forces(after).forces])
+        return after
+
+    def take_back(
+        self, system: System, state: State, after: State, dt: float, forces: Callable[[], list[FloatArray | None]]
+    ) -> None:
+        """Make the step back from `after` and compare with `state`; `forces` gives those of the step, for rounding.
+
+        Raises
+        ------
+        ReversibilityError
+            As `step`.
+        """
+        try:
+            back = self.stepper.step(system, after, -dt)
+        except ConvergenceError as error:
+            message = f"step {after.step} cannot be taken back: {error}"
+            raise retold(error, message, ReversibilityError, after.step) from error
+        acceleration = max((_largest(f * system.inverse_masses) for f in forces() if f is not None), default=0.0)
+        off = _missed(state, after, back, dt, acceleration)
+        residual = float(off.max(initial=0.0))
+        if not residual <= self.tolerance:
+            atom = int(np.argmax(off.max(axis=1)))
+            raise ReversibilityError(
+                f"step {after.step} is not reversible: taken back, atom {atom} misses its start by {residual:.3g} "
+                f"(relative; allowed {self.tolerance:.3g}); use a smaller time step than {system.shown_time(dt)}",
+                residual=residual,
+                tolerance=self.tolerance,
+                atoms=[atom],
+                step=after.step,
+            )
+
+
+def _missed(state: State, after: State, back: State, dt: float, acceleration: float) -> FloatArray:
+    """How far a step that was taken back misses its start, relative as in `ReversibilityCheck`, shape (n_atoms, 3)."""
+    speed = max(_largest(state.velocities), _largest(after.velocities))
+    length = max(extent(state.positions), speed * abs(dt))
+    rounding = 8 * float(np.spacing(_largest(state.positions)))
+    kick = abs(dt) * acceleration
+    moved = np.maximum(np.abs(back.positions - state.positions) - rounding, 0.0)
+    turned = np.maximum(np.abs(back.velocities - state.velocities) - KICK_ROUNDING * kick, 0.0)
+    # A speed of zero both before and after leaves nothing to compare with.
+    return np.asarray(np.maximum(moved / (length or 1.0), turned / (speed or 1.0)))
+
+
+def _largest(values: np.ndarray) -> float:
+    return float(np.abs(values).max(initial=0.0))

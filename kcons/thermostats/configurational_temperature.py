@@ -257,34 +257,21 @@ class TemperatureSplit:
             raise InputError(
                 f"{len(self._series)} samples are too few for an error; add {MIN_SAMPLES} or more", item="samples"
             )
-        series = np.array(self._series)
-        exists = self._clusters.shifts, self._axes, self._rest
+        series, notes = np.array(self._series), self._left_out()
         found: list[Estimate | None] = [None, None, None]
+        exists = self._clusters.shifts, self._axes, self._rest
         for kind, (name, there) in enumerate(zip(("shifts", "turns", "internal motions"), exists, strict=True)):
             if there.any() and series[:, 0, kind].any():
                 found[kind], doubt = temperature(series[:, 0, kind], series[:, 1, kind])
                 if doubt:
                     warnings.warn(f"temperature of {name}: {doubt}", UserWarning, stacklevel=2)
+            elif there.any() and kind < 2:
+                notes.append(f"no force {name} clusters as a whole: that has no temperature")
         counts = 3 * int(exists[0].sum()), int(exists[1].sum())
         squares = [max(float(series[:, 1, kind].mean()), 0.0) / max(counts[kind], 1) for kind in (0, 1)]
-        return SplitTemperatures(
-            shift=found[0],
-            turn=found[1],
-            internal=found[2],
-            shifts=counts[0],
-            turns=counts[1],
-            shift_frequency=math.sqrt(squares[0]),
-            turn_frequency=math.sqrt(squares[1]),
-            samples=len(series),
-            left_out=(
-                *self._left_out(),
-                *(
-                    f"no force {does} clusters as a whole: that has no temperature"
-                    for does, kind in (("shifts", 0), ("turns", 1))
-                    if exists[kind].any() and not series[:, 0, kind].any()
-                ),
-            ),
-        )
+        frequencies = math.sqrt(squares[0]), math.sqrt(squares[1])
+        shift, turn, internal = found
+        return SplitTemperatures(shift, turn, internal, *counts, *frequencies, len(series), tuple(notes))
 
     # -- inner ----------------------------------------------------------------------------------
 

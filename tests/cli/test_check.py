@@ -197,20 +197,15 @@ def test_errors_take_one_line(folder, capsys, name, more, words):
 
 def test_advice_is_of_the_command(folder, tmp_path, capsys):
     """What remarks and errors tell to do can be done with files and options."""
-    bare = tmp_path / "t.xyz"
+    bare, few = tmp_path / "t.xyz", files.topology(tmp_path / "few.gro", N - 1, files.water(N - 1, 1)[0])
     atoms = "".join(f"{'OHH'[k % 3]} {k}.0 0.0 0.0\n" for k in range(3 * N))
     bare.write_text(f"{3 * N}\n\n{atoms}")
-    arguments = [str(folder / "good.trr"), "--topology", str(bare), "--constrain", "allbonds", "--no-rigid-water"]
-    assert main(["check", *arguments, "--out", str(tmp_path / "out")]) in (0, 1, 2)
+    for top in (bare, few):
+        words = ["check", str(folder / "good.trr"), "--topology", str(top), "--constrain", "allbonds"]
+        assert main([*words, "--no-rigid-water", "--out", str(tmp_path / top.stem)]) in (0, 1, 2)
     said = capsys.readouterr()
     page = " ".join((said.out + said.err).split())
     assert "bonds were guessed from distances and covalent radii" in page and "give a topology with bonds" in page
-    for name in ("short.trr", "few.gro"):
-        (tmp_path / name).write_bytes(b"")
-    files.topology(tmp_path / "few.gro", N - 1, files.water(N - 1, 1)[0])
-    main(["check", str(folder / "good.trr"), "--topology", str(tmp_path / "few.gro"), "--out", str(tmp_path / "few")])
-    said = capsys.readouterr()
-    page += said.out + said.err
     for words in ("guess_bonds", "universe", "guess_TopologyAttrs", "backend", "select_atoms"):
         assert words not in page
 

@@ -35,8 +35,6 @@ ACCELERATED = ("OpenCL", "CUDA", "HIP")
 PACKAGE = "kcons_device"
 _CORE = ("program_integrator.cpp", "plain_platforms.cpp")
 _FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared", "-w")
-#: Of kernels for Reference and CPU.
-KERNEL_FLAGS = _FLAGS
 
 
 def compiler() -> list[str]:
@@ -178,12 +176,12 @@ def kernels_library(source: str) -> Path:
     """
     if not compiler():
         raise UnsupportedError("steps on the platforms Reference and CPU need a C++ compiler, and there is none")
-    path = folder() / f"kernels_{hashlib.sha256(f'{KERNEL_FLAGS} {source}'.encode()).hexdigest()[:24]}.so"
+    path = folder() / f"kernels_{hashlib.sha256(f'{_FLAGS} {source}'.encode()).hexdigest()[:24]}.so"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as made:
             text = Path(made) / "kernels.cpp"
             text.write_text(source)
-            _compile([str(text), *KERNEL_FLAGS, "-o", f"{made}/kernels.so"])
+            _compile([str(text), *_FLAGS, "-o", f"{made}/kernels.so"])
             os.replace(f"{made}/kernels.so", path)
     return path

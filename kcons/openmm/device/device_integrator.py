@@ -20,7 +20,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
 from kcons.openmm.device.held_rows import constraints_of, function_on_device
-from kcons.openmm.device.kernel_rows import KernelRows, as_parts
+from kcons.openmm.device.kernel_rows import KernelRows
 from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
@@ -200,7 +200,9 @@ class DeviceIntegrator(ProjectedIntegrator):
         _ALIVE[int(made.this)] = self
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
-        return as_parts(parts)
+        given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
+        known = len(given) < 2 and all(isinstance(part, KernelRows) for part in given)
+        return given if known else (KernelRows(given),)
 
     def _write(self) -> Program:
         """A step without parts: kernels hold their rows."""
@@ -430,7 +432,7 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     masses = np.ctypeslib.as_array(given.masses, (given.particles,)).copy()
     positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
     box = np.array(given.box[:9]).reshape(3, 3)
-    rows = part.rows_at(masses, (pairs, lengths), positions, box if box.any() else None, given.time)
+    rows = part.rows_at(masses, pairs, lengths, positions, box if box.any() else None, given.time)
     if integrator is not None:
         integrator.rows = rows
     source, arrays, parts, sizes = plan(described, platform, masses, given.groups, rows)

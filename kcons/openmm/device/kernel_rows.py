@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from kcons.openmm.callback_rows import CarriedConstraints, Engine, refuse_virtua
 from kcons.openmm.device.held_rows import constraints_of
 from kcons.openmm.device.rows import DeviceRows
 from kcons.openmm.integrator.guard import SystemRows, settled_rows
-from kcons.openmm.integrator.part import Part, Precision, Solver
+from kcons.openmm.integrator.part import Precision, Solver
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import accepted, masses_of, positions_of
 
@@ -58,7 +58,8 @@ class KernelRows(CarriedConstraints):
     def rows_at(
         self,
         masses: FloatArray,
-        system_rows: tuple[IntArray, FloatArray],
+        pairs: IntArray,
+        lengths: FloatArray,
         positions: FloatArray,
         cell: FloatArray | None,
         time: float,
@@ -70,16 +71,14 @@ class KernelRows(CarriedConstraints):
         KconsError
             As `DeviceRows`.
         """
-        pairs, lengths = system_rows
         # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
         moving = (masses[pairs] > 0).any(axis=1)  # between others OpenMM holds nothing
         pairs, lengths = pairs[moving], lengths[moving]
         lengths = np.where(settled_rows(pairs, lengths, len(masses)), lengths.astype(np.float32), lengths)
-        system_rows = pairs, lengths
-        made_of = masses.tobytes(), *(np.asarray(array).tobytes() for array in system_rows)
+        made_of = tuple(array.tobytes() for array in (masses, pairs, lengths))
         if self._bound is None or self._of != made_of:
             cell = None if self._wraps is False else cell
-            rows = DeviceRows(masses, system_rows, self.given, positions, cell, time)
+            rows = DeviceRows(masses, (pairs, lengths), self.given, positions, cell, time)
             self._bound, self._of = (rows, Engine(rows.motion, masses, cell)), made_of
             self._slopes = None
         return self._bound[0]
@@ -177,11 +176,3 @@ class KernelRows(CarriedConstraints):
 
     def __repr__(self) -> str:
         return f"<KernelRows: {sum(item.n_rows for item in self.given)} rows and the constraints of the System>"
-
-
-def as_parts(parts: Any) -> tuple[Part, ...]:
-    """What an integrator on the device was given to hold as one part; nothing where that is nothing."""
-    given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
-    if not given or (len(given) == 1 and isinstance(given[0], KernelRows)):
-        return given
-    return (KernelRows(given),)

@@ -68,7 +68,7 @@ class ItemWriter:
     def _each(self, write: Callable[[int, Row], str]) -> str:
         return "".join(write(k, row) for k, row in enumerate(self.rows))
 
-    def _begin(self, what: str, first: str, changed: str) -> str:
+    def _begin(self, what: str, first: str) -> str:
         def room(k: int, row: Row) -> str:
             size = 3 * len(row.atoms)
             kept = f", b{k}[{size}]" if row.how == NEAREST else ""
@@ -77,7 +77,7 @@ class ItemWriter:
         lengths = self._each(lambda k, r: f" mixed i{k} = 1/{self.targets[k]};\n" if self._plain(r) else "")
         return (
             f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
-            f"mixed* {changed}, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
+            f"mixed* d, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
             f"{self.table.shape[1]};\n{self._each(room)}{lengths} mixed off[{self.count}], sum[{self.count}];\n "
             f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n"
         )
@@ -112,22 +112,22 @@ class ItemWriter:
         steps = (f" ROWS_STEP(b{k}, {3 * i}, x, {3 * b}, {3 * a})" for i, (a, b) in enumerate(pairwise(row.atoms), 1))
         return f" b{k}[0] = b{k}[1] = b{k}[2] = 0;{''.join(steps)}\n"
 
-    def _value(self, k: int, row: Row, time: str, moved: bool, out: str) -> str:
+    def _value(self, k: int, row: Row, time: str, moved: bool) -> str:
         """Value less target, or value alone, and gradient of a row."""
         text = self._gathered(k, row, moved)
         if not self._plain(row):
-            return f"{text} rows_f{row.function}(r{k}, {self.parameters[k]}, {time}, {out});\n"
+            return f"{text} rows_f{row.function}(r{k}, {self.parameters[k]}, {time}, o{k});\n"
         u, t = [f"r{k}[{3 + c}]" for c in range(3)], self.targets[k]
         square = "+".join(f"{each}*{each}" for each in u)
-        lines = [f" {out}[{1 + c}] = -i{k}*{u[c]}; {out}[{4 + c}] = i{k}*{u[c]};" for c in range(3)]
-        return f"{text} {out}[0] = ({square}-{t}*{t})*((mixed) 0.5*i{k});{''.join(lines)}\n"
+        lines = [f" o{k}[{1 + c}] = -i{k}*{u[c]}; o{k}[{4 + c}] = i{k}*{u[c]};" for c in range(3)]
+        return f"{text} o{k}[0] = ({square}-{t}*{t})*((mixed) 0.5*i{k});{''.join(lines)}\n"
 
     def _reference(self, time: str) -> str:
-        def one(k: int, row: Row) -> str:
+        text = ""
+        for k, row in enumerate(self.rows):
             kept = "".join(f" g{k}[{c}] = o{k}[{1 + c}];" for c in range(3 * len(row.atoms)))
-            return f"{self._images(k, row)}{self._value(k, row, time, False, f'o{k}')}{kept} sum[{k}] = 0;\n"
-
-        return self._each(one)
+            text += f"{self._images(k, row)}{self._value(k, row, time, False)}{kept} sum[{k}] = 0;\n"
+        return text
 
     def _wanted(self, k: int, row: Row, time: str, rate: int) -> str:
         """Target of a row at a time, or its rate; of rows of velocities there is no rate."""
@@ -208,7 +208,7 @@ class ItemWriter:
             )
 
         def turn(k: int, row: Row) -> str:
-            text = self._value(k, row, "time-h/2" if row.rolls else "time", True, f"o{k}")
+            text = self._value(k, row, "time-h/2" if row.rolls else "time", True)
             text += f" off[{k}] = o{k}[0]{'' if self._plain(row) else f'-t{k}'};"
             if row.period:
                 text += f" off[{k}] -= {literal(row.period)}*rint(off[{k}]/{literal(row.period)});"
@@ -223,7 +223,7 @@ class ItemWriter:
         missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};")
         fail = f"{{FAIL({self.row_number}+bad, off[bad]); return;}}\n"
         return (
-            f"{self._begin('positions', 'h', 'd')}{self._reference('time-h')}{self._each(start)} int bad = -1{first};\n"
+            f"{self._begin('positions', 'h')}{self._reference('time-h')}{self._each(start)} int bad = -1{first};\n"
             f" for (int turn = 0;; turn++) {{\n int there = 1;\n{self._each(turn)} if ({stop}) break;{then}\n"
             f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored(False)}{self._solved()} }}\n"
             f"{self._each(turned)} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
@@ -243,7 +243,7 @@ class ItemWriter:
             return f" off[{k}] = {'+'.join(parts)}-c{k};\n"
 
         return (
-            f"{self._begin('velocities', 'rate', 'd')}{self._reference('time')}{self._each(demanded)}"
+            f"{self._begin('velocities', 'rate')}{self._reference('time')}{self._each(demanded)}"
             f"{self._factored(True)} for (int pass = 0; pass < {1 + self.coarse}; pass++) {{\n"
             f"{self._each(speed)}{self._solved()} }}\n if (rate != 0) {{{self._sums('')} }}\n}}\n"
         )

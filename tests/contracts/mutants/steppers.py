@@ -59,9 +59,6 @@ MUTANTS = {
         ("np.sqrt((1 - self.keep«**2→»)", "monte_carlo::velocities_are_those_of_the_temperature"),
         ("(1 / kt[k«] - 1 / kt[k + 1→ + 1] - 1 / kt[k»])", "monte_carlo::the_rule_and_what_changes_places"),
     ],
-    "steppers/reversibility_check.py": [
-        ("if not residual <«= self.tolerance→ 1e300»:", "stepper::check_finds_a_stepper_that_is_not_reversible"),
-    ],
     "thermostats/nose_hoover.py": [
         ("q[0] *= «count→1.0»", "nose_hoover::temperature_oscillates_with_the_period_asked_for"),
         ("if «not state.is_of(system)→False»:", "state::another_system_begins_a_thermostat_anew"),

@@ -55,8 +55,48 @@ public:
         cc.initializeContexts();
     }
 protected:
-    void prepare(ContextImpl& c) override;
-    void launch(const string& kernel) override;
+    void prepare(ContextImpl& c) override {
+        ContextSelector selector(cc);
+        wide = cc.getUseDoublePrecision() || cc.getUseMixedPrecision();
+        for (auto& array : plan.arrays) {
+            int size = array.whole ? sizeof(int) : wide ? sizeof(double) : sizeof(float);
+            arrays[array.name].initialize(cc, array.values.size(), size, array.name);
+            write(array.name, array.values);
+        }
+        forces.resize(plan.slots > 1 ? plan.slots : 0);
+        for (auto& saved : forces) saved.initialize<long long>(cc, cc.getLongForceBuffer().getSize(), "kconsForces");
+        follow();
+        cc.addReorderListener(new Follower(*this));
+        program = cc.compileProgram(plan.source);
+    }
+    void launch(const string& name) override {
+        ComputeKernel& kernel = kernels[name];
+        // Arguments in the order of `kernels.py`: numbers, OpenMM's arrays, forces of each group, own arrays.
+        if (!kernel) {
+            kernel = program->createKernel(name);
+            kernel->addArg(cc.getPaddedNumAtoms());
+            for (int k = 0; k < 8; k++) kernel->addArg();
+            kernel->addArg(cc.getPosq());
+            kernel->addArg(cc.getUseMixedPrecision() ? cc.getPosqCorrection() : cc.getPosq());
+            kernel->addArg(cc.getVelm());
+            kernel->addArg(cc.getAtomIndexArray());
+            for (int slot = 0; slot < plan.slots; slot++)
+                if (forces.empty()) kernel->addArg(cc.getLongForceBuffer());
+                else kernel->addArg(forces[slot]);
+            for (auto& array : plan.arrays) kernel->addArg(arrays[array.name]);
+        }
+        kernel->setArg(1, numbers.step);
+        kernel->setArg(2, numbers.launch++);
+        const double given[] = {numbers.dt, numbers.time, numbers.tolerance};
+        for (int k = 0; k < 3; k++) if (wide) kernel->setArg(3+k, given[k]); else kernel->setArg(3+k, (float) given[k]);
+        for (int k = 0; k < 3; k++) {
+            const Vec3& b = numbers.box[k];
+            if (wide) kernel->setArg(6+k, mm_double4(b[0], b[1], b[2], 0));
+            else kernel->setArg(6+k, mm_float4(b[0], b[1], b[2], 0));
+        }
+        int size = plan.workGroup, groups = min((plan.items+size-1)/size, 256);
+        kernel->execute(max(groups, 1)*size, size);
+    }
     void positionsMoved() override { cc.reorderAtoms(); }
     void keepForces(int slot) override { cc.getLongForceBuffer().copyTo(forces[slot]); }
 private:
@@ -95,49 +135,6 @@ private:
     vector<ComputeArray> forces;
     bool wide = false;   // whether `mixed` is double
 };
-
-void CommonStep::prepare(ContextImpl& c) {
-    ContextSelector selector(cc);
-    wide = cc.getUseDoublePrecision() || cc.getUseMixedPrecision();
-    for (auto& array : plan.arrays) {
-        int size = array.whole ? sizeof(int) : wide ? sizeof(double) : sizeof(float);
-        arrays[array.name].initialize(cc, array.values.size(), size, array.name);
-        write(array.name, array.values);
-    }
-    forces.resize(plan.slots > 1 ? plan.slots : 0);
-    for (auto& saved : forces) saved.initialize<long long>(cc, cc.getLongForceBuffer().getSize(), "kconsForces");
-    follow();
-    cc.addReorderListener(new Follower(*this));
-    program = cc.compileProgram(plan.source);
-}
-void CommonStep::launch(const string& name) {
-    ComputeKernel& kernel = kernels[name];
-    // Arguments in the order of `kernels.py`: numbers, OpenMM's arrays, forces of each group, own arrays.
-    if (!kernel) {
-        kernel = program->createKernel(name);
-        kernel->addArg(cc.getPaddedNumAtoms());
-        for (int k = 0; k < 8; k++) kernel->addArg();
-        kernel->addArg(cc.getPosq());
-        kernel->addArg(cc.getUseMixedPrecision() ? cc.getPosqCorrection() : cc.getPosq());
-        kernel->addArg(cc.getVelm());
-        kernel->addArg(cc.getAtomIndexArray());
-        for (int slot = 0; slot < plan.slots; slot++)
-            if (forces.empty()) kernel->addArg(cc.getLongForceBuffer());
-            else kernel->addArg(forces[slot]);
-        for (auto& array : plan.arrays) kernel->addArg(arrays[array.name]);
-    }
-    kernel->setArg(1, numbers.step);
-    kernel->setArg(2, numbers.launch++);
-    const double given[] = {numbers.dt, numbers.time, numbers.tolerance};
-    for (int k = 0; k < 3; k++) if (wide) kernel->setArg(3+k, given[k]); else kernel->setArg(3+k, (float) given[k]);
-    for (int k = 0; k < 3; k++) {
-        const Vec3& b = numbers.box[k];
-        if (wide) kernel->setArg(6+k, mm_double4(b[0], b[1], b[2], 0));
-        else kernel->setArg(6+k, mm_float4(b[0], b[1], b[2], 0));
-    }
-    int size = plan.workGroup, groups = min((plan.items+size-1)/size, 256);
-    kernel->execute(max(groups, 1)*size, size);
-}
 
 class CommonFactory : public KernelFactory {
     KernelImpl* createKernelImpl(string name, const Platform& platform, ContextImpl& c) const override {
