@@ -16,7 +16,7 @@ from kcons.plan.clusters import Shape, classify, cluster_labels
 from kcons.solvers.chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.rank_revealing import independent, rank, stacks
+from kcons.solvers.rank_revealing import independent, rank
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.small_clusters import SmallClusters
@@ -341,8 +341,9 @@ def mark_dependent_rows(
     found = 0
     for rows in clusters:
         part = jacobian[rows]
-        (stack,) = stacks(part, np.zeros(len(rows), np.int64))
-        (b,) = stack.dense(part.data * root_w[part.indices])
+        columns, place = np.unique(part.indices, return_inverse=True)
+        b = np.zeros((len(rows), len(columns)))
+        b[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * root_w[part.indices]
         size = np.linalg.norm(b, axis=1, keepdims=True)
         triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
         diagonal = np.zeros(len(rows))

@@ -72,14 +72,16 @@ def without_second_order_rows(constraint_set: ConstraintSet, positions: FloatArr
         Rows that cannot be converted; the message says what to hold instead.
     """
     bodies: list[FlatBody] = []
+    miss: FloatArray | None = None
     for stack in _stacks(constraint_set, positions, time):
+        miss = np.abs(constraint_set.value(positions, time) / constraint_set.scale) if miss is None else miss
         suspects = stack.suspects(positions)
         straight, done = stack.straight_triangles(suspects)
         bodies += straight
         for rows in stack.rows[suspects & ~done]:
             bodies += find_flat_bodies(LocalRows(constraint_set, rows, positions, time))
         regular = 0
-        for rows in stack.rows[stack.off_target(positions) & ~suspects]:
+        for rows in stack.rows[stack.off_target(positions, miss) & ~suspects]:
             block = LocalRows(constraint_set, rows, positions, time).restored()
             regular += 1
             if block.singular(block.x):
@@ -178,12 +180,12 @@ class _Stack:
         ]
         return bodies, done
 
-    def off_target(self, x: FloatArray) -> BoolArray:
-        """Blocks so far from their targets that their geometry says nothing about the surface."""
+    def off_target(self, x: FloatArray, miss: FloatArray) -> BoolArray:
+        """Blocks so far from their targets, by what rows miss, that their geometry says nothing about the surface."""
         result = np.zeros(len(self.rows), bool)
         if self.rows.shape[1] <= 3:
             return result
-        miss = np.abs(self.held.value(x, self.time) / self.held.scale)[self.rows].max(axis=1)
+        miss = miss[self.rows].max(axis=1)
         far = np.flatnonzero(miss > 1e-10)
         if len(far):
             unit = self.chosen(far).dense(x)[0]
