@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcons.batched.groups import Group, kinds_of
 from kcons.batched.projections import Projection, Task
-from kcons.constraints.arguments import IntArray
+from kcons.constraints.arguments import IntArray, whole_number
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
@@ -93,7 +93,8 @@ class Batch:
             raise InputError(f"dtype is {dtype}; give torch.float64 or torch.float32", item="dtype")
         self.systems = tuple(given * copies)
         self.device, self.dtype, self.compiled = torch.device(device), dtype, compiled
-        self.check_every = check_every or (1 if self.device.type == "cpu" else CHECK_EVERY)
+        often = 1 if self.device.type == "cpu" else CHECK_EVERY
+        self.check_every = often if check_every is None else whole_number(check_every, "check_every")
         self.n_systems = len(self.systems)
         self.atom_starts = _starts([each.n_atoms for each in self.systems])
         self.row_starts = _starts([each.constraint_set.n_rows for each in self.systems])

@@ -114,6 +114,9 @@ def test_what_is_refused():
         Batch([])
     with pytest.raises(InputError, match=r"float64 or torch\.float32"):
         Batch(water(), dtype=torch.float16)
+    for wrong in (0, "often"):
+        with pytest.raises(InputError, match="check_every"):
+            Batch(water(), check_every=wrong)
     centers = [CenterDistance([0], [1, 2])]
     groups = Batch(Motion(ConstraintSet(centers, WATER, MASSES), WATER))
     with pytest.raises(UnsupportedError, match="defined by the masses"):
