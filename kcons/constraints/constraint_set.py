@@ -74,6 +74,8 @@ class ConstraintSet:
 
     Attributes
     ----------
+    masses : ndarray, shape (n_atoms,)
+        They cannot be changed: make a new set for others.
     lattice : ndarray, shape (2, 3, 3), or None
         Cell vectors as rows, and the inverse with zeros for directions without periodicity.
     images : Images or None
@@ -122,7 +124,7 @@ class ConstraintSet:
         if m.shape != (len(x),):
             raise InputError(f"masses must have shape ({len(x)},), not {m.shape}", item="masses")
         self.n_atoms = len(x)
-        self.masses = m
+        self.masses = read_only(m)  # engines know their inverse
         self._set_cell(cell, pbc)
         _check_atoms(given, x, m)
 
@@ -342,6 +344,10 @@ class ConstraintSet:
         part.constraints = tuple(_compact(p, atoms) for p in pieces)
         part.starts = np.concatenate([[0], np.cumsum([p.n_rows for p in pieces], dtype=np.int64)]).astype(np.int64)
         return part, atoms
+
+    def __setstate__(self, own: dict[str, Any]) -> None:
+        vars(self).update(own)
+        read_only(self.masses)  # a copy can be written to
 
     def replaced(self, constraints: Sequence[Constraint], positions: FloatArray, time: float) -> ConstraintSet:
         """The same atoms, masses and cell under other constraints; their targets must be set. Nothing is checked."""
