@@ -154,7 +154,7 @@ MUTANTS = {
     ],
     "constraints/constraint_set.py": [
         ("np.maximum(1e-«10→8» * self.scale, 8 * np.finfo(float)", "certificate::what_is_allowed_scales_with_rounding"),
-        ("self.masses = «read_only(m)→m»", "constraint_set::masses_cannot_be_changed_as_engines_know_them_by_their"),
-        ("«read_only(self.masses)→pass»  # a copy", "constraint_set::masses_cannot_be_changed_as_engines_know_them_by"),
+        ("self.masses = «read_only(m)→m»", "constraint_set::masses_cannot_be_changed"),
+        ("«read_only(self.masses)→pass»  # a copy", "constraint_set::masses_cannot_be_changed"),
     ],
 }
