@@ -183,8 +183,7 @@ def bonds_of(atoms: Atoms) -> IntArray:
     given = snapshot.topology.bonds
     if len(given) or not atoms.numbers.any():
         return given
-    finite = np.flatnonzero(np.isfinite(atoms.positions).all(axis=1))
-    return finite[guess_bonds(snapshot.subset(finite))]
+    return guess_bonds(snapshot, among=np.isfinite(atoms.positions).all(axis=1))
 
 
 def repair_elements(atoms: Atoms) -> int:

@@ -134,7 +134,7 @@ def atom_array(atoms: Any, item: str) -> NDArray[Any]:
         return np.atleast_1d(np.asarray(atoms))
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
-            f"{item}: rows name different numbers of atoms, {_value_text(atoms)}; use one object for each number",
+            f"{item}: rows name different numbers of atoms, {_value_text(atoms)}; give rows of one width",
             item="atoms",
         ) from None
 
@@ -144,28 +144,46 @@ def atom_column(atoms: Any, item: str) -> NDArray[Any]:
     return atom_array(atoms, item).reshape(-1, 1)
 
 
+def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") -> IntArray:
+    """Different atoms, a row of them for each row, shape (n, width); `item` is at fault where they are none."""
+    table = atom_array(atoms, name)
+    if table.size == 0:
+        return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
+    if not np.issubdtype(table.dtype, np.integer):
+        remedy = "; of a mask give np.flatnonzero(mask)" if table.dtype == bool else ""
+        raise InputError(f"{name}: atom indices must be integers, not {table.dtype}{remedy}", item=item)
+    table = np.atleast_2d(table.astype(np.int64))
+    if table.ndim != 2:
+        raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item=item)
+    if width is not None and table.shape[1] != width:
+        raise InputError(
+            f"{name}: a row has {width} atom{'s' if width > 1 else ''}, but atoms has shape {np.shape(atoms)}",
+            item=item,
+        )
+    if table.min() < 0:
+        row, slot = np.argwhere(table < 0)[0]
+        raise InputError(
+            f"{name}: row {row} has the negative atom index {table[row, slot]}; count atoms from 0",
+            item=item,
+            atoms=table[row],
+        )
+    if table.shape[1] > 1:
+        ordered = np.sort(table, axis=1)
+        repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+        if repeated.any():
+            row = int(np.argmax(repeated))
+            raise InputError(
+                f"{name}: row {row} names an atom twice: {tuple(table[row].tolist())}", item=item, atoms=table[row]
+            )
+    return table
+
+
 def check_pairs(pairs: ArrayLike, n_atoms: int | None = None, item: str = "bonds") -> IntArray:
     """Pairs of different atoms, shape (n, 2), a copy; of a number of atoms that need not be known yet."""
-    try:
-        table = np.asarray(pairs)
-    except ValueError as error:
-        raise InputError(f"{item} must be pairs of atoms, shape (n, 2): {error}", item=item) from None
-    if table.size == 0:
-        return np.zeros((0, 2), np.int64)
-    if table.ndim != 2 or table.shape[1] != 2 or not np.issubdtype(table.dtype, np.integer):
-        raise InputError(f"{item} must be pairs of atoms, shape (n, 2), not {table.dtype} {table.shape}", item=item)
-    bad = (table < 0).any(axis=1) | (table[:, 0] == table[:, 1])
-    if n_atoms is not None:
-        bad |= (table >= n_atoms).any(axis=1)
-    if bad.any():
-        i, j = table[int(np.argmax(bad))].tolist()
-        raise InputError(
-            f"{item} has the pair ({i}, {j}); give two different atoms of 0 to "
-            + ("the last" if n_atoms is None else f"{n_atoms - 1}"),
-            item=item,
-            atoms=[i, j],
-        )
-    return table.astype(np.int64)
+    table = atom_table(pairs, item, 2, item)
+    if n_atoms is not None and table.max(initial=-1) >= n_atoms:
+        raise InputError(f"{item} name atom {table.max()}; there are atoms 0 to {n_atoms - 1}", item=item)
+    return table
 
 
 def refuse_other(value: Any, kind: type | tuple[type, ...], item: str, remedy: str) -> None:

@@ -30,7 +30,6 @@ import os
 import re
 import shutil
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -270,7 +269,7 @@ def keep_somewhere() -> bool:
 
 
 class Announcer:
-    """Says that kernels of kcons are compiled, once it has taken `PATIENCE`; and no garbage is collected meanwhile.
+    """Says that kernels of kcons are compiled, the first that begins after `PATIENCE`; keeps garbage meanwhile.
 
     Attributes
     ----------
@@ -286,7 +285,6 @@ class Announcer:
         self.keeps = keeps
         # Numba compiles in one thread at a time.
         self._depth, self._begun, self._collected = 0, 0.0, False
-        self._timer = threading.Timer(0.0, self._announce)
 
     @property
     def compiling(self) -> bool:
@@ -295,30 +293,23 @@ class Announcer:
 
     def begin(self) -> None:
         """A kernel begins to be compiled; it may be a part of another one."""
+        now = time.perf_counter()
+        if not self._depth:
+            self._begun, self._collected = now, gc.isenabled()
+            gc.disable()
         self._depth += 1
-        if self._depth > 1:
-            return
-        self._begun = time.perf_counter()
-        self._collected = gc.isenabled()
-        gc.disable()
-        if not self.announced:
-            self._timer = threading.Timer(max(PATIENCE - self.seconds, 0.0), self._announce)
-            self._timer.daemon = True
-            self._timer.start()
+        if not self.announced and self.seconds + now - self._begun >= PATIENCE:
+            self._announce()
 
     def end(self) -> None:
         """It is compiled, or has failed."""
         self._depth -= 1
-        if self._depth:
-            return
-        self.seconds += time.perf_counter() - self._begun
-        if self._collected:
-            gc.enable()
-        self._timer.cancel()
+        if not self._depth:
+            self.seconds += time.perf_counter() - self._begun
+            if self._collected:
+                gc.enable()
 
     def _announce(self) -> None:
-        if self.announced or not self._depth:
-            return
         self.announced = True
         said = (
             "This happens once on a machine and takes some seconds; `kcons warmup` does it beforehand"

@@ -28,7 +28,7 @@ from kcons.constraints.arguments import (
     MD_UNITS,
     Kind,
     as_float_array,
-    atom_array,
+    atom_table,
     checked,
     out_of_range,
     plain_target,
@@ -37,7 +37,7 @@ from kcons.constraints.arguments import (
 from kcons.constraints.compilation import has_a_file, njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.constraints.vectors import first_true
-from kcons.errors import ConstraintError, InputError, SingularGeometryError
+from kcons.errors import ConstraintError, InputError, SingularGeometryError, UnsupportedError
 
 IntArray = NDArray[np.int64]
 #: A step along which derivatives are imaginary parts: its square vanishes beside 1, and a power of two does not round.
@@ -45,6 +45,9 @@ _COMPLEX_STEP = 2.0**-100
 
 #: Rows that loop over more atoms are compiled, where others are taken at once.
 WIDE = 6
+
+#: What each row has an entry of, in all families.
+_BY_ROW = ("atoms", "target", "masses", "whole", "cell_offsets")
 
 #: All families by name.
 FAMILIES: dict[str, type[Constraint]] = {}
@@ -95,7 +98,7 @@ class Constraint:
     #: How many of the parameters, the first ones, are the same in all rows of an object: numbers of atoms and the like.
     alike: int = 0
     #: Atoms a row, where the family fixes it.
-    row_width: ClassVar[int | None] = None
+    row_width: int | None = None
     #: Data held for each row: name -> shape of one row's entry, -1 standing for the width.
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     #: Which of these are lengths, and with which power, where units change.
@@ -148,30 +151,32 @@ class Constraint:
             cls.__init__ = checked(cls.__init__, units=True)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
-        self.atoms: IntArray = read_only(_atom_table(atoms, type(self).__name__, self.row_width))
+        self.atoms: IntArray = read_only(atom_table(atoms, type(self).__name__, self.row_width))
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
         self._keep(**data)
         self._settle()
 
     def _keep(self, **data: ArrayLike) -> None:
-        """Store data listed in `per_row`, broadcast to all rows; copies, which users cannot change."""
+        """Store data listed in `per_row`, for all rows; copies, which users cannot change."""
         for name, value in data.items():
-            shape = (self.n_rows, *(self.width if size < 0 else size for size in self.per_row[name]))
-            try:
-                array = np.broadcast_to(as_float_array(value, f"{self.family}: {name}"), shape)
-            except InputError:
-                raise
-            except ValueError:
-                raise InputError(
-                    f"{self.family}: {name} has shape {np.shape(value)}; give {shape[1:] or 'one number'} "
-                    f"for all rows or {shape}",
-                    item=name,
-                ) from None
-            wrong = out_of_range(array)
-            if wrong is not None:
-                row, said = wrong
-                raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
-            setattr(self, name, read_only(np.array(array, order="C")))
+            setattr(self, name, read_only(np.array(self._of_each_row(name, value, self.per_row[name]), order="C")))
+
+    def _of_each_row(self, name: str, value: ArrayLike, entry: tuple[int, ...]) -> FloatArray:
+        """Numbers for all rows or for each, spread over the rows; `entry` is the shape of one row's."""
+        shape = (self.n_rows, *(self.width if size < 0 else size for size in entry))
+        array = as_float_array(value, f"{self.family}: {name}")
+        try:
+            array = np.broadcast_to(array, shape)
+        except ValueError:
+            raise InputError(
+                f"{self.family}: {name} has shape {array.shape}; give {shape[1:] or 'one number'} for all, or {shape}",
+                item=name,
+            ) from None
+        wrong = out_of_range(array)
+        if wrong is not None:
+            row, said = wrong
+            raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
+        return array
 
     def __setstate__(self, own: dict[str, Any]) -> None:
         for value in own.values():
@@ -346,46 +351,60 @@ class Constraint:
                 f"row {first_row + k}, {self.row_name(k)}: {say(k)}", item=item, atoms=self.atoms[k].tolist()
             )
 
-    def with_masses(self, masses: FloatArray) -> Constraint:
+    def changed(self, **own: Any) -> Self:
+        """Copy with other attributes, of which nothing is checked."""
+        copy = object.__new__(type(self))
+        copy.__dict__.update(self.__dict__ | own)
+        return copy
+
+    def with_masses(self, masses: FloatArray) -> Self:
         """Copy that knows the masses of its atoms, shape (n_rows, width); most families need none."""
         if not self.uses_masses:
             return self
-        copy = self.with_target(self.target)
-        copy.masses = read_only(np.array(masses, dtype=np.float64, order="C"))
-        return copy
+        return self.changed(masses=read_only(np.array(masses, dtype=np.float64, order="C")))
 
     def with_target(self, target: Target) -> Self:
         """Copy of this object held at another target."""
-        copy = object.__new__(type(self))
-        copy.__dict__.update(self.__dict__)
         plain, matters = plain_target(target, f"{self.family}: target", self.held)
-        copy.target = as_target(plain, self.n_rows)
-        if matters:
-            copy.units = MD_UNITS
+        return self.changed(target=as_target(plain, self.n_rows), units=MD_UNITS if matters else self.units)
+
+    def rescaled(self, factor: float) -> Self:
+        """The same where every length is a number larger by `factor` (0.1 from angstrom to nm).
+
+        Raises
+        ------
+        UnsupportedError
+            Own functions, velocity rows, targets that move with time: what they mean in another unit is not known.
+        """
+        if factor == 1.0:
+            return self
+        powers = dict(self.held.exponents or {"unknown": 1})
+        if self.moving or not powers.keys() <= {"length", "angle"}:
+            what = "a target that moves" if self.moving else "own functions or velocities"
+            raise UnsupportedError(
+                f"{self!r} has {what}; it cannot be converted to another unit. Write it in the units of the host"
+            )
+        own = {name: getattr(self, name) * factor**power for name, power in self.length_powers.items()}
+        if self.target is not None:
+            own["target"] = np.asarray(self.target) * factor ** powers.get("length", 0)
+        copy = self.changed(**{name: read_only(array) for name, array in own.items()})
+        copy._settle()
         return copy
 
     def select(self, rows: Sequence[int] | IntArray) -> Self:
         """Copy with some of the rows, their targets and their data."""
         rows = np.asarray(rows, dtype=np.int64)
-        copy = self.with_target(None)
-        copy.atoms = read_only(self.atoms[rows])
-        for name in self.per_row:
-            setattr(copy, name, read_only(getattr(self, name)[rows]))
-        if self.masses is not None:
-            copy.masses = read_only(self.masses[rows])
-        copy.whole = None if self.whole is None else self.whole[rows]
-        copy.cell_offsets = None if self.cell_offsets is None else self.cell_offsets[rows]
-        if isinstance(self.target, np.ndarray):
-            copy.target = read_only(self.target[rows])
-        elif self.target is not None:
-            copy.target = _selected(self.target, rows, self.n_rows, self.period)
-        return copy
+        data = {name: getattr(self, name) for name in (*_BY_ROW, *self.per_row)}
+        own: dict[str, Any] = {
+            name: read_only(array[rows]) for name, array in data.items() if isinstance(array, np.ndarray)
+        }
+        if isinstance(self.target, MovingTarget):
+            own["target"] = _selected(self.target, rows, self.n_rows, self.period)
+        return self.changed(**own)
 
     def renumbered(self, new_index: IntArray) -> Self:
         """Copy with atom a replaced by new_index[a]."""
-        copy = self.with_target(self.target)
-        copy.atoms = read_only(np.asarray(new_index, dtype=np.int64)[self.atoms])
-        return copy
+        return self.changed(atoms=read_only(np.asarray(new_index, dtype=np.int64)[self.atoms]))
 
     def row_name(self, row: int) -> str:
         """For example 'Distance(4, 5)'."""
@@ -454,39 +473,6 @@ def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float |
         rate=lambda t: target.rate_at(t, n_rows, period)[rows],
         acceleration=lambda t: target.acceleration_at(t, n_rows, period)[rows],
     )
-
-
-def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
-    table = atom_array(atoms, name)
-    if table.size == 0:
-        return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
-    if not np.issubdtype(table.dtype, np.integer):
-        remedy = "; of a mask give np.flatnonzero(mask)" if table.dtype == bool else ""
-        raise InputError(f"{name}: atom indices must be integers, not {table.dtype}{remedy}", item="atoms")
-    table = np.atleast_2d(table.astype(np.int64))
-    if table.ndim != 2:
-        raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item="atoms")
-    if width is not None and table.shape[1] != width:
-        raise InputError(
-            f"{name}: a row has {width} atom{'s' if width > 1 else ''}, but atoms has shape {np.shape(atoms)}",
-            item="atoms",
-        )
-    if table.min() < 0:
-        row, slot = np.argwhere(table < 0)[0]
-        raise InputError(
-            f"{name}: row {row} has the negative atom index {table[row, slot]}; count atoms from 0",
-            item="atoms",
-            atoms=table[row],
-        )
-    if table.shape[1] > 1:
-        ordered = np.sort(table, axis=1)
-        repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
-        if repeated.any():
-            row = int(np.argmax(repeated))
-            raise InputError(
-                f"{name}: row {row} names an atom twice: {tuple(table[row].tolist())}", item="atoms", atoms=table[row]
-            )
-    return table
 
 
 def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:

@@ -129,7 +129,7 @@ class ConstraintSet:
         _check_atoms(given, x, m)
 
         self.constraints: tuple[Constraint, ...] = ()
-        self.starts: IntArray = np.concatenate([[0], np.cumsum([c.n_rows for c in given])]).astype(np.int64)
+        self.starts = _starts(given)
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)
@@ -138,7 +138,8 @@ class ConstraintSet:
         for start, item in zip(self.starts, marked, strict=False):
             r = self._gather(item, x, y)
             item.check(r, time, int(start))
-            _check_derivatives(item, time)
+            if isinstance(item.target, MovingTarget):
+                item.target.check(repr(item), time, item.n_rows, item.period)
             if item.target is None:
                 item = item.with_target(
                     item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)
@@ -177,15 +178,13 @@ class ConstraintSet:
     @cached_property
     def holonomic(self) -> NDArray[np.bool_]:
         """True for position rows, False for velocity rows, shape (n_rows,)."""
-        return np.concatenate([np.full(c.n_rows, c.holonomic) for c in self.constraints] or [np.zeros(0, bool)])
+        return np.repeat(np.array([c.holonomic for c in self.constraints], bool), np.diff(self.starts))
 
     @cached_property
     def incidence(self) -> sp.csr_array:
         """Which row touches which atom, shape (n_rows, n_atoms), entries 1."""
-        columns = np.concatenate([c.atoms.ravel() for c in self.constraints] or [np.zeros(0, np.int64)])
-        widths = np.concatenate(
-            [np.full(c.n_rows, c.width, dtype=np.int64) for c in self.constraints] or [np.zeros(0, np.int64)]
-        )
+        columns = np.concatenate([np.zeros(0, np.int64), *(c.atoms.ravel() for c in self.constraints)])
+        widths = np.repeat(np.array([c.width for c in self.constraints], np.int64), np.diff(self.starts))
         indptr = np.concatenate([[0], np.cumsum(widths)])
         return sp.csr_array((np.ones(len(columns)), columns, indptr), shape=(self.n_rows, self.n_atoms))
 
@@ -235,20 +234,11 @@ class ConstraintSet:
 
     def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
-        time = finite_number(time, "time")
-        x = self._positions(x)
-        y = self.whole(x)
-        data, columns, widths = [], [], []
-        for c in self.constraints:
-            data.append(c.gradient(self._gather(c, x, y), time).ravel())
-            columns.append((3 * c.atoms[:, :, None] + np.arange(3)).ravel())
-            widths.append(np.full(c.n_rows, 3 * c.width, dtype=np.int64))
-        if not data:
-            return sp.csr_array((0, 3 * self.n_atoms))
-        indptr = np.concatenate([[0], np.cumsum(np.concatenate(widths))])
-        return sp.csr_array(
-            (np.concatenate(data), np.concatenate(columns), indptr), shape=(self.n_rows, 3 * self.n_atoms)
-        )
+        time, x = finite_number(time, "time"), self._positions(x)
+        y, pattern = self.whole(x), self.incidence
+        data = joined([c.gradient(self._gather(c, x, y), time).ravel() for c in self.constraints])
+        columns = (3 * pattern.indices[:, None] + np.arange(3)).ravel()
+        return sp.csr_array((data, columns, 3 * pattern.indptr), shape=(self.n_rows, 3 * self.n_atoms))
 
     def target_rates(self, time: float = 0.0, order: int = 1) -> FloatArray:
         """Rates of what rows are held at, or of `order` 2 their accelerations, shape (n_rows,).
@@ -335,26 +325,25 @@ class ConstraintSet:
             numbers = np.zeros(self.n_atoms, np.int64)
             numbers[atoms] = np.arange(len(atoms))
             images = self.images.among(atoms, numbers, rows)
-        part = object.__new__(ConstraintSet)
-        part.images = images
-        part.n_atoms = len(atoms)
-        part.masses = self.masses[atoms]
-        part.lattice = self.lattice
-        part.scale = self.scale[rows]
-        part.constraints = tuple(_compact(p, atoms) for p in pieces)
-        part.starts = np.concatenate([[0], np.cumsum([p.n_rows for p in pieces], dtype=np.int64)]).astype(np.int64)
+        renumbered = [p.changed(atoms=read_only(np.searchsorted(atoms, p.atoms))) for p in pieces]
+        part = self._other(len(atoms), self.masses[atoms], renumbered)
+        part.images, part.scale = images, self.scale[rows]
         return part, atoms
 
     def __setstate__(self, own: dict[str, Any]) -> None:
         vars(self).update(own)
         read_only(self.masses)  # a copy can be written to
 
+    def _other(self, n_atoms: int, masses: FloatArray, constraints: Sequence[Constraint]) -> ConstraintSet:
+        """A set of other constraints in the same cell, of which nothing is checked."""
+        other = object.__new__(ConstraintSet)
+        other.n_atoms, other.masses, other.lattice = n_atoms, masses, self.lattice
+        other.constraints, other.starts = tuple(constraints), _starts(constraints)
+        return other
+
     def replaced(self, constraints: Sequence[Constraint], positions: FloatArray, time: float) -> ConstraintSet:
         """The same atoms, masses and cell under other constraints; their targets must be set. Nothing is checked."""
-        other = object.__new__(ConstraintSet)
-        other.n_atoms, other.masses, other.lattice = self.n_atoms, self.masses, self.lattice
-        ends = np.cumsum([c.n_rows for c in constraints], dtype=np.int64)
-        other.starts = np.concatenate([[0], ends]).astype(np.int64)
+        other = self._other(self.n_atoms, self.masses, constraints)
         marked, other.images = find_images(
             constraints, other.starts, positions, self.lattice, self.half_width, time, self.constraints
         )
@@ -616,6 +605,11 @@ class ConstraintSet:
         return f"<ConstraintSet: {self.n_rows} rows on {self.n_atoms} atoms>"
 
 
+def _starts(constraints: Sequence[Constraint]) -> IntArray:
+    """The first rows, and the end."""
+    return np.cumsum([0, *(c.n_rows for c in constraints)], dtype=np.int64)
+
+
 def joined(pieces: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate(pieces) if pieces else np.zeros(0)
 
@@ -644,23 +638,6 @@ def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: Floa
     if not np.round((x[links[:, 1]] - x[links[:, 0]]) @ lattice[1]).any():
         return x
     return make_whole(x, *spanning_tree(links, len(x)), lattice)
-
-
-def _check_derivatives(item: Constraint, time: float) -> None:
-    """Refuse derivatives of a moving target that contradict it: atoms would leave it without another sign."""
-    if not isinstance(item.target, MovingTarget):
-        return
-    if item.target.unresolved(time, item.n_rows, item.period):
-        raise InputError(
-            f"{item!r}: the target changes within less than the step of its differences, {item.target.time_step:g}; "
-            "give its rate and acceleration, or MovingTarget(..., time_step=...), 1/50 of the time in which it changes",
-            item="time_step",
-        )
-    said = item.target.contradiction(time, item.n_rows, item.period)
-    if said:
-        raise InputError(
-            f"{item!r}: the target contradicts itself: {said}; correct it, or leave the derivatives out", item="target"
-        )
 
 
 def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:
@@ -712,12 +689,6 @@ def _speed_of(c: Constraint, r: FloatArray, time: float) -> FloatArray:
     """A v of admissible velocities."""
     rate = _rate_of(c, time)
     return rate - c.time_terms(r, np.zeros_like(r), time)[0] if c.moving and c.holonomic else rate
-
-
-def _compact(item: Constraint, atoms: IntArray) -> Constraint:
-    copy = item.with_target(item.target)
-    copy.atoms = read_only(np.searchsorted(atoms, item.atoms))
-    return copy
 
 
 def _distinct(numbers: IntArray, limit: int) -> IntArray:

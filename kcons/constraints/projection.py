@@ -96,14 +96,12 @@ def rank(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> int:
 
 def row_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
     """Orthonormal basis V of the space that the (conjugate) rows span, shape (n, rank); A+A = V V^H."""
-    _, singular, vt = np.linalg.svd(_unit_rows(_matrix(matrix)), full_matrices=False)
-    return np.ascontiguousarray(vt[: _count(singular, rtol)].conj().T)
+    return _bases(matrix, rtol)[1]
 
 
 def column_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
     """Orthonormal basis of the range of the row-normalized matrix, shape (s, rank)."""
-    w, singular, _ = np.linalg.svd(_unit_rows(_matrix(matrix)), full_matrices=False)
-    return np.ascontiguousarray(w[:, : _count(singular, rtol)])
+    return _bases(matrix, rtol)[0]
 
 
 def full_rank_factors(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> tuple[NumberArray, NumberArray]:
@@ -232,12 +230,10 @@ def project_velocities(
     matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0, rtol: float = RANK_TOLERANCE
 ) -> FloatArray:
     """The nearest velocities, in the mass metric, with A v = c: v - M^-1/2 B+ (A v - c)."""
-    A = _matrix(matrix, real=True)
-    root = _Root(masses, A.shape[1])
+    A, root, B = _weighted(matrix, masses)
     flat = _vector(v, A.shape[1], "v", real=True)
     off = A @ flat - np.broadcast_to(_numbers(c, "c", real=True), (len(A),))
-    correction = pseudo_inverse(root.weighted(A), rtol).matrix @ off
-    return np.asarray(flat - root.from_weighted(correction)).reshape(np.shape(v))
+    return np.asarray(flat - root.from_weighted(pseudo_inverse(B, rtol).matrix @ off)).reshape(np.shape(v))
 
 
 # -- dynamics (eqs. 99-107) -------------------------------------------------------------------------
@@ -248,10 +244,8 @@ def constrained_inverse(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK
 
     With independent rows it is M^-1 - M^-1 A^T (A M^-1 A^T)^-1 A M^-1.
     """
-    A = _matrix(matrix, real=True)
-    root = _Root(masses, A.shape[1])
-    half = root.from_weighted(parallel_projector(root.weighted(A), rtol))
-    return root.from_weighted(half.T)
+    _, root, B = _weighted(matrix, masses)
+    return root.from_weighted(root.from_weighted(parallel_projector(B, rtol)).T)
 
 
 def multipliers(
@@ -261,21 +255,17 @@ def multipliers(
 
     (A M^-1 A^T) lambda = b - A M^-1 f, solved by (B B^T)+ = (B+)^T B+.
     """
-    A = _matrix(matrix, real=True)
-    root = _Root(masses, A.shape[1])
-    B_plus = pseudo_inverse(root.weighted(A), rtol).matrix
-    right = _vector(b, len(A), "b", real=True) - A @ root.solve(_vector(f, A.shape[1], "f", real=True))
-    return np.asarray(B_plus.T @ (B_plus @ right))
+    A, root, B = _weighted(matrix, masses)
+    B_plus = pseudo_inverse(B, rtol).matrix
+    return np.asarray(B_plus.T @ (B_plus @ _lacking(A, root, f, b)))
 
 
 def constraint_force(
     matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
 ) -> FloatArray:
     """The force z = A^T (A M^-1 A^T)^-1 (b - A M^-1 f) = M^1/2 B+ (b - A M^-1 f), as f (notes eq. 104)."""
-    A = _matrix(matrix, real=True)
-    root = _Root(masses, A.shape[1])
-    right = _vector(b, len(A), "b", real=True) - A @ root.solve(_vector(f, A.shape[1], "f", real=True))
-    z = root.times(pseudo_inverse(root.weighted(A), rtol).matrix @ right)
+    A, root, B = _weighted(matrix, masses)
+    z = root.factor @ (pseudo_inverse(B, rtol).matrix @ _lacking(A, root, f, b))
     return np.asarray(z).reshape(np.shape(f))
 
 
@@ -286,10 +276,9 @@ def acceleration(
 
     The notes lost the M^-1 in front of A^T. In mass-weighted form the second term is M^-1/2 B+ b.
     """
-    A = _matrix(matrix, real=True)
-    root = _Root(masses, A.shape[1])
+    A, root, B = _weighted(matrix, masses)
     free = constrained_inverse(A, masses, rtol) @ _vector(f, A.shape[1], "f", real=True)
-    driven = root.from_weighted(pseudo_inverse(root.weighted(A), rtol).matrix @ _vector(b, len(A), "b", real=True))
+    driven = root.from_weighted(pseudo_inverse(B, rtol).matrix @ _vector(b, len(A), "b", real=True))
     return np.asarray(free + driven).reshape(np.shape(f))
 
 
@@ -368,18 +357,6 @@ def _vector(values: ArrayLike, length: int, item: str, real: bool = False) -> Nu
     return array
 
 
-def _mass_diagonal(masses: ArrayLike, n: int) -> FloatArray:
-    """The diagonal of M, shape (n,), from n/3 or n masses (notes eq. 79)."""
-    m = _numbers(masses, "masses", real=True).ravel()
-    if 3 * len(m) == n:
-        m = np.repeat(m, 3)
-    if len(m) != n:
-        raise InputError(f"masses must have {n // 3} or {n} entries, not {len(m)}", item="masses")
-    if not np.all(np.isfinite(m) & (m > 0)):
-        raise InputError("masses must be positive and finite; hold an atom by three rows instead", item="masses")
-    return m
-
-
 class _Root:
     """M^1/2: the Cholesky factor L, M = L L^T, of a diagonal M its square roots."""
 
@@ -393,31 +370,41 @@ class _Root:
                 item="masses",
             ) from None
 
-    def weighted(self, A: FloatArray) -> FloatArray:
-        """B = A L^-T."""
-        return np.asarray(scipy.linalg.solve_triangular(self.factor, A.T, lower=True).T)
-
     def from_weighted(self, x: FloatArray) -> FloatArray:
         """L^-T x."""
         return np.asarray(scipy.linalg.solve_triangular(self.factor, x, lower=True, trans="T"))
-
-    def times(self, x: FloatArray) -> FloatArray:
-        """L x."""
-        return np.asarray(self.factor @ x)
 
     def solve(self, x: FloatArray) -> FloatArray:
         """M^-1 x."""
         return np.asarray(scipy.linalg.cho_solve((self.factor, True), x))
 
 
+def _weighted(matrix: ArrayLike, masses: ArrayLike) -> tuple[FloatArray, _Root, FloatArray]:
+    """A, M^1/2, and B = A L^-T."""
+    A = _matrix(matrix, real=True)
+    root = _Root(masses, A.shape[1])
+    return A, root, np.asarray(scipy.linalg.solve_triangular(root.factor, A.T, lower=True).T)
+
+
+def _lacking(A: FloatArray, root: _Root, f: ArrayLike, b: ArrayLike) -> FloatArray:
+    """b - A M^-1 f."""
+    free = root.solve(_vector(f, A.shape[1], "f", real=True))
+    return np.asarray(_vector(b, len(A), "b", real=True) - A @ free)
+
+
 def _mass_matrix(masses: ArrayLike, n: int) -> FloatArray:
-    """M as a matrix, shape (n, n), symmetric."""
+    """M, shape (n, n): symmetric, or diagonal of n/3 or n masses (notes eq. 79)."""
     M = _numbers(masses, "masses", real=True)
-    if M.shape != (n, n) or n == 1:
-        return np.diag(_mass_diagonal(masses, n))
-    if not np.all(np.isfinite(M)) or np.any(np.abs(M - M.T) > 1e-10 * np.max(np.abs(M))):
-        raise InputError("the mass matrix must be finite and symmetric", item="masses")
-    return M
+    if M.shape == (n, n) and n > 1:
+        if not np.all(np.isfinite(M)) or np.any(np.abs(M - M.T) > 1e-10 * np.max(np.abs(M))):
+            raise InputError("the mass matrix must be finite and symmetric", item="masses")
+        return M
+    m = np.repeat(M.ravel(), 3) if 3 * M.size == n else M.ravel()
+    if len(m) != n:
+        raise InputError(f"masses must have {n // 3} or {n} entries, not {len(m)}", item="masses")
+    if not np.all(np.isfinite(m) & (m > 0)):
+        raise InputError("masses must be positive and finite; hold an atom by three rows instead", item="masses")
+    return np.diag(m)
 
 
 def _row_sizes(A: NumberArray) -> FloatArray:
@@ -428,12 +415,12 @@ def _row_sizes(A: NumberArray) -> FloatArray:
     return np.where(sizes > 0, sizes, 1.0)
 
 
-def _unit_rows(A: NumberArray) -> NumberArray:
-    return A / _row_sizes(A)[:, None]
-
-
-def _count(singular: FloatArray, rtol: float) -> int:
-    return int(np.sum(singular > rtol * singular[0])) if len(singular) and singular[0] > 0 else 0
+def _bases(matrix: ArrayLike, rtol: float) -> tuple[NumberArray, NumberArray]:
+    """Orthonormal bases of the range and of the row space of the row-normalized matrix."""
+    A = _matrix(matrix)
+    w, singular, vt = np.linalg.svd(A / _row_sizes(A)[:, None], full_matrices=False)
+    kept = (singular > rtol * singular.max(initial=0.0)) & (singular > 0)
+    return np.ascontiguousarray(w[:, kept]), np.ascontiguousarray(vt[kept].conj().T)
 
 
 def _left_inverse(F: NumberArray) -> NumberArray:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import HELD, as_float_array, check_call, has_units, out_of_range, positive, read_only
 from kcons.constraints.arguments import FloatArray as FloatArray
@@ -73,33 +73,39 @@ class MovingTarget:
             return first_derivative(lambda t: self.rate_at(t, rows), time, self.time_step)
         return second_derivative(lambda t: self.at(t, rows), time, self.time_step, period)
 
-    def contradiction(self, time: float, rows: int, period: float | None = None) -> str:
-        """What a given derivative and differences say at two times soon after `time`, where they differ; or ''."""
-        for name, given, derivative, function, jump in (
+    def check(self, name: str, time: float, rows: int, period: float | None = None) -> None:
+        """Refuse derivatives that are not those of the target soon after `time`: atoms would leave it silently.
+
+        `name` is what messages call the rows that it belongs to.
+        """
+        h, (function, jump) = self.time_step, (self.at, period) if self.rate is None else (self.rate_at, None)
+
+        def rough(t: float) -> bool:
+            coarse, fine = (first_derivative(partial(function, rows=rows), t, step, jump) for step in (h, h / 2))
+            size = np.maximum(np.abs(coarse), np.abs(fine)) + 1e-9 * np.abs(function(t, rows)).max(initial=0.0) / h
+            return bool((np.abs(fine - coarse) > ROUGH * size).any())
+
+        # At two times so far apart that one kink does not count.
+        if self.acceleration is None and rough(time + 5 * h) and rough(time + 15 * h):
+            raise InputError(
+                f"{name}: the target changes within less than the step of its differences, {h:g}; give its rate and "
+                "acceleration, or MovingTarget(..., time_step=...), 1/50 of the time in which it changes",
+                item="time_step",
+            )
+        for what, given, derivative, of, period_of in (
             ("rate", self.rate, self.rate_at, self.at, period),
             ("acceleration", self.acceleration, self.acceleration_at, self.rate_at, None),
         ):
-            if given is not None:
-                own, whole = partial(derivative, rows=rows), partial(function, rows=rows)
-                found = contradiction(own, whole, time, self.time_step, jump)
-                if found is not None:
-                    return (
-                        f"its {name} is {found.given:.6g} at t = {found.time:g}, but differences give {found.found:.6g}"
-                    )
-        return ""
-
-    def unresolved(self, time: float, rows: int, period: float | None = None) -> bool:
-        """Whether what is not given changes too fast for differences with `time_step`, at two times after `time`."""
-        if self.acceleration is not None:
-            return False
-        function, jump = (self.at, period) if self.rate is None else (self.rate_at, None)
-        for later in (5.0, 15.0):  # so far apart that one kink does not count
-            t, h = time + later * self.time_step, self.time_step
-            coarse, fine = (first_derivative(partial(function, rows=rows), t, step, jump) for step in (h, h / 2))
-            size = np.maximum(np.abs(coarse), np.abs(fine)) + 1e-9 * np.abs(function(t, rows)).max(initial=0.0) / h
-            if not (np.abs(fine - coarse) > ROUGH * size).any():
-                return False
-        return True
+            if given is None:
+                continue
+            own, whole = partial(derivative, rows=rows), partial(of, rows=rows)
+            found = contradiction(own, whole, time, h, period_of)
+            if found is not None:
+                raise InputError(
+                    f"{name}: the target contradicts itself: its {what} is {found.given:.6g} at t = {found.time:g}, "
+                    f"but differences give {found.found:.6g}; correct it, or leave the derivatives out",
+                    item="target",
+                )
 
 
 Target: TypeAlias = Annotated[float | ArrayLike | MovingTarget | TimeFunction | None, HELD]
@@ -132,17 +138,6 @@ WRONG = 1e-3
 ROUGH = 0.1
 
 
-def contradicted(
-    given: FloatArray | float, coarse: FloatArray, fine: FloatArray, rounding: FloatArray
-) -> NDArray[np.bool_]:
-    """Where a given derivative is not what differences with a step and with half of it agree in.
-
-    Sizes of `rounding` count as none.
-    """
-    size = np.maximum(np.abs(given), np.abs(fine)) + rounding
-    return np.asarray((np.abs(fine - given) > WRONG * size) & (np.abs(fine - coarse) <= WRONG * size))
-
-
 class Contradiction(NamedTuple):
     """The number in the array, the time, the derivative that was given there and the one found by differences."""
 
@@ -155,13 +150,17 @@ class Contradiction(NamedTuple):
 def contradiction(
     derivative: Function, function: Function, time: float, time_step: float, period: float | None = None
 ) -> Contradiction | None:
-    """What a given derivative and differences of its function say soon after `time`; None where they agree."""
+    """What a given derivative and differences of its function say soon after `time`; None where they agree.
+
+    It is given that differences with a step and with half of it agree in.
+    """
     told = None
     for later in (1.3, 2.7):  # at one alone there may be a kink
         t, h = time + later * time_step, 0.1 * time_step
         given = derivative(t)
         coarse, fine = (first_derivative_4(function, t, step, period) for step in (h, h / 2))
-        wrong = contradicted(given, coarse, fine, 1e-9 * np.abs(function(t)) / h)
+        size = np.maximum(np.abs(given), np.abs(fine)) + 1e-9 * np.abs(function(t)) / h
+        wrong = (np.abs(fine - given) > WRONG * size) & (np.abs(fine - coarse) <= WRONG * size)
         if not wrong.any():
             return None
         k = int(np.argmax(wrong))

@@ -25,11 +25,9 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.mdanalysis.loading import format_of
 from kcons.mdanalysis.topology import check_box, constraints_of, dimensions_of, snapshot_of, velocities_known
 from kcons.motion.motion import Motion
-from kcons.topology.other_units import all_rescaled
+from kcons.topology.rigid_groups import VirtualSites
 from kcons.topology.rows_by_name import HeldRows
-from kcons.topology.topology import Snapshot, whole_numbers
-from kcons.topology.virtual_sites import VirtualSites
-from kcons.topology.whole_molecules import whole_molecules
+from kcons.topology.topology import Snapshot, whole_molecules, whole_numbers
 
 if TYPE_CHECKING:
     import ase
@@ -230,7 +228,7 @@ def _of_openmm(
     if part is not None:
         rows += part.motion.constraint_set.constraints
     snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)
-    return snapshot, all_rescaled(rows, 1 / NM)
+    return snapshot, [item.rescaled(1 / NM) for item in rows]
 
 
 # -- ASE and OpenMM -------------------------------------------------------------------------------
@@ -309,7 +307,7 @@ def universe_of(snapshot: Snapshot) -> Any:
 def _rows(constraints: Iterable[Constraint]) -> list[Constraint]:
     """Constraints in angstrom."""
     if isinstance(constraints, HeldRows):
-        return all_rescaled(constraints, 1.0 / constraints.snapshot.angstrom)
+        return [item.rescaled(1.0 / constraints.snapshot.angstrom) for item in constraints]
     return list(constraints)
 
 
@@ -360,7 +358,7 @@ def _openmm(
     from kcons.openmm import hold
     from kcons.openmm.topology import openmm_topology
 
-    rows, sites = all_rescaled(_rows(constraints), NM), None
+    rows, sites = [item.rescaled(NM) for item in _rows(constraints)], None
     if isinstance(constraints, HeldRows):
         sites = constraints.virtual_sites.in_unit(NM / constraints.snapshot.angstrom)
     snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)

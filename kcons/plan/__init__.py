@@ -3,9 +3,8 @@
 - `clusters`: rows that belong together, and the shape of each cluster
 - `clusters_alike`: clusters of equal rows, and an order in which the rows of one are eliminated
 - `independent_blocks`: pieces of a cluster whose ranks add up
-- `rank`: the number of independent rows
 - `second_order`: rows that are singular only at second order, converted
-- `plan`: the clusters of a set, with a solver each, and the table which solver serves which shape
+- `plan`: the clusters of a set, with their ranks and a solver each, and the table which solver serves which shape
 """
 
 from kcons.plan.plan import Plan, make_plan

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.periodic.one_piece import connected, spanning_tree
 from kcons.constraints.target import FloatArray
 
 #: Largest cluster, in rows, that goes through the lanes.
@@ -56,66 +56,19 @@ class Shape:
     starts: IntArray = field(default_factory=lambda: _NONE)
 
 
-def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows: IntArray) -> IntArray:
-    """Cluster number of each row: rows that share a movable atom belong together; -1 for rows without one."""
+def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray) -> IntArray:
+    """Cluster number of each row, by its first row: rows that share a movable atom belong together; -1 without one."""
     incidence = constraint_set.incidence
     n_rows, n_atoms = incidence.shape
-    free = np.ones(n_atoms)
-    free[pinned] = 0.0
-    links = incidence.copy()
-    links.data = free[links.indices]
-    links.eliminate_zeros()
+    free = np.ones(n_atoms, dtype=bool)
+    free[pinned] = False
+    row = np.repeat(np.arange(n_rows), np.diff(incidence.indptr))
+    inside = free[incidence.indices]
+    links = np.stack([row[inside], n_rows + incidence.indices[inside]], axis=1)
+    movable = np.bincount(row[inside], minlength=n_rows) > 0
+    found = connected(links, n_rows + n_atoms)[0][:n_rows][movable]
     labels = np.full(n_rows, -1, dtype=np.int64)
-    if n_rows == 0:
-        return labels
-    begins, atoms = links.indptr.astype(np.int64), links.indices.astype(np.int64)
-    found = joined(begins, atoms, n_atoms)
-    movable = np.diff(links.indptr) > 0
-    movable[pinned_rows] = False
-    if movable.any():
-        used = np.zeros(int(found.max()) + 1, dtype=bool)
-        used[found[movable]] = True
-        labels[movable] = (np.cumsum(used) - 1)[found[movable]]
-    return labels
-
-
-def joined(begins: IntArray, atoms: IntArray, n_atoms: int) -> IntArray:
-    """Number of the cluster of each row, by its first row; row k has the atoms from begins[k] to begins[k + 1]."""
-    labels: IntArray = plain_if_small(_joined, len(atoms))(begins, atoms, n_atoms)
-    return labels
-
-
-@njit(cache=True)
-def _joined(begins, atoms, n_atoms):  # type: ignore[no-untyped-def]
-    # Union-find with path halving.
-    n = len(begins) - 1
-    first = np.full(n_atoms, -1, np.int64)
-    parent = np.arange(n)
-    for k in range(n):
-        for p in range(begins[k], begins[k + 1]):
-            a = atoms[p]
-            if first[a] < 0:
-                first[a] = k
-                continue
-            one, two = k, first[a]
-            while parent[one] != one:
-                parent[one] = parent[parent[one]]
-                one = parent[one]
-            while parent[two] != two:
-                parent[two] = parent[parent[two]]
-                two = parent[two]
-            parent[max(one, two)] = min(one, two)
-    labels = np.empty(n, np.int64)
-    count = 0
-    for k in range(n):
-        root = parent[k]
-        while parent[root] != root:
-            root = parent[root]
-        if root == k:
-            labels[k] = count
-            count += 1
-        else:
-            labels[k] = labels[root]
+    labels[movable] = (np.cumsum(np.bincount(found) > 0) - 1)[found]
     return labels
 
 
@@ -258,42 +211,19 @@ def _small_shapes(
 
 def _paths(rows: IntArray, pairs: IntArray, n_atoms: int, clusters: int) -> Shape:
     """Order the rows and atoms of open chains from one end to the other."""
-    order, atoms, starts = plain_if_small(_walk, len(pairs))(pairs, n_atoms, clusters)
+    ends = pairs.ravel()
+    ends = ends[np.bincount(ends, minlength=n_atoms)[ends] == 1]
+    label, _ = connected(pairs, n_atoms)
+    # A chain begins with the end that comes first, and chains have the order of these.
+    begins = ends[np.sort(np.unique(label[ends], return_index=True)[1])]
+    number = np.full(len(label), -1)
+    number[label[begins]] = np.arange(clusters)
+    tree, _ = spanning_tree(pairs, n_atoms, np.concatenate([begins, np.arange(n_atoms)]))
+    tree = tree[number[label[tree]] >= 0]
+    chain = number[label[tree]]
+    atoms = tree[np.argsort(chain, kind="stable")]
+    place = np.empty(n_atoms, np.int64)
+    place[atoms] = np.arange(len(atoms))
+    order = np.argsort(place[pairs].max(axis=1))
+    starts = np.concatenate([[0], np.cumsum(np.bincount(chain, minlength=clusters))])
     return Shape("Chains", rows[order], clusters, True, atoms=atoms, starts=starts, pairs=pairs[order])
-
-
-@njit(cache=True)
-def _walk(pairs, n_atoms, clusters):  # type: ignore[no-untyped-def]
-    n = len(pairs)
-    bonds = np.full((n_atoms, 2), -1, np.int64)
-    degree = np.zeros(n_atoms, np.int64)
-    for k in range(n):
-        for side in range(2):
-            a = pairs[k, side]
-            bonds[a, degree[a]] = k
-            degree[a] += 1
-    done = np.zeros(n, np.bool_)
-    order = np.empty(n, np.int64)
-    atoms = np.empty(n + clusters, np.int64)
-    starts = np.empty(clusters + 1, np.int64)
-    used, met, path = 0, 0, 0
-    for k in range(n):
-        for side in range(2):
-            a = pairs[k, side]
-            if degree[a] != 1 or done[bonds[a, 0]]:
-                continue
-            starts[path] = met
-            path += 1
-            atoms[met] = a
-            met += 1
-            bond = bonds[a, 0]
-            while bond >= 0 and not done[bond]:
-                done[bond] = True
-                order[used] = bond
-                used += 1
-                a = pairs[bond, 0] + pairs[bond, 1] - a
-                atoms[met] = a
-                met += 1
-                bond = bonds[a, 0] if bonds[a, 0] != bond else bonds[a, 1]
-    starts[path] = met
-    return order, atoms, starts

@@ -16,7 +16,7 @@ import numpy as np
 from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.plan.clusters import joined
+from kcons.constraints.periodic.one_piece import spanning_tree
 
 _GROUND = -1
 
@@ -36,7 +36,7 @@ def row_blocks(
     ``members[starts[k]:starts[k + 1]]``, sorted; nothing for forests.
     """
     ground = fixed_atoms(constraint_set)
-    ends: list[tuple[IntArray, IntArray, IntArray, bool]] = []
+    ends: list[tuple[IntArray, IntArray, IntArray]] = []
     for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
         if not item.holonomic or item.fixes_atoms or not accept(item) or item.n_rows == 0:
             continue
@@ -50,24 +50,15 @@ def row_blocks(
             nodes = np.where(np.isin(nodes, ground), _GROUND, nodes)
         if not item.translation_invariant:
             nodes = np.hstack([nodes, np.full((len(nodes), 1), _GROUND)])
-        ends.append((nodes[:, :-1].ravel(), nodes[:, 1:].ravel(), np.repeat(numbers, nodes.shape[1] - 1), False))
-        if nodes.shape[1] > 2:
-            ends.append((nodes[:, -1], nodes[:, 0], numbers, True))
-    nothing = np.zeros(0, np.int64), np.zeros(1, np.int64)
+        # A row of several atoms is a cycle through them.
+        sides, ahead = (nodes.shape[1] if nodes.shape[1] > 2 else 1), np.roll(nodes, -1, axis=1)
+        ends.append((nodes[:, :sides].ravel(), ahead[:, :sides].ravel(), np.repeat(numbers, sides)))
     if not ends:
-        return nothing
-    u = np.concatenate([e[0] for e in ends])
-    v = np.concatenate([e[1] for e in ends])
-    row = np.concatenate([e[2] for e in ends])
-    closing = np.concatenate([np.full(len(e[0]), e[3]) for e in ends])
-    proper = u != v
-    u, v, row, closing = u[proper], v[proper], row[proper], closing[proper]
+        return np.zeros(0, np.int64), np.zeros(1, np.int64)
+    u, v, row = (np.concatenate(parts) for parts in zip(*ends, strict=True))
+    u, v, row = u[u != v], v[u != v], row[u != v]
     vertices, index = np.unique(np.concatenate([u, v]), return_inverse=True)
     u, v = index[: len(u)], index[len(u) :]
-    sides = np.stack([u[~closing], v[~closing]], axis=1)
-    n_parts = int(joined(2 * np.arange(len(sides) + 1), sides.ravel(), len(vertices)).max(initial=-1)) + 1
-    if len(sides) == len(vertices) - n_parts:  # no edge closes a cycle
-        return nothing
     block = edge_blocks(u, v, len(vertices))
     # A wide row has several edges, all in one block.
     keys = np.unique(block * constraint_set.n_rows + row)
@@ -80,73 +71,28 @@ def row_blocks(
 
 def edge_blocks(u: IntArray, v: IntArray, n_vertices: int) -> IntArray:
     """Number of the 2-connected block of each edge, from u to v, of a multigraph without loops."""
-    blocks: IntArray = plain_if_small(_edge_blocks, len(u))(u, v, n_vertices)
+    vertices, parents = spanning_tree(np.stack([u, v], axis=1), n_vertices)
+    place = np.argsort(vertices)
+    blocks: IntArray = plain_if_small(_edge_blocks, len(u))(place[u], place[v], place[parents])
     return blocks
 
 
 @njit(cache=True)
-def _edge_blocks(u, v, n_vertices):  # type: ignore[no-untyped-def]
-    # Hopcroft and Tarjan 1973, with own stack.
-    n_edges = len(u)
-    start = np.zeros(n_vertices + 1, np.int64)
-    for e in range(n_edges):
-        start[u[e] + 1] += 1
-        start[v[e] + 1] += 1
-    for a in range(n_vertices):
-        start[a + 1] += start[a]
-    fill = start[:-1].copy()
-    half = np.empty(2 * n_edges, np.int64)
-    for e in range(n_edges):
-        half[fill[u[e]]] = e
-        fill[u[e]] += 1
-        half[fill[v[e]]] = e
-        fill[v[e]] += 1
-    next_half = start[:-1].copy()
-    found = np.full(n_vertices, -1, np.int64)
-    low = np.zeros(n_vertices, np.int64)
-    block = np.full(n_edges, -1, np.int64)
-    open_edges = np.empty(n_edges, np.int64)
-    path = np.empty(n_vertices, np.int64)
-    via = np.empty(n_vertices, np.int64)
-    n_open, clock, n_blocks = 0, 0, 0
-    for root in range(n_vertices):
-        if found[root] >= 0:
-            continue
-        found[root] = low[root] = clock
-        clock += 1
-        depth = 0
-        path[0], via[0] = root, -1
-        while depth >= 0:
-            a = path[depth]
-            if next_half[a] < start[a + 1]:
-                e = half[next_half[a]]
-                next_half[a] += 1
-                if e == via[depth]:
-                    continue
-                b = u[e] + v[e] - a
-                if found[b] < 0:
-                    open_edges[n_open] = e
-                    n_open += 1
-                    found[b] = low[b] = clock
-                    clock += 1
-                    depth += 1
-                    path[depth], via[depth] = b, e
-                elif found[b] < found[a]:
-                    open_edges[n_open] = e
-                    n_open += 1
-                    low[a] = min(low[a], found[b])
-                continue
-            depth -= 1
-            if depth < 0:
-                break
-            p, e = path[depth], via[depth + 1]
-            low[p] = min(low[p], low[a])
-            if low[a] >= found[p]:
-                while True:
-                    n_open -= 1
-                    last = open_edges[n_open]
-                    block[last] = n_blocks
-                    if last == e:
-                        break
-                n_blocks += 1
-    return block
+def _edge_blocks(u, v, parent):  # type: ignore[no-untyped-def]
+    # Each edge and those of the tree on the way between its ends are one cycle. Vertices come after their parents,
+    # breadth first; one stands for the edge to its parent, the first of a block for the block.
+    block = np.arange(len(parent))
+    for e in range(len(u)):
+        a, b, cycle = u[e], v[e], -1
+        while a != b:
+            a, b = max(a, b), min(a, b)
+            while block[a] != a:
+                block[a] = block[block[a]]
+                a = block[a]
+            if cycle >= 0:
+                block[max(a, cycle)] = min(a, cycle)
+            cycle = a if cycle < 0 else min(a, cycle)
+            a = parent[a]
+    for k in range(len(block)):
+        block[k] = block[block[k]]
+    return block[np.maximum(u, v)]

@@ -9,15 +9,14 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import BoolArray
+from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError
 from kcons.plan.clusters import Shape, classify, cluster_labels
-from kcons.plan.rank import mark_dependent_rows, rank_of_small, small_enough
 from kcons.solvers.chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.rank_revealing import independent
+from kcons.solvers.rank_revealing import independent, rank
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.small_clusters import SmallClusters
@@ -26,6 +25,10 @@ from kcons.solvers.sparse.mixed_rows import SparseRows
 
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
+#: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
+ORDERED_ROWS = 400
+#: Rows of clusters of one kind among which that is done.
+ORDERED_IN_ALL = 20_000
 
 
 @dataclass(frozen=True)
@@ -209,7 +212,7 @@ def make_plan(
     with np.errstate(divide="ignore"):
         inverse_masses[touched] /= constraint_set.masses[touched]
     inverse_masses[pinned] = 0.0
-    labels = cluster_labels(constraint_set, pinned, pinned_rows)
+    labels = cluster_labels(constraint_set, pinned)
     driven = constraint_set.moving or not bool(constraint_set.holonomic.all())
     rank = len(pinned_rows)
     plan = Plan(constraint_set, named, [], labels, pinned, pinned_rows, inverse_masses, rank, driven)
@@ -315,6 +318,56 @@ def _shapes(
         chosen = np.where(labels >= 0, number[labels], -1)
         for shape in classify(constraint_set, chosen, inverse_masses):
             yield shape, kind
+
+
+def small_enough(clusters: list[IntArray]) -> bool:
+    sizes = [len(rows) for rows in clusters]
+    return max(sizes, default=0) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL
+
+
+def mark_dependent_rows(
+    constraint_set: ConstraintSet,
+    clusters: list[IntArray],
+    inverse_masses: FloatArray,
+    positions: FloatArray,
+    time: float,
+    eliminate_last: BoolArray,
+) -> int:
+    """Independent rows of small clusters, by pivoted QR; marks those that the best conditioned rows leave over."""
+    from scipy.linalg import qr  # slow to import
+
+    jacobian = constraint_set.jacobian(positions, time)
+    root_w = np.repeat(np.sqrt(inverse_masses), 3)
+    found = 0
+    for rows in clusters:
+        part = jacobian[rows]
+        columns, place = np.unique(part.indices, return_inverse=True)
+        b = np.zeros((len(rows), len(columns)))
+        b[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * root_w[part.indices]
+        size = np.linalg.norm(b, axis=1, keepdims=True)
+        triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
+        diagonal = np.zeros(len(rows))
+        diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
+        # The diagonal of the triangle stands for the singular values: it does not grow, and is their size.
+        left_over = ~independent(diagonal)
+        eliminate_last[rows[order]] = left_over
+        found += int(np.sum(~left_over))
+    return found
+
+
+def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
+    """Rank of many small clusters of distances at once, from the singular values of their B."""
+    ends = shape.atoms[:, shape.pairs]  # (n_clusters, K, 2) global atoms
+    difference = positions[ends[..., 0]] - positions[ends[..., 1]]
+    if lattice is not None:
+        difference = minimum_image(difference, lattice)
+    n, k = ends.shape[:2]
+    b = np.zeros((n, k, shape.atoms.shape[1], 3))
+    row = np.arange(k)
+    root_w = np.sqrt(inverse_masses[shape.atoms[0]])
+    b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
+    b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
+    return rank(b.reshape(n, k, -1))
 
 
 def _by_cluster(rows: IntArray, labels: IntArray) -> list[IntArray]:

@@ -72,16 +72,16 @@ def without_second_order_rows(constraint_set: ConstraintSet, positions: FloatArr
         Rows that cannot be converted; the message says what to hold instead.
     """
     bodies: list[FlatBody] = []
-    sigma: FloatArray | None = None
+    miss: FloatArray | None = None
     for stack in _stacks(constraint_set, positions, time):
-        sigma = constraint_set.value(positions, time) if sigma is None else sigma
-        suspects = stack.suspects(constraint_set, positions, time)
-        straight, done = stack.straight_triangles(constraint_set, suspects, time)
+        miss = np.abs(constraint_set.value(positions, time) / constraint_set.scale) if miss is None else miss
+        suspects = stack.suspects(positions)
+        straight, done = stack.straight_triangles(suspects)
         bodies += straight
         for rows in stack.rows[suspects & ~done]:
             bodies += find_flat_bodies(LocalRows(constraint_set, rows, positions, time))
         regular = 0
-        for rows in stack.rows[stack.off_target(constraint_set, positions, sigma, time) & ~suspects]:
+        for rows in stack.rows[stack.off_target(positions, miss) & ~suspects]:
             block = LocalRows(constraint_set, rows, positions, time).restored()
             regular += 1
             if block.singular(block.x):
@@ -89,60 +89,59 @@ def without_second_order_rows(constraint_set: ConstraintSet, positions: FloatArr
                 regular = 0
             if regular >= _REGULAR_SAMPLES:
                 break
-    if not bodies:
-        return constraint_set
-    return with_flat_bodies(constraint_set, bodies, positions, time)
+    return with_flat_bodies(constraint_set, bodies, positions, time) if bodies else constraint_set
 
 
 @dataclass
 class _Stack:
-    """Blocks of one shape.
+    """Blocks of one shape of a set, at a time.
 
     Attributes
     ----------
     rows : ndarray of int, shape (n_blocks, n_rows)
     atoms : ndarray of int, shape (n_blocks, n_atoms)
+    pinned : ndarray of int
+        Fixed atoms of the set.
     """
 
+    held: ConstraintSet
+    time: float
     rows: IntArray
     atoms: IntArray
+    pinned: IntArray
 
     def chosen(self, which: IntArray | BoolArray) -> _Stack:
-        return _Stack(self.rows[which], self.atoms[which])
+        return replace(self, rows=self.rows[which], atoms=self.atoms[which])
 
-    def suspects(self, constraint_set: ConstraintSet, x: FloatArray, time: float) -> BoolArray:
+    def suspects(self, x: FloatArray) -> BoolArray:
         """Blocks that are singular at second order at `x`, shape (n_blocks,)."""
-        unit, _, curvature = self.dense(constraint_set, x, time)
+        unit, _, curvature = self.dense(x)
         doubtful: BoolArray = np.asarray(np.isfinite(unit).all(axis=(1, 2)))
         doubtful[doubtful] = _deficient(unit[doubtful])
         if doubtful.any() and not doubtful.all():
-            few = self.chosen(doubtful)
-            doubtful[doubtful] = few.suspects(constraint_set, x, time)
-            return doubtful
-        if doubtful.any():
+            doubtful[doubtful] = self.chosen(doubtful).suspects(x)
+        elif doubtful.any():
             extent = np.ptp(x[self.atoms], axis=1).max(axis=1)
             doubtful = unsolvable(unit, curvature, np.where(extent > 0, extent, 1.0))
         return doubtful
 
-    def dense(
-        self, constraint_set: ConstraintSet, x: FloatArray, time: float, pinned: IntArray | None = None
-    ) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
+    def dense(self, x: FloatArray) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
         """Row-normalized A of each block, fixed atoms' columns zero, its norms, and the curvatures of the same rows."""
         n_blocks, n_rows = self.rows.shape
         n_atoms = self.atoms.shape[1]
         a = np.zeros((n_blocks, n_rows, n_atoms, 3))
         pieces: list[tuple[Constraint, FloatArray, IntArray, IntArray, IntArray]] = []
-        for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
+        for item, start in zip(self.held.constraints, self.held.starts, strict=False):
             block, row = np.nonzero((self.rows >= start) & (self.rows < start + item.n_rows))
             if len(block) == 0:
                 continue
             part = item.select(self.rows[block, row] - start)
             slots = np.argmax(self.atoms[block][:, None, :] == part.atoms[:, :, None], axis=2)
-            r = constraint_set.gather(part, x)
+            r = self.held.gather(part, x)
             with np.errstate(divide="ignore", invalid="ignore"):
-                a[block[:, None], row[:, None], slots] = part.gradient(r, time)
+                a[block[:, None], row[:, None], slots] = part.gradient(r, self.time)
             pieces.append((part, r, block, row, slots))
-        free = ~np.isin(self.atoms, fixed_atoms(constraint_set) if pinned is None else pinned)
+        free = ~np.isin(self.atoms, self.pinned)
         a *= free[:, None, :, None]
         unit = a.reshape(n_blocks, n_rows, -1)
         norms = np.linalg.norm(unit, axis=2)
@@ -152,31 +151,26 @@ class _Stack:
             field = v.reshape(n_blocks, n_atoms, 3) * free[:, :, None]
             bent = np.zeros((n_blocks, n_rows))
             for part, r, block, row, slots in pieces:
-                bent[block, row] = part.curvature(r, field[block[:, None], slots], time)
+                bent[block, row] = part.curvature(r, field[block[:, None], slots], self.time)
             return bent / norms
 
         return unit / norms[:, :, None], norms, curvature
 
-    def straight_triangles(
-        self, constraint_set: ConstraintSet, suspects: BoolArray, time: float
-    ) -> tuple[list[FlatBody], BoolArray]:
+    def straight_triangles(self, suspects: BoolArray) -> tuple[list[FlatBody], BoolArray]:
         """Collinear triatomics held by three distances, all at once, and which blocks they are."""
         done = np.zeros(len(self.rows), bool)
-        if self.rows.shape[1] != 3 or self.atoms.shape[1] != 3:
+        lengths = [np.full(c.n_rows, c.holds_length and not c.moving) for c in self.held.constraints]
+        plain = np.concatenate(lengths)[self.rows].all(axis=1) & ~np.isin(self.atoms, self.pinned).any(axis=1)
+        if self.rows.shape[1] != 3 or self.atoms.shape[1] != 3 or not plain.any():
             return [], done
-        lengths = [np.full(c.n_rows, c.holds_length and not c.moving) for c in constraint_set.constraints]
-        plain = np.concatenate(lengths)[self.rows].all(axis=1)
-        plain &= ~np.isin(self.atoms, fixed_atoms(constraint_set)).any(axis=1)
-        if not plain.any():
-            return [], done
-        length = constraint_set.target(time)[self.rows]
+        length = self.held.target(self.time)[self.rows]
         order = np.argsort(length, axis=1)
         length = np.take_along_axis(length, order, axis=1)
         rows = np.take_along_axis(self.rows, order, axis=1)
         excess = np.abs(length[:, 0] + length[:, 1] - length[:, 2])
         done = plain & (excess <= length[:, 2] * np.where(suspects, MISFIT, _FLAT_TARGETS))
         found = np.flatnonzero(done)
-        ends, side = (constraint_set.incidence[rows[found, k]].indices.reshape(-1, 2).astype(np.int64) for k in (2, 0))
+        ends, side = (self.held.incidence[rows[found, k]].indices.reshape(-1, 2).astype(np.int64) for k in (2, 0))
         nearer = np.where((ends[:, :1] == side).any(axis=1), 0, 1)
         c = length[found, nearer] / (length[found, 0] + length[found, 1])
         middle = self.atoms[found].sum(axis=1) - ends.sum(axis=1)
@@ -186,20 +180,20 @@ class _Stack:
         ]
         return bodies, done
 
-    def off_target(self, constraint_set: ConstraintSet, x: FloatArray, sigma: FloatArray, time: float) -> BoolArray:
-        """Blocks so far from their targets that their geometry says nothing about the surface."""
-        miss = np.abs(sigma[self.rows] / constraint_set.scale[self.rows]).max(axis=1)
-        result = miss > 1e-10
-        if self.rows.shape[1] <= 3 or not result.any():
-            return np.zeros_like(result)
-        far = np.flatnonzero(result)
-        unit = self.chosen(far).dense(constraint_set, x, time)[0]
-        if unit.shape[1] <= unit.shape[2]:
-            # At a distance s from a flat geometry the smallest singular value is s, and the rows are off by s^2.
-            smallest = np.linalg.svd(unit, compute_uv=False)[:, -1]
-            far = far[miss[far] > 0.1 * smallest**2]
-        result[:] = False
-        result[far] = True
+    def off_target(self, x: FloatArray, miss: FloatArray) -> BoolArray:
+        """Blocks so far from their targets, by what rows miss, that their geometry says nothing about the surface."""
+        result = np.zeros(len(self.rows), bool)
+        if self.rows.shape[1] <= 3:
+            return result
+        miss = miss[self.rows].max(axis=1)
+        far = np.flatnonzero(miss > 1e-10)
+        if len(far):
+            unit = self.chosen(far).dense(x)[0]
+            if unit.shape[1] <= unit.shape[2]:
+                # At a distance s from a flat geometry the smallest singular value is s, and the rows are off by s^2.
+                smallest = np.linalg.svd(unit, compute_uv=False)[:, -1]
+                far = far[miss[far] > 0.1 * smallest**2]
+            result[far] = True
         return result
 
 
@@ -214,6 +208,7 @@ def _deficient(unit: FloatArray) -> BoolArray:
 def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> Iterator[_Stack]:
     """All blocks small enough for dense algebra, by shape; tests larger ones on the way."""
     rows: IntArray | None = None
+    pinned = fixed_atoms(constraint_set)
     for accept in _LEVELS:
         members, starts = row_blocks(constraint_set, accept, rows)
         sizes = np.diff(starts)
@@ -232,7 +227,8 @@ def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -
             chunk = max(1, DENSE_ENTRIES // int(n_rows * 3 * n_atoms))
             for lo in range(0, len(same), chunk):
                 some = same[lo : lo + chunk, None]
-                yield _Stack(members[starts[some] + np.arange(n_rows)], atoms[first_atom[some] + np.arange(n_atoms)])
+                of_some = members[starts[some] + np.arange(n_rows)], atoms[first_atom[some] + np.arange(n_atoms)]
+                yield _Stack(constraint_set, time, *of_some, pinned)
         rows = np.sort(members[large[label]])
         if len(rows) == 0:
             return
@@ -340,8 +336,8 @@ class LocalRows:
 
     def linear(self, x: FloatArray) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
         """Row-normalized A without the columns of fixed atoms, its norms, and the curvatures of the same rows."""
-        stack = _Stack(np.arange(self.part.n_rows)[None], np.arange(len(self.atoms))[None])
-        unit, norms, curvature = stack.dense(self.part, x, self.time, np.flatnonzero(self.pinned))
+        every = np.arange(self.part.n_rows)[None], np.arange(len(self.atoms))[None]
+        unit, norms, curvature = _Stack(self.part, self.time, *every, np.flatnonzero(self.pinned)).dense(x)
         return unit[0], norms[0], lambda v: curvature(v[None])[0]
 
     def decomposed(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, int]:
@@ -356,11 +352,6 @@ class LocalRows:
             return False
         unit, _, curvature = self.linear(x)
         return bool(unsolvable(unit[None, rows], lambda v: curvature(v[0])[None, rows], np.array([extent_of(x)]))[0])
-
-    def stressed(self, x: FloatArray) -> IntArray:
-        """Rows (block numbering) that take part in a dependence omega^T A = 0."""
-        u, _, _, rank = self.decomposed(x)
-        return np.flatnonzero(np.einsum("rk,rk->r", u[:, rank:], u[:, rank:]) > 1e-10)
 
     def rank(self, x: FloatArray, rows: IntArray | None = None) -> int:
         unit = self.linear(x)[0]
@@ -387,7 +378,9 @@ class LocalRows:
         """Pairs of atoms that keep their distance at positions nearby, and the rank there."""
         rng = np.random.default_rng(20090131)
         n = len(self.atoms)
-        step = DISPLACEMENT * self._shortest()
+        wide = [c for c in self.part.constraints if c.width > 1 and c.n_rows]
+        sides = [np.linalg.norm(np.diff(self.part.gather(c, self.x), axis=1), axis=2).min() for c in wide]
+        step = DISPLACEMENT * min(sides, default=extent_of(self.x))
         best, rigid = -1, np.eye(n, dtype=bool)
         for _ in range(3):
             x = self.x + step * rng.standard_normal(self.x.shape)
@@ -397,16 +390,12 @@ class LocalRows:
                 continue
             best = rank
             # A few random motions show every pair that can move.
-            motions = rng.standard_normal((8, vt.shape[0] - rank)) @ vt[rank:]
-            motions = motions.reshape(8, n, 3)
+            motions = (rng.standard_normal((8, len(vt) - rank)) @ vt[rank:]).reshape(8, n, 3)
             motions[:, self.pinned] = 0.0
             apart = self.unwrapped(x)
             apart = apart[:, None] - apart[None, :]
-            lengths = np.linalg.norm(apart, axis=2) + np.eye(n)
-            rates = np.zeros((n, n))
-            for motion in motions:
-                along = np.einsum("ijc,ijc->ij", apart / lengths[:, :, None], motion[:, None] - motion[None, :])
-                rates = np.maximum(rates, np.abs(along))
+            apart /= (np.linalg.norm(apart, axis=2) + np.eye(n))[:, :, None]
+            rates = np.abs(np.einsum("ijc,mijc->mij", apart, motions[:, :, None] - motions[:, None])).max(axis=0)
             rigid = rates < 1e-7
         return rigid, best
 
@@ -414,14 +403,6 @@ class LocalRows:
         """Positions made whole across the boundary, following the rows."""
         found = [item.with_target(None) for item in self.part.constraints]
         return whole_bodies(found, self.part.whole(x), self.part.lattice)
-
-    def _shortest(self) -> float:
-        lengths = [
-            np.linalg.norm(np.diff(self.part.gather(c, self.x), axis=1), axis=2).min()
-            for c in self.part.constraints
-            if c.width > 1 and c.n_rows
-        ]
-        return float(min(lengths)) if lengths else extent_of(self.x)
 
 
 def extent_of(x: FloatArray) -> float:
@@ -488,7 +469,8 @@ def find_flat_bodies(block: LocalRows) -> list[FlatBody]:
     """
     rigid, generic = block.rigid_pairs()
     x = block.unwrapped(block.x)
-    stressed = block.stressed(block.x)
+    u, _, _, rank = block.decomposed(block.x)
+    stressed = np.flatnonzero((u[:, rank:] ** 2).sum(axis=1) > 1e-10)  # rows with a part in some omega^T A = 0
     loaded = np.unique(np.concatenate([block.row_atoms[k] for k in stressed]))
     found: list[IntArray] = []
     for body in _cliques(rigid):

@@ -1,18 +1,15 @@
 """What a file says about a system, and the rows that follow from it.
 
-- `topology`: atoms, residues, bonds and masses, the same for every MD engine
-- `whole_molecules`: groups and molecules made whole across the faces of the cell
+- `topology`: atoms, residues, bonds and masses, the same for every MD engine; molecules made whole across faces
 - `guessed_bonds`: bonds for systems that come without
-- `rigid_groups`: rigid groups of atoms as rows
-- `ring_systems`, `angle_rows`: rows that hold all angles, none too many
+- `rigid_groups`: rigid groups of atoms as rows; massless sites that three atoms place
+- `angle_rows`: rows that hold all angles, none too many
 - `holding`: the options for what is held, the same for every MD engine
 - `rows_by_name`: rows by name: bonds with hydrogens, all bonds, angles, rigid water
-- `virtual_sites`: massless sites that are placed by three atoms
-- `other_units`: constraints in another unit of length
 """
 
 from kcons.topology.holding import Holding
-from kcons.topology.rows_by_name import HeldRows, held_rows
+from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import Snapshot, Topology, bond_angles
 
-__all__ = ["HeldRows", "Holding", "Snapshot", "Topology", "bond_angles", "held_rows"]
+__all__ = ["HeldRows", "Holding", "Snapshot", "Topology", "bond_angles", "rows_of"]

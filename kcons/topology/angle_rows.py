@@ -5,6 +5,10 @@ plane with it, their angles add up to 360 degrees to first order, and do not fee
 neighbors are the base of an atom. Their angle is held, and each other neighbor is held by its angles with both of
 them or, where it lies in their plane, by one angle and an improper dihedral. The angles between two others stay what
 they are, since the geometry does.
+
+The angles of a small ring depend on each other, too. In a flat ring they do not feel to first order that it puckers;
+only their sum, which is at its largest, keeps it flat. So n - 3 angles and n - 3 dihedrals hold a flat ring of n atoms
+whose bonds are held.
 """
 
 from __future__ import annotations
@@ -13,13 +17,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kcons.constraints import Angle
-from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import lined_up, minimum_image, neighbor_lists
+from kcons.constraints import Angle, Dihedral, Distance
+from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.periodic.one_piece import connected, lined_up, minimum_image, neighbor_lists
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross, dot, norm
 from kcons.topology.rigid_groups import body_numbers, inside_bodies
-from kcons.topology.ring_systems import RingSystems, ring_rows, ring_systems
 from kcons.topology.topology import BoolArray, Snapshot, bond_angles
 
 #: Beyond this an angle is held by a linear row, in degrees.
@@ -31,6 +34,16 @@ FLAT_CENTER = 30.0
 _NARROW = 0.1
 #: Part of the largest sine that is as good for the angle of the base.
 _WIDE = 0.7
+#: Rings of more atoms are chains that happen to close.
+LARGEST = 8
+#: Ring systems of more atoms (graphene, zeolites) keep all of their rows, dependent ones too.
+LARGE_SYSTEM = 60
+#: A ring is flat if no dihedral in it is larger, in degrees.
+FLAT_RING = 20.0
+#: What is left of a row of length 1 beside the rows before it, if it depends on them.
+_DEPENDENT = 1e-6
+#: The first row that is this close to the best, so that rounding does not choose.
+_AS_GOOD = 1 - 1e-6
 
 
 def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -> tuple[IntArray, IntArray]:
@@ -52,44 +65,36 @@ def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -
         Impropers a-j-b-c of an atom j with its neighbors, and dihedrals of flat rings.
     """
     n = snapshot.topology.n_atoms
-    systems = ring_systems(bonds, n)
-    label = _labels(n, bonds, systems, rigid)
-    triples, quads = _centers(snapshot, bonds, label)
-    for k, rings in enumerate(systems.rings):
-        inside = bonds[systems.of_bond == k]
+    of_bond, systems = ring_systems(bonds, n)
+    # The same number for bonds of one ring system or rigid group; -1 for all others.
+    label, first = of_bond.copy(), len(systems)
+    for body in body_numbers(n, rigid):
+        both = body[bonds]
+        together = (label < 0) & (both[:, 0] >= 0) & (both[:, 0] == both[:, 1])
+        label[together] = first + both[together, 0]
+    triples, quads = ([rows] for rows in _centers(snapshot, bonds, label))
+    for k, rings in enumerate(systems):
+        inside = bonds[of_bond == k]
         every = bond_angles(inside, n)
-        straight = Angle(every).measure(lined_up(snapshot.positions[every], snapshot.lattice), 0.0) > np.radians(
-            STRAIGHT
-        )
-        bent, impropers = every[~straight], _impropers(snapshot, inside)
-        angles, dihedrals = ring_rows(
-            snapshot, inside, bent, impropers, rings, lambda rows: inside_bodies(n, rows, rigid)
-        )
+        angle = Angle(every).measure(lined_up(snapshot.positions[every], snapshot.lattice), 0.0)
+        straight = angle > np.radians(STRAIGHT)
+        impropers = _centers(snapshot, inside, np.full(len(inside), -1))[1]
+        angles, dihedrals = ring_rows(snapshot, inside, every[~straight], impropers, rings, rigid)
         triples += [every[straight], angles]
         quads.append(dihedrals)
-    found = np.concatenate([np.zeros((0, 3), np.int64), *triples])
+    found = np.concatenate(triples)
     found[:, [0, 2]] = np.sort(found[:, [0, 2]], axis=1)
-    turned = np.concatenate([np.zeros((0, 4), np.int64), *quads])
+    turned = np.concatenate(quads)
     return found[np.lexsort((found[:, 2], found[:, 0], found[:, 1]))], turned[np.lexsort(turned.T[[3, 2, 0, 1]])]
 
 
-def _labels(n: int, bonds: IntArray, systems: RingSystems, rigid: Sequence[IntArray]) -> IntArray:
-    """A number for each bond, the same for bonds of one ring system or rigid group; -1 for all others."""
-    label, first = systems.of_bond.copy(), len(systems.rings)
-    for body in body_numbers(n, rigid):
-        both = body[bonds]
-        inside = (label < 0) & (both[:, 0] >= 0) & (both[:, 0] == both[:, 1])
-        label[inside] = first + both[inside, 0]
-    return label
-
-
-def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list[IntArray], list[IntArray]]:
+def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[IntArray, IntArray]:
     """Rows at each atom, but for those between bonds with the same label."""
     n = snapshot.topology.n_atoms
     starts, ends = neighbor_lists(bonds, n)
     code = bonds[:, 0] * n + bonds[:, 1]
-    triples: list[IntArray] = []
-    quads: list[IntArray] = []
+    triples: list[IntArray] = [np.zeros((0, 3), np.int64)]
+    quads: list[IntArray] = [np.zeros((0, 4), np.int64)]
     degree = np.diff(starts)
     for d in np.unique(degree[degree > 1]).tolist():
         vertex = np.flatnonzero(degree == d)
@@ -102,7 +107,8 @@ def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list
         rank = np.where(group >= 0, group, len(bonds) + n)
         order = np.lexsort((others, -snapshot.topology.masses[others], rank))
         others, group = (np.take_along_axis(a, order, axis=1) for a in (others, group))
-        e = _directions(snapshot, vertex[:, None], others)
+        e = minimum_image(snapshot.positions[others] - snapshot.positions[vertex[:, None]], snapshot.lattice)
+        e = e / norm(e)[..., None]
         swap = _second(e, group)
         others, group = (np.take_along_axis(a, swap, axis=1) for a in (others, group))
         e = np.take_along_axis(e, swap[..., None], axis=1)
@@ -116,7 +122,7 @@ def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[list
             axis = np.argmax(earlier, axis=1)
             row = np.arange(len(vertex))
             quads.append(np.stack([others[:, 0], vertex, others[row, axis], others[:, k]], axis=1)[turning])
-    return triples, quads
+    return np.concatenate(triples), np.concatenate(quads)
 
 
 def _second(e: FloatArray, group: IntArray) -> IntArray:
@@ -160,19 +166,146 @@ def _third(
     quads.append(improper[wanted & flat & ~alone])
 
 
-def _impropers(snapshot: Snapshot, bonds: IntArray) -> IntArray:
-    """Improper dihedrals where three or more of the bonds meet in one plane."""
-    triples: list[IntArray] = []
-    quads: list[IntArray] = [np.zeros((0, 4), np.int64)]
-    starts, ends = neighbor_lists(bonds, snapshot.topology.n_atoms)
-    for vertex in np.flatnonzero(np.diff(starts) > 2)[:, None]:
-        others = ends[starts[vertex[0]] : starts[vertex[0] + 1]][None]
-        e = _directions(snapshot, vertex[:, None], others)
-        for k in range(2, others.shape[1]):
-            _third(vertex, others, e, k, np.ones(1, dtype=bool), triples, quads)
-    return np.concatenate(quads)
+# -- rings ---------------------------------------------------------------------------------------
 
 
-def _directions(snapshot: Snapshot, vertex: IntArray, others: IntArray) -> FloatArray:
-    u = minimum_image(snapshot.positions[others] - snapshot.positions[vertex], snapshot.lattice)
-    return np.asarray(u / norm(u)[..., None])
+def ring_systems(bonds: IntArray, n_atoms: int) -> tuple[IntArray, list[list[IntArray]]]:
+    """Rings that share bonds: the shortest ring through each bond, up to `LARGEST` atoms; `bonds` sorted, each once.
+
+    Returns
+    -------
+    of_bond : ndarray of int, shape (n_bonds,)
+        The system each bond belongs to, -1 for bonds in no small ring.
+    rings : list of list of ndarray of int
+        The rings of each system: their atoms, one after the other.
+    """
+    of_bond = np.full(len(bonds), -1)
+    keep = _without_ends(bonds, n_atoms)
+    starts, ends = neighbor_lists(bonds[keep], n_atoms)
+    number = {pair: k for k, pair in enumerate(map(tuple, bonds.tolist()))}
+    found: dict[tuple[int, ...], IntArray] = {}
+    for i, j in bonds[keep].tolist():
+        ring = _shortest_ring(i, j, starts, ends)
+        if ring:
+            found.setdefault(tuple(sorted(ring)), np.array(ring))
+    cycles = list(found.values())
+    members = [
+        [number[tuple(sorted(p))] for p in zip(c.tolist(), np.roll(c, -1).tolist(), strict=True)] for c in cycles
+    ]
+    links = [(len(bonds) + k, b) for k, ring in enumerate(members) for b in ring]
+    label, _ = connected(np.array(links, dtype=np.int64).reshape(-1, 2), len(bonds) + len(cycles))
+    rings: dict[int, list[IntArray]] = {}
+    for cycle, ring in zip(cycles, members, strict=True):
+        rings.setdefault(int(label[ring[0]]), []).append(cycle)
+    for k, system in enumerate(rings):
+        of_bond[label[: len(bonds)] == system] = k
+    return of_bond, list(rings.values())
+
+
+def ring_rows(
+    snapshot: Snapshot,
+    bonds: IntArray,
+    triples: IntArray,
+    impropers: IntArray,
+    rings: Sequence[IntArray],
+    rigid: Sequence[IntArray],
+) -> tuple[IntArray, IntArray]:
+    """Which angles and dihedrals hold one ring system whose bonds are held.
+
+    Parameters
+    ----------
+    bonds, triples, impropers : ndarray of int
+        Those within the system: its bonds, its angles, impropers at its flat centers.
+    rings : sequence of ndarray of int
+        Its rings, whose dihedrals are candidates where they are flat.
+    rigid : sequence of ndarray, shape (n_bodies, n_atoms)
+        Groups that are held rigid: rows within one are not returned.
+
+    Returns
+    -------
+    triples, quads : ndarray of int, shapes (n, 3) and (n, 4)
+    """
+    if len(np.unique(bonds)) > LARGE_SYSTEM:
+        return triples, impropers
+    turns = [np.stack([np.roll(ring, -k) for k in range(4)], axis=1) for ring in rings if len(ring) > 3]
+    flat = [quads for quads in turns if _is_flat(snapshot, quads)]
+    quads = np.concatenate([impropers, *flat])
+    items: list[Constraint] = [Distance(bonds), Angle(triples), Dihedral(quads)]
+    rows = _gradients(snapshot, items)
+    n = snapshot.topology.n_atoms
+    held = np.concatenate(
+        [np.ones(len(bonds), dtype=bool), inside_bodies(n, triples, rigid), inside_bodies(n, quads, rigid)]
+    )
+    chosen = np.zeros(len(rows), dtype=bool)
+    chosen[np.flatnonzero(~held)[_independent(rows[held], rows[~held])]] = True
+    angles, dihedrals = np.split(chosen[len(bonds) :], [len(triples)])
+    return triples[angles], quads[dihedrals]
+
+
+def _without_ends(bonds: IntArray, n_atoms: int) -> BoolArray:
+    """Bonds left when atoms with one bond are taken away, again and again."""
+    keep = np.ones(len(bonds), dtype=bool)
+    while True:
+        degree = np.bincount(bonds[keep].ravel(), minlength=n_atoms)
+        ends: BoolArray = keep & (degree[bonds] == 1).any(axis=1)
+        if not ends.any():
+            return keep
+        keep &= ~ends
+
+
+def _shortest_ring(i: int, j: int, starts: IntArray, ends: IntArray) -> list[int]:
+    """Atoms of the shortest ring through the bond i-j, none if it has more than `LARGEST`."""
+    before = {i: i}
+    shell = [i]
+    for _ in range(LARGEST - 1):
+        reached = []
+        for a in shell:
+            for b in ends[starts[a] : starts[a + 1]].tolist():
+                if b in before or (a, b) == (i, j):
+                    continue
+                before[b] = a
+                reached.append(b)
+        if j in before:
+            ring = [j]
+            while ring[-1] != i:
+                ring.append(before[ring[-1]])
+            return ring
+        shell = reached
+    return []
+
+
+def _is_flat(snapshot: Snapshot, quads: IntArray) -> bool:
+    r = lined_up(snapshot.positions[quads], snapshot.lattice)
+    return bool(np.abs(Dihedral(quads).measure(r, 0.0)).max() < np.radians(FLAT_RING))
+
+
+def _gradients(snapshot: Snapshot, items: Sequence[Constraint]) -> FloatArray:
+    """Rows by atoms, weighted with the masses and of length 1, shape (n_rows, 3 n_atoms of the rows)."""
+    atoms = np.unique(np.concatenate([item.atoms.ravel() for item in items]))
+    masses = snapshot.topology.masses[atoms]
+    weight = 1 / np.sqrt(masses) if (masses > 0).all() else np.ones(len(atoms))
+    parts = []
+    for item in items:
+        r = lined_up(snapshot.positions[item.atoms], snapshot.lattice)
+        rows = np.zeros((item.n_rows, len(atoms), 3))
+        place = np.searchsorted(atoms, item.atoms)
+        np.add.at(rows, (np.arange(item.n_rows)[:, None], place), item.gradient(r, 0.0) * weight[place][..., None])
+        parts.append(rows.reshape(item.n_rows, 3 * len(atoms)))
+    both = np.concatenate(parts)
+    return np.asarray(both / np.linalg.norm(both, axis=1, keepdims=True))
+
+
+def _independent(given: FloatArray, rows: FloatArray) -> IntArray:
+    """As many of `rows` as are independent of each other and of `given`, those farthest from the others first."""
+    chosen = []
+    _, s, basis = np.linalg.svd(given, full_matrices=False)
+    basis = basis[s > _DEPENDENT * s[:1].max(initial=0.0)]
+    left = rows - (rows @ basis.T) @ basis
+    length = np.linalg.norm(left, axis=1)
+    while length.max(initial=0.0) > _DEPENDENT:
+        best = int(np.argmax(length >= _AS_GOOD * length.max()))
+        chosen.append(best)
+        direction = left[best] / length[best]
+        left = left - np.outer(left @ direction, direction)
+        length = np.linalg.norm(left, axis=1)
+    return np.sort(np.array(chosen, dtype=np.int64))

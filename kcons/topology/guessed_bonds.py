@@ -59,14 +59,15 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
     """
     topology = snapshot.topology
     radius = _radii(topology.elements)
-    able = np.flatnonzero((radius > 0) if among is None else (radius > 0) & among)
+    every = np.ones(topology.n_atoms, dtype=bool) if among is None else among
+    able = np.flatnonzero((radius > 0) & every)
     if topology.n_atoms and not (topology.elements != "").any():
         raise InputError(
             "there are no bonds and no elements to guess them from; give a topology with bonds, or elements",
             item="elements",
         )
     x = snapshot.positions / snapshot.angstrom
-    bad = ~np.isfinite(x).all(axis=1)
+    bad = every & ~np.isfinite(x).all(axis=1)
     if bad.any():
         atom = int(np.argmax(bad))
         raise InputError(f"position of {topology.atom_name(atom)} is not finite", item="positions", atoms=[atom])
@@ -81,7 +82,9 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
     hydrogen = topology.hydrogen
     near &= ~(hydrogen[i] & hydrogen[j]) | (away < 0.9)
     pairs, away = pairs[near], away[near]
-    kept = _nearest_of_hydrogens(pairs, away, hydrogen)
+    nearest = np.full(topology.n_atoms, np.inf)
+    np.minimum.at(nearest, pairs, away[:, None])
+    kept = (~hydrogen[pairs] | (away[:, None] <= nearest[pairs])).all(axis=1)
     if atoms is not None:
         kept &= atoms[pairs].any(axis=1)
     pairs, away = pairs[kept], away[kept]
@@ -181,18 +184,6 @@ def across(pairs: IntArray, lengths: FloatArray) -> BoolArray:
     return found
 
 
-def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray) -> BoolArray:
-    """Which pairs stay when every hydrogen keeps only its nearest neighbor."""
-    best = np.full(len(hydrogen), np.inf)
-    for side in (0, 1):
-        np.minimum.at(best, pairs[:, side], away)
-    keep = np.ones(len(pairs), dtype=bool)
-    for side in (0, 1):
-        atom = pairs[:, side]
-        keep &= ~hydrogen[atom] | (away <= best[atom])
-    return keep
-
-
 def close_pairs(x: FloatArray, lattice: FloatArray | None, reach: float) -> tuple[IntArray, FloatArray]:
     """Pairs closer than `reach` in any image, shape (n, 2), and their distances."""
     from scipy.spatial import cKDTree
@@ -203,23 +194,20 @@ def close_pairs(x: FloatArray, lattice: FloatArray | None, reach: float) -> tupl
     fractional, y = wrapped_into(x, lattice)
     # Atoms within reach of a face of the cell are repeated beyond the opposite one.
     depth = reach * np.linalg.norm(lattice[1], axis=0)
-    images = product(*(range(-int(n), int(n) + 1) for n in np.ceil(depth)))
     copies, owners = [], []
-    for image in np.array(list(images)):
+    for image in product(*(range(-int(n), int(n) + 1) for n in np.ceil(depth))):
         moved = fractional + image
         inside = (((moved > -depth) & (moved < 1 + depth)) | (depth == 0)).all(axis=1)
         copies.append(y[inside] + image @ lattice[0])
         owners.append(np.flatnonzero(inside))
-    whole, number = np.concatenate(copies), np.concatenate(owners)
-    found = cKDTree(y).sparse_distance_matrix(cKDTree(whole), reach, output_type="ndarray")
+    number = np.concatenate(owners)
+    found = cKDTree(y).sparse_distance_matrix(cKDTree(np.concatenate(copies)), reach, output_type="ndarray")
     owned, away = np.sort(np.stack([found["i"], number[found["j"]]], axis=1), axis=1), found["v"]
-    other = owned[:, 0] != owned[:, 1]
-    owned, away = owned[other], away[other]
-    # The shortest image of each pair.
+    # The shortest image of each pair of different atoms.
     order = np.lexsort((away, owned[:, 1], owned[:, 0]))
     owned, away = owned[order], away[order]
-    first = np.ones(len(owned), dtype=bool)
-    first[1:] = (owned[1:] != owned[:-1]).any(axis=1)
+    first = owned[:, 0] != owned[:, 1]
+    first[1:] &= (owned[1:] != owned[:-1]).any(axis=1)
     return owned[first], away[first]
 
 

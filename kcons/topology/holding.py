@@ -32,8 +32,8 @@ RowMaker = Callable[[IntArray], Constraint]
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-class GroupOptions(TypedDict, total=False):
-    """Options of `Holding` that mean the same on arrays and in every MD engine."""
+class Options(TypedDict, total=False):
+    """Options of `Holding` beside `constrain`."""
 
     rigid_water: bool
     water_names: Iterable[str]
@@ -41,11 +41,6 @@ class GroupOptions(TypedDict, total=False):
     rigid_residues: Iterable[str]
     rigid_bodies: Iterable[str | Sequence[int] | IntArray]
     angles: Literal["angles", "distances"]
-
-
-class Options(GroupOptions, total=False):
-    """Options of `Holding` beside `constrain`."""
-
     on: Mapping[Any, RowMaker] | Sequence[tuple[Any, RowMaker]] | None
     select: ArrayLike | str
     guess_bonds: bool | Literal["missing"]

@@ -5,6 +5,8 @@ they are singular. So a few atoms, the bases, keep their distances: two for atom
 space. On a line and in a plane every other atom is tied to the bases by x_a = sum w_i x_i (`LinearRelation`), in
 space by three distances: to those of the bases that it sees under the widest angles, or in a large body to three atoms
 nearby, so that no atom takes part in many rows.
+
+Massless sites, such as M of TIP4P and the lone pairs of TIP5P, are placed by three atoms and not held.
 """
 
 from __future__ import annotations
@@ -14,14 +16,14 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, LinearRelation
+from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, SingularGeometryError, did_you_mean
-from kcons.topology.topology import BoolArray, Snapshot, listed, selected_numbers
-from kcons.topology.virtual_sites import VirtualSites, fitted
-from kcons.topology.whole_molecules import whole_groups
+from kcons.topology.topology import BoolArray, Snapshot, listed, selected_numbers, whole_groups
 
 #: Residues that are water, and the molecule when there are no residues.
 WATER = frozenset(
@@ -59,6 +61,66 @@ _AS_GOOD = 1 - 1e-6
 
 
 @dataclass(frozen=True, eq=False)
+class VirtualSites:
+    """Sites at r_0 + a (r_1 - r_0) + b (r_2 - r_0) + c (r_1 - r_0) x (r_2 - r_0).
+
+    They have no mass and no degrees of freedom, so that nothing holds them: they are placed after every move of
+    their parents, and their forces act on the parents.
+
+    Attributes
+    ----------
+    sites : ndarray of int, shape (n,)
+    parents : ndarray of int, shape (n, 3)
+        Atoms 0, 1, 2; for water the oxygen and the hydrogens.
+    coefficients : ndarray, shape (n, 3)
+        a, b, and c in 1/length.
+    """
+
+    sites: IntArray
+    parents: IntArray
+    coefficients: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.sites)
+
+    def _arms(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        origin = x[self.parents[:, 0]]
+        return origin, x[self.parents[:, 1]] - origin, x[self.parents[:, 2]] - origin
+
+    def place(self, positions: ArrayLike) -> FloatArray:
+        """Positions with the sites where they belong, shape (n_atoms, 3); molecules must be whole."""
+        x = np.array(as_float_array(positions, "positions"))
+        origin, u, w = self._arms(x)
+        a, b, c = self.coefficients.T[:, :, None]
+        x[self.sites] = origin + a * u + b * w + c * np.cross(u, w)
+        return x
+
+    def spread_forces(self, positions: ArrayLike, forces: ArrayLike) -> FloatArray:
+        """Forces with those on the sites handed to the parents, shape (n_atoms, 3).
+
+        The work along any motion of the parents, total force and torque stay the same.
+        """
+        x = as_float_array(positions, "positions")
+        f = np.array(as_float_array(forces, "forces"))
+        if f.shape != x.shape:
+            raise InputError(f"forces have shape {f.shape}, positions {x.shape}", item="forces")
+        _, u, w = self._arms(x)
+        a, b, c = self.coefficients.T[:, :, None]
+        acting = f[self.sites].copy()
+        first = a * acting + c * np.cross(w, acting)
+        second = b * acting + c * np.cross(acting, u)
+        f[self.sites] = 0.0
+        np.add.at(f, self.parents[:, 0], acting - first - second)
+        np.add.at(f, self.parents[:, 1], first)
+        np.add.at(f, self.parents[:, 2], second)
+        return f
+
+    def in_unit(self, factor: float) -> VirtualSites:
+        """The same where lengths are given by numbers larger by `factor`."""
+        return VirtualSites(self.sites, self.parents, np.asarray(self.coefficients / np.array([1.0, 1.0, factor])))
+
+
+@dataclass(frozen=True, eq=False)
 class Waters:
     """Rigid waters of a system.
 
@@ -77,10 +139,6 @@ class Waters:
         held, seen = atoms[self.triples].all(axis=1), atoms[self.sites.parents].all(axis=1)
         sites = VirtualSites(self.sites.sites[seen], self.sites.parents[seen], self.sites.coefficients[seen])
         return Waters(self.triples[held], sites)
-
-    def rows(self, geometry: tuple[float, float] | None, angstrom: float) -> list[Constraint]:
-        """See `water_rows`."""
-        return [water_rows(self.triples, geometry, angstrom)] if len(self.triples) else []
 
 
 def water_rows(triples: IntArray, geometry: tuple[float, float] | None, angstrom: float = 1.0) -> Distance:
@@ -124,19 +182,15 @@ def find_waters(
     atoms = np.flatnonzero(called[topology.residues])
     number, residue = np.unique(topology.residues[atoms], return_inverse=True)
     symbol = topology.elements[atoms]
-    oxygen, hydrogen = symbol == "O", symbol == "H"
     # Anything else counts as a site if it has no mass; Drude particles have some, and move by themselves.
-    site = ~oxygen & ~hydrogen & (topology.masses[atoms] == 0)
-    count = [
-        np.bincount(residue, weights=mask, minlength=len(number)) for mask in (oxygen, hydrogen, site, symbol != "?")
-    ]
-    whole = (count[0] == 1) & (count[1] == 2) & (count[0] + count[1] + count[2] == count[3])
-    alone = (count[0] == 1) & (count[3] == 1)
-    odd = np.flatnonzero(~whole & ~alone)
+    kind = np.select([symbol == "O", symbol == "H", topology.masses[atoms] == 0], [0, 1, 2], 3)
+    count = np.zeros((len(number), 4), np.int64)
+    np.add.at(count, (residue, kind), 1)
+    whole = (count[:, [0, 1, 3]] == [1, 2, 0]).all(axis=1)
+    odd = np.flatnonzero(~whole & (count != [1, 0, 0, 0]).any(axis=1))
     if len(odd):
         where = atoms[residue == odd[0]]
-        n_oxygen, n_hydrogen, n_site, n_all = (int(of_each[odd[0]]) for of_each in count)
-        others = n_all - n_oxygen - n_hydrogen - n_site
+        n_oxygen, n_hydrogen, _, others = count[odd[0]].tolist()
         besides = f" and {others} with mass besides" if others else ""
         raise InputError(
             f"residue {topology.residue_name(int(number[odd[0]]))} (atoms {where[0]} to {where[-1]}) is called water "
@@ -146,17 +200,12 @@ def find_waters(
             atoms=where.tolist(),
         )
     member = whole[residue]
-    # Atoms of a residue in their order, so that oxygen comes before its hydrogens in the triples.
-    o = atoms[member & oxygen]
-    h = atoms[member & hydrogen]
-    triples = np.zeros((len(o), 3), np.int64)
-    triples[:, 0] = o[np.argsort(residue[member & oxygen], kind="stable")]
-    triples[:, 1:] = h[np.argsort(residue[member & hydrogen], kind="stable")].reshape(-1, 2)
-    rank = np.cumsum(whole) - 1
-    sites = atoms[member & site]
-    parents = triples[rank[residue[member & site]]]
+    held = np.flatnonzero(member & (kind < 2))
+    triples = atoms[held[np.lexsort((kind[held], residue[held]))]].reshape(-1, 3)
+    sites = member & (kind == 2)
+    parents = triples[(np.cumsum(whole) - 1)[residue[sites]]]
     middle = 0.0 if geometry is None else geometry[0] * float(np.cos(np.radians(geometry[1]) / 2))
-    return Waters(triples, _water_sites(snapshot, sites, parents, number[residue[member & site]], model_site, middle))
+    return Waters(triples, _water_sites(snapshot, atoms[sites], parents, number[residue[sites]], model_site, middle))
 
 
 def _water_sites(
@@ -182,7 +231,8 @@ def _water_sites(
             item="positions",
             atoms=parents[flat[0]].tolist(),
         )
-    found = fitted(sites, parents, r[:, 3], r[:, :3]).coefficients
+    frame = np.stack([u, w, np.cross(u, w)], axis=-1)
+    found = np.asarray(np.linalg.solve(frame, to_site[..., None])[..., 0], dtype=np.float64)
     key = np.char.add(np.char.add(topology.residue_names[residue], "/"), topology.names[sites])
     for name in np.unique(key):
         these = key == name
@@ -194,14 +244,13 @@ def _water_sites(
                 item="positions",
                 atoms=sites[these][:1].tolist(),
             )
-        a, b = np.median(found[these, :2], axis=0)
-        a = b = 0.5 * (a + b)
+        a = float(np.median(found[these, :2], axis=0).mean())
         # One lone pair may have the name of the other in some molecules.
         c = float(np.median(np.abs(found[these, 2])))
         in_plane = c * float(np.median(area[these])) < 0.05 * snapshot.angstrom
         if model_site and in_plane:
             measured = float(np.median(np.linalg.norm(0.5 * (u[these] + w[these]), axis=1)))
-            a = b = 0.5 * model_site / (middle or measured / snapshot.angstrom)
+            a = 0.5 * model_site / (middle or measured / snapshot.angstrom)
         found[these, :2] = a
         found[these, 2] = 0.0 if in_plane else np.copysign(c, found[these, 2])
     return VirtualSites(sites, parents, found)
@@ -252,16 +301,15 @@ def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]
     return [np.array(group) for _, group in sorted(by_size.items())]
 
 
-def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT) -> list[Constraint]:
+def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint]:
     """Rows that hold every group rigid: distances between bases, and relations for all other atoms.
+
+    Bodies that are linear or planar up to `FLAT` are held exactly so; positions may be off by that much.
 
     Parameters
     ----------
     groups : sequence of ndarray, shape (n_bodies, n_atoms)
         Bodies of one size each.
-    flat : float
-        Extent across a line or a plane, relative to that along it, up to which a body is held as linear or planar.
-        It is then held exactly flat, so that positions may be off by that much.
 
     Raises
     ------
@@ -280,7 +328,7 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT
         r, n = whole_groups(snapshot, atoms), atoms.shape[1]
         center = r.mean(axis=1, keepdims=True)
         _, s, axes = np.linalg.svd(r - center, full_matrices=False)
-        dimension = 1 + (s[:, 1:3] > flat * s[:, :1]).sum(axis=1) if n > 2 else np.ones(len(atoms), np.int64)
+        dimension = 1 + (s[:, 1:3] > FLAT * s[:, :1]).sum(axis=1) if n > 2 else np.ones(len(atoms), np.int64)
         _refuse_coincident(snapshot, atoms, s)
         for d in np.unique(dimension).tolist():
             these = np.flatnonzero(dimension == d)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,18 +22,18 @@ from kcons.constraints.periodic.one_piece import lined_up
 from kcons.errors import InputError
 from kcons.topology.angle_rows import STRAIGHT, angle_rows
 from kcons.topology.guessed_bonds import FAR, guess_bonds, reaches
-from kcons.topology.holding import CONSTRAIN, GroupOptions, Holding, RowMaker
+from kcons.topology.holding import CONSTRAIN, Holding
 from kcons.topology.rigid_groups import (
-    FLAT,
+    VirtualSites,
     Waters,
     body_rows,
     find_waters,
     inside_bodies,
     listed_bodies,
     residue_bodies,
+    water_rows,
 )
 from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
-from kcons.topology.virtual_sites import VirtualSites
 
 #: No bond is that long, in angstrom, whatever its atoms.
 TORN = 10.0
@@ -115,38 +115,18 @@ class HeldRows(list[Constraint]):
         return f"<HeldRows: {self.summary()}>"
 
 
-def held_rows(
-    snapshot: Snapshot,
-    constrain: str | None = "hbonds",
-    *,
-    on: Sequence[tuple[IntArray, RowMaker]] = (),
-    selected: BoolArray | None = None,
-    guess: bool | Literal["missing"] = "missing",
-    flat: float = FLAT,
-    remedy: str = "give a topology with bonds",
-    **options: Unpack[GroupOptions],
-) -> HeldRows:
-    """Rows that hold what is named.
+def rows_of(snapshot: Snapshot, holding: Holding, numbers: Callable[[Any], IntArray], remedy: str) -> HeldRows:
+    """Rows that hold what is named; to be called where users call.
 
     Parameters
     ----------
     snapshot : Snapshot
-    constrain : {'hbonds', 'allbonds', 'hangles', 'allangles', 'none'} or None
-        See `CONSTRAIN`; the first three are what they are in OpenMM.
-    on : sequence of (atoms, callable)
-        Rows on selections; the callable gets the atoms and gives a constraint, for example `CenterOfMass`.
-    selected : ndarray of bool, shape (n_atoms,), optional
-        Rows are kept if all of their atoms are marked; `rigid_bodies` and `on` are not restricted.
-    guess : bool or 'missing'
-        Whether bonds are guessed: 'missing' where atoms have none, with a warning; True all of them anew; False
-        never.
-    flat : float
-        See `kcons.topology.rigid_groups.body_rows`.
+    holding : Holding
+        What is held.
+    numbers : callable
+        Gets what stands in `holding` as a selection, gives atoms as numbers or as a mask.
     remedy : str
         What the error about missing bonds recommends.
-    **options
-        rigid_water, water_names, water_geometry, rigid_residues, rigid_bodies, angles: see
-        `kcons.topology.holding.Holding`.
 
     Returns
     -------
@@ -161,25 +141,7 @@ def held_rows(
     Warns
     -----
     UserWarning
-        If bonds were guessed without being asked for (guess='missing'), or not for all hydrogens.
-    """
-    holding = Holding(constrain, on=on, select="all" if selected is None else selected, guess_bonds=guess, **options)
-    return rows_of(snapshot, holding, np.asarray, remedy, flat)
-
-
-def rows_of(
-    snapshot: Snapshot,
-    holding: Holding,
-    numbers: Callable[[Any], IntArray],
-    remedy: str,
-    flat: float = FLAT,
-) -> HeldRows:
-    """`held_rows` for what an MD engine selects in its own way; to be called where users call.
-
-    Parameters
-    ----------
-    numbers : callable
-        Gets what stands in `holding` as a selection, gives atoms as numbers or as a mask.
+        If bonds were guessed without being asked for (guess_bonds='missing'), or not for all hydrogens.
     """
     kind, topology = holding.kind, snapshot.topology
     geometry, _ = holding.geometry()
@@ -193,16 +155,18 @@ def rows_of(
     groups = residue_bodies(snapshot, holding.residues)
     if selected is not None:
         waters = waters.among(selected)
-        groups = [kept for kept in (g[selected[g].all(axis=1)] for g in groups) if len(kept)]
-    groups = _without_waters(groups, waters.triples)
-    groups += listed_bodies(snapshot, bodies)
+        groups = [g[selected[g].all(axis=1)] for g in groups]
+    # Rigid residues that are rigid water are held as water.
+    groups = [g[~np.isin(g, waters.triples[:, 0]).any(axis=1)] for g in groups]
+    groups = [g for g in groups if len(g)] + listed_bodies(snapshot, bodies)
     _refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))
     bonds = snapshot.topology.bonds
     bonds = bonds[~_closing(bonds, topology.hydrogen)]
     _refuse_torn(snapshot, bonds[inside_bodies(snapshot.topology.n_atoms, bonds, groups)])
     rows = _internal(snapshot, kind, [waters.triples, *groups], selected, holding.angles)
-    rows += waters.rows(geometry, snapshot.angstrom)
-    rows += body_rows(snapshot, groups, flat)
+    if len(waters.triples):
+        rows.append(water_rows(waters.triples, geometry, snapshot.angstrom))
+    rows += body_rows(snapshot, groups)
     for key, make in holding.own_rows:
         made = make(numbers(key))
         if not isinstance(made, Constraint):
@@ -298,14 +262,6 @@ def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray |
     if topology.residues_known:
         loose &= np.bincount(topology.residues, minlength=topology.n_residues)[topology.residues] > 1
     return np.flatnonzero(loose)
-
-
-def _without_waters(groups: list[IntArray], triples: IntArray) -> list[IntArray]:
-    """Rigid residues that are rigid water are held as water."""
-    if not len(triples):
-        return groups
-    oxygens = triples[:, 0]
-    return [kept for kept in (g[~np.isin(g, oxygens).any(axis=1)] for g in groups) if len(kept)]
 
 
 # -- bonds and angles as rows -----------------------------------------------------------------------

@@ -16,7 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import BoolArray, connected, lattice_of, neighbor_lists
+from kcons.constraints.periodic.one_piece import (
+    BoolArray,
+    connected,
+    lattice_of,
+    lined_up,
+    make_whole,
+    minimum_image,
+    neighbor_lists,
+    spanning_tree,
+)
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -123,25 +132,6 @@ class Topology:
             residues_known=False,
         )
 
-    def subset(self, atoms: IntArray) -> Topology:
-        """Some atoms, renumbered in the order of `atoms`, with the bonds among them."""
-        new = np.full(self.n_atoms, -1, dtype=np.int64)
-        new[atoms] = np.arange(len(atoms))
-        bonds = new[self.bonds]
-        old_residues, residues = np.unique(self.residues[atoms], return_inverse=True)
-        return replace(
-            self,
-            names=self.names[atoms],
-            elements=self.elements[atoms],
-            masses=self.masses[atoms],
-            residues=residues.astype(np.int64),
-            residue_names=self.residue_names[old_residues],
-            residue_ids=self.residue_ids[old_residues],
-            chains=self.chains[old_residues],
-            bonds=sorted_pairs(bonds[(bonds >= 0).all(axis=1)]),
-            charges=None if self.charges is None else self.charges[atoms],
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
@@ -198,15 +188,59 @@ class Snapshot:
             velocities=None if self.velocities is None else self.velocities * factor,
         )
 
-    def subset(self, atoms: IntArray) -> Snapshot:
-        """Some atoms only, renumbered."""
-        return replace(
-            self,
-            topology=self.topology.subset(atoms),
-            positions=self.positions[atoms],
-            velocities=None if self.velocities is None else self.velocities[atoms],
-            indices=None if self.indices is None else self.indices[atoms],
-        )
+
+# -- molecules made whole across the faces of the cell --------------------------------------------
+
+#: No two images of an atom are that close, in angstrom.
+_ROUNDING = 1e-3
+
+
+def whole_groups(snapshot: Snapshot, atoms: IntArray) -> FloatArray:
+    """Positions of groups, each made whole, shape (n, width, 3).
+
+    By minimum images from atom to atom; atoms of one molecule, whose neighbors in the group may be farther away than
+    half the cell, lie where its bonds say.
+    """
+    r = lined_up(snapshot.positions[atoms], snapshot.lattice)
+    if snapshot.lattice is None or not len(snapshot.topology.bonds):
+        return r
+    y, molecule = _in_molecules(snapshot)
+    for k in range(1, atoms.shape[1]):
+        same = molecule[atoms[:, :k]] == molecule[atoms[:, k, None]]
+        first = np.argmax(same, axis=1)
+        bonded = same.any(axis=1)
+        row = np.arange(len(atoms))
+        meant = r[row, first] + y[atoms[:, k]] - y[atoms[row, first]]
+        moved = bonded & (np.abs(meant - r[:, k]).max(axis=1) > _ROUNDING * snapshot.angstrom)
+        # What comes after goes along.
+        r[moved, k:] += (meant - r[:, k])[moved, None]
+    return r
+
+
+def _in_molecules(snapshot: Snapshot) -> tuple[FloatArray, IntArray]:
+    """Positions of whole molecules, and a number for each; atoms of endless ones have a number each."""
+    bonds, n = snapshot.topology.bonds, snapshot.topology.n_atoms
+    y = whole_molecules(snapshot).positions
+    molecule, count = connected(bonds, n)
+    d = y[bonds[:, 0]] - y[bonds[:, 1]]
+    around = np.abs(d - minimum_image(d, snapshot.lattice)).max(axis=1) > _ROUNDING * snapshot.angstrom
+    endless = np.isin(molecule, molecule[bonds[around, 0]])
+    return y, np.where(endless, count + np.arange(n), molecule)
+
+
+def whole_molecules(snapshot: Snapshot, links: IntArray | None = None) -> Snapshot:
+    """Every molecule in one piece: bonded atoms moved to their nearest images, from the first atom on.
+
+    Parameters
+    ----------
+    links : ndarray of int, shape (n, 2), optional
+        What counts as bonded; by default the bonds of the topology.
+    """
+    if snapshot.lattice is None:
+        return snapshot
+    tree = spanning_tree(snapshot.topology.bonds if links is None else links, snapshot.topology.n_atoms)
+    x = make_whole(snapshot.positions, *tree, snapshot.lattice)
+    return snapshot if np.array_equal(x, snapshot.positions) else replace(snapshot, positions=x)
 
 
 # -- arrays ---------------------------------------------------------------------------------------

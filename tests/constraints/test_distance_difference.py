@@ -124,15 +124,6 @@ def test_bondcombos_become_this_row_and_go_back():
     assert other.measure(atoms.positions[other.atoms], 0.0) == pytest.approx([wanted], abs=1e-14)
 
 
-def test_the_bonds_of_a_difference_may_change_when_it_is_restored():
-    """The row asks for other lengths of its bonds; those that it does not name stay."""
-    atoms = Atoms("OHHOHH", [[0, 0, 0], [0.97, 0, 0], [-0.3, 0.92, 0], [2.7, 0, 0], [3.1, 0.8, 0.3], [3.1, -0.5, 0.7]])
-    atoms.info["bonds"] = [[0, 1], [0, 2], [3, 4], [3, 5]]
-    constrain(atoms, DistanceDifference([[0, 1], [1, 3]], 0.0), project=True)
-    assert atoms.get_distance(0, 1) == pytest.approx(atoms.get_distance(1, 3), abs=1e-12)
-    assert atoms.get_distance(0, 2) == pytest.approx(np.hypot(0.3, 0.92), rel=0.0125)
-
-
 def test_replicas_each_have_their_own():
     atoms = proton()
     atoms.set_cell([6.0, 5.0, 5.0])

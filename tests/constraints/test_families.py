@@ -343,11 +343,6 @@ def test_undefined_gradients_are_refused(item, x, words):
     assert set(caught.value.atoms) <= set(item.atoms.ravel().tolist())
 
 
-def test_almost_straight_angles_are_accepted():
-    held = ConstraintSet(Angle([0, 1, 2]), bent(179.9999), np.ones(3))
-    assert held.target()[0] == pytest.approx(np.radians(179.9999), rel=1e-14)
-
-
 DIFFERENCE = DistanceDifference(TRANSFER).todict()
 #: What is no such row, and what is said of it.
 REFUSED = [

@@ -6,12 +6,10 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.plan import clusters, make_plan
+from kcons.plan import make_plan
 from kcons.plan.clusters import LANES_CLUSTERS, LANES_ROWS, Shape, classify, cluster_labels
 
 NONE = np.zeros(0, np.int64)
@@ -43,14 +41,9 @@ def same_partition(labels, groups) -> bool:
 def test_fixed_atoms_separate_and_their_rows_belong_to_no_cluster() -> None:
     rows = [held.FixedAtoms([2, 5]), held.Distance([[0, 1], [1, 2], [2, 3], [3, 4], [2, 5]])]
     x = places(6)
-    labels = cluster_labels(ConstraintSet(rows, x, np.ones(6)), np.array([2, 5]), np.arange(6))
+    labels = cluster_labels(ConstraintSet(rows, x, np.ones(6)), np.array([2, 5]))
     assert same_partition(labels, [(6, 7), (8, 9)])
     assert (labels[:6] == -1).all() and labels[10] == -1
-
-
-def test_labels_of_no_rows() -> None:
-    assert len(cluster_labels(ConstraintSet([], places(3), np.ones(3)), NONE, NONE)) == 0
-    assert list(classify(ConstraintSet([], places(3), np.ones(3)), NONE, np.zeros(3))) == []
 
 
 # -- shapes -----------------------------------------------------------------------------------------
@@ -160,15 +153,3 @@ def test_every_row_goes_to_exactly_one_shape(seed: int) -> None:
     taken = np.concatenate([s.rows.ravel() for s in classify(constraint_set, plan.labels, plan.inverse_masses)])
     np.testing.assert_array_equal(np.sort(taken), np.flatnonzero(plan.labels >= 0))
     assert sum(k.clusters for k in plan.kinds) == plan.labels.max() + 1
-
-
-def test_clusters_are_those_of_a_graph_by_python_and_compiled() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        n, n_atoms = int(rng.integers(1, 30)), int(rng.integers(2, 40))
-        rows = [rng.choice(n_atoms, size=int(rng.integers(0, min(4, n_atoms) + 1)), replace=False) for _ in range(n)]
-        begins, atoms = np.cumsum([0, *map(len, rows)]), np.concatenate(rows).astype(np.int64)
-        incidence = sp.csr_array((np.ones(len(atoms)), atoms, begins), shape=(n, n_atoms))
-        expected = connected_components(incidence @ incidence.T, directed=False)[1]
-        for joined in (clusters._joined, clusters._joined.py_func):
-            np.testing.assert_array_equal(joined(begins, atoms, n_atoms), expected)

@@ -188,14 +188,6 @@ def test_multipliers_of_dependent_rows_in_very_different_units(unit: float) -> N
 # -- rank ---------------------------------------------------------------------------------------------
 
 
-def test_a_bond_to_two_fixed_atoms_in_line_has_rank_one() -> None:
-    x = np.array([[-1.0, 0, 0], [0, 0, 0], [1.5, 0, 0]])
-    rows = [held.FixedAtoms([0, 2]), held.LinearCombination([1, 0], [[1.0, 0, 0], [-1, 0, 0]])]
-    rows.append(held.LinearCombination([1, 2], [[1.0, 0, 0], [-1, 0, 0]]))
-    plan = planned(rows, x)
-    assert lines(plan) == [("SparseRows", 1, 2, 1)]
-
-
 def test_rank_is_that_of_the_dense_matrix() -> None:
     for seed in range(30):
         rng = np.random.default_rng(seed)

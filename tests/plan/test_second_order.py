@@ -79,23 +79,14 @@ def rigidly_moved(held: ConstraintSet, x: Array) -> Array:
 
 
 LEFT_ALONE: dict[str, tuple[object, list[Constraint], int]] = {
-    "one bond twice": ([[0, 0, 0], [1, 0, 0]], [Distance([(0, 1), (1, 0)])], 1),
     "methane by 10 distances": (METHANE, [Distance(pairs_of(5))], 9),
     "methane by bonds and angles": (
         METHANE,
         [Distance([(0, i) for i in range(1, 5)]), Angle([(i, 0, j) for i, j in combinations(range(1, 5), 2)])],
         9,
     ),
-    "octahedron by 15": (np.vstack([np.eye(3), -np.eye(3)]), [Distance(pairs_of(6))], 12),
-    "bipyramid by 10": (np.vstack([ring(3), [[0, 0, 1.0], [0, 0, -1.0]]]), [Distance(pairs_of(5))], 9),
     "hexagon with an atom above all of it": (np.vstack([ring(6), [[0.2, 0.1, 1.3]]]), [Distance(pairs_of(7))], 15),
-    "benzene by its bonds": (BENZENE, [Distance(BENZENE_BONDS)], 12),
     "water by three distances": ([[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0]], [Distance(pairs_of(3))], 3),
-    "water by bonds and angle": (
-        [[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0]],
-        [Distance([(0, 1), (0, 2)]), Angle([(1, 0, 2)])],
-        3,
-    ),
     "straight chain": ([[k, 0, 0] for k in range(6)], [Distance([(k, k + 1) for k in range(5)])], 5),
     "planar zigzag by bonds, angles and trans dihedrals": (
         [[0, 0, 0], [1, 0.5, 0], [2, 0, 0], [3, 0.5, 0], [4, 0, 0]],

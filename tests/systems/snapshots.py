@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from kcons.topology.holding import Holding
+from kcons.topology.rows_by_name import rows_of
 from kcons.topology.topology import Snapshot, Topology, sorted_pairs
 
 HOH = np.radians(104.52)
@@ -44,6 +46,10 @@ def snapshot(
         pbc=np.full(3, cell is not None),
         **options,
     )
+
+
+def held_rows(made, constrain="hbonds", remedy="give a topology with bonds", **options):
+    return rows_of(made, Holding(constrain, **options), np.asarray, remedy)
 
 
 def rotations(count, seed=0):

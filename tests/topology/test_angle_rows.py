@@ -10,7 +10,7 @@ import pytest
 from ase.build import molecule
 from host_systems import VILLIN
 from openmm import app
-from snapshots import snapshot
+from snapshots import held_rows, snapshot
 
 import kcons.openmm
 from kcons.constraints import Angle, Distance
@@ -18,7 +18,6 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.topology.angle_rows import FLAT_CENTER, angle_rows
 from kcons.topology.guessed_bonds import guess_bonds
-from kcons.topology.rows_by_name import held_rows
 from kcons.topology.topology import bond_angles
 
 
@@ -204,7 +203,7 @@ def test_selected_atoms_and_distances():
     made = of_ase("CH3CONH2")
     some = np.ones(len(made.positions), dtype=bool)
     some[-1] = False
-    rows = held_rows(made, "allangles", selected=some)
+    rows = held_rows(made, "allangles", select=some)
     assert condition(rows.constraint_set, made.positions)[1] == rows.constraint_set.n_rows
     assert not any((item.atoms == len(some) - 1).any() for item in rows)
     apart = held_rows(made, "allangles", angles="distances")

@@ -42,13 +42,6 @@ def test_iterables_are_read_once():
     assert Holding("none", rigid_residues="HOH").residues == ("HOH",)
 
 
-def test_own_rows_are_a_mapping_or_pairs():
-    assert (
-        Holding("none", on={(0, 1): len}).own_rows == Holding("none", on=[((0, 1), len)]).own_rows == (((0, 1), len),)
-    )
-    assert Holding().own_rows == ()
-
-
 def test_geometry_of_water():
     assert Holding().geometry() == (None, 0.0)
     assert Holding(water_geometry="TIP4P/2005").geometry() == ((0.9572, 104.52), 0.1546)

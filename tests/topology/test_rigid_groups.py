@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
-from snapshots import WATER, rotations, snapshot
+from snapshots import WATER, held_rows, rotations, snapshot
 
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
-from kcons.topology.rigid_groups import GEOMETRIES, body_rows, find_waters, listed_bodies, residue_bodies
-from kcons.topology.rows_by_name import held_rows
+from kcons.topology.rigid_groups import GEOMETRIES, body_rows, find_waters, listed_bodies, residue_bodies, water_rows
 
 RNG = np.random.default_rng(11)
 SHAPES = {
@@ -113,7 +112,7 @@ def test_four_site_water_with_its_site_placed():
     exact = find_waters(made, model_site=0.15)
     placed = exact.sites.place(x)
     np.testing.assert_allclose(np.linalg.norm(placed[3::4] - placed[0::4], axis=1), 0.15, atol=1e-3)
-    assert [r.n_rows for r in waters.rows(None, 1.0)] == [9]
+    assert water_rows(waters.triples, None).n_rows == 9
 
 
 def lone_pairs(mirrored, n=2):

@@ -10,8 +10,8 @@ from snapshots import snapshot
 
 from kcons.constraints import Angle, Dihedral, Distance
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.topology import ring_systems
-from kcons.topology.ring_systems import LARGEST, ring_rows
+from kcons.topology import angle_rows
+from kcons.topology.angle_rows import LARGEST, ring_rows, ring_systems
 from kcons.topology.topology import bond_angles, sorted_pairs
 
 NO_QUADS = np.zeros((0, 4), np.int64)
@@ -23,8 +23,8 @@ def cycle(*atoms):
 
 def found(bonds, n):
     """Labels of the bonds, and the sizes of the rings of each system."""
-    systems = ring_systems.ring_systems(sorted_pairs(bonds), n)
-    return systems.of_bond.tolist(), [sorted(len(ring) for ring in rings) for rings in systems.rings]
+    of_bond, systems = ring_systems(sorted_pairs(bonds), n)
+    return of_bond.tolist(), [sorted(len(ring) for ring in rings) for rings in systems]
 
 
 def ring(n, height, length=1.4):
@@ -34,12 +34,13 @@ def ring(n, height, length=1.4):
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), np.array(height, dtype=float)], axis=1)
 
 
-def rows_of_ring(x, within=None):
+def rows_of_ring(x, *body):
+    """Of a ring of which some atoms are held rigid."""
     n = len(x)
     bonds = sorted_pairs(cycle(*range(n)))
     made = snapshot(["C"] * n, x, bonds)
-    nothing = within or (lambda rows: np.zeros(len(rows), dtype=bool))
-    return ring_rows(made, bonds, bond_angles(bonds, n), NO_QUADS, [np.arange(n)], nothing)
+    rigid = [np.array([body])] if body else []
+    return ring_rows(made, bonds, bond_angles(bonds, n), NO_QUADS, [np.arange(n)], rigid)
 
 
 def singular_values(x, triples, quads):
@@ -94,17 +95,16 @@ def test_a_ring_is_rigid_by_as_many_rows_as_it_needs(height, angles, dihedrals):
 
 def test_rows_within_a_body_are_held_already():
     x = ring(6, np.zeros(6))
-    body = np.arange(6)
-    triples, quads = rows_of_ring(x, lambda rows: np.isin(rows, body).all(axis=1))
+    triples, quads = rows_of_ring(x, *range(6))
     assert len(triples) == len(quads) == 0
     # Four of the six: two more atoms of two bonds, 6 of their rows are 3 bonds, 1 angle, 2 dihedrals.
-    triples, quads = rows_of_ring(x, lambda rows: np.isin(rows, body[:4]).all(axis=1))
-    assert not np.isin(triples, body[:4]).all(axis=1).any()
+    triples, quads = rows_of_ring(x, *range(4))
+    assert not np.isin(triples, range(4)).all(axis=1).any()
     assert (len(triples), len(quads)) == (1, 2)
 
 
 def test_a_large_system_keeps_what_it_has(monkeypatch):
-    monkeypatch.setattr(ring_systems, "LARGE_SYSTEM", 5)
+    monkeypatch.setattr(angle_rows, "LARGE_SYSTEM", 5)
     triples, quads = rows_of_ring(ring(6, np.zeros(6)))
     assert (len(triples), len(quads)) == (6, 0)
 
@@ -114,11 +114,8 @@ def test_a_ring_across_the_faces_of_the_cell_is_the_same_ring():
     bonds = sorted_pairs(cycle(*range(6)))
     cell = 8.0 * np.eye(3)
     rows = [
-        ring_rows(
-            snapshot(["C"] * 6, y, bonds, cell=cell), bonds, bond_angles(bonds, 6), NO_QUADS, [np.arange(6)],
-            lambda rows: np.zeros(len(rows), dtype=bool),
-        )
+        ring_rows(snapshot(["C"] * 6, y, bonds, cell=cell), bonds, bond_angles(bonds, 6), NO_QUADS, [np.arange(6)], [])
         for y in (x + 4.0, np.mod(x, 8.0))
-    ]  # fmt: skip
+    ]
     for one, two in zip(*rows, strict=True):
         np.testing.assert_array_equal(one, two)

@@ -8,12 +8,11 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from snapshots import WATER, snapshot
+from snapshots import WATER, held_rows, snapshot
 
 from kcons.constraints import CenterOfMass
 from kcons.errors import InputError
 from kcons.motion import Motion
-from kcons.topology.rows_by_name import bond_angles, held_rows
 
 # Ethanol, C C O H(O) and five H, and a water.
 ETHANOL = np.array(
@@ -74,9 +73,9 @@ def test_missing_bonds_are_guessed_and_said():
         np.testing.assert_array_equal(one.atoms, two.atoms)
     with pytest.warns(UserWarning, match="^1 bonds were guessed"):
         held_rows(solution([*BONDS[:-1]]), "allbonds")
-    assert held_rows(solution(), "hbonds", guess=True).bonds_guessed == 8  # asked for: no warning
+    assert held_rows(solution(), "hbonds", guess_bonds=True).bonds_guessed == 8  # asked for: no warning
     with pytest.raises(InputError, match=r"no bonds of C of EOH 1 \(atom 0\), nor have 8 others; give a topology"):
-        held_rows(solution(()), "hbonds", guess=False)
+        held_rows(solution(()), "hbonds", guess_bonds=False)
 
 
 def test_hydrogens_that_get_no_bond_are_told():
@@ -94,12 +93,12 @@ def test_hydrogens_that_get_no_bond_are_told():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         whole = replace(cut, cell=np.diag([12.0] * 3), pbc=np.ones(3, dtype=bool))
-        assert not len(held_rows(whole, "hbonds", guess=True).loose_hydrogens)
+        assert not len(held_rows(whole, "hbonds", guess_bonds=True).loose_hydrogens)
         # Not among the atoms that are asked for; an ion of its own residue.
-        assert not len(held_rows(cut, "hbonds", guess=True, selected=np.array([True, True, False])).loose_hydrogens)
+        assert not len(held_rows(cut, "hbonds", guess_bonds=True, select=np.array([True, True, False])).loose_hydrogens)
         known = replace(cut.topology, residues=np.array([0, 0, 1]), residue_names=np.array(["OH", "H"]))
         known = replace(known, residue_ids=np.array(["1", "2"]), chains=np.full(2, ""), residues_known=True)
-        assert not len(held_rows(replace(cut, topology=known), "hbonds", guess=True).loose_hydrogens)
+        assert not len(held_rows(replace(cut, topology=known), "hbonds", guess_bonds=True).loose_hydrogens)
 
 
 def test_without_residues_molecules_are_found():
@@ -149,7 +148,7 @@ def test_virtual_sites_are_no_degrees_of_freedom():
         ({"constrain": "none", "rigid_water": False}, "nothing is to be held"),
         ({"angles": "cosines"}, "choose .angles. or .distances."),
         ({"water_geometry": (1.0, 190.0)}, "give a positive length"),
-        ({"selected": np.zeros(12, bool)}, "nothing to hold within the selection of 0 atoms"),
+        ({"select": np.zeros(12, bool)}, "nothing to hold within the selection of 0 atoms"),
     ],
 )
 def test_bad_input_is_named(options, said):
@@ -202,11 +201,3 @@ def test_bodies_that_a_missing_cell_tears_are_refused(atom, shift, said, options
     with pytest.raises(InputError, match=said):
         held_rows(replace(made, positions=x), "none", **options)
     held_rows(replace(made, positions=x, cell=np.diag([shift, 40.0, 40.0]), pbc=np.full(3, True)), "none", **options)
-
-
-def test_bond_angles_are_all_of_them():
-    rng = np.random.default_rng(0)
-    bonds = np.array([p for p in combinations(range(12), 2) if rng.random() < 0.3])
-    linked = {tuple(b) for b in bonds.tolist()} | {tuple(b[::-1]) for b in bonds.tolist()}
-    expected = [(i, j, k) for j in range(12) for i in range(12) for k in range(i + 1, 12) if {(i, j), (j, k)} <= linked]
-    assert [tuple(t) for t in bond_angles(bonds, 12).tolist()] == expected

@@ -83,14 +83,6 @@ def test_names_that_come_again_otherwise_are_of_one_residue(names):
     assert residues.tolist() == [0] * len(names) and first.tolist() == [0]
 
 
-def test_molecules_are_named_by_formula():
-    made = snapshot(
-        ["O", "H", "H", "C", "O", "Na"], np.zeros((6, 3)), [(0, 1), (0, 2), (3, 4)]
-    ).topology.with_molecules()
-    assert made.residue_names.tolist() == ["H2O", "CO", "Na"]
-    assert made.residues.tolist() == [0, 0, 0, 1, 1, 2]
-
-
 def test_single_precision_gives_back_the_decimals_of_a_file():
     rng = np.random.default_rng(1)
     for decimals in (3, 4):
@@ -107,13 +99,6 @@ def test_pairs_and_components():
     assert sorted_pairs([(3, 1), (0, 2), (1, 3)]).tolist() == [[0, 2], [1, 3]]
     number, count = connected(np.array([[1, 3]]), 5)
     assert (number.tolist(), count) == ([0, 1, 2, 1, 3], 4)
-
-
-def test_subset_keeps_bonds_inside():
-    part = snapshot(["O", "H", "H"] * 2, np.zeros((6, 3)), [(0, 1), (0, 2), (3, 4)]).topology.subset(
-        np.array([0, 2, 3])
-    )
-    assert part.bonds.tolist() == [[0, 1]]
 
 
 def test_units_and_numbers_of_atoms():

@@ -6,7 +6,7 @@ import numpy as np
 import openmm
 from snapshots import WATER
 
-from kcons.topology.virtual_sites import VirtualSites, fitted
+from kcons.topology.rigid_groups import VirtualSites
 
 RNG = np.random.default_rng(7)
 
@@ -48,8 +48,6 @@ def test_spread_forces_do_the_same_work():
     np.testing.assert_allclose(np.cross(x, spread).sum(0), np.cross(x, f).sum(0), atol=1e-13)
 
 
-def test_fitted_gives_back_the_coefficients_and_units_scale():
+def test_units_scale():
     x = sites().place(np.concatenate([WATER, np.zeros((3, 3))]) + 3.0)
-    again = fitted(sites().sites, sites().parents, x[3:], np.tile(x[:3], (3, 1, 1)))
-    np.testing.assert_allclose(again.coefficients, sites().coefficients, atol=1e-12)
     np.testing.assert_allclose(sites().in_unit(0.1).place(x / 10), x / 10, atol=1e-14)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from snapshots import snapshot
+from snapshots import held_rows, snapshot
 
 from kcons.errors import InputError
-from kcons.topology.rows_by_name import held_rows
-from kcons.topology.whole_molecules import whole_groups, whole_molecules
+from kcons.topology.topology import whole_groups, whole_molecules
 
 CELLS = [np.diag([7.0, 8.0, 9.0]), np.array([[7.0, 0, 0], [2.0, 8.0, 0], [-1.0, 3.0, 9.0]])]
 

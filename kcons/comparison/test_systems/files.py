@@ -26,7 +26,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.topology.whole_molecules import whole_molecules
+from kcons.topology.topology import whole_molecules
 
 if TYPE_CHECKING:
     from kcons.topology.rows_by_name import HeldRows

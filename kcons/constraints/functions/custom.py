@@ -76,18 +76,18 @@ class PythonRows(Constraint, base=True):
     def _time(self, time: float) -> tuple[float, ...]:
         return (time,) if self.time_dependent else ()
 
-    def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
-        """What a function returned for row `k`, as float64 of that shape."""
+    def _checked(self, found: Any, name: str, shape: tuple[int, ...], k: int | None = None) -> Any:
+        """What a function returned for row `k`, or for all, as float64 of that shape."""
         if type(found) is float and not shape:
             return found
         if type(found) not in (np.ndarray, np.float64) or found.dtype is not _FLOAT:
-            found = as_float_array(found, f"{self.row_name(k)}: {name}")
+            found = as_float_array(found, f"{self.family if k is None else self.row_name(k)}: {name}")
         if found.shape != shape:
+            of = f"positions of shape ({self.n_rows}, 3)" if k is None else f"row {k}"
             raise InputError(
-                f"{self.family}: {name} returned shape {found.shape} for row {k}; it must return "
-                f"{shape if shape else 'one number'}",
+                f"{self.family}: {name} returned shape {found.shape} for {of}; it must return {shape or 'one number'}",
                 item=name,
-                atoms=self.atoms[k].tolist(),
+                atoms=() if k is None else self.atoms[k].tolist(),
             )
         return found
 
@@ -165,23 +165,20 @@ class Custom(PythonRows):
         """Value of row `k` alone at `r`, shape (width, 3), which cannot be written to; for kernels."""
         found = self.function(r, time) if self.time_dependent else self.function(r)
         # Of Python and of NumPy.
-        return found if isinstance(found, float) else float(self._checked(found, k, "function", ()))
+        return found if isinstance(found, float) else float(self._checked(found, "function", (), k))
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         if self.gradient_function is None:
             return self._differenced_gradient(r[None], time, k)[0]
         found = self.gradient_function(r, time) if self.time_dependent else self.gradient_function(r)
-        return np.asarray(self._checked(found, k, "gradient", r.shape))
+        return np.asarray(self._checked(found, "gradient", r.shape, k))
 
     def _differenced_gradient(self, r: FloatArray, time: float, first: int = 0) -> FloatArray:
         step = 1e-3 * self._length(r)
         places = r + step[:, None, None] * _along(self.width)[:, None]
-        values = self._from_the_first(np.array([self._values(place, time, first) for place in places]))
-        slope = np.dot(_DIFFERENCE, values.reshape(4, -1)).reshape(-1, len(r)) / step
-        return np.ascontiguousarray(slope.T).reshape(r.shape)
-
-    def _from_the_first(self, values: FloatArray) -> FloatArray:
-        return values if self.period is None else nearest_image(values - values[0], self.period)
+        values = np.array([self._values(place, time, first) for place in places])
+        slope = np.dot(_DIFFERENCE, nearest_image(values - values[0], self.period).reshape(4, -1))
+        return np.ascontiguousarray((slope.reshape(-1, len(r)) / step).T).reshape(r.shape)
 
     def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
         """Differenced change of the value along a direction of unit length."""
@@ -192,17 +189,15 @@ class Custom(PythonRows):
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         speed, start, length = np.sqrt(_contract(v, v)), np.zeros(self.n_rows), self._length(r)
         along = v / np.where(speed > 0, speed, 1.0)[:, None, None]
+
+        def at(s: FloatArray) -> FloatArray:
+            return r + s[:, None, None] * along
+
         if self.gradient_function is None:
-
-            def value(s: FloatArray) -> FloatArray:
-                return self.measure(r + s[:, None, None] * along, time)
-
-            return second_derivative(value, start, 0.02 * length, self.period) * speed**2
-
-        def slope(s: FloatArray) -> FloatArray:
-            return _contract(self.gradient(r + s[:, None, None] * along, time), along)
-
-        return first_derivative_4(slope, start, 1e-3 * length) * speed**2
+            bent = second_derivative(lambda s: self.measure(at(s), time), start, 0.02 * length, self.period)
+        else:
+            bent = first_derivative_4(lambda s: _contract(self.gradient(at(s), time), along), start, 1e-3 * length)
+        return bent * speed**2
 
     def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         if not self.time_dependent:
@@ -232,10 +227,8 @@ class Custom(PythonRows):
         size = np.sqrt(_contract(slope, slope))
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
-        found = self._slope(r, along, 1e-3 * length, time)
-        remedy = "correct it, or give the length over which the function varies (length=...)"
+        found, finer = (self._slope(r, along, step * length, time) for step in (1e-3, 0.5e-3))
         if self.gradient_function is None:
-            finer = self._slope(r, along, 0.5e-3 * length, time)
             self.refuse_singular(
                 ~(np.abs(finer - found) <= WRONG * size),
                 first_row,
@@ -245,18 +238,19 @@ class Custom(PythonRows):
                     "Move the atoms, give the length over which it varies (length=...), or its gradient"
                 ),
             )
-        else:
+            return
 
-            def worst(k: int) -> str:
-                other = self._differenced_gradient(r, time)[k]
-                a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - other))), other.shape)
-                return (
-                    f"gradient gives {slope[k, a, i]:.6g} for {'xyz'[i]} of its atom {self.atoms[k, a]}, but "
-                    f"differences of the function give {other[a, i]:.6g}; {remedy}"
-                )
+        def worst(k: int) -> str:
+            other = self._differenced_gradient(r, time)[k]
+            a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - other))), other.shape)
+            return (
+                f"gradient gives {slope[k, a, i]:.6g} for {'xyz'[i]} of its atom {self.atoms[k, a]}, but differences "
+                f"of the function give {other[a, i]:.6g}; correct it, or give the length over which the function "
+                "varies (length=...)"
+            )
 
-            given = _contract(slope, along)
-            self.refuse_input(~(np.abs(given - found) <= WRONG * size), first_row, worst, "gradient")
+        wrong = ~(np.abs(_contract(slope, along) - found) <= WRONG * size)
+        self.refuse_input(wrong, first_row, worst, "gradient")
 
 
 class ImplicitSurface(Custom):
@@ -320,7 +314,8 @@ class ImplicitSurface(Custom):
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         if self.gradient_function is None:
             return self._differenced_gradient(r, time)
-        return self._call(self.gradient_function, "gradient", r, time, (3,)).reshape(r.shape)
+        found = self.gradient_function(read_only_view(r[:, 0]), *self._time(time))
+        return np.asarray(self._checked(found, "gradient", (self.n_rows, 3))).reshape(r.shape)
 
     def row_value(self, k: int, r: FloatArray, time: float) -> float:
         return float(self.measure(r[None], time)[0])
@@ -329,20 +324,8 @@ class ImplicitSurface(Custom):
         return np.asarray(self.gradient(r[None], time)[0])
 
     def _values(self, r: FloatArray, time: float, first: int) -> FloatArray:
-        return self._call(self.function, "function", r, time, ())
-
-    def _call(
-        self, function: Callable[..., Any], name: str, r: FloatArray, time: float, shape: tuple[int, ...]
-    ) -> FloatArray:
-        found = function(read_only_view(r[:, 0]), *self._time(time))
-        result, wanted = as_float_array(found, f"ImplicitSurface: {name}"), (self.n_rows, *shape)
-        if result.shape != wanted:
-            raise InputError(
-                f"ImplicitSurface: {name} returned shape {result.shape} for positions of shape ({self.n_rows}, 3); "
-                f"it must return {wanted}",
-                item=name,
-            )
-        return result
+        found = self.function(read_only_view(r[:, 0]), *self._time(time))
+        return np.asarray(self._checked(found, "function", (self.n_rows,)))
 
 
 class CustomVelocity(PythonRows, VelocityRows):
@@ -398,7 +381,7 @@ class CustomVelocity(PythonRows, VelocityRows):
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         found = self.coefficients(read_only_view(r), *self._time(time))
-        return np.asarray(self._checked(found, k, "coefficients", (self.width, 3)))
+        return np.asarray(self._checked(found, "coefficients", (self.width, 3), k))
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         bent = [self._changes(k, r[k], v[k], time) for k in range(self.n_rows)]

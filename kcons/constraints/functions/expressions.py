@@ -19,7 +19,6 @@ import tempfile
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from itertools import count
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -55,8 +54,6 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
     InputError
         What is no formula; unknown names and functions.
     """
-    if not isinstance(formula, str):
-        raise InputError(f"Formula: formula must be text, not {formula!r:.60}", item="formula")
     if len(formula) > MAX_LENGTH:
         raise _too_large(formula, f"has {len(formula)} characters, and at most {MAX_LENGTH} are read")
     try:
@@ -118,7 +115,10 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                     f"and functions{hint}",
                     item="formula",
                 )
-    return _with_numbers(formula, tree), found
+    undefined = undefined_part(tree, _PI)
+    if undefined is not None:
+        raise InputError(f"Formula: {undefined} in {formula!r:.200}; give numbers with a finite value", item="formula")
+    return tree, found
 
 
 def _too_large(
@@ -138,40 +138,6 @@ def _check_depth(formula: str, tree: ast.expr) -> None:
     raise _too_large(formula, f"is nested in more than {MAX_DEPTH} levels")
 
 
-def _is_number(tree: ast.expr) -> bool:
-    return not any(isinstance(node, ast.Name) and node.id not in (*FUNCTIONS, "pi") for node in ast.walk(tree))
-
-
-def _with_numbers(formula: str, tree: ast.expr) -> ast.expr:
-    """The tree with the values of parts that have no names; `InputError` where one of them is no number."""
-    if isinstance(tree, ast.Constant):
-        return tree
-    if not _is_number(tree):
-        for field, part in ast.iter_fields(tree):
-            if field == "args":
-                setattr(tree, field, [_with_numbers(formula, each) for each in part])
-            elif isinstance(part, ast.expr) and field != "func":
-                setattr(tree, field, _with_numbers(formula, part))
-        return tree
-    what = undefined_part(tree, _PI)
-    if what is not None:
-        raise InputError(f"Formula: {what} in {formula!r:.200}; give numbers with a finite value", item="formula")
-    with np.errstate(all="ignore"):
-        return ast.copy_location(ast.Constant(float(_value(tree, _PI))), tree)
-
-
-def _operands(tree: ast.expr) -> list[ast.expr]:
-    """The parts of a formula that an operation or a function is done with."""
-    match tree:
-        case ast.Call(args=args):
-            return args
-        case ast.BinOp(left=left, right=right):
-            return [left, right]
-        case ast.UnaryOp(operand=operand):
-            return [operand]
-    return []
-
-
 def _value(tree: ast.expr, numbers: Mapping[str, Any], constant: Callable[[Any], Any] = np.float64) -> Any:
     """The value of a tree, with numbers for names."""
     match tree:
@@ -179,95 +145,72 @@ def _value(tree: ast.expr, numbers: Mapping[str, Any], constant: Callable[[Any],
             return constant(value)
         case ast.Name(id=name):
             return numbers[name]
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return FUNCTIONS[name](*(_value(each, numbers, constant) for each in args))
+        case ast.BinOp(left=left, op=operation, right=right):
+            return _OPERATIONS[type(operation)](_value(left, numbers, constant), _value(right, numbers, constant))
         case ast.UnaryOp(op=sign, operand=operand):
             value = _value(operand, numbers, constant)
             return -value if isinstance(sign, ast.USub) else value
-    parts = [_value(each, numbers, constant) for each in _operands(tree)]
-    match tree:
-        case ast.Call(func=ast.Name(id=name)):
-            return FUNCTIONS[name](*parts)
-        case ast.BinOp(op=operation):
-            return _OPERATIONS[type(operation)](*parts)
     raise AssertionError(ast.dump(tree))
 
 
 def undefined_part(tree: ast.expr, numbers: Mapping[str, float]) -> str | None:
-    """The smallest part of a tree that has no finite value with these numbers, in words; None if all have one."""
-    inside = _operands(tree)
-    for node in inside:
-        found = undefined_part(node, numbers)
-        if found:
-            return found
-    with np.errstate(all="ignore"):
-        value = _value(tree, numbers)
-        if np.isfinite(value):
-            return None
-        if isinstance(tree, ast.Call):
-            return f"{ast.unparse(tree)} is {value} where {ast.unparse(inside[0])} = {_value(inside[0], numbers):g}"
-    return f"{ast.unparse(tree)} is {value}"
-
-
-def width_of(formula: str, parameters: Sequence[str], speeds: bool = False) -> int:
-    """Atoms a row.
-
-    Raises
-    ------
-    InputError
-        As `parsed`; a formula without atoms, or one that leaves some out.
-    """
-    numbers = parsed(formula, parameters, speeds)[1]
-    if not numbers:
-        raise InputError(
-            f"Formula: {formula!r} names no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of the "
-            "second",
-            item="formula",
-        )
-    width = max(numbers)
-    if len(numbers) < width:
-        left_out = next(k for k in count(1) if k not in numbers)
-        raise InputError(
-            f"Formula: {formula!r} names atom {width} of a row and not atom {left_out}; number them from 1 on",
-            item="formula",
-        )
-    return width
-
-
-@cache
-def code_of(formula: str, width: int, parameters: tuple[str, ...], speeds: bool = False) -> Code:
-    """The code of a formula over so many atoms a row; with `speeds`, of one that is linear in their velocities.
-
-    Raises
-    ------
-    InputError
-        As `width_of`; another width; a formula that does not change with the positions, or is not linear in the
-        velocities.
-    UnsupportedError
-        There is no folder that it can be written to.
-    """
-    tree, _ = parsed(formula, parameters, speeds)
-    named = width_of(formula, parameters, speeds)
-    if named != width:
-        raise InputError(
-            f"Formula: {formula!r} names {named} atoms a row, and atoms has {width} a row; give as many as the formula "
-            "names",
-            item="atoms",
-        )
-    return Code(formula, tree, width, parameters, speeds)
+    """The smallest part of a tree, among those that have names of `numbers` only, without a finite value, in words."""
+    known: dict[ast.AST, bool] = {}
+    for node in reversed(list(ast.walk(tree))):  # parts before what they are parts of
+        function = isinstance(node, ast.Name) and node.id in FUNCTIONS
+        known[node] = function or all(known[part] for part in ast.iter_child_nodes(node))
+        if isinstance(node, ast.Name) and not function:
+            known[node] = node.id in numbers
+        if not isinstance(node, ast.expr) or function or not known[node]:
+            continue
+        with np.errstate(all="ignore"):
+            value = _value(node, numbers)
+            if not np.isfinite(value):
+                inside = node.args[:1] if isinstance(node, ast.Call) else []
+                of = "".join(f" where {ast.unparse(each)} = {_value(each, numbers):g}" for each in inside)
+                return f"{ast.unparse(node)} is {value}{of}"
+    return None
 
 
 class Code:
-    """What is computed of a formula.
+    """What is computed of a formula with parameters of these names; with `speeds`, of one that is linear in velocities.
 
     Attributes
     ----------
     row, rate : callable
         As of a `Constraint`; `rate` is None where the time is not in the formula.
+    width : int
+        Atoms a row.
     invariant : bool
         Whether a common shift of all atoms changes nothing.
+
+    Raises
+    ------
+    InputError
+        As `parsed`; a formula without atoms, or one that leaves some out; one that does not change with the positions,
+        or is not linear in the velocities.
+    UnsupportedError
+        There is no folder that it can be written to.
     """
 
-    def __init__(self, formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], speeds: bool) -> None:
-        self.tree, n = tree, 3 * width
+    def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool = False) -> None:
+        tree, atoms = parsed(formula, parameters, speeds)
+        if not atoms:
+            raise InputError(
+                f"Formula: {formula!r} names no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of "
+                "the second",
+                item="formula",
+            )
+        width = max(atoms)
+        if len(atoms) < width:
+            raise InputError(
+                f"Formula: {formula!r} names atom {width} of a row and not atom "
+                f"{min({*range(1, width)} - atoms)}; number them from 1 on",
+                item="formula",
+            )
+        self.tree, self.width, n = tree, width, 3 * width
         names = [f"{kind}{axis}{atom}" for kind in ["", "v"] for atom in range(1, width + 1) for axis in "xyz"]
 
         def value(r: Any, p: Any, t: Any) -> Any:
@@ -285,6 +228,10 @@ class Code:
             texts.append(_function("rate", tape, [moves]))
         module = _module("\n\n".join([f"# Written by kcons for {formula!r}.", "from numpy import *\n", *texts]))
         self.row, self.rate = module.row, getattr(module, "rate", None)
+
+
+#: Each once.
+code_of = cache(Code)
 
 
 #: Operations of tapes, for real numbers and, to first order in imaginary parts, complex ones.

@@ -15,12 +15,12 @@ from kcons.constraints.arguments import (
     FloatArray,
     as_float_array,
     atom_array,
-    out_of_range,
     positive,
+    refuse_other,
     without_units,
 )
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part, width_of
+from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part
 from kcons.constraints.target import Target
 from kcons.errors import InputError
 
@@ -82,11 +82,8 @@ class Formula(Constraint):
         *,
         period: Annotated[float, ANY, positive] | None = None,
     ) -> None:
-        if not isinstance(parameters, Mapping | None):
-            raise InputError(
-                f"Formula: parameters is {parameters!r:.60}; give numbers by name, such as {{'k': 2.0}}",
-                item="parameters",
-            )
+        refuse_other(parameters, (Mapping, type(None)), "parameters", "numbers by name, such as {'k': 2.0}")
+        refuse_other(formula, str, "formula", "text, such as 'x1**2 + y1**2 - 1'")
         given = dict(parameters or {})
         self.formula, self.names = formula, list(given)
         self.period = period
@@ -98,31 +95,21 @@ class Formula(Constraint):
             taken = name in (*FUNCTIONS, "copysign", "t", "pi") or name.startswith(("_", "vx", "vy", "vz"))
             if not name.isidentifier() or iskeyword(name) or taken or (name[1:].isdigit() and name[0] in "xyz"):
                 raise InputError(f"Formula: {name!r} cannot be the name of a parameter; give another one", item=name)
-        alone = width_of(formula, self.names, self.of_speeds) == 1
+        self.row_width = self.code().width
         table = atom_array(atoms, self.family)
-        super().__init__(table.reshape(-1, 1) if alone and table.ndim < 2 else table, target)
+        super().__init__(table.reshape(-1, 1) if self.row_width == 1 and table.ndim < 2 else table, target)
         columns = []
         for name, value in given.items():
             plain, matters = without_units(value, f"Formula: {name}", ANY)
             self.units = MD_UNITS if matters else self.units
-            column = as_float_array(plain, f"Formula: {name}")
-            if column.shape not in ((), (1,), (self.n_rows,)):
-                raise InputError(
-                    f"Formula: parameter {name!r} has shape {column.shape}; give one finite number, or one for each of "
-                    f"the {self.n_rows} rows",
-                    item=name,
-                )
-            wrong = out_of_range(column)
-            if wrong is not None:
-                raise InputError(f"Formula: parameter {name!r} is {wrong[1]}", item=name)
-            columns.append(np.broadcast_to(column, (self.n_rows,)))
+            columns.append(self._of_each_row(name, plain, ()))
         self.per_row = {"values": (len(columns),)}  # type: ignore[misc]
         self._keep(values=np.stack(columns, axis=1) if columns else np.zeros((self.n_rows, 0)))
         self.translation_invariant = self.code().invariant
 
     def code(self) -> Code:
         """What is computed of the formula."""
-        return code_of(self.formula, self.width, tuple(self.names), self.of_speeds)
+        return code_of(self.formula, tuple(self.names), self.of_speeds)
 
     @property
     def row(self) -> Any:  # type: ignore[override]

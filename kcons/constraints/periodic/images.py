@@ -25,11 +25,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
-from kcons.constraints.compilation import njit, plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.periodic.one_piece import BoolArray, connected, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray, nearest_image
@@ -114,7 +115,13 @@ class Images:
 
     def ancestors(self, needed: IntArray, n_atoms: int) -> IntArray:
         """`needed` and the atoms by which they are made whole."""
-        return self.atoms[plain_if_small(_with_ancestors, len(self.atoms))(self.atoms, self.parents, needed, n_atoms)]
+        parent, keep = np.arange(n_atoms), np.zeros(n_atoms, bool)
+        parent[self.atoms] = self.parents
+        while len(needed):
+            keep[needed] = True
+            needed = parent[needed]
+            needed = needed[~keep[needed]]
+        return self.atoms[keep[self.atoms]]
 
 
 def image_error(row_name: str, atoms: IntArray, half_width: float) -> ImageError:
@@ -148,7 +155,7 @@ def find_images(
     InputError
         A link of the tree as long as half the cell: its image is ambiguous.
     """
-    given = [_unmarked(item) for item in constraints]
+    given = [item.changed(whole=None, cell_offsets=None) for item in constraints]
     if lattice is None:
         return given, None
     tables = [
@@ -161,9 +168,9 @@ def find_images(
     if not tables or all(table.plain_at_once for table in tables):
         return given, None
     ties = [item for item in ties if item.holds_length and not item.moving and item.n_rows]
-    others = [_Links(_unmarked(item), 0, x, lattice, half_width, time) for item in ties]
+    others = [_Links(item.changed(whole=None, cell_offsets=None), 0, x, lattice, half_width, time) for item in ties]
     held = [t for t in [*tables, *others] if t.held]
-    keys = np.sort(np.concatenate([t.keys(n_atoms)[t.short] for t in held] or [np.zeros(0, np.int64)]))
+    keys = np.concatenate([np.zeros(0, np.int64), *(t.keys(n_atoms)[t.short] for t in held)])
     for table in tables:
         table.sort_rows(keys, n_atoms)
     if not any(table.whole.any() or table.unsure.any() for table in tables):
@@ -242,13 +249,12 @@ class _Links:
             return
         pairs = np.sort(self.neighbors, axis=2)
         wanted = pairs[..., 0] * n_atoms + pairs[..., 1]
-        place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
-        found = keys[place] == wanted if len(keys) else np.zeros(wanted.shape, bool)
+        found = np.isin(wanted, keys)
         # The compiled solvers know minimum images of distances, angles and dihedrals only.
         self.whole = np.logical_not(found.all(axis=1)) | (self.item.kind == RowKind.LINEAR) | (not self._in_line)
 
-    def offered(self) -> tuple[IntArray, FloatArray, IntArray]:
-        """Pairs of atoms, lengths (NaN: to be measured) and rows of the links offered to the tree."""
+    def offered(self) -> tuple[NDArray[Any], ...]:
+        """Links offered to the tree: pairs of atoms, lengths (NaN: unknown), rows, if held, if distances."""
         rows = np.repeat(np.arange(self.item.n_rows), len(self.links))
         pairs, lengths = self.neighbors.reshape(-1, 2), self.lengths.ravel()
         if self.item.links is None and 2 < self.item.width <= ALL_PAIRS_WIDTH and self.whole.any():
@@ -257,7 +263,8 @@ class _Links:
             pairs = np.concatenate([pairs, np.stack([more[:, a], more[:, b]], axis=-1).reshape(-1, 2)])
             lengths = np.concatenate([lengths, np.full(len(more) * len(a), np.nan)])
             rows = np.concatenate([rows, np.repeat(np.flatnonzero(self.whole), len(a))])
-        return pairs, lengths, self.start + rows
+        kinds = (np.full(len(rows), kind) for kind in (self.held, self.item.holds_length))
+        return pairs, lengths, self.start + rows, *kinds
 
     def find_closures(
         self, y: FloatArray, lattice: FloatArray, longest: FloatArray, component: IntArray, frameworks: BoolArray
@@ -331,12 +338,10 @@ class _Links:
     def marked(self, needed: BoolArray) -> Constraint:
         """A copy that knows its whole rows, and the cell_offsets of all rows whose atoms are made whole."""
         self.cell_offsets[~needed] = 0
-        if not self.whole.any() and not self.cell_offsets.any():
+        offsets = self.cell_offsets if self.cell_offsets.any() else None
+        if offsets is None and not self.whole.any():
             return self.item
-        copy = self.item.with_target(self.item.target)
-        copy.whole = self.whole
-        copy.cell_offsets = self.cell_offsets if self.cell_offsets.any() else None
-        return copy
+        return self.item.changed(whole=self.whole, cell_offsets=offsets)
 
 
 def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: float) -> None:
@@ -349,12 +354,6 @@ def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: flo
     reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([t.lengths[:, 0] for t in held]))
     for table in held:
         table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
-
-
-def _unmarked(item: Constraint) -> Constraint:
-    copy = item.with_target(item.target)
-    copy.whole = copy.cell_offsets = None
-    return copy
 
 
 def _tree(
@@ -370,14 +369,8 @@ def _tree(
     from scipy.sparse.csgraph import minimum_spanning_tree  # slow to import
 
     n_atoms = len(x)
-    offered = [table.offered() for table in tables]
-    pair = np.sort(np.concatenate([o[0] for o in offered]), axis=1)
-    row = np.concatenate([o[2] for o in offered])
-    length = np.concatenate([o[1] for o in offered])
-    held, distance = (
-        np.concatenate([np.full(len(o[2]), kind) for kind, o in zip(kinds, offered, strict=True)])
-        for kinds in ([t.held for t in tables], [t.item.holds_length for t in tables])
-    )
+    pair, length, row, held, distance = map(np.concatenate, zip(*(table.offered() for table in tables), strict=True))
+    pair = np.sort(pair, axis=1)
     unknown = np.isnan(length)
     apart = x[pair[unknown, 1]] - x[pair[unknown, 0]]
     length[unknown] = np.linalg.norm(minimum_image(apart, lattice), axis=1)
@@ -429,18 +422,3 @@ def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: 
         item="target" if item.holds_length else "positions",
         atoms=atoms,
     )
-
-
-@njit(cache=True)
-def _with_ancestors(atoms, parents, needed, n_atoms):  # type: ignore[no-untyped-def]
-    """Which of `atoms` are needed, or lie between a needed one and its root."""
-    marked = np.zeros(n_atoms, np.bool_)
-    for a in needed:
-        marked[a] = True
-    keep = np.zeros(len(atoms), np.bool_)
-    for back in range(len(atoms)):
-        k = len(atoms) - 1 - back
-        if marked[atoms[k]]:
-            keep[k] = True
-            marked[parents[k]] = True
-    return keep

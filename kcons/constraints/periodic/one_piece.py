@@ -80,8 +80,7 @@ def connected(pairs: IntArray, n_atoms: int) -> tuple[IntArray, int]:
 
     links = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
     count, label = connected_components(links, directed=False)
-    _, first, number = np.unique(label, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[number].astype(np.int64), int(count)
+    return label.astype(np.int64), int(count)
 
 
 def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) -> tuple[IntArray, IntArray]:

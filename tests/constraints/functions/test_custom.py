@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from constraint_cases import MASSES, TIME, hoop, saddle, scattered, spread
+from constraint_cases import MASSES, TIME, saddle, scattered, spread
 
 from kcons.constraints import Custom, Dihedral, Distance, Formula, ImplicitSurface
 from kcons.constraints.constraint_set import ConstraintSet
@@ -25,7 +25,6 @@ def gap_gradient(r):
 SQUARES = "((x{0} - x{1})**2 + (y{0} - y{1})**2 + (z{0} - z{1})**2)"
 SADDLE = "z1 - (x1**2 - y1**2)/4 - x1**3/9"
 SPREAD = f"exp(-{SQUARES.format(1, 2)}/8) + {SQUARES.format(2, 3)}/5*cos(t)"
-HOOP = "y1*cos(0.8*t) - x1*sin(0.8*t)"
 
 
 @pytest.mark.parametrize(
@@ -48,13 +47,6 @@ def test_differenced_curvature_does_not_depend_on_the_unit_of_time():
     slow, fast = item.curvature(r, 1e-6 * v, TIME), item.curvature(r, 1e6 * v, TIME)
     assert slow * 1e24 == pytest.approx(fast, rel=1e-9)
     assert item.curvature(r, 0 * v, TIME).tolist() == [0.0]
-
-
-def test_differenced_time_terms():
-    exact, differenced = Formula(HOOP, [0, 1]), hoop([0, 1])
-    r, v = scattered(0)[exact.atoms], scattered(1)[exact.atoms]
-    for found, expected in zip(differenced.time_terms(r, v, TIME), exact.time_terms(r, v, TIME), strict=True):
-        assert found == pytest.approx(expected, abs=2e-11)
 
 
 def test_a_wrong_gradient_is_found_before_it_moves_anything():

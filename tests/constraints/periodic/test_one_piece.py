@@ -8,7 +8,6 @@ import pytest
 from kcons.constraints.periodic.one_piece import (
     follow_parents,
     lattice_of,
-    lined_up,
     make_whole,
     minimum_image,
     spanning_tree,
@@ -36,24 +35,6 @@ def test_directions_without_periodicity_never_count(pbc):
 def test_cells_that_are_none_are_refused():
     with pytest.raises(InputError, match="zero or not independent"):
         lattice_of(np.ones((3, 3)), True)
-
-
-def test_shortest_images():
-    lattice = lattice_of(CELL, True)
-    d = np.random.default_rng(0).normal(size=(20, 3))
-    cells = np.random.default_rng(1).integers(-4, 5, size=(20, 3))
-    np.testing.assert_allclose(minimum_image(d + cells @ CELL, lattice), d, atol=1e-12)
-    assert minimum_image(d, None) is d
-
-
-def test_lists_follow_their_first_atom():
-    lattice = lattice_of(CELL, True)
-    rng = np.random.default_rng(2)
-    r = np.cumsum(rng.normal(size=(6, 9, 3)), axis=1)
-    wrapped = r + rng.integers(-3, 4, size=(6, 9, 3)) @ CELL
-    found = lined_up(wrapped.copy(), lattice)
-    np.testing.assert_allclose(found - found[:, :1], r - r[:, :1], atol=1e-12)
-    np.testing.assert_array_equal(found[:, 0], wrapped[:, 0])
 
 
 def test_a_tree_is_walked_breadth_first_from_its_roots():

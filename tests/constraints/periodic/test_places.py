@@ -74,6 +74,10 @@ TIES = {
 }
 
 
+def near(found, expected, atol: float) -> None:
+    np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+
+
 def _systems(place: str, tie: str) -> list[tuple[Motion, np.ndarray]]:
     """The molecule in open space, and in a cell with each atom in another image; and by how much atoms are moved."""
     found = []
@@ -97,28 +101,22 @@ def test_a_molecule_is_the_same_in_the_cell_as_in_open_space(place, tie):
     one, other = there.constraint_set, here.constraint_set
     assert (there.rank, there.plan.kinds[0].clusters) == (here.rank, here.plan.kinds[0].clusters)
     shifted = np.concatenate([np.full(c.n_rows, not c.relative) for c in other.constraints])
-    np.testing.assert_allclose(one.value(new), other.value(new + moved), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(one.measure(new)[~shifted], other.measure(new + moved)[~shifted], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(one.jacobian(new).toarray(), other.jacobian(new + moved).toarray(), rtol=0, atol=1e-11)
-    np.testing.assert_allclose(one.curvature(new, v), other.curvature(new + moved, v), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(
-        there.project_positions(new, WHOLE), here.project_positions(new + moved, STORED) - moved, rtol=0, atol=1e-11
-    )
+    near(one.value(new), other.value(new + moved), 1e-12)
+    near(one.measure(new)[~shifted], other.measure(new + moved)[~shifted], 1e-12)
+    near(one.jacobian(new).toarray(), other.jacobian(new + moved).toarray(), 1e-11)
+    near(one.curvature(new, v), other.curvature(new + moved, v), 1e-9)
+    near(there.project_positions(new, WHOLE), here.project_positions(new + moved, STORED) - moved, 1e-11)
     np.testing.assert_allclose(there.restore_positions(new), here.restore_positions(new + moved) - moved, atol=1e-9)
     tangent = there.project_velocities(WHOLE, v)
-    np.testing.assert_allclose(tangent, here.project_velocities(STORED, v), rtol=0, atol=1e-11)
-    np.testing.assert_allclose(
-        there.acceleration(WHOLE, tangent, f), here.acceleration(STORED, tangent, f), rtol=0, atol=1e-9
-    )
-    np.testing.assert_allclose(
-        there.constraint_force(WHOLE, tangent, f), here.constraint_force(STORED, tangent, f), rtol=0, atol=1e-9
-    )
+    near(tangent, here.project_velocities(STORED, v), 1e-11)
+    near(there.acceleration(WHOLE, tangent, f), here.acceleration(STORED, tangent, f), 1e-9)
+    near(there.constraint_force(WHOLE, tangent, f), here.constraint_force(STORED, tangent, f), 1e-9)
     ends = []
     for motion, shift in ((there, np.zeros((5, 3))), (here, moved)):
         system = System(motion, lambda x, t, shift=shift: 3.0 * (WHOLE - (x - shift)))
         ends.append(run(system, system.initial_state(WHOLE + shift, 0.3 * tangent), 0.005, 40))
         assert motion.report(ends[-1].positions).residual < 1e-12
-    np.testing.assert_allclose(ends[0].positions, ends[1].positions - moved, rtol=0, atol=1e-9)
+    near(ends[0].positions, ends[1].positions - moved, 1e-9)
 
 
 def test_another_image_from_one_call_to_the_next():
@@ -133,7 +131,5 @@ def test_another_image_from_one_call_to_the_next():
         ahead, behind = images @ cell, rng.integers(-2, 3, WHOLE.shape) @ cell
         ahead[:2, 2] = behind[:2, 2] = 0.0
         found = motion.project_positions(new + ahead, WHOLE + behind) - ahead
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(
-            motion.project_velocities(WHOLE + behind, v), motion.project_velocities(WHOLE, v), rtol=0, atol=1e-12
-        )
+        near(found, expected, 1e-12)
+        near(motion.project_velocities(WHOLE + behind, v), motion.project_velocities(WHOLE, v), 1e-12)

@@ -47,15 +47,15 @@ MUTANTS = {
     "constraints/contradictions.py": [
         ("same = open_ & (given[place] «== key→!= given[place]»)", "images::a_length_found_and_the_same_one_given"),
     ],
+    "constraints/constraint.py": [
+        ('powers.get("length", «0→1»)', "constraint::the_same_points_fulfil_it"),
+        ('not powers.keys() <= {«→"unknown", »', "constraint::what_has_no_known_units_is_refused"),
+    ],
     "topology/rows_by_name.py": [
         (
             "«_refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))→pass»",
             "rows_by_name::bodies_that_a_missing_cell_tears_are_refused",
         ),
-    ],
-    "topology/other_units.py": [
-        ('powers.get("length", «0→1»)', "other_units::the_same_points_fulfil_it"),
-        ('not powers.keys() <= {«→"unknown", »', "other_units::what_has_no_known_units_is_refused"),
     ],
     "topology/angle_rows.py": [
         ("flat = volume < «→-»np.sin(np.radians(FLAT_CENTER))", "angle_rows::a_flat_center_has_an_improper_dihedral"),
@@ -64,8 +64,6 @@ MUTANTS = {
             "turning = «(earlier.sum(axis=1) == 1) & ~earlier[:, 0]→earlier.sum(axis=1) > 9»",
             "angle_rows::beside_a_rigid_body_only_what_it_leaves_is_held",
         ),
-    ],
-    "topology/ring_systems.py": [
         ("FLAT_RING = «2→»0.0", "ring_systems::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
         ("_independent(rows[«held→:0»], rows[~held])", "ring_systems::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
     ],

@@ -37,7 +37,7 @@ MUTANTS = {
         ("concatenate([slope[self.f :], «-→»slope[: self", "mechanics::friction_by_a_hamiltonian_that_depends_on_time"),
     ],
     "constraints/projection.py": [
-        ("rtol)].«conj().→»T)", "constraints/projection::complex_matrices"),
+        ("vt[kept].«conj().→»T)", "constraints/projection::complex_matrices"),
     ],
     "models/multibody.py": [
         (

@@ -9,7 +9,7 @@ MUTANTS = {
         ),
     ],
     "constraints/functions/expressions.py": [
-        ("    what = «undefined_part(tree, _PI)→None»", "expressions::formulas_without_bound_are_refused_at_once"),
+        ("    undefined = «undefined_part(tree, _PI)→None»", "expressions::formulas_without_bound_are_refused_at_once"),
         ("lambda _, x: «next(some)→-np.ones(40)»", "expressions::shifts_are_found_out"),
     ],
     "constraints/constraint.py": [

@@ -140,7 +140,7 @@ MUTANTS = {
         ),
         ("BOND_LIKE = «1→0».5", "images::a_polymer_that_closes_through_the_boundary"),
     ],
-    "plan/rank.py": [
+    "plan/plan.py": [
         ("«eliminate_last[rows[order]] = left_over→pass»", "plan::dependent_rows_are_eliminated_last"),
     ],
     "motion/certificate.py": [

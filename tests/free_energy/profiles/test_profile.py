@@ -69,6 +69,25 @@ def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error):
     assert (np.abs(away) < 1.96).mean() >= 0.85
 
 
+@pytest.mark.validation
+@pytest.mark.parametrize(
+    ("name", "n", "error"),
+    [
+        ("Lennard-Jones", 20, 0.3),
+        ("Lennard-Jones", 40, 0.5),
+        ("double well", 9, 0.4),
+        ("torsion", 14, 1.0),
+        ("Morse", 12, 0.5),
+    ],
+)
+def test_bands_over_many_sets_of_noise(name, n, error):
+    """What docs/free_energy.md says of them."""
+    case = CASES[name]
+    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(100)])
+    assert 0.9 < math.sqrt((away**2).mean()) < 1.15
+    assert 0.9 < (np.abs(away) < 1.96).mean() < 0.98
+
+
 @pytest.mark.parametrize(
     ("seeds", "low", "high"),
     [(range(6), 0.7, 1.3), pytest.param(range(40), 0.9, 1.15, marks=pytest.mark.validation)],
@@ -164,7 +183,7 @@ def uniform(name, n, error, seeds=2):
 
 
 def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side():
-    """Each window is sampled equally long. Splines are the better method for equal distances here."""
+    """Each window is sampled equally long."""
     assert adapted("Lennard-Jones", 7, 10, 0.009)[10] < uniform("Lennard-Jones", 20, 0.009)
 
 
