@@ -128,14 +128,13 @@ def check_out(out: FloatArray, shape: tuple[int, ...], item: str = "out") -> Non
         raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)
 
 
-def atom_array(atoms: Any, item: str) -> NDArray[Any]:
+def atom_array(atoms: Any, name: str, item: str = "atoms") -> NDArray[Any]:
     """Atoms as an array of any shape, a single one as an array of one."""
     try:
         return np.atleast_1d(np.asarray(atoms))
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
-            f"{item}: rows name different numbers of atoms, {_value_text(atoms)}; give rows of one width",
-            item="atoms",
+            f"{name}: rows name different numbers of atoms, {_value_text(atoms)}; give rows of one width", item=item
         ) from None
 
 
@@ -146,7 +145,7 @@ def atom_column(atoms: Any, item: str) -> NDArray[Any]:
 
 def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") -> IntArray:
     """Different atoms, a row of them for each row, shape (n, width); `item` is at fault where they are none."""
-    table = atom_array(atoms, name)
+    table = atom_array(atoms, name, item)
     if table.size == 0:
         return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
     if not np.issubdtype(table.dtype, np.integer):

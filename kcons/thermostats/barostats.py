@@ -211,7 +211,7 @@ class Barostat(DropsSystemCaches):
         if self.tension and kind not in ("semi-isotropic", "lateral", "anisotropic"):
             raise InputError(f"kind={kind!r} has no surface tension; use 'semi-isotropic' or 'lateral'", item="tension")
         self.every, self.seed = every, seed_from(rng)
-        self.molecules = None if molecules is None else check_pairs(molecules)
+        self.molecules = None if molecules is None else check_pairs(molecules, item="molecules")
         self.held: Held = held
         self.cutoff = cutoff
         self._known: tuple[CellSystem, BarostatBodies] | None = None

@@ -247,7 +247,7 @@ def find_pieces(
         tree = constraint_set.images
         nearest.append(np.stack([tree.parents, tree.atoms], axis=1))
     if molecules is not None:
-        bonds = check_pairs(molecules, n_atoms)
+        bonds = check_pairs(molecules, n_atoms, "molecules")
         links.append(bonds)
         nearest.append(bonds)
     around = any(c.cell_offsets is not None and c.cell_offsets.any() for c in rows_of)

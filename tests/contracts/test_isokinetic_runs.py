@@ -65,7 +65,7 @@ def test_forces_whose_squares_overflow():
     after = Isokinetic(momentum="free").step(held, State(x, v), 0.01)
     np.testing.assert_allclose(after.velocities, math.sqrt(2 * held.kinetic_energy(v) / 6), rtol=1e-14)
     light = system([], x, [1e-200, 1.0], lambda x, t: np.full_like(x, 1e200))
-    with pytest.raises(NonFiniteError, match="non-finite position at step 1"):
+    with pytest.raises(NonFiniteError, match="non-finite velocity at step 1"):
         Isokinetic(momentum="free").step(light, State(x, v), 0.01)
 
 

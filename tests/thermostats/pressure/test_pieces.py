@@ -134,7 +134,7 @@ def test_bonds_tie_what_constraints_do_not():
     pieces = find_pieces(system, x, ALL, bonds)
     assert len(pieces) == 5
     assert len(set(pieces.label[:5].tolist())) == 1
-    with pytest.raises(InputError, match="pair"):
+    with pytest.raises(InputError, match="molecules name atom 99"):
         find_pieces(system, x, ALL, [[0, 99]])
 
 
