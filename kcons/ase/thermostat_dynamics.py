@@ -37,6 +37,7 @@ from kcons.thermostats import (
 from kcons.thermostats.barostats import Barostat, ConstantPressure, require_barostat
 from kcons.thermostats.freedom import Momentum
 from kcons.thermostats.isokinetic import Convention
+from kcons.thermostats.monte_carlo import POTENTIAL
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
@@ -304,6 +305,17 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
             HamiltonianMonteCarlo, steps=steps, rng=self.seed, stepper=stepper, keep=keep, tolerance=tolerance
         )
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
+
+    @property
+    def state(self) -> State:
+        """As that of the other dynamics; it knows its potential energy, for which a calculator may be asked again."""
+        state = super().state
+        held = state.thermostat
+        if held is None or not math.isnan(held[POTENTIAL]):
+            return state
+        known = held.copy()
+        known[POTENTIAL] = self._systems().potential_energy(state.positions, state.time)
+        return replace(state, thermostat=known).read_only()
 
     @property
     def counts(self) -> Counts:

@@ -74,6 +74,8 @@ class ConstraintSet:
 
     Attributes
     ----------
+    masses : ndarray, shape (n_atoms,)
+        They cannot be changed: make a new set for others.
     lattice : ndarray, shape (2, 3, 3), or None
         Cell vectors as rows, and the inverse with zeros for directions without periodicity.
     images : Images or None
@@ -122,7 +124,7 @@ class ConstraintSet:
         if m.shape != (len(x),):
             raise InputError(f"masses must have shape ({len(x)},), not {m.shape}", item="masses")
         self.n_atoms = len(x)
-        self.masses = m
+        self.masses = read_only(m)  # engines know their inverse
         self._set_cell(cell, pbc)
         _check_atoms(given, x, m)
 
@@ -327,6 +329,10 @@ class ConstraintSet:
         part = self._other(len(atoms), self.masses[atoms], renumbered)
         part.images, part.scale = images, self.scale[rows]
         return part, atoms
+
+    def __setstate__(self, own: dict[str, Any]) -> None:
+        vars(self).update(own)
+        read_only(self.masses)  # a copy can be written to
 
     def _other(self, n_atoms: int, masses: FloatArray, constraints: Sequence[Constraint]) -> ConstraintSet:
         """A set of other constraints in the same cell, of which nothing is checked."""

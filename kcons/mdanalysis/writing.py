@@ -88,7 +88,7 @@ class TrajectoryWriter:
     velocities : bool, optional
         Write velocities; by default where the format has them.
     forces : bool
-        Write forces, where the format has them.
+        Write forces, where the format has them; NaN where a state does not know them, as the first of a run.
     **options
         For MDAnalysis' writer, such as ``precision=4`` of XTC.
 
@@ -204,7 +204,8 @@ class TrajectoryWriter:
         extras = self._extras(arrays, time)
         ts = self._universe.trajectory.ts
         for name in ("positions", *self._kept):
-            setattr(ts, name, arrays.get(name, np.zeros_like(arrays["positions"])) * units[name])
+            missing = np.full_like(arrays["positions"], np.nan if name == "forces" else 0.0)
+            setattr(ts, name, arrays.get(name, missing) * units[name])
         ts.time, ts.frame, ts.dimensions = time * self.units.time, self.n_frames, box
         ts.data["step"] = self.n_frames if step is None else step
         ts.data.update(extras)

@@ -252,6 +252,8 @@ class System:
         self.friction = not_negative(friction, "friction")
         #: The state that the last step ended in, whose arrays need not be looked at.
         self.last: State | None = None
+        #: The state that the last run returned, which cannot be written to, and the same as steps go on from it.
+        self.shown: tuple[State, State] | None = None
         #: Steps on their way that have ended in a state, whose they are, what they depend on, and they themselves.
         self.going: tuple[State, Any, Any, Any] | None = None
 
@@ -262,7 +264,7 @@ class System:
             self.going = (state, *going[1:])
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "going": None}  # those steps are of this System
+        return {**vars(self), "going": None, "shown": None}  # those steps are of this System
 
     @cached_property
     def schedule(self) -> Schedule:

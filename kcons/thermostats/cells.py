@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array, check_call, check_pairs, checked, positive, refuse_other
+from kcons.constraints.arguments import as_array, check_call, check_pairs, checked, positive, read_only, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import connected, spanning_tree
 from kcons.constraints.target import FloatArray
@@ -74,7 +74,7 @@ class CellSystem(System):
             )
         for name, function in (("force", force), ("potential", potential), ("stress", stress)):
             check_call(name, function, ("x", "t", "cell"))
-        self._matrix = motion.lattice[0].copy()
+        self._matrix = read_only(motion.lattice[0].copy())
         self.periodic: NDArray[np.bool_] = motion.lattice[1].any(axis=0)
         self._pbc: bool | list[bool] = True if self.periodic.all() else self.periodic.tolist()
         self.stress_of = stress
@@ -120,7 +120,7 @@ class CellSystem(System):
             As `Motion.set_cell`; nothing was changed.
         """
         self.motion.set_cell(cell, self._pbc, positions)
-        self._matrix = self.lattice[0].copy()
+        self._matrix = read_only(self.lattice[0].copy())
 
     def initial_state(
         self,

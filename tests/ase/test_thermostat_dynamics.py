@@ -478,3 +478,22 @@ def test_velocities_that_cannot_be_drawn():
     with pytest.raises(InputError, match="atoms are off row"):
         draw_velocities(atoms, 300)
     assert np.array_equal(atoms.get_momenta(), before[1])
+
+
+def test_a_state_of_monte_carlo_can_be_saved_and_exchanged_where_calculators_give_new_results(tmp_path):
+    def made(given=None, temperature=300):
+        atoms = waters(calc=Waves())
+        return ConstrainedMonteCarlo(atoms, 0.5 * FS, temperature, steps=3, rng=7, state=given)
+
+    sampler = made()
+    sampler.run(3)
+    sampler.state.save(tmp_path / "half.npz")
+    other = made(State.load(tmp_path / "half.npz"))
+    known = other.state.thermostat[0]
+    assert known == pytest.approx(other.atoms.get_potential_energy(), abs=1e-12)
+    for each in (sampler, other):
+        each.run(3)
+    assert sampler.counts.proposals == other.counts.proposals == 6
+    assert np.array_equal(sampler.atoms.positions, other.atoms.positions)
+    sampler.atoms.positions += 0.3
+    assert sampler.state.thermostat[0] == pytest.approx(sampler.atoms.get_potential_energy(), abs=1e-12)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+from copy import copy, deepcopy
+
 import numpy as np
 import pytest
 from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
@@ -9,6 +12,8 @@ from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
 from kcons.constraints import Angle, Distance, FixedAtoms, LinearCombination, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
+from kcons.motion import Motion
+from kcons.steppers import System
 
 TRICLINIC = np.array([[10.0, 0.0, 0.0], [3.0, 9.0, 0.0], [-2.0, 1.0, 8.0]])
 
@@ -178,3 +183,12 @@ def test_what_was_given_may_be_changed_afterwards():
     assert np.array_equal(held.value(x), before[0])
     assert np.array_equal(held.jacobian(x).toarray(), before[1])
     assert held.masses.tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("made", [lambda m: m, copy, deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
+def test_masses_cannot_be_changed(made):
+    x = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    motion = made(Motion(ConstraintSet(Distance([0, 1]), x, [1.0, 2.0]), x))
+    for masses in (motion.masses, motion.constraint_set.masses, System(motion).masses):
+        with pytest.raises(ValueError, match="read-only"):
+            masses[0] = 5.0

@@ -112,6 +112,18 @@ def test_observables_of_h5md(tmp_path):
         assert file["observables/multipliers"].attrs["run_units"] == "Å, ps, kJ/mol"
 
 
+@pytest.mark.parametrize("ending", ["trr", "h5md", "nc"])
+def test_forces_that_a_state_does_not_know_are_not_zero(ending, tmp_path):
+    made, state, motion = system()
+    assert state.forces is None
+    states = []
+    with TrajectoryWriter(tmp_path / f"f.{ending}", 3 * N, motion=motion, forces=True) as writer:
+        run(made, state, 0.002, 2, observers=[writer, states.append])
+    frames = [ts.forces.copy() for ts in files.loaded(tmp_path / f"f.{ending}", N).trajectory]
+    assert np.isnan(frames[0]).all()
+    np.testing.assert_allclose(frames[-1], states[-1].forces, rtol=1e-5, atol=1e-4)
+
+
 KILLED = """
 import os, sys
 sys.path[:0] = {paths!r}

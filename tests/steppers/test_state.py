@@ -56,6 +56,31 @@ def test_start_off_the_constraints():
     assert np.abs(system.masses @ (projected.positions - off)).max() <= 1e-14
 
 
+@pytest.mark.parametrize("stepper", [Rattle(), Langevin(0.5, 1.0, rng=1)])
+def test_a_state_that_a_run_returns_is_changed_by_replace_only(stepper):
+    """In place, forces of the places that were would go with new ones; runs go on from it as before, at no cost."""
+    system, state = rotor()
+    calls = []
+
+    def force(x, t):
+        calls.append(t)
+        return -0.3 * x
+
+    system = System(system.motion, force)
+    end = run(system, system.initial_state(state.positions, state.velocities), 0.01, 4, stepper=stepper)
+    for name in ("positions", "velocities", "forces"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(end, name)[0] = 1.0
+    assert run(system, end, 0.01, 0, stepper=stepper) is end
+    before = len(calls)
+    after = run(system, end, 0.01, 3, stepper=stepper)
+    assert len(calls) == before + 3
+    whole = run(system, system.initial_state(state.positions, state.velocities), 0.01, 7, stepper=stepper)
+    assert np.array_equal(after.positions, whole.positions) and np.array_equal(after.velocities, whole.velocities)
+    with pytest.raises(InputError, match="off row"):
+        run(system, replace(after, positions=1.2 * after.positions), 0.01, 1, stepper=stepper)
+
+
 def test_start_with_forbidden_velocities():
     system, state = rotor(omega=1.0)
     stretching = state.velocities + np.array([[0.5, 0, 0], [0, 0, 0]])

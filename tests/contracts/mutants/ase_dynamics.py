@@ -21,6 +21,12 @@ MUTANTS = {
         ('("numbers",« "initial_charges", "initial_magmoms"→»)', "binding::forces_of_the_same_calculator_that_changed"),
         ("if «now < before→False» and self._more", "binding::what_was_given_by_numbers_of_atoms_is_no_longer_of_these"),
     ],
+    "ase/thermostat_dynamics.py": [
+        (
+            "known[POTENTIAL] = «self._systems().potential_energy(state.positions, state.time)→math.nan»",
+            "thermostat_dynamics::a_state_of_monte_carlo_can_be_saved_and_exchanged_where_calculators_give_new_results",
+        ),
+    ],
     "thermostats/langevin.py": [
         ("if self.thermostat.friction >«→=» 0:", "logger::without_noise_the_log_is_of_the_end[0.0]"),
     ],

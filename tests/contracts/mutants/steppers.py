@@ -90,6 +90,7 @@ MUTANTS = {
         ("if «unpacked > length→False»:", "steppers/files::an_archive_that_would_unpack_to_more_is_refused"),
     ],
     "steppers/running.py": [
+        ("system.shown = state«.read_only()→», state", "state::a_state_that_a_run_returns_is_changed_by_replace_only"),
         ("if steps and holds and «state is not system.last→False»:", "state::start_off_the_constraints"),
         (
             "    «refuse_clock(state.time, state.step, state.time_remainder)\n    →»if stepper",
@@ -154,5 +155,7 @@ MUTANTS = {
     ],
     "constraints/constraint_set.py": [
         ("np.maximum(1e-«10→8» * self.scale, 8 * np.finfo(float)", "certificate::what_is_allowed_scales_with_rounding"),
+        ("self.masses = «read_only(m)→m»", "constraint_set::masses_cannot_be_changed"),
+        ("«read_only(self.masses)→pass»  # a copy", "constraint_set::masses_cannot_be_changed"),
     ],
 }

@@ -151,3 +151,11 @@ def test_other_steppers_go_on_in_the_cell_of_the_state(stepper):
     second = run(system, there, 0.05, 2, stepper=stepper)
     assert np.array_equal(first.positions, second.positions)
     assert np.array_equal(first.cell, there.cell) and np.array_equal(system.cell, there.cell)
+
+
+def test_the_cell_of_a_system_is_changed_by_set_cell_only():
+    system, state = begun()
+    for cell in (1.0, 1.02):
+        system.set_cell(cell * system.cell, state.positions)
+        with pytest.raises(ValueError, match="read-only"):
+            system.cell[0, 0] = 3.0
