@@ -106,8 +106,7 @@ def run(
     stepper : Stepper, optional
         `Rattle` by default.
     observers : iterable of callable
-        Each is called with the state at the start and after every `every` steps; it can keep the state, and not
-        change its arrays.
+        Each is called with the state at the start and after every `every` steps; it can keep the state.
     every : int
     check_every : int, optional
         The first state, and one in so many, is certified: sigma and A v evaluated by the constraint set itself, beside
@@ -119,8 +118,7 @@ def run(
     Raises
     ------
     InputError
-        A start off the constraints; negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units,
-        or that is no finite number; what is no system, state, stepper or observer; a state whose time is no finite
+        A start off the constraints; what is no system, state, stepper or observer; a state whose time is no finite
         number, or whose step no count.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
@@ -136,8 +134,7 @@ def run(
     refuse_other(system, System, "system", "a kcons.System")
     refuse_other(state, State, "state", "a kcons.State, such as system.initial_state(positions, velocities)")
     refuse_clock(state.time, state.step, state.time_remainder)
-    if stepper is None:
-        stepper = Rattle()
+    stepper = Rattle() if stepper is None else stepper
     require_stepper(stepper)
     refuse_other(observers, Iterable, "observers", "a list of functions of a state")
     observers = list(observers)
