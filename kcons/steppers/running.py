@@ -146,8 +146,7 @@ def run(
     if dt == 0 or not holds:
         check_every = 0
     schedule = system.schedule
-    if system.shown is not None and state is system.shown[0]:
-        state = system.shown[1]
+    state = system.behind(state)
     if hasattr(stepper, "barostat"):
         state = stepper.start(system, state)  # type: ignore[attr-defined]  # the first state shown has a cell
     if steps and holds and state is not system.last:
@@ -178,8 +177,5 @@ def run(
         if record is not None:
             error.trajectory = Trajectory(kept, kept[-1] if kept else state)  # type: ignore[attr-defined]
         raise
-    if steps:
-        system.shown = state.read_only(), state
-    if system.shown is not None and state is system.shown[1]:
-        state = system.shown[0]  # steps go on from the state itself, which nobody else has
+    state = system.show(state, bool(steps))
     return state if record is None else Trajectory(kept, state)

@@ -263,6 +263,16 @@ class System:
         if going is not None and going[0] is after and going[3].simple and not len(going[3].numbers):
             self.going = (state, *going[1:])
 
+    def behind(self, state: State) -> State:
+        """What steps go on from: the state itself where `state` shows the one that the last run ended in."""
+        return self.shown[1] if self.shown is not None and state is self.shown[0] else state
+
+    def show(self, state: State, new: bool) -> State:
+        """The same state, which cannot be written to, where steps go on from it."""
+        if new:
+            self.shown = state.read_only(), state
+        return self.shown[0] if self.shown is not None and state is self.shown[1] else state
+
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "going": None, "shown": None}  # those steps are of this System
 

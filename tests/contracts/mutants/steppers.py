@@ -90,14 +90,14 @@ MUTANTS = {
         ("if «unpacked > length→False»:", "steppers/files::an_archive_that_would_unpack_to_more_is_refused"),
     ],
     "steppers/running.py": [
-        ("system.shown = state«.read_only()→», state", "state::a_state_that_a_run_returns_is_changed_by_replace_only"),
         ("if steps and holds and «state is not system.last→False»:", "state::start_off_the_constraints"),
         (
-            "    «refuse_clock(state.time, state.step, state.time_remainder)\n    →»if stepper",
+            "    «refuse_clock(state.time, state.step, state.time_remainder)\n    →»stepper = Rattle",
             "stepper::states_made_by_hand_with_impossible_numbers",
         ),
     ],
     "steppers/state.py": [
+        ("self.shown = state«.read_only()→», state", "state::a_state_that_a_run_returns_is_changed_by_replace_only"),
         ("return «self.is_of(system) and →»(", "state::forces_of_another_system_are_not_taken"),
         ("«(there is here or np.array_equal(there, here))→True»", "state::forces_are_kept_at_their_positions_only"),
         ("if «time != self.time or →»(", "state::forces_are_kept_at_their_time_and_velocities_only"),
