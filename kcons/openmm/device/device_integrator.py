@@ -394,6 +394,27 @@ class DeviceIntegrator(ProjectedIntegrator):
             return float(self.read("memory")[program.kept.index(name)])
         return {**program.numbers, **program.settings}[program.known(name)]
 
+    # Programs that copy integrators (openmmtools) read all variables by number, and write them.
+
+    def getNumGlobalVariables(self) -> int:
+        return len(self.program.numbers)
+
+    def getGlobalVariableName(self, index: int) -> str:
+        return list(self.program.numbers)[index]
+
+    def getGlobalVariable(self, index: int) -> float:
+        return self.getGlobalVariableByName(self.getGlobalVariableName(index))
+
+    def setGlobalVariable(self, index: int, value: float) -> None:
+        """As for a CustomIntegrator, settings have their own value again in the next step."""
+        self.program.write(self.getGlobalVariableName(index), float(value))
+
+    def getNumPerDofVariables(self) -> int:
+        """None, and there are no tables and computations either."""
+        return 0
+
+    getNumComputations = getNumTabulatedFunctions = getNumPerDofVariables
+
     def setRandomNumberSeed(self, seed: int) -> None:
         """The seed of noise, before the Context is made; 0 for one that nobody knows."""
         self._seed = whole_number(seed, "seed", -(2**31), 2**31 - 1)

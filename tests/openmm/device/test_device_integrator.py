@@ -267,6 +267,14 @@ def test_settings_change_what_is_done():
         made[0].setGlobalVariableByName("kT", 1.0)
     made[0].setGlobalVariableByName("link1", 0.25)
     assert made[0].getGlobalVariableByName("link1") == 0.25
+    for integrator in made:  # as openmmtools does: settings have their values again in the next step
+        names = [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
+        k = names.index("kT")
+        assert integrator.getGlobalVariable(k) == integrator.getGlobalVariableByName("kT") > 0
+        integrator.setGlobalVariable(k, 0.0)
+        integrator.step(1)
+        assert integrator.getTemperature()._value == 900.0 and integrator.getGlobalVariable(k) > 0
+    assert made[0].getNumPerDofVariables() == made[0].getNumTabulatedFunctions() == 0
     with pytest.raises(UnsupportedError, match="force groups"):
         made[0].setIntegrationForceGroups({0})
 
