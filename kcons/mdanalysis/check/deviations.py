@@ -148,8 +148,7 @@ class RowTable:
         self.others: ConstraintSet | None = None
         if len(self._rows):
             self.others, self._atoms = held.subset(self._rows)
-        #: By atom: 0 where no row has it.
-        self._is_held = np.zeros(held.n_atoms, dtype=np.int32)
+        self._is_held = np.zeros(held.n_atoms, dtype=np.int32)  # 0 where no row has the atom
         self._is_held[held.touched] = _EXPONENT
         # Runs of rows of one unit.
         starts = np.append(0, np.flatnonzero(np.diff(self.units)) + 1)
