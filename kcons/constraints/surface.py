@@ -67,7 +67,7 @@ class Sphere(Surface):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR}
     length_powers = {"center": 1}
-    singular = "atom {atoms} lies at the center of the sphere: gradient of {row}, undefined; move the atom"
+    singular = "atom {atom} lies at the center of the sphere: gradient undefined; move the atom"
     center: FloatArray
 
     def __init__(self, atoms: ArrayLike, center: Lengths, radius: Target = None) -> None:
@@ -97,7 +97,7 @@ class Cylinder(Surface):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"point": _VECTOR, "axis": _VECTOR}
     length_powers = {"point": 1}
-    singular = "atom {atoms} lies on the axis of the cylinder: gradient of {row}, undefined; move the atom"
+    singular = "atom {atom} lies on the axis of the cylinder: gradient undefined; move the atom"
     point: FloatArray
     axis: FloatArray
 
@@ -132,9 +132,7 @@ class Torus(Surface):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR, "axis": _VECTOR, "major_radius": ()}
     length_powers = {"center": 1, "major_radius": 1}
-    singular = (
-        "atom {atoms} lies on the axis or on the core circle of the torus: gradient of {row}, undefined; move the atom"
-    )
+    singular = "atom {atom} lies on the axis or on the core circle of the torus: gradient undefined; move the atom"
     center: FloatArray
     axis: FloatArray
     major_radius: FloatArray
@@ -150,7 +148,7 @@ class Torus(Surface):
         super().__init__(atoms, minor_radius, center=center, axis=axis, major_radius=major_radius)
 
     def _settle(self) -> None:
-        self.refuse_input(
+        self.refuse(
             ~(self.major_radius > 0),
             0,
             lambda k: f"major_radius {self.major_radius[k]:g} is not positive",
@@ -197,7 +195,7 @@ class Ellipsoid(Surface):
         "rotation": (3, 3),
     }
     length_powers = {"center": 1, "inverse_axes": -1}
-    singular = "atom {atoms} lies at the center of the ellipsoid: gradient of {row}, undefined; move the atom"
+    singular = "atom {atom} lies at the center of the ellipsoid: gradient undefined; move the atom"
     center: FloatArray
     inverse_axes: FloatArray
     rotation: FloatArray
@@ -258,7 +256,7 @@ class Ellipsoid(Surface):
         if self.target is None:
             return
         target = self.target_at(time)
-        self.refuse_input(
+        self.refuse(
             ~(target > -self.scale()),
             first_row,
             lambda k: f"target {target[k]:g} lies beyond the center of the ellipsoid; use 0 for its surface",

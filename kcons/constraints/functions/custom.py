@@ -126,7 +126,7 @@ class Custom(PythonRows):
 
     functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function")
     kind = RowKind.FUNCTION
-    singular = "{row}: value and gradient must be finite, and the gradient not zero; move the atoms"
+    singular = "value and gradient must be finite, and the gradient not zero; move the atoms"
 
     def __init__(
         self,
@@ -229,11 +229,11 @@ class Custom(PythonRows):
         along /= np.sqrt(_contract(along, along))[:, None, None]
         found, finer = (self._slope(r, along, step * length, time) for step in (1e-3, 0.5e-3))
         if self.gradient_function is None:
-            self.refuse_singular(
+            self.refuse(
                 ~(np.abs(finer - found) <= WRONG * size),
                 first_row,
-                lambda k, row: (
-                    f"{row}: differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
+                lambda k: (
+                    f"differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
                     f"gradient, {found[k]:.3g} and {finer[k]:.3g}: it vanishes, or the function varies faster. "
                     "Move the atoms, give the length over which it varies (length=...), or its gradient"
                 ),
@@ -250,7 +250,7 @@ class Custom(PythonRows):
             )
 
         wrong = ~(np.abs(_contract(slope, along) - found) <= WRONG * size)
-        self.refuse_input(wrong, first_row, worst, "gradient")
+        self.refuse(wrong, first_row, worst, "gradient")
 
 
 class ImplicitSurface(Custom):
@@ -349,7 +349,7 @@ class CustomVelocity(PythonRows, VelocityRows):
         Differences are taken at steps of at most 1e-3 `length`, and, with `time_dependent`, of `time_step`.
     """
 
-    singular = "{row}: the coefficients are zero or not finite; move the atoms"
+    singular = "the coefficients are zero or not finite; move the atoms"
     functions: ClassVar[tuple[str, ...]] = ("coefficients",)
 
     def __init__(

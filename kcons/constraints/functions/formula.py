@@ -122,7 +122,7 @@ class Formula(Constraint):
     def parameters(self) -> FloatArray:
         return self.values
 
-    def undefined(self, k: int, row: str, r: FloatArray, time: float) -> str:
+    def undefined(self, k: int, r: FloatArray, time: float) -> str:
         axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
         numbers = dict(zip([*axes, "t", *self.names], [*r.ravel(), time, *self.values[k]], strict=True))
         numbers |= {f"v{axis}": 1.0 for axis in axes} | {"pi": np.pi}
@@ -130,7 +130,7 @@ class Formula(Constraint):
         if what is None:
             flat = not self.select([k]).gradient(r[None], time).any()
             what = f"its gradient is {'zero' if flat else 'not finite'}"
-        return f"{row}, {self.formula!r}: {what} at the start; move the atoms, or write another formula"
+        return f"{self.formula!r}: {what} at the start; move the atoms, or write another formula"
 
     @classmethod
     def restored(cls, data: Mapping[str, Any]) -> Self:
