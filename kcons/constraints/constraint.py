@@ -29,10 +29,10 @@ from kcons.constraints.arguments import (
     Kind,
     as_float_array,
     atom_table,
+    check_range,
     checked,
-    out_of_range,
-    plain_target,
     read_only,
+    without_units,
 )
 from kcons.constraints.compilation import has_a_file, njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
@@ -171,10 +171,7 @@ class Constraint:
                 f"{self.family}: {name} has shape {array.shape}; give {shape[1:] or 'one number'} for all, or {shape}",
                 item=name,
             ) from None
-        wrong = out_of_range(array)
-        if wrong is not None:
-            row, said = wrong
-            raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
+        check_range(array, f"{self.family}: {name} of row {{row}}", name, self.atoms)
         return array
 
     def __setstate__(self, own: dict[str, Any]) -> None:
@@ -355,7 +352,7 @@ class Constraint:
 
     def with_target(self, target: Target) -> Self:
         """Copy of this object held at another target."""
-        plain, matters = plain_target(target, f"{self.family}: target", self.held)
+        plain, matters = without_units(target, f"{self.family}: target", self.held)
         return self.changed(target=as_target(plain, self.n_rows), units=MD_UNITS if matters else self.units)
 
     def rescaled(self, factor: float) -> Self:

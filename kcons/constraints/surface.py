@@ -21,7 +21,7 @@ from kcons.constraints.arguments import (
     PositiveLengths,
     as_float_array,
     atom_column,
-    out_of_range,
+    check_range,
     read_only,
     unit,
 )
@@ -332,7 +332,5 @@ def _for_each(vectors: ArrayLike, count: int, name: str) -> FloatArray:
 
 def _held(item: LinearRows, point: ArrayLike) -> FloatArray:
     points = _for_each(point, item.n_rows, "point")
-    wrong = out_of_range(points)
-    if wrong is not None:
-        raise InputError(f"{item.family}: point is {wrong[1]}", item="point")
+    check_range(points, f"{item.family}: point of row {{row}}", "point")
     return read_only(np.asarray(np.einsum("ki,ki->k", item.coefficients[:, 0], points)))

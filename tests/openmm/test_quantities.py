@@ -76,7 +76,7 @@ def test_rows_are_held_at_what_was_written():
 def test_moving_targets_may_return_quantities():
     plain = MovingTarget(lambda t: 0.1 + 0.2 * t, lambda t: 0.2, lambda t: 0.0)
     written = MovingTarget(
-        lambda t: (1 + 2 * t) * angstrom, lambda t: 2 * angstrom / ps, lambda t: 0 * nm / ps**2, 20 * unit.femtosecond
+        lambda t: (1 + 2 * t) * angstrom, lambda t: 2 * angstrom / ps, lambda t: 0 * nm / ps**2
     )
     for target in (written, lambda t: (0.1 + 0.2 * t) * nm):
         one, other = (sigma([Distance([[0, 1]], each)]) for each in (plain, target))
