@@ -437,11 +437,16 @@ class Constraint:
         if cls.functions or found != names:
             wrong = sorted(names.symmetric_difference(found)) or list(cls.functions)
             raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
+        item = cls._rebuilt(data)
+        item.units = data.get("units")
+        return item
+
+    @classmethod
+    def _rebuilt(cls, data: Mapping[str, Any]) -> Self:
         item = object.__new__(cls)
         for name in cls.shared:
             setattr(item, name, data[name])
         Constraint.__init__(item, data["atoms"], data["target"], **{name: data[name] for name in cls.per_row})
-        item.units = data.get("units")
         return item
 
     def __repr__(self) -> str:

@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import as_float_array, finite_number, read_only
 from kcons.constraints.constraint import Constraint, IntArray, constraints_in
-from kcons.constraints.contradictions import found_as_given, refuse_contradictions
-from kcons.constraints.periodic.images import Images, find_images, image_error
+from kcons.constraints.contradictions import agreed_targets
+from kcons.constraints.periodic.images import Images, find_images
 from kcons.constraints.periodic.one_piece import lattice_of, lined_up, make_whole, spanning_tree
 from kcons.constraints.target import FloatArray, MovingTarget, nearest_image
 from kcons.constraints.vectors import extent, norm
-from kcons.errors import InputError, KconsError
+from kcons.errors import ImageError, InputError, KconsError
 
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
 MOST_STRAIN = 0.1
@@ -142,8 +142,8 @@ class ConstraintSet:
                     item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)
                 )
             bound.append(item)
-        refuse_contradictions(bound, self.starts, time)
-        self.constraints = tuple(found_as_given(bound, [item.target is None for item in marked], time))
+        found = [item.target is None for item in marked]
+        self.constraints = tuple(agreed_targets(bound, found, self.starts, time))
         self._set_scale(x, time)
 
     def _set_scale(self, x: FloatArray, time: float) -> None:
@@ -465,7 +465,18 @@ class ConstraintSet:
         if link >= 0:
             pair = np.array([self.images.parents[link], self.images.atoms[link]])
             row = int(self.images.unheld[link])
-            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
+            raise self._image_error(row, pair, numbers)
+
+    def _image_error(self, row: int, pair: IntArray, numbers: IntArray | None) -> ImageError:
+        """The error for two atoms of a row that have drifted half the cell apart."""
+        atoms = pair if numbers is None else numbers[pair]
+        return ImageError(
+            f"row {self.row_name(row)}: atoms {atoms[0]} and {atoms[1]}, which nothing ties together, are half the "
+            f"cell apart ({self.half_width:g} in its narrowest direction); further on the row would mean other "
+            "periodic images. Use a larger cell, make the ConstraintSet without a cell and keep positions unwrapped, "
+            "or hold what ties these atoms together",
+            atoms=atoms,
+        )
 
     def refuse_other_images(
         self, x: FloatArray, before: FloatArray, time: float | None, numbers: IntArray | None = None
@@ -497,7 +508,7 @@ class ConstraintSet:
             row = int(np.argmax(np.where(bad, here, -1.0)))
             atoms = self.row_atoms(row)
             pair = atoms[[0, int(np.argmax(changed[atoms]))]]
-            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
+            raise self._image_error(row, pair, numbers)
 
     @cached_property
     def _longest_plain(self) -> tuple[float, int]:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.periodic.one_piece import BoolArray, connected, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray, nearest_image
-from kcons.errors import ImageError, InputError
+from kcons.errors import InputError
 
 #: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbors in the list.
 ALL_PAIRS_WIDTH = 12
@@ -122,17 +122,6 @@ class Images:
             needed = parent[needed]
             needed = needed[~keep[needed]]
         return self.atoms[keep[self.atoms]]
-
-
-def image_error(row_name: str, atoms: IntArray, half_width: float) -> ImageError:
-    """The error for two atoms of a row that have drifted half the cell apart."""
-    return ImageError(
-        f"row {row_name}: atoms {atoms[0]} and {atoms[1]}, which nothing ties together, are half the cell apart "
-        f"({half_width:g} in its narrowest direction); further on the row would mean other periodic images. Use a "
-        "larger cell, make the ConstraintSet without a cell and keep positions unwrapped, or hold what ties these "
-        "atoms together",
-        atoms=atoms,
-    )
 
 
 def find_images(
