@@ -15,7 +15,6 @@ import inspect
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -86,9 +85,9 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
     return np.require(array, requirements=["C", "A", "W"])
 
 
-def finite_array(values: ArrayLike, n_atoms: int, item: str) -> FloatArray:
+def finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
     """A copy of values for each atom, shape (n_atoms, 3); `InputError` where they are not finite."""
-    array = as_array(values, (n_atoms, 3), item).copy()
+    array = as_array(np.array(as_float_array(values, item)), (n_atoms, 3), item)
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
         atom = int(np.argmax(bad))
@@ -339,33 +338,16 @@ _PLAIN = (int, float, bool, str, type(None))
 
 
 class Kind(NamedTuple):
-    """What a number is.
-
-    Attributes
-    ----------
-    words : str
-        For messages.
-    exponents : tuple of (str, int), or None
-        Base dimensions by their names in OpenMM; None for any.
-    """
+    """What a number is: in words, for messages, and its base dimensions by their names in OpenMM; None for any."""
 
     words: str
     exponents: tuple[tuple[str, int], ...] | None
-
-    def per_time(self, power: int = 1) -> Kind:
-        """Its rate of change, or with 2 its acceleration."""
-        if self.exponents is None:
-            return self
-        exponents = dict(self.exponents)
-        exponents["time"] = exponents.get("time", 0) - power
-        per = "ps" if power == 1 else f"ps**{power}"
-        return Kind(f"{self.words}/{per}", tuple((name, n) for name, n in exponents.items() if n))
 
 
 ANY = Kind("any unit", None)
 NUMBER = Kind("a plain number", ())
 LENGTH = Kind("nm", (("length", 1),))
-SPEED = LENGTH.per_time()
+SPEED = Kind("nm/ps", (("length", 1), ("time", -1)))
 ANGLE = Kind("radian", (("angle", 1),))
 TIME = Kind("ps", (("time", 1),))
 #: A vector of which only the direction counts.
@@ -424,24 +406,9 @@ def refuse_units(values: Any, item: str) -> None:
     if has_units(values):
         raise InputError(
             f"{item} has units ({quantity_text(values)}), and only kcons.openmm knows what the other numbers are in; "
-            "give plain numbers in the units of the run",
+            "give plain numbers in the units of the run (nm and ps in OpenMM)",
             item=item,
         )
-
-
-@dataclass(frozen=True)
-class Unitless:
-    """A function whose results are taken without their units; for those that may return Quantities."""
-
-    function: Callable[..., Any]
-    item: str
-    kind: Kind
-
-    def __call__(self, *arguments: Any) -> Any:
-        found = self.function(*arguments)
-        if type(found) is tuple:  # several results, each of its own kind
-            return tuple(without_units(part, self.item, ANY)[0] for part in found)
-        return without_units(found, self.item, self.kind)[0]
 
 
 # -- arguments looked at by what their annotations say ----------------------------------------------

@@ -63,10 +63,11 @@ def _refuse_two_targets(atoms: IntArray, rows: IntArray, target: FloatArray, per
     bad = np.abs(difference) > _SAME * np.maximum(np.abs(target[repeated]), np.abs(target[repeated + 1]))
     if bad.any():
         k = int(repeated[np.argmax(bad)])
+        (one, first), (other, second) = sorted((int(rows[n]), float(target[n])) for n in (k, k + 1))
         raise ContradictionError(
-            f"constraints #{rows[k]} and #{rows[k + 1]} on atoms {tuple(atoms[k].tolist())} have different targets "
-            f"{float(target[k])!r}, {float(target[k + 1])!r}; remove one of them",
-            rows=rows[k : k + 2].tolist(),
+            f"constraints #{one} and #{other} on atoms {tuple(atoms[k].tolist())} have different targets {first!r}, "
+            f"{second!r}; remove one of them",
+            rows=[one, other],
             atoms=atoms[k].tolist(),
         )
 
