@@ -317,9 +317,7 @@ class ConstraintSet:
             if wholes:
                 between = self.images.ancestors(np.concatenate(wholes), self.n_atoms)
                 atoms = np.union1d(atoms, between)
-            numbers = np.zeros(self.n_atoms, np.int64)
-            numbers[atoms] = np.arange(len(atoms))
-            images = self.images.among(atoms, numbers, rows)
+            images = self.images.among(atoms, rows)
         renumbered = [p.changed(atoms=read_only(np.searchsorted(atoms, p.atoms))) for p in pieces]
         part = self._other(len(atoms), self.masses[atoms], renumbered)
         part.images, part.scale = images, self.scale[rows]
