@@ -343,13 +343,12 @@ class Windows:
         self.workers = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         self.settings = settings or Settings()
         self.both_sides, self.seed = both_sides, seed_from(rng)
-        self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
         self._failed: dict[str, str] = {}
         self.approach = approach_of(approach, sampler.names)
         mine: dict[str, Any] = {"coordinates": list(sampler.names), "system": sampler.digest}
         mine |= {"settings": asdict(self.settings), "seed": self.seed, "both sides": both_sides}
-        mine |= {"approach": self.approach.tolist(), "start": self.start.tolist()}
+        mine |= {"approach": self.approach.tolist(), "start": sampler.start.tolist()}
         self._results = ResultFolder(folder, "settings.json", mine, FILES, "windows")
         self._results.refuse_others()
         self.folder = self._results.path
@@ -483,7 +482,7 @@ class Windows:
         file = self.file(window)
         if not file.exists():
             return False
-        away = nearest_image(Series.load(file).value[:1] - np.array(window.target), self.periods)
+        away = nearest_image(Series.load(file).value[:1] - np.array(window.target), self.sampler.periods)
         if np.abs(away).max(initial=0.0) > 1e-4:
             wanted = ", ".join(f"{q:g}" for q in self._targets[window.number])
             raise OccupiedError(
@@ -540,7 +539,7 @@ class Windows:
             if sides:
                 found.append(combine_sides(number, np.array(target), sides, self.sampler))
         found.sort(key=lambda w: w.value.tolist())
-        return FreeEnergy(self.sampler.names, self.periods, found, problems, tuple(self.sampler.angles))
+        return FreeEnergy(self.sampler.names, self.sampler.periods, found, problems, tuple(self.sampler.angles))
 
 
 #: What is said of a window whose process was killed, and errors of Dask that say so.
