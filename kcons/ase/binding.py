@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import pickle
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
-from threading import local
 from typing import Any, TypeAlias
 
 import ase.constraints
@@ -23,9 +21,6 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
-
-#: Engines of the last objects that are kept for other objects with the same rows, as frames of a file have.
-RECENT = 2
 
 #: What objects of ASE hold, by the names of their attributes.
 _HELD = "index", "mask", "dir", "pairs", "bondlengths", "triples", "bonds", "angles", "dihedrals", "bondcombos"
@@ -58,8 +53,6 @@ class Binding:
     weights: tuple[FloatArray, FloatArray, FloatArray] | None
     #: Other constraints on the atoms, and what these held when they were looked at.
     others: Company = ()
-    #: The object that may take the engine to another cell, if it is still there.
-    owner: Callable[[], object] = lambda: None
 
     def fits(self, atoms: Atoms) -> bool:
         """Whether number of atoms, periodicity and masses are still the same."""
@@ -72,10 +65,6 @@ class Binding:
             and name == self.mass_array
             and arrays[name].tobytes() == self.masses
         )
-
-    def serves(self, holder: object, cell: FloatArray) -> bool:
-        """Whether `holder`, whose cell is this, can go on with the engine: copies share it while all are in one."""
-        return not self.periodic or self.owner() is holder or cell.tobytes() == self.cell
 
     def follow_cell(self, atoms: Atoms, cell: FloatArray) -> None:
         """Let the engine know the cell, if it has changed; an `InputError` leaves it as it was."""
@@ -117,11 +106,7 @@ def refuse_not_finite(values: FloatArray, what: str) -> None:
         )
 
 
-def bind(
-    given: Sequence[Constraint],
-    atoms: Atoms,
-    time: float = 0.0,
-) -> Binding:
+def bind(given: Sequence[Constraint], atoms: Atoms, time: float = 0.0) -> Binding:
     """A new engine for `given` on `atoms`."""
     periodic = bool(atoms.pbc.any())
     x = atoms.arrays["positions"]
@@ -143,39 +128,6 @@ def bind(
         cell=atoms.cell.array.tobytes(),
         weights=_weights(motion) if len(touched) == len(atoms) else None,
     )
-
-
-class _Recent(local):
-    """Engines that were built last in this thread, each with the rows as they were given."""
-
-    def __init__(self) -> None:
-        self.known: deque[tuple[bytes, Binding]] = deque(maxlen=RECENT)
-
-
-_recent = _Recent()
-
-
-def shared(given: Sequence[Constraint], atoms: Atoms) -> Binding:
-    """An engine as `bind` gives it, or one that was built before for the same rows, masses and cell.
-
-    Frames of a file need one engine together. Only rows whose engine depends on no positions have it in common: targets
-    are given, nothing was converted to linear rows, and minimum images say all.
-    """
-    settled = all(item.target is not None for item in given)
-    try:
-        content = pickle.dumps(tuple(given)) if settled else b""
-    except (pickle.PicklingError, AttributeError, TypeError):  # functions of the user
-        content = b""
-    for known, bound in _recent.known:
-        same_cell = not bound.periodic or atoms.cell.array.tobytes() == bound.cell
-        if content == known and same_cell and bound.fits(atoms):
-            return bound
-    bound = bind(given, atoms)
-    motion = bound.motion
-    plain = motion.constraint_set.images is None and all(item.cell_offsets is None for item in bound.given)
-    if content and plain and not motion.conversions:
-        _recent.known.append((content, bound))
-    return bound
 
 
 def holding(item: Any) -> Any:
