@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any, TypeAlias
+from typing import Any
 
 import ase.constraints
 import numpy as np
@@ -28,10 +28,6 @@ _HELD = "index", "mask", "dir", "pairs", "bondlengths", "triples", "bonds", "ang
 #: ASE objects that only add forces, so that they get along with any constraint.
 FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
 
-
-#: Constraints on atoms, each with what it holds.
-Company: TypeAlias = tuple[tuple[Any, Any], ...]
-
 _PLURAL = {"position": "positions", "momentum": "momenta", "force": "forces"}
 _FLOAT = np.dtype(np.float64)
 
@@ -43,28 +39,17 @@ class Binding:
     motion: Motion
     given: tuple[Constraint, ...]
     touched: IntArray
-    n_atoms: int
-    mass_array: str
-    masses: bytes
+    made_for: tuple[Any, ...]
     periodic: bool
-    pbc: bytes
     cell: bytes
     #: m and 1/m (0 for fixed atoms) for each component, and room for velocities; None if only some atoms are held.
     weights: tuple[FloatArray, FloatArray, FloatArray] | None
     #: Other constraints on the atoms, and what these held when they were looked at.
-    others: Company = ()
+    others: tuple[Any, ...] = ()
 
     def fits(self, atoms: Atoms) -> bool:
         """Whether number of atoms, periodicity and masses are still the same."""
-        # Every hook comes through here: compare bytes, which costs a fraction of a microsecond, and build nothing.
-        arrays = atoms.arrays
-        name = "masses" if "masses" in arrays else "numbers"
-        return (
-            len(arrays["positions"]) == self.n_atoms
-            and atoms.pbc.tobytes() == self.pbc
-            and name == self.mass_array
-            and arrays[name].tobytes() == self.masses
-        )
+        return _read_by_engine(atoms) == self.made_for
 
     def follow_cell(self, atoms: Atoms, cell: FloatArray) -> None:
         """Let the engine know the cell, if it has changed; an `InputError` leaves it as it was."""
@@ -88,11 +73,19 @@ class Binding:
                     item=what,
                 )
             array = np.array(values, np.float64, order="C")
-        if array.shape != (self.n_atoms, 3):
-            raise InputError(f"{_PLURAL[what]} must have shape ({self.n_atoms}, 3), not {array.shape}", item=what)
+        wanted = (self.motion.n_atoms, 3)
+        if array.shape != wanted:
+            raise InputError(f"{_PLURAL[what]} must have shape {wanted}, not {array.shape}", item=what)
         if self.weights is None and not isfinite(np.vdot(array, array)):
             refuse_not_finite(array, what)
         return array
+
+
+def _read_by_engine(atoms: Atoms) -> tuple[Any, ...]:
+    """What an engine is made of besides rows and cell; every hook asks: bytes, compared in part of a microsecond."""
+    arrays = atoms.arrays
+    name = "masses" if "masses" in arrays else "numbers"
+    return len(arrays["positions"]), atoms.pbc.tobytes(), name, arrays[name].tobytes()
 
 
 def refuse_not_finite(values: FloatArray, what: str) -> None:
@@ -115,16 +108,12 @@ def bind(given: Sequence[Constraint], atoms: Atoms, time: float = 0.0) -> Bindin
     )
     motion = Motion(held, x, time=time)
     touched = touched_atoms(held.constraints)
-    name = "masses" if "masses" in atoms.arrays else "numbers"
     return Binding(
         motion=motion,
         given=held.constraints,
         touched=touched,
-        n_atoms=len(atoms),
-        mass_array=name,
-        masses=atoms.arrays[name].tobytes(),
+        made_for=_read_by_engine(atoms),
         periodic=periodic,
-        pbc=atoms.pbc.tobytes(),
         cell=atoms.cell.array.tobytes(),
         weights=_weights(motion) if len(touched) == len(atoms) else None,
     )
@@ -139,31 +128,22 @@ def holding(item: Any) -> Any:
     return None if isinstance(item, FORCES_ONLY) else pickle.dumps([own.get(name) for name in _HELD])
 
 
-def company(present: Sequence[Any]) -> Company:
-    """Constraints, each with what it holds now."""
+def company(present: Sequence[Any]) -> tuple[tuple[Any, Any], ...]:
+    """Constraints, each with what it holds now; equal as long as they are the same objects and hold the same."""
     return tuple((item, holding(item)) for item in present)
-
-
-def same_company(present: Sequence[Any], known: Company) -> bool:
-    """Whether these are the same constraints, and hold what they held."""
-    if len(present) != len(known):
-        return False
-    for item, (one, held) in zip(present, known, strict=True):
-        if item is not one or ((now := holding(item)) is not held and now != held):
-            return False
-    return True
 
 
 def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
     """Refuse ASE constraints that share atoms with `own`: ASE would apply them one after the other."""
-    if same_company(present, bound.others):
+    now = company(present)
+    if now == bound.others:
         return
     for other in present:
         if other is own or isinstance(other, FORCES_ONLY):
             continue
         if type(other) is ase.constraints.FixCom and all(c.translation_invariant for c in bound.given):
             continue  # a common shift of all atoms changes no row
-        both = np.intersect1d(_acted_on(other, bound.n_atoms), bound.touched)
+        both = np.intersect1d(_acted_on(other, bound.motion.n_atoms), bound.touched)
         if len(both):
             raise UnsupportedError(
                 f"{type(other).__name__} acts on atom {both[0]}, which kcons holds too; ASE would apply the two "
@@ -171,7 +151,7 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
                 "does so for what is on the atoms; for new rows, held = from_ase_constraints(atoms), "
                 "atoms.set_constraint(), constrain(atoms, [*held, *new])"
             )
-    bound.others = company(present)
+    bound.others = now
 
 
 def _acted_on(other: Any, n_atoms: int) -> IntArray:
