@@ -137,7 +137,7 @@ def test_no_time_and_no_times():
     still = body.solve(*hung(SWING), (1, 1))
     np.testing.assert_array_equal(still.q[-1], hung(SWING)[0])
     nothing = body.solve(*hung(SWING), (0, 0.1), [])
-    assert nothing.q.shape == (0, 3) and nothing.multipliers.shape == (0, 2) and nothing.steps > 0
+    assert nothing.q.shape == (0, 3) and nothing.multipliers.shape == (0, 2) and nothing.evaluations > 0
 
 
 # -- the same motion in other coordinates ------------------------------------------------------------
@@ -255,7 +255,7 @@ def test_a_crossing_of_two_ways_is_passed_straight_on():
     body = Multibody(np.ones(3), lambda q, v, t: np.zeros(3), lambda q: np.array([q[2], q[2] - q[0] * q[1]]))
     found = body.solve([-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], (0, 3), **steps_of(0.25))
     np.testing.assert_allclose(found.q[-1], [2.0, 0.0, 0.0], rtol=0, atol=1e-12)
-    assert found.steps > 12
+    assert len(found.t) > 13
     for near in (0.0, 1e-11):  # where rounding alone decides whether something is left of the second row, and beside it
         with pytest.raises(SingularGeometryError, match="only 1 constraints are independent, and 2 at the start"):
             body._place(np.array([0.0, near, 0.0]), 0.0, 2)

@@ -22,6 +22,7 @@ Wilkinson, SIAM Review 18, 578 (1976). Kagstrom and Ruhe, ACM Trans. Math. Softw
 from __future__ import annotations
 
 from enum import Enum
+from itertools import product
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -262,9 +263,9 @@ def _of_unit_length(chain: ComplexArray) -> ComplexArray:
 def _staircase(N: ComplexArray, zero: float) -> tuple[list[int], ComplexArray, ComplexArray, float] | None:
     """Null spaces of a nilpotent matrix and of what is left of it, one after the other.
 
-    Returns the dimensions of them, which never grow, as singular values interlace; W, strictly upper triangular by
-    blocks of these sizes, and the unitary V with V W V^H = N but for what was neglected; and the least singular value
-    that was not taken as zero. None if N is not nilpotent to this accuracy.
+    Their dimensions, which never grow, as singular values interlace; W, strictly upper triangular by blocks of these
+    sizes, and the unitary V with V W V^H = N but for what was neglected; and the least singular value that was not
+    taken as zero. None if N is not nilpotent to this accuracy.
     """
     W, V = N.copy(), np.eye(len(N), dtype=np.complex128)
     widths: list[int] = []
@@ -460,10 +461,9 @@ def find_equilibria(
     if edges.shape != (n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):
         raise InputError(f"the box has shape ({n}, 2), its lower edges first", item="box")
     low, width = edges[:, 0], edges[:, 1] - edges[:, 0]
-    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * n), axis=-1).reshape(-1, n) if n <= 6 else np.zeros((0, n))
-    fixed = np.vstack([np.full((1, n), 0.5), corners])
+    fixed = [[0.5] * n, *(product((0.0, 1.0), repeat=n) if n <= 6 else ())]
     spread = generator_of(rng).random((max(starts - len(fixed), 0), n))
-    points = low + width * np.vstack([fixed, spread])[:starts]
+    points = low + width * np.array([*fixed, *spread])[:starts]
     found: list[FloatArray] = []
     with np.errstate(all="ignore"):
         speeds = [float(np.linalg.norm(flow.velocity(time, p))) for p in points]
