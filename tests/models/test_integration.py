@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.models.integration import METHODS, check_run, integrate, jacobian_by_differences
+from kcons.models.integration import METHODS, check_run, integrate
 
 
 def turn(t, y):
@@ -43,13 +43,6 @@ def test_a_motion_that_is_known_is_taken_as_it_is(end):
     np.testing.assert_array_equal(found.sol(0.9 * end), [0.9 * end, 7.0])
     np.testing.assert_allclose(found.t_events[0], [0.75 * end], rtol=1e-14)
     np.testing.assert_allclose(found.sol(0.2 * end), [np.cos(0.2 * end), np.sin(0.2 * end)], atol=1e-5)
-
-
-def test_differences_of_one_number_and_of_many():
-    X = np.array([0.4, -120.0])
-    found = jacobian_by_differences(lambda t, X: [X[0] * X[1], np.sin(X[0]) + t], 0.5, X)
-    np.testing.assert_allclose(found, [[-120.0, 0.4], [np.cos(0.4), 0.0]], atol=1e-11)
-    np.testing.assert_allclose(jacobian_by_differences(lambda t, X: X @ X, 0.0, X), 2 * X, rtol=1e-9)
 
 
 def run(t_span=(0.0, 1.0), t_eval=None, method="RK45", **sizes):

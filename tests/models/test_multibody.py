@@ -218,9 +218,6 @@ def test_one_place_against_the_theory(rank, singular):
         np.testing.assert_allclose(moved, projection.project_velocities(G, M, v), rtol=0, atol=1e-10)
 
 
-# -- dependent rows ----------------------------------------------------------------------------------
-
-
 # -- what is refused ---------------------------------------------------------------------------------
 
 
@@ -319,7 +316,6 @@ def test_what_ends_a_run_is_told_not_what_was_got_over():
         ({"v": [0.0, np.inf, 0.0]}, "v"),
         ({"v": np.zeros((3, 1))}, "v"),
         ({"rtol": np.nan}, "rtol"),
-        ({"max_step": -1.0}, "max_step"),
     ],
 )
 def test_bad_arguments_are_named(change, item):

@@ -159,10 +159,6 @@ class Logistic(GrowthModel):
             raise InputError(f"x = {x0:g} at t = 0 came from infinity at t = {since:.6g}; give later times", item="t")
         return np.asarray(self.plateau / left)
 
-    def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
-        """dV/dx, shape (1, 1)."""
-        return np.asarray([[self.alpha - 2.0 * self.beta * as_float_array(x, "x")[0]]])
-
 
 class LotkaVolterra(GrowthModel):
     """Prey x_1 and predators x_2 (notes eqs. 69, 70).

@@ -48,12 +48,6 @@ def test_holonomic_row():
         HolonomicRow(product).value(P)
 
 
-def test_moving_target():
-    row = LinearRow([1.0, 2.0, 0.0], lambda t: (3.0 + t, 1.0))
-    assert row.value(P) == pytest.approx(3.5 - 3.3)
-    assert row.rate(P) == 1.0
-
-
 def test_velocity_row():
     row = VelocityRow(lambda t, x: [t, x[0], 1.0], lambda t, x: x[1])
     assert row.gradient(P).tolist() == [0.3, 0.5, 1.0]
