@@ -259,10 +259,9 @@ def joined(operations: Sequence[Op]) -> list[Op]:
 # -- kernels ------------------------------------------------------------------------------------------
 
 _HALVES = """ SYNC_THREADS;
- for (int span = WG/2; span > 0; span /= 2) {
-  if (LOCAL_ID < span) for (int k = 0; k < COUNT*WG; k += WG) shared[LOCAL_ID+k] += shared[LOCAL_ID+k+span];
-  SYNC_THREADS;
- }
+ if (LOCAL_ID < 8) for (int k = 0; k < COUNT*WG; k += WG) for (int j = LOCAL_ID+8; j < WG; j += 8) shared[LOCAL_ID+k] += shared[j+k];
+ SYNC_THREADS;
+ if (LOCAL_ID == 0) for (int k = 0; k < COUNT*WG; k += WG) for (int j = 1; j < min(8, WG); j++) shared[k] += shared[j+k];
 """
 
 
@@ -281,7 +280,7 @@ def _taken(count: int, bank: int) -> str:
     return (
         f" mixed {sums};\n {{mixed {' = 0, '.join(names)} = 0;\n"
         f" for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {{{added}}}\n"
-        f"{_summed(names)}{kept}\n SYNC_THREADS;}}\n"
+        f"{_summed(names)} if (LOCAL_ID == 0) {{{kept}}}}}\n"
     )
 
 

@@ -65,6 +65,11 @@ class ItemWriter:
         """Whether a row is a distance that is held at one length."""
         return self.held.functions[row.function].is_distance and not row.moves
 
+    def _legs(self, row: Row) -> list[dict[int, str]]:
+        """Atoms that share three numbers of a row's gradient, and with which sign: of a distance both."""
+        a = row.atoms
+        return [{a[0]: "-", a[1]: "+"}] if self._plain(row) else [{each: "+"} for each in a]
+
     def _each(self, write: Callable[[int, Row], str]) -> str:
         return "".join(write(k, row) for k, row in enumerate(self.rows))
 
@@ -74,12 +79,11 @@ class ItemWriter:
             kept = f", b{k}[{size}]" if row.how == NEAREST else ""
             return f" mixed r{k}[{size * (1 + row.rolls)}], o{k}[{1 + size}], g{k}[{size}]{kept};\n"
 
-        lengths = self._each(lambda k, r: f" mixed i{k} = 1/{self.targets[k]};\n" if self._plain(r) else "")
         return (
             f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
             f"mixed* d, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
-            f"{self.table.shape[1]};\n{self._each(room)}{lengths} mixed off[{self.count}], sum[{self.count}];\n "
-            f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n"
+            f"{self.table.shape[1]};\n{self._each(room)} mixed off[{self.count}], sum[{self.count}];\n "
+            f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n mixed z;\n"
         )
 
     # -- rows ------------------------------------------------------------------------------------
@@ -119,13 +123,13 @@ class ItemWriter:
             return f"{text} rows_f{row.function}(r{k}, {self.parameters[k]}, {time}, o{k});\n"
         u, t = [f"r{k}[{3 + c}]" for c in range(3)], self.targets[k]
         square = "+".join(f"{each}*{each}" for each in u)
-        lines = [f" o{k}[{1 + c}] = -i{k}*{u[c]}; o{k}[{4 + c}] = i{k}*{u[c]};" for c in range(3)]
-        return f"{text} o{k}[0] = ({square}-{t}*{t})*((mixed) 0.5*i{k});{''.join(lines)}\n"
+        lines = [f" o{k}[{1 + c}] = {u[c]};" for c in range(3)]
+        return f"{text} o{k}[0] = (mixed) 0.5*({square}-{t}*{t});{''.join(lines)}\n"
 
     def _reference(self, time: str) -> str:
         text = ""
         for k, row in enumerate(self.rows):
-            kept = "".join(f" g{k}[{c}] = o{k}[{1 + c}];" for c in range(3 * len(row.atoms)))
+            kept = "".join(f" g{k}[{c}] = o{k}[{1 + c}];" for c in range(3 * len(self._legs(row))))
             text += f"{self._images(k, row)}{self._value(k, row, time, False)}{kept} sum[{k}] = 0;\n"
         return text
 
@@ -139,12 +143,12 @@ class ItemWriter:
 
     def _product(self, k: int, j: int, left: str) -> str:
         """Entry of J: the gradient of row k in `left` times M^-1 that of row j at the start; '' where it is zero."""
-        terms = [
-            f"w[{a}]*({'+'.join(f'{left.format(k, 3 * p + c)}*g{j}[{3 * q + c}]' for c in range(3))})"
-            for p, a in enumerate(self.rows[k].atoms)
-            for q, b in enumerate(self.rows[j].atoms)
-            if a == b
-        ]
+        terms = []
+        for p, one in enumerate(self._legs(self.rows[k])):
+            for q, other in enumerate(self._legs(self.rows[j])):
+                weight = "".join(f"{'+' if one[a] == other[a] else '-'}w[{a}]" for a in one if a in other)
+                along = "+".join(f"{left.format(k, 3 * p + c)}*g{j}[{3 * q + c}]" for c in range(3))
+                terms += [f"({weight})*({along})"] if weight else []
         return "+".join(terms)
 
     def _factored(self, symmetric: bool) -> str:
@@ -184,12 +188,19 @@ class ItemWriter:
             taken = "".join(f"-J[{k * n + j}]*y[{j}]" for j in sorted(self.filled[k]) if j > k)
             lines.append(f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}]; sum[{k}] += y[{k}];\n")
         for k, row in enumerate(self.rows):
-            each = [(3 * a + c, a, 3 * p + c) for p, a in enumerate(row.atoms) for c in range(3)]
-            lines += [f" d[{place}] -= w[{a}]*g{k}[{slot}]*y[{k}];" for place, a, slot in each] + ["\n"]
+            for p, leg in enumerate(self._legs(row)):
+                for c in range(3):
+                    lines.append(f" z = g{k}[{3 * p + c}]*y[{k}];")
+                    lines += [f" d[{3 * a + c}] {'-' if sign == '+' else '+'}= w[{a}]*z;" for a, sign in leg.items()]
+            lines.append("\n")
         return "".join(lines)
 
     def _sums(self, by: str) -> str:
-        return self._each(lambda k, r: f" rows_sums[{self.row_number}+{k}] -= sum[{k}]{by};\n" if r.summed else "")
+        return self._each(lambda k, r: f" rows_sums[{self.row_number}+{k}] -= {self._unit(k, r)}sum[{k}]{by};\n" if r.summed else "")
+
+    def _unit(self, k: int, row: Row) -> str:
+        """What multipliers are to be multiplied by."""
+        return f"{self.targets[k]}*" if self._plain(row) else ""
 
     # -- functions -------------------------------------------------------------------------------
 
@@ -204,7 +215,7 @@ class ItemWriter:
                 rounded = f" a{k} += ROWS_ROUNDING*({size});"
             return (
                 f" mixed t{k} = {'h*' if row.rolls else ''}{goal}, "
-                f"a{k} = tolerance*{self.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''};{rounded}\n"
+                f"a{k} = tolerance*{self._unit(k, row)}{self.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''};{rounded}\n"
             )
 
         def turn(k: int, row: Row) -> str:
@@ -215,7 +226,7 @@ class ItemWriter:
             return f"{text} there = there && fabs(off[{k}]) <= a{k};\n"  # so that NaN fails
 
         def turned(k: int, row: Row) -> str:
-            along = "+".join(f"o{k}[{1 + c}]*g{k}[{c}]" for c in range(3 * len(row.atoms)))
+            along = "+".join(f"o{k}[{1 + c}]*g{k}[{c}]" for c in range(3 * len(self._legs(row))))
             return f" if (!({along} > 0)) bad = {k};\n"
 
         # A row of one particle is met to rounding, by one more iteration.
@@ -239,7 +250,11 @@ class ItemWriter:
             return f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
 
         def speed(k: int, row: Row) -> str:
-            parts = [f"g{k}[{3 * p + c}]*d[{3 * a + c}]" for p, a in enumerate(row.atoms) for c in range(3)]
+            parts = [
+                f"g{k}[{3 * p + c}]*({''.join(f'{sign}d[{3 * a + c}]' for a, sign in leg.items())})"
+                for p, leg in enumerate(self._legs(row))
+                for c in range(3)
+            ]
             return f" off[{k}] = {'+'.join(parts)}-c{k};\n"
 
         return (
