@@ -1,33 +1,140 @@
-"""Small clusters: straight code for a work-item, which has the cluster in registers.
+"""Clusters of rows as C: families as functions, small clusters as straight code, large ones as tables.
 
-Newton's method with J = A(x + d) M^-1 A(x)^T, whose elimination is written out: what stays zero has no code. A distance
-is written as (u.u - t^2)/2t with the gradient u/t, which needs neither root nor division.
+The same text is compiled as OpenCL C, CUDA, HIP and C++; its numbers are `mixed`. A work-item has a small cluster in
+registers: Newton's method with J = A(x + d) M^-1 A(x)^T, whose elimination is written out; what stays zero has no code.
+Distances are held as u.u/2 = t^2/2, which needs neither root nor division. A work-group has a large cluster, with an
+order of elimination by levels (see `clusters.c`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.functions.straight_line import Function, Operand, Tape, record
 from kcons.constraints.target import FloatArray
-from kcons.openmm.device.c_writer import literal
-from kcons.openmm.device.held_rows import IN_CELLS, NEAREST, STORED, Row, Shape
+from kcons.plan.clusters_alike import elimination
 
+#: Rows, atoms of a cluster and atoms of a row up to which a work-item has the cluster in registers.
+ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4
 #: Rows from which a matrix has the precision of forces: registers are then scarce, and residuals are exact still.
 FEW = 4
+#: How rows take their atoms, see `clusters.c`.
+STORED, RELATIVE, NEAREST, IN_CELLS = range(4)
+#: Where a function has no tape.
+REMEDY = ", and is not written in C; leave it to the host (device=False)"
+#: Operations that are operators in C, and functions that have another name there.
+_OPERATORS = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/"}
+_NAMES = {"absolute": "fabs", "power": "pow", "arctan2": "atan2", "arcsin": "asin", "arccos": "acos", "arctan": "atan"}
+
+
+class Array(NamedTuple):
+    """An array of 'mixed' or 'int' numbers, which kernels know by its name, and what it begins with.
+
+    One that is `saved` belongs to a state: checkpoints and States have it.
+    """
+
+    name: str
+    kind: str
+    values: FloatArray | IntArray
+    saved: bool = False
+
+
+# -- families -----------------------------------------------------------------------------------------
+
+
+def literal(number: float) -> str:
+    """A number as C, in the precision of the kernel."""
+    return f"((mixed) {float(number)!r})"
+
+
+def _text(operand: Operand) -> str:
+    if not isinstance(operand, tuple):
+        return literal(operand)
+    name, k = operand
+    return {"k": f"k{k}", "t": "t"}.get(name, f"{name}[{k}]")
+
+
+def _lines(tape: Tape) -> str:
+    lines = []
+    for k, (name, operands) in enumerate(tape.steps):
+        given = [_text(each) for each in operands]
+        if name in _OPERATORS:
+            text = _OPERATORS[name].join(given)
+        else:
+            text = f"-{given[0]}" if name == "negative" else f"{_NAMES.get(name, name)}({', '.join(given)})"
+        lines.append(f" mixed k{k} = {text};\n")
+    return "".join(lines)
+
+
+def c_functions(name: str, function: Function, space: str = "") -> str:
+    """A row as ``void NAME(const mixed* r, GLOBAL const mixed* p, mixed t, mixed* out)``, r and out in a `space`.
+
+    With the time in a formula also its dq/dt, ``NAME_rate``. Raises UnsupportedError where C cannot be written for it.
+    """
+    tape = function.tape(REMEDY)
+    results = "".join(f" out[{k}] = {_text(each)};\n" for k, each in enumerate(tape.results))
+    places = f"{space}const mixed* r, GLOBAL const mixed* p, mixed t"
+    text = f"DEVICE void {name}({places}, {space}mixed* out) {{\n{_lines(tape)}{results}}}\n"
+    if function.rate is not None:
+        rate = record(function.rate, function.known, REMEDY)
+        text += f"DEVICE mixed {name}_rate({places}) {{\n{_lines(rate)} return {_text(rate.results[0])};\n}}\n"
+    return text
+
+
+# -- clusters that look alike -------------------------------------------------------------------------
+
+
+class Row(NamedTuple):
+    """A row of a shape: number of its function, its atoms in the cluster, how it takes them, and what it is."""
+
+    function: int
+    atoms: tuple[int, ...]
+    how: int
+    rolls: bool
+    moves: bool
+    depends: bool
+    summed: bool
+    period: float
+
+
+class Shape(NamedTuple):
+    """Clusters that look alike, whose code or tables are written once: its rows, those that depend on others last.
+
+    `atoms` are their particles, shape (n, n_atoms), `clusters` their rows in the set, (n, n_rows); single atoms have no
+    rows and no `name`, which ends those of functions. The first cluster has the number `first` among those of the name.
+    """
+
+    atoms: IntArray
+    rows: tuple[Row, ...] = ()
+    clusters: IntArray = np.zeros((0, 0), np.int64)
+    name: str = ""
+    first: int = 0
+
+    @property
+    def together(self) -> bool:
+        """Whether a work-group has a cluster; else a work-item."""
+        widest = max((len(row.atoms) for row in self.rows), default=0)
+        return len(self.rows) > ITEM_ROWS or self.atoms.shape[1] > ITEM_ATOMS or widest > ITEM_WIDTH
+
+    @property
+    def n_rows(self) -> int:
+        """Independent rows of a cluster."""
+        return sum(not row.depends for row in self.rows)
+
+
+# -- small ones ---------------------------------------------------------------------------------------
 
 
 class ItemWriter:
-    """The two functions of a shape for a work-item, and what they read of each cluster.
+    """The two functions of a shape for a work-item, and the `table` that they read, (n_clusters, size).
 
-    Attributes
-    ----------
-    table : ndarray, shape (n_clusters, size)
-        Numbers of each cluster; those of the first one begin at `start`, of the present one at ``n``.
+    Its numbers for the first cluster begin at `start`, for the present one at ``n``.
     """
 
     def __init__(self, shape: Shape, held: Any, start: int, first_row: int) -> None:
@@ -57,9 +164,6 @@ class ItemWriter:
             return literal(values[0])
         self.table = np.column_stack([self.table, values])
         return f"n[{self.table.shape[1] - 1}]"
-
-    def text(self) -> str:
-        return self.positions() + self.velocities()
 
     def _plain(self, row: Row) -> bool:
         """Whether a row is a distance that is held at one length."""
@@ -196,10 +300,12 @@ class ItemWriter:
         return "".join(lines)
 
     def _sums(self, by: str) -> str:
-        return self._each(lambda k, r: f" rows_sums[{self.row_number}+{k}] -= {self._unit(k, r)}sum[{k}]{by};\n" if r.summed else "")
+        return self._each(
+            lambda k, r: f" rows_sums[{self.row_number}+{k}] -= {self._unit(k, r)}sum[{k}]{by};\n" if r.summed else ""
+        )
 
     def _unit(self, k: int, row: Row) -> str:
-        """What multipliers are to be multiplied by."""
+        """What residuals are multiplied by, and multipliers are to be."""
         return f"{self.targets[k]}*" if self._plain(row) else ""
 
     # -- functions -------------------------------------------------------------------------------
@@ -213,10 +319,8 @@ class ItemWriter:
             if row.how == STORED:
                 size = "+".join(f"fabs(o{k}[{1 + c}]*r{k}[{c}])" for c in range(3 * len(row.atoms)))
                 rounded = f" a{k} += ROWS_ROUNDING*({size});"
-            return (
-                f" mixed t{k} = {'h*' if row.rolls else ''}{goal}, "
-                f"a{k} = tolerance*{self._unit(k, row)}{self.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''};{rounded}\n"
-            )
+            allowed = f"tolerance*{self._unit(k, row)}{self.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''}"
+            return f" mixed t{k} = {'h*' if row.rolls else ''}{goal}, a{k} = {allowed};{rounded}\n"
 
         def turn(k: int, row: Row) -> str:
             text = self._value(k, row, "time-h/2" if row.rolls else "time", True)
@@ -227,14 +331,18 @@ class ItemWriter:
 
         def turned(k: int, row: Row) -> str:
             along = "+".join(f"o{k}[{1 + c}]*g{k}[{c}]" for c in range(3 * len(self._legs(row))))
-            return f" if (!({along} > 0)) bad = {k};\n"
+            return f" if (!({along} > 0)) {told(k, row)}\n"
+
+        def told(k: int, row: Row) -> str:
+            return f"{{bad = {k}; miss = off[{k}]{f'/{self.targets[k]}' if self._plain(row) else ''};}}"
 
         # A row of one particle is met to rounding, by one more iteration.
         first, stop, then = (", last = 0", "there && last", " last = there;") if self.single else ("", "there", "")
-        missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};")
-        fail = f"{{FAIL({self.row_number}+bad, off[bad]); return;}}\n"
+        missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) {told(k, row)}")
+        fail = f"{{FAIL({self.row_number}+bad, miss); return;}}\n"
         return (
-            f"{self._begin('positions', 'h')}{self._reference('time-h')}{self._each(start)} int bad = -1{first};\n"
+            f"{self._begin('positions', 'h')}{self._reference('time-h')}{self._each(start)}"
+            f" int bad = -1{first};\n mixed miss = 0;\n"
             f" for (int turn = 0;; turn++) {{\n int there = 1;\n{self._each(turn)} if ({stop}) break;{then}\n"
             f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored(False)}{self._solved()} }}\n"
             f"{self._each(turned)} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
@@ -262,3 +370,116 @@ class ItemWriter:
             f"{self._factored(True)} for (int pass = 0; pass < {1 + self.coarse}; pass++) {{\n"
             f"{self._each(speed)}{self._solved()} }}\n if (rate != 0) {{{self._sums('')} }}\n}}\n"
         )
+
+
+# -- large ones ---------------------------------------------------------------------------------------
+
+
+def large_clusters(shapes: list[Shape], held: Any, first_row: int) -> tuple[list[Array], IntArray, list[Shape], str]:
+    """The clusters of all large shapes in one set of tables.
+
+    Also rows of the set in their order, shapes with the numbers of their first clusters, and the two functions as C.
+    """
+    numbered: list[Shape] = []
+    rows: list[int] = []
+    kinds: list[Row] = []
+    levels: list[int] = []
+    #: Of each row the atoms and the later rows that it is coupled to, among those of all clusters.
+    atoms: list[IntArray] = []
+    later: list[IntArray] = []
+    doubtful: list[bool] = []
+    clusters = [(0, 0, 0)]
+    for shape in shapes:
+        numbered.append(shape._replace(name="large", first=len(clusters) - 1))
+        order = elimination([row.atoms for row in shape.rows], {k for k, r in enumerate(shape.rows) if r.depends})
+        # Where rows may depend on others any pivot may vanish: not all of them are marked in large clusters.
+        doubtful += [bool(held.doubtful[shape.clusters].any())] * shape.clusters.size
+        for cluster in shape.clusters:
+            first, first_atom, _ = clusters[-1]
+            kinds += [shape.rows[k] for k in order.rows]
+            atoms += [np.array(row.atoms) + first_atom for row in kinds[first:]]
+            later += [some + first for some in order.later]
+            levels += (order.levels[:-1] + first).tolist()
+            rows += cluster[order.rows].tolist()
+            clusters.append((len(rows), first_atom + shape.atoms.shape[1], len(levels)))
+    count, n_atoms, _ = clusters[-1]
+    slot_atom, slot_row = np.concatenate(atoms), np.repeat(np.arange(count), [len(some) for some in atoms])
+    touch = np.argsort(slot_atom, kind="stable")
+    # Entries row by row, the diagonal first; their keys grow.
+    entry_row = np.repeat(np.arange(count), [1 + len(some) for some in later])
+    entry_column = np.concatenate([[k, *some] for k, some in enumerate(later)])
+    diagonal = np.searchsorted(entry_row, np.arange(count + 1))
+    key = entry_row * count + entry_column
+    product = np.concatenate([_pairs(some) for some in np.split(touch, np.flatnonzero(np.diff(slot_atom[touch])) + 1)])
+    product_key = slot_row[product] @ [count, 1]
+    both = np.concatenate([_pairs(np.arange(*ends)) for ends in zip(diagonal[:-1] + 1, diagonal[1:], strict=True)])
+    update_key = entry_column[both] @ [count, 1]
+    update = np.column_stack([both, entry_row[both[:, 0]]])
+    earlier = np.flatnonzero(entry_row < entry_column)
+    earlier = earlier[np.argsort(entry_column[earlier], kind="stable")]
+    sizes = [len(held.parameters[row]) for row in rows]
+    flags = [row.rolls + 2 * doubt + 4 * row.summed for row, doubt in zip(kinds, doubtful, strict=True)]
+    moves = np.array([row.moves for row in kinds])
+    columns: list[Any] = [
+        [*(row.function for row in kinds), 0],
+        np.searchsorted(slot_row, np.arange(count + 1)),
+        np.cumsum([0, *sizes]),
+        [*(row.how for row in kinds), 0],
+        diagonal,
+        np.searchsorted(entry_column[earlier], np.arange(count + 1)),
+        [*flags, 0],
+        [*np.where(moves, held.mover[rows], -1), 0],
+        [*held.cell[rows], 0],
+    ]
+    base = np.repeat([first_atom for _, first_atom, _ in clusters[:-1]], np.diff([first for first, _, _ in clusters]))
+    tables: dict[str, Any] = {
+        "cluster": clusters,
+        "row": np.stack(columns, axis=1),
+        "slot": np.stack([slot_atom - base[slot_row], slot_row], axis=1),
+        "level": [*levels, count],
+        "entry": np.stack(
+            [
+                [*entry_row, 0],
+                [*entry_column, 0],
+                [*np.searchsorted(np.sort(product_key), key), len(product)],
+                [*np.searchsorted(np.sort(update_key), key), len(update)],
+            ],
+            axis=1,
+        ),
+        "product": product[np.argsort(product_key, kind="stable")],
+        "update": update[np.argsort(update_key, kind="stable")],
+        "earlier": earlier,
+        "atom": np.searchsorted(slot_atom[touch], np.arange(n_atoms + 1)),
+        "touch": touch,
+    }
+    arrays = [Array(f"rows_{name}", "int", np.ravel(table)) for name, table in tables.items()]
+    arrays = [array if array.values.size else array._replace(values=np.zeros(1)) for array in arrays]
+    periods = [row.period for row in kinds]
+    numbers = np.stack([held.target[rows], held.scale[rows], periods], axis=1)
+    parameters = np.concatenate([*(held.parameters[row] for row in rows), np.zeros(1)])
+    arrays += [Array("rows_number", "mixed", numbers.ravel()), Array("rows_parameter", "mixed", parameters)]
+    slots, entries = len(slot_row), len(entry_row)
+    rooms = {"place": 9 * slots, "now": 3 * slots + count, "there": 3 * slots + count}
+    rooms |= {"upper": entries, "lower": entries} | dict.fromkeys(("pivot", "off", "answer", "sum"), count)
+    arrays += [Array(f"rows_{name}", "mixed", np.zeros(size)) for name, size in rooms.items()]
+    source = _source(sorted({row.function for row in kinds}), held, first_row)
+    return arrays, np.array(rows), numbered, source
+
+
+def _source(used: list[int], held: Any, first_row: int) -> str:
+    functions = "".join(c_functions(f"rows_g{f}", held.functions[f], "GLOBAL ") for f in used)
+    cases = "".join(f" case {f}: rows_g{f}(r, p, t, out); break;\n" for f in used)
+    timed = [f for f in used if held.functions[f].rate is not None]
+    rates = "".join(f" if (f == {f}) return rows_g{f}_rate(r, p, t);\n" for f in timed)
+    return (
+        f"{functions}DEVICE void rows_function(int f, GLOBAL const mixed* r, GLOBAL const mixed* p, mixed t, "
+        f"GLOBAL mixed* out) {{\n switch (f) {{\n{cases} }}\n}}\n"
+        f"DEVICE mixed rows_drift(int f, GLOBAL const mixed* r, GLOBAL const mixed* p, mixed t) {{\n{rates}"
+        f" return 0;\n}}\n#define ROWS_FIRST_LARGE {first_row}\n"
+        f"{Path(__file__).with_name('clusters.c').read_text()}"
+    )
+
+
+def _pairs(some: IntArray) -> IntArray:
+    """All pairs of numbers in a list, each with itself and those after it, shape (n, 2)."""
+    return np.stack([some[side] for side in np.triu_indices(len(some))], axis=1)
