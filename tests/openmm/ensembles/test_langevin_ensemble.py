@@ -194,6 +194,6 @@ def test_a_force_that_gets_another_group_in_a_run_is_noticed_at_the_next_check()
     integrator.step(5)
     kept = state_of(context)
     context.getSystem().getForces()[0].setForceGroup(7)
-    with pytest.raises(InputError, match="CustomExternalForce is in force group 7.*back at step 5"):
+    with pytest.raises(InputError, match=r"CustomExternalForce is in force group 7.*back at step 5"):
         integrator.step(5)
     np.testing.assert_array_equal(state_of(context), kept)
