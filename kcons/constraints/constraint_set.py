@@ -23,6 +23,8 @@ from kcons.constraints.target import FloatArray, MovingTarget, nearest_image
 from kcons.constraints.vectors import extent, norm
 from kcons.errors import ImageError, InputError, KconsError
 
+#: Parts of the cell at which a link that nothing holds is taken to have reached half of it.
+_HALF = 0.5 - 1e-9
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
 MOST_STRAIN = 0.1
 
@@ -431,17 +433,13 @@ class ConstraintSet:
         (longest, row), half = self._longest_plain, self.half_width
         tied = 0.0 if self.images is None else self.images.longest
         if max(longest, tied) >= half:
-            found = longest >= half
+            what, item = f"a distance of {tied:g} that ties atoms", "cell"
+            if longest >= half:
+                what, item = f"row {self.row_name(row)}: target {longest:g}", "target"
             raise InputError(
-                (
-                    f"row {self.row_name(row)}: target {longest:g}"
-                    if found
-                    else f"a distance of {tied:g} that ties atoms"
-                )
-                + f" is not shorter than half the box ({half:g}), and its minimum image is ambiguous; use a larger "
+                f"{what} is not shorter than half the box ({half:g}), and its minimum image is ambiguous; use a larger "
                 "cell, or make a new ConstraintSet in this one",
-                item="target" if found else "cell",
-                atoms=self.row_atoms(row) if found else (),
+                item=item,
             )
 
     @property
@@ -459,11 +457,14 @@ class ConstraintSet:
         """
         if self.images is None or self.lattice is None:
             return
-        link = self.images.reached_half(whole, self.lattice)
-        if link >= 0:
-            pair = np.array([self.images.parents[link], self.images.atoms[link]])
-            row = int(self.images.unheld[link])
-            raise self._image_error(row, pair, numbers)
+        links = np.flatnonzero(self.images.unheld >= 0)
+        if not len(links):
+            return
+        pairs = np.stack([self.images.parents[links], self.images.atoms[links]])
+        reached = np.abs((whole[pairs[1]] - whole[pairs[0]]) @ self.lattice[1]).max(axis=1)
+        worst = int(np.argmax(reached))
+        if reached[worst] >= _HALF:
+            raise self._image_error(int(self.images.unheld[links[worst]]), pairs[:, worst], numbers)
 
     def _image_error(self, row: int, pair: IntArray, numbers: IntArray | None) -> ImageError:
         """The error for two atoms of a row that have drifted half the cell apart."""

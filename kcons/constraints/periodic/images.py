@@ -42,8 +42,6 @@ ALL_PAIRS_WIDTH = 12
 BOND_LIKE = 1.5
 #: Part of half the cell from which a held distance is followed along the tree: off its row it may be longer than half.
 NEARLY = 0.9
-#: Parts of the cell at which an unheld link is taken to have reached half of it.
-_HALF = 0.5 - 1e-9
 
 
 @dataclass(frozen=True)
@@ -79,15 +77,6 @@ class Images:
         step = x[self.atoms] - x_ref[self.atoms]
         cells = np.round((y_ref - x_ref)[self.atoms] @ lattice[1]) - np.round(step @ lattice[1])
         return cells @ lattice[0]
-
-    def reached_half(self, y: FloatArray, lattice: FloatArray) -> int:
-        """An unheld link, as an index into `atoms`, that is as long as half the cell in positions made whole; or -1."""
-        links = np.flatnonzero(self.unheld >= 0)
-        if not len(links):
-            return -1
-        parts = np.abs((y[self.atoms[links]] - y[self.parents[links]]) @ lattice[1]).max(axis=1)
-        worst = int(np.argmax(parts))
-        return int(links[worst]) if parts[worst] >= _HALF else -1
 
     def among(self, atoms: IntArray, rows: IntArray) -> Images | None:
         """The part of the tree between `atoms` and between rows `rows`, both sorted, by their places among these.
