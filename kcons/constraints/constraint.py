@@ -218,13 +218,7 @@ class Constraint:
         return out.T
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        """q, shape (n_rows,), and dq/dr, shape (n_rows, width, 3); of velocity rows 0 and the coefficients of v.
-
-        Parameters
-        ----------
-        r : ndarray, shape (n_rows, width, 3)
-        time : float
-        """
+        """q, shape (n_rows,), and dq/dr, of the shape of `r`, (n_rows, width, 3); of velocity rows 0 and a."""
         with np.errstate(all="ignore"):  # either may be undefined where the other is not
             out = self._evaluated(r, time)
         return out[0], np.ascontiguousarray(out[1:].T).reshape(r.shape)

@@ -60,20 +60,9 @@ class BottDuffinSolution(NamedTuple):
 def pseudo_inverse(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> PseudoInverse:
     """A+, through the singular values of the row-normalized matrix (notes eqs. 154-158).
 
-    The rank is found on rows of unit length, so that it does not depend on the units of the rows. With V
-    an orthonormal basis of the row space, A = (A V) V^H is a full-rank factorisation and A+ = V (A V)+.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (s, n)
-        Real or complex.
-    rtol : float
-        Singular values below this part of the largest count as zero.
-
-    Raises
-    ------
-    InputError
-        No matrix, or a NaN or infinity in it.
+    The rank is found on rows of unit length, so that it does not depend on the units of the rows: singular values
+    below `rtol` of the largest count as zero. With V an orthonormal basis of the row space, A = (A V) V^H is a
+    full-rank factorisation and A+ = V (A V)+.
     """
     A = _matrix(matrix)
     V = row_space(A, rtol)
@@ -175,13 +164,7 @@ def is_solvable(
 def require_solvable(
     matrix: ArrayLike, b: ArrayLike, tolerance: float = SOLVABILITY_TOLERANCE, rtol: float = RANK_TOLERANCE
 ) -> None:
-    """Refuse rows that contradict each other.
-
-    Raises
-    ------
-    ContradictionError
-        If A A+ b differs from b (notes eq. 95); it names the rows that are off.
-    """
+    """Raise `ContradictionError`, which names the rows that are off, where A A+ b differs from b (notes eq. 95)."""
     miss = _unsolved(matrix, b, tolerance, rtol)
     if not miss.any():
         return

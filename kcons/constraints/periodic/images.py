@@ -48,19 +48,14 @@ NEARLY = 0.9
 class Images:
     """The tree along which the atoms of whole rows, and all atoms tied to them, are made whole.
 
-    Attributes
-    ----------
-    atoms, parents : ndarray of int, shape (k,)
-        Parents come before their children; a root is its own parent and keeps the image it is stored in.
-    unheld : ndarray of int, shape (k,)
-        For unheld links the row they come from, -1 for others.
-    longest : float
-        The longest of the other links.
+    Parents come before their children; a root is its own parent and keeps the image it is stored in.
     """
 
     atoms: IntArray
     parents: IntArray
+    #: For unheld links the row they come from, -1 for others.
     unheld: IntArray
+    #: The longest of the other links.
     longest: float = 0.0
 
     def make_whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
@@ -113,16 +108,10 @@ def find_images(
     time: float,
     ties: Sequence[Constraint] = (),
 ) -> tuple[list[Constraint], Images | None]:
-    """Sort rows into plain and whole ones and find the tree.
+    """Copies that know which of their rows are whole, with their cell_offsets; and the tree, None if all are plain.
 
     Targets may still be missing; `starts` are the first rows, `ties` what the constraints replace: rows that are held
-    still and tie atoms together. Gives copies that know which of their rows are whole, with their cell_offsets, and the
-    tree, None if all rows are plain.
-
-    Raises
-    ------
-    InputError
-        A link of the tree as long as half the cell: its image is ambiguous.
+    still and tie atoms together. A link of the tree as long as half the cell is refused: its image is ambiguous.
     """
     given = [item.changed(whole=None, cell_offsets=None) for item in constraints]
     if lattice is None:
@@ -321,13 +310,7 @@ def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: flo
 def _tree(
     tables: Sequence[_Links], given: Sequence[Constraint], x: FloatArray, lattice: FloatArray, half_width: float
 ) -> tuple[Images, FloatArray, IntArray]:
-    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component.
-
-    Raises
-    ------
-    InputError
-        A link that is needed is as long as half the cell.
-    """
+    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component."""
     from scipy.sparse.csgraph import minimum_spanning_tree  # slow to import
 
     n_atoms = len(x)
