@@ -151,6 +151,7 @@ class Constraint:
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
         self.atoms: IntArray = read_only(atom_table(atoms, type(self).__name__, self.row_width))
+        target = 0.0 if target is None and not self.holonomic else target
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
         self._keep(**data)
         self._settle()
@@ -279,8 +280,9 @@ class Constraint:
         return target
 
     def parameters(self) -> FloatArray:
-        """Numbers for the compiled kernels, shape (n_rows, p); see `RowKind`."""
-        return np.zeros((self.n_rows, 0))
+        """Numbers for `row` and the compiled kernels, shape (n_rows, p): the width, where `alike`, and the data."""
+        data = [getattr(self, name).reshape(self.n_rows, -1) for name in self.per_row]
+        return np.hstack([np.full((self.n_rows, min(self.alike, 1)), float(self.width)), *data])
 
     @property
     def linked(self) -> IntArray:
@@ -331,6 +333,11 @@ class Constraint:
             if item:
                 raise InputError(message, item=item, atoms=atoms)
             raise SingularGeometryError(message, rows=[first_row + k], atoms=atoms)
+
+    def refuse_zero(self, coefficients: FloatArray) -> None:
+        """Refuse rows whose coefficients, shape (n_rows, width, 3), are all zero."""
+        zero = ~np.any(coefficients, axis=(1, 2))
+        self.refuse(zero, 0, lambda k: f"all coefficients of row {k} are zero; remove the row", "coefficients")
 
     def changed(self, **own: Any) -> Self:
         """Copy with other attributes, of which nothing is checked."""
