@@ -134,7 +134,6 @@ MUTANTS = {
     ],
     "constraints/periodic/images.py": [
         ("«| (self.item.kind == RowKind.LINEAR)→»", "images::atoms_in_any_image_are_held_as_whole_ones"),
-        ("_HALF = 0.«5 - 1e-9→6»", "images::atoms_that_nothing_ties_raise_before_their_image_flips"),
         (
             "cells = «np.round((y_ref - x_ref)[self.atoms] @ lattice[1]) - →-»np.round(step @ lattice[1])",
             "images::atoms_in_any_image_are_held_as_whole_ones",
@@ -154,6 +153,7 @@ MUTANTS = {
         ),
     ],
     "constraints/constraint_set.py": [
+        ("_HALF = 0.«5 - 1e-9→6»", "images::atoms_that_nothing_ties_raise_before_their_image_flips"),
         ("np.maximum(1e-«10→8» * self.scale, 8 * np.finfo(float)", "certificate::what_is_allowed_scales_with_rounding"),
         ("self.masses = «read_only(m)→m»", "constraint_set::masses_cannot_be_changed"),
         ("«read_only(self.masses)→pass»  # a copy", "constraint_set::masses_cannot_be_changed"),
