@@ -306,14 +306,14 @@ class Scan:
             shown.add_column(f"{name}\n{unit}", justify="right")
         for heading in ("energy\nkJ/mol", "hysteresis\nkJ/mol", "calls\n", "force left\neV/angstrom"):
             shown.add_column(heading, justify="right")
-        for point, row in zip(self.grid.points, self.rows(), strict=True):
-            turns = zip(self.grid.shown(point), self.grid.in_degrees, strict=True)
-            cells = [f"{v:.2f}" if turn else f"{v:.4f}" for v, turn in turns]
-            cells += [f"{row['energy_kJ_mol']:.3f}", f"{row['hysteresis_kJ_mol']:.3f}", str(row["calls"])]
-            cells.append(f"{row['force_left_eV_A']:.4f}")
-            if row["error"]:
-                cells[-4:] = "failed", "", str(row["calls"]), ""
-            shown.add_row(*cells)
+        for row in self.rows():
+            *values, _, energy, spread, calls, left, error = row.values()
+            numbers = (
+                ("failed", "", f"{calls}", "")
+                if error
+                else (f"{energy:.3f}", f"{spread:.3f}", f"{calls}", f"{left:.4f}")
+            )
+            shown.add_row(*(f"{value:.6g}" for value in values), *numbers)
         return shown
 
     def plot(self) -> Figure:
