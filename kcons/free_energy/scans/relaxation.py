@@ -236,11 +236,7 @@ class Descent:
     def relaxed(self, x: FloatArray, fmax: float, most: int = 200) -> Relaxed:
         """Follow the forces on the constraints to a minimum of the energy, by at most so many evaluations.
 
-        Raises
-        ------
-        ConvergenceError
-            Too many evaluations, or forces that are not the gradient of the energy; `error.positions` is the last
-            place.
+        `ConvergenceError` of too many, or of forces that are not the gradient; `error.positions` is the last place.
         """
         try:
             with np.errstate(all="ignore"):

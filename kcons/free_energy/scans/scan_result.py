@@ -44,21 +44,6 @@ class Grid:
     """All combinations of the values of one or two coordinates, in angstrom or radian, up or down.
 
     Of dihedrals over a whole turn the last value, which is the first one again, is left out.
-
-    Attributes
-    ----------
-    coordinates : list of Constraint
-    values : list of ndarray
-    rings : list of bool
-        Whether the first value of a coordinate follows on its last.
-    names, keys : list of str
-        'Dihedral(0, 1, 2, 3)'; without blanks, for files, 'dihedral_0_1_2_3'.
-    in_degrees : list of bool
-        Which coordinates are angles, shown in degrees.
-    units : list of str
-        Of the values as they are shown; formulas and functions have their own.
-    shape : tuple of int
-    points : list of tuple of int
     """
 
     def __init__(self, coordinates: Sequence[Constraint], values: Sequence[ArrayLike]) -> None:
@@ -76,8 +61,10 @@ class Grid:
             if item.moving or not item.holonomic:
                 raise UnsupportedError(f"{item!r} moves with time or holds velocities; scan a coordinate of positions")
         made = [_axis(item, given) for item, given in zip(self.coordinates, values, strict=True)]
+        #: Arrays; and whether the first value of a coordinate follows on its last.
         self.values, self.rings = [axis for axis, _ in made], [ring for _, ring in made]
         self.names = [item.row_name(0) for item in self.coordinates]
+        # Without blanks, for files: 'dihedral_0_1_2_3'.
         keys = ["_".join([item.family.lower(), *map(str, item.atoms[0].tolist()[:6])]) for item in self.coordinates]
         self.keys = [key + (f"_{n}" if key in keys[:n] else "") for n, key in enumerate(keys)]
         self.in_degrees = [item.held == ANGLE for item in self.coordinates]
