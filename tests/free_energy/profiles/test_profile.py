@@ -34,12 +34,6 @@ CASES = {
         math.pi,
         2 * math.pi,
     ),
-    "Morse": Case(
-        lambda r: 50 * (1 - np.exp(-2 * (r - 1))) ** 2,
-        lambda r: 200 * (1 - np.exp(-2 * (r - 1))) * np.exp(-2 * (r - 1)),
-        0.7,
-        4.0,
-    ),
 }
 
 
@@ -60,32 +54,18 @@ def off(profile, case):
 @pytest.mark.parametrize(
     ("name", "n", "error"), [("Lennard-Jones", 20, 0.3), ("double well", 9, 0.4), ("torsion", 14, 1.0)]
 )
-def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error):
+@pytest.mark.parametrize(
+    ("seeds", "low", "high", "covered"),
+    [(6, 0.4, 1.6, 0.85), pytest.param(100, 0.81, 1.32, 0.9, marks=pytest.mark.validation)],
+    ids=["few", "many"],
+)
+def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error, seeds, low, high, covered):
     """Few windows: what lies between them counts as well. 30 differences; their mean square has a standard deviation
     of 0.26 if they are independent."""
     case = CASES[name]
-    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(6)])
-    assert 0.4 < (away**2).mean() < 1.6
-    assert (np.abs(away) < 1.96).mean() >= 0.85
-
-
-@pytest.mark.validation
-@pytest.mark.parametrize(
-    ("name", "n", "error"),
-    [
-        ("Lennard-Jones", 20, 0.3),
-        ("Lennard-Jones", 40, 0.5),
-        ("double well", 9, 0.4),
-        ("torsion", 14, 1.0),
-        ("Morse", 12, 0.5),
-    ],
-)
-def test_bands_over_many_sets_of_noise(name, n, error):
-    """What docs/free_energy.md says of them."""
-    case = CASES[name]
-    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(100)])
-    assert 0.9 < math.sqrt((away**2).mean()) < 1.15
-    assert 0.9 < (np.abs(away) < 1.96).mean() < 0.98
+    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(seeds)])
+    assert low < (away**2).mean() < high
+    assert covered <= (np.abs(away) < 1.96).mean() <= (1.0 if seeds < 100 else 0.98)
 
 
 @pytest.mark.parametrize(
