@@ -201,12 +201,12 @@ def repair_elements(atoms: Atoms) -> int:
     return changed
 
 
-def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0, *, water: bool = False) -> int:
+def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0) -> int:
     """Give hydrogens more mass, in place, and take it from the heavy atoms that they are bonded to; how many have it.
 
     This slows the angles of hydrogens, so that with their bonds held steps may be 4 fs; averages of configurations stay
-    as they are. The same as OpenMM's ``hydrogenMass``. A second call with the same mass changes nothing. Momenta stay:
-    draw velocities afterwards.
+    as they are. The same as OpenMM's ``hydrogenMass``: water stays as it is. A second call with the same mass changes
+    nothing. Momenta stay: draw velocities afterwards.
 
     Parameters
     ----------
@@ -214,8 +214,6 @@ def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0, *, water: bool = 
         Bonds are the pairs in ``atoms.info['bonds']``; without them they are guessed.
     mass : float
         Of each hydrogen that is bonded to a heavy atom, in dalton.
-    water : bool
-        Whether to change water as well, which rigid water does not need.
 
     Raises
     ------
@@ -228,8 +226,7 @@ def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0, *, water: bool = 
     pairs = bonds[light[bonds].sum(axis=1) == 1]
     pairs = np.where(light[pairs[:, :1]], pairs, pairs[:, ::-1])  # hydrogen, heavy
     count, among = (np.bincount(end, minlength=len(atoms)) for end in (bonds.ravel(), pairs[:, 1]))
-    if not water:
-        pairs = pairs[~((atoms.numbers == 8) & (count == 2) & (among == 2))[pairs[:, 1]]]
+    pairs = pairs[~((atoms.numbers == 8) & (count == 2) & (among == 2))[pairs[:, 1]]]
     # Of a bridge, from the first of its heavy atoms.
     pairs = pairs[np.unique(pairs[:, 0], return_index=True)[1]]
     masses = atoms.get_masses()
