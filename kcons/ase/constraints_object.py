@@ -164,8 +164,9 @@ class Constraints(FixConstraint):
         if changed:
             accepted.refuse_taken_along(motion, old, cell)
         found = accepted.ask(motion.constraint_set, old, x)
-        frame = found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched)
-        if not frame:
+        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched):
+            motion.project_positions(x, accepted.asked, out=x)
+        else:
             try:
                 if changed or found & ELSEWHERE:
                     accepted.look(motion, old, cell, elsewhere=True)
@@ -173,13 +174,9 @@ class Constraints(FixConstraint):
                 motion.project_positions(x, old, out=x)
             except (ConvergenceError, InputError, UnsupportedError) as error:
                 refuse_not_finite(x, "position")
-                frame = fulfilled(motion.constraint_set, x, bound.touched)
-                if not frame:
-                    if isinstance(error, ConvergenceError):
-                        error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
-                    raise
-        if frame:
-            motion.project_positions(x, accepted.asked, out=x)
+                if isinstance(error, ConvergenceError):
+                    error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
+                raise
         if self._positions_due <= 0:
             try:
                 motion.certify(x)
