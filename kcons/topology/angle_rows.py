@@ -47,22 +47,12 @@ _AS_GOOD = 1 - 1e-6
 
 
 def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -> tuple[IntArray, IntArray]:
-    """Angles and dihedrals that hold all angles between bonds that are held.
+    """Angles, shape (n, 3), and dihedrals, shape (m, 4), that hold all angles between bonds that are held.
 
-    Parameters
-    ----------
-    snapshot : Snapshot
-    bonds : ndarray of int, shape (n_bonds, 2)
-        Sorted, each once; those within rigid groups too.
-    rigid : sequence of ndarray, shape (n_bodies, n_atoms)
-        Groups that are held rigid. Rows within one are not needed, and may be among those returned.
-
-    Returns
-    -------
-    triples : ndarray of int, shape (n_angles, 3)
-        With the vertex in the middle, sorted by vertex and ends. Beyond `STRAIGHT`, it is the only row of an end.
-    quads : ndarray of int, shape (n_dihedrals, 4)
-        Impropers a-j-b-c of an atom j with its neighbors, and dihedrals of flat rings.
+    `bonds` are sorted, each once, those within rigid groups too. Rows within one of the groups `rigid`, arrays of shape
+    (n_bodies, n_atoms), are not needed, and may be among those returned. Angles have the vertex in the middle and are
+    sorted by vertex and ends; one beyond `STRAIGHT` is the only row of an end. Dihedrals are impropers a-j-b-c of an
+    atom j with its neighbors, and those of flat rings.
     """
     n = snapshot.topology.n_atoms
     of_bond, systems = ring_systems(bonds, n)
@@ -170,14 +160,10 @@ def _third(
 
 
 def ring_systems(bonds: IntArray, n_atoms: int) -> tuple[IntArray, list[list[IntArray]]]:
-    """Rings that share bonds: the shortest ring through each bond, up to `LARGEST` atoms; `bonds` sorted, each once.
+    """The system of rings of each bond, -1 for none, shape (n_bonds,), and the rings of each system.
 
-    Returns
-    -------
-    of_bond : ndarray of int, shape (n_bonds,)
-        The system each bond belongs to, -1 for bonds in no small ring.
-    rings : list of list of ndarray of int
-        The rings of each system: their atoms, one after the other.
+    Rings that share bonds are one system. There is the shortest ring through each bond, up to `LARGEST` atoms, given by
+    its atoms, one after the other; `bonds` are sorted, each once.
     """
     of_bond = np.full(len(bonds), -1)
     keep = _without_ends(bonds, n_atoms)
@@ -210,20 +196,10 @@ def ring_rows(
     rings: Sequence[IntArray],
     rigid: Sequence[IntArray],
 ) -> tuple[IntArray, IntArray]:
-    """Which angles and dihedrals hold one ring system whose bonds are held.
+    """Which angles, shape (n, 3), and dihedrals, shape (m, 4), hold one ring system whose bonds are held.
 
-    Parameters
-    ----------
-    bonds, triples, impropers : ndarray of int
-        Those within the system: its bonds, its angles, impropers at its flat centers.
-    rings : sequence of ndarray of int
-        Its rings, whose dihedrals are candidates where they are flat.
-    rigid : sequence of ndarray, shape (n_bodies, n_atoms)
-        Groups that are held rigid: rows within one are not returned.
-
-    Returns
-    -------
-    triples, quads : ndarray of int, shapes (n, 3) and (n, 4)
+    Bonds, angles and impropers at flat centers are those within the system; dihedrals of flat rings are candidates,
+    too. Rows within one of the groups `rigid` are left out.
     """
     if len(np.unique(bonds)) > LARGE_SYSTEM:
         return triples, impropers

@@ -123,16 +123,9 @@ class VirtualSites:
 
 @dataclass(frozen=True, eq=False)
 class Waters:
-    """Rigid waters of a system.
+    """Rigid waters of a system: oxygen and hydrogens, and massless sites."""
 
-    Attributes
-    ----------
-    triples : ndarray of int, shape (n, 3)
-        Oxygen and hydrogens.
-    sites : VirtualSites
-    """
-
-    triples: IntArray
+    triples: IntArray  # shape (n, 3)
     sites: VirtualSites
 
     def among(self, atoms: BoolArray) -> Waters:
@@ -158,24 +151,12 @@ def find_waters(
     model_site: float = 0.0,
     geometry: tuple[float, float] | None = None,
 ) -> Waters:
-    """Waters by residue name and composition: one oxygen, two hydrogens, massless sites.
+    """Waters by residue name (in capitals) and composition: one oxygen, two hydrogens, massless sites.
 
-    Waters of one oxygen alone, as in crystal structures, are left out.
-
-    Parameters
-    ----------
-    names : frozenset of str
-        Residue names, in capitals.
-    model_site : float
-        Length O-M in angstrom where the geometry was given by name; 0 takes the sites where they are.
-    geometry : tuple of float, optional
-        O-H length in angstrom and H-O-H angle in degrees at which the waters are held; None as they are.
-
-    Raises
-    ------
-    InputError
-        A residue that is called water and is composed otherwise; it is named. Sites that are not at their water, or
-        whose water has no plane.
+    Waters of one oxygen alone, as in crystal structures, are left out. `model_site` is the length O-M in angstrom of a
+    geometry that was given by name, 0 takes the sites where they are; `geometry` is the O-H length and the H-O-H angle
+    in degrees at which the waters are held, None as they are. Refused, with its name, is a residue that is called water
+    and is composed otherwise; so are sites that are not at their water, or whose water has no plane.
     """
     topology = snapshot.topology
     kinds, kind = np.unique(topology.residue_names, return_inverse=True)
@@ -284,12 +265,9 @@ def residue_bodies(snapshot: Snapshot, names: Sequence[str]) -> list[IntArray]:
 
 
 def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]) -> list[IntArray]:
-    """Checked lists of atoms, grouped by their size.
+    """Lists of atoms, grouped by their size.
 
-    Raises
-    ------
-    InputError
-        Atoms that do not exist or come twice; bodies of one atom.
+    Refused are atoms that do not exist or come twice, and bodies of one atom.
     """
     by_size: dict[int, list[IntArray]] = {}
     for k, body in enumerate(bodies):
@@ -305,17 +283,8 @@ def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]
 def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint]:
     """Rows that hold every group rigid: distances between bases, and relations for all other atoms.
 
-    Bodies that are linear or planar up to `FLAT` are held exactly so; positions may be off by that much.
-
-    Parameters
-    ----------
-    groups : sequence of ndarray, shape (n_bodies, n_atoms)
-        Bodies of one size each.
-
-    Raises
-    ------
-    SingularGeometryError
-        Two atoms of a body at one point.
+    Groups are arrays of shape (n_bodies, n_atoms), bodies of one size each. Those that are linear or planar up to
+    `FLAT` are held exactly so; positions may be off by that much. Two atoms of a body at one point are refused.
     """
     pairs: list[IntArray] = []
     lengths: list[FloatArray] = []
