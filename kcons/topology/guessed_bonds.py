@@ -98,10 +98,8 @@ def reaches(snapshot: Snapshot, bonds: IntArray) -> tuple[FloatArray, FloatArray
 
 def _radii(elements: NDArray[np.str_]) -> FloatArray:
     """Covalent radii in angstrom, 0 where an element forms no bonds."""
-    radius = np.zeros(len(elements))
-    for symbol, value in RADII.items():
-        radius[elements == symbol] = value
-    return radius
+    kinds, kind = np.unique(elements, return_inverse=True)
+    return np.array([RADII.get(symbol, 0.0) for symbol in kinds.tolist()])[kind]
 
 
 def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: IntArray, able: BoolArray) -> IntArray:

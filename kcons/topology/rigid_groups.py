@@ -299,7 +299,12 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint
         center = r.mean(axis=1, keepdims=True)
         _, s, axes = np.linalg.svd(r - center, full_matrices=False)
         dimension = 1 + (s[:, 1:3] > FLAT * s[:, :1]).sum(axis=1) if n > 2 else np.ones(len(atoms), np.int64)
-        _refuse_coincident(snapshot, atoms, s)
+        points = np.flatnonzero(s[:, 0] < 1e-6 * snapshot.angstrom)
+        if len(points):
+            body, name = atoms[points[0]].tolist(), snapshot.topology.atom_name
+            raise SingularGeometryError(
+                f"the atoms of a rigid body coincide: {name(body[0])} and {name(body[1])}; give positions", atoms=body
+            )
         for d in np.unique(dimension).tolist():
             these = np.flatnonzero(dimension == d)
             if d == 3 and n > LARGE:
@@ -335,8 +340,10 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint
             tied[d + 1].append((named.ravel(), bases_of, np.swapaxes(w, 1, 2).reshape(-1, d + 1)))
     rows: list[Constraint] = []
     if pairs:
-        joined, first = _each_once(np.concatenate(pairs))
-        rows.append(Distance(joined, np.concatenate(lengths)[first]))
+        joined = np.sort(np.concatenate(pairs), axis=1)
+        # Each once, in the order in which they came.
+        first = np.sort(np.unique(joined @ [int(joined.max()) + 1, 1], return_index=True)[1])
+        rows.append(Distance(joined[first], np.concatenate(lengths)[first]))
     for parts in tied.values():
         if parts:
             rows.append(LinearRelation(*(np.concatenate([part[k] for part in parts]) for k in range(3))))
@@ -420,26 +427,6 @@ def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:
 def _farthest(distance: FloatArray) -> IntArray:
     """The first atom as far as the farthest, up to rounding: the same choice whatever the unit of length."""
     return np.argmax(distance >= _AS_GOOD * distance.max(axis=1, keepdims=True), axis=1).astype(np.int64)
-
-
-def _each_once(pairs: IntArray) -> tuple[IntArray, IntArray]:
-    """Pairs sorted within and listed once, in their order, and where they came first."""
-    ordered = np.sort(pairs, axis=1)
-    code = ordered[:, 0] * (int(ordered.max()) + 1) + ordered[:, 1]
-    _, first = np.unique(code, return_index=True)
-    first = np.sort(first)
-    return ordered[first], first
-
-
-def _refuse_coincident(snapshot: Snapshot, atoms: IntArray, s: FloatArray) -> None:
-    points = np.flatnonzero(s[:, 0] < 1e-6 * snapshot.angstrom)
-    if len(points):
-        body = atoms[points[0]]
-        raise SingularGeometryError(
-            f"the atoms of a rigid body coincide: {snapshot.topology.atom_name(int(body[0]))} and "
-            f"{snapshot.topology.atom_name(int(body[1]))}; give positions",
-            atoms=body.tolist(),
-        )
 
 
 def body_numbers(n_atoms: int, groups: Sequence[IntArray]) -> Iterator[IntArray]:
