@@ -60,7 +60,7 @@ def by_methods() -> Iterator[tuple[str, Trail]]:
         options = {"forces": {"water": "ase", "ethanol": "emt"}[name]} if name in ("water", "ethanol") else {}
         system = test_systems.build(name, SIZES.get(name), **options)
         for method in METHODS.values():
-            if method.refuses(system) is None and (method.engine == "arrays" or "kcons" in method.title):
+            if method.refusal(system) is None and (method.engine == "arrays" or "kcons" in method.title):
                 setting = 1e-11 if method.adaptive else method.settings(system)[-1]
                 moving = method.start(system, setting)
                 moving.advance()
