@@ -25,7 +25,6 @@ class LinearRows(Constraint, base=True):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
     kind = RowKind.LINEAR
-    held_in_place = True
     coefficients: FloatArray
 
     def _settle(self) -> None:
@@ -33,7 +32,7 @@ class LinearRows(Constraint, base=True):
         self.translation_invariant = bool(
             self.width > 1 and np.all(np.abs(c.sum(axis=1)) <= 1e-12 * np.abs(c).sum(axis=1).max(initial=0.0))
         )
-        self.refuse_input(
+        self.refuse(
             ~np.any(c, axis=(1, 2)),
             0,
             lambda k: f"all coefficients of row {k} are zero; remove the row",

@@ -67,7 +67,7 @@ class LinearVelocity(VelocityRows):
         super().__init__(atoms, target, coefficients=coefficients)
 
     def _settle(self) -> None:
-        self.refuse_input(
+        self.refuse(
             ~np.any(self.coefficients, axis=(1, 2)),
             0,
             lambda k: f"all coefficients of row {k} are zero; remove the row",
@@ -150,7 +150,11 @@ class KnifeEdge(VelocityRows):
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         d = r[:, 1] - r[:, 0]
-        _refuse_short(self, norm(np.cross(d, self.normal)), norm(d), "the blade is normal to its plane", first_row)
+        self.refuse(
+            ~(norm(np.cross(d, self.normal)) > 1e-7 * norm(d)),
+            first_row,
+            lambda k: "the blade is normal to its plane, so its direction is undefined; move the atoms",
+        )
 
 
 class Rolling(VelocityRows):
@@ -224,8 +228,11 @@ class Rolling(VelocityRows):
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         s = r[:, 1] - r[:, 0]
-        in_wheel = np.hypot(dot(s, self.normal), dot(s, self.heading))
-        _refuse_short(self, in_wheel, norm(s), "the rim atom lies on the axle of the wheel", first_row)
+        self.refuse(
+            ~(np.hypot(dot(s, self.normal), dot(s, self.heading)) > 1e-7 * norm(s)),
+            first_row,
+            lambda k: "the rim atom lies on the axle of the wheel, so its direction is undefined; move the atoms",
+        )
 
 
 def _pairs(first: ArrayLike, second: ArrayLike, family: str) -> ArrayLike:
@@ -233,11 +240,3 @@ def _pairs(first: ArrayLike, second: ArrayLike, family: str) -> ArrayLike:
     if a.shape != b.shape or a.ndim != 1:
         raise InputError(f"{family}: {a.shape} and {b.shape} atoms are given; give one pair a row", item="atoms")
     return np.stack([a, b], axis=1)
-
-
-def _refuse_short(item: Constraint, part: FloatArray, whole: FloatArray, what: str, first_row: int) -> None:
-    item.refuse_singular(
-        ~(part > 1e-7 * whole),
-        first_row,
-        lambda k, row: f"{row}: {what}, so its direction is undefined; move the atoms",
-    )

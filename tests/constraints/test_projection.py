@@ -155,7 +155,7 @@ def test_complex_matrices(rows: int, columns: int, rank: int) -> None:
     np.testing.assert_allclose(U @ projection.general_solution(U, b, y), b, atol=1e-12)
     np.testing.assert_allclose(projection.general_solution(U, b, X @ b + along @ y), X @ b + along @ y, atol=1e-12)
     if rank < rows:
-        W = projection.column_space(U)
+        W = projection.row_space(U.conj().T)
         assert not projection.is_solvable(U, b + 1j * (np.eye(rows) - W @ W.conj().T) @ rng.normal(size=rows))
 
 

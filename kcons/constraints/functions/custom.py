@@ -126,7 +126,7 @@ class Custom(PythonRows):
 
     functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function")
     kind = RowKind.FUNCTION
-    singular = "{row}: value and gradient must be finite, and the gradient not zero; move the atoms"
+    singular = "value and gradient must be finite, and the gradient not zero; move the atoms"
 
     def __init__(
         self,
@@ -180,12 +180,6 @@ class Custom(PythonRows):
         slope = np.dot(_DIFFERENCE, nearest_image(values - values[0], self.period).reshape(4, -1))
         return np.ascontiguousarray((slope.reshape(-1, len(r)) / step).T).reshape(r.shape)
 
-    def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
-        """Differenced change of the value along a direction of unit length."""
-        return first_derivative_4(
-            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step, self.period
-        )
-
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         speed, start, length = np.sqrt(_contract(v, v)), np.zeros(self.n_rows), self._length(r)
         along = v / np.where(speed > 0, speed, 1.0)[:, None, None]
@@ -227,13 +221,18 @@ class Custom(PythonRows):
         size = np.sqrt(_contract(slope, slope))
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
-        found, finer = (self._slope(r, along, step * length, time) for step in (1e-3, 0.5e-3))
+
+        def at(s: FloatArray) -> FloatArray:
+            return self.measure(r + s[:, None, None] * along, time)
+
+        steps, start = (1e-3 * length, 0.5e-3 * length), np.zeros(self.n_rows)
+        found, finer = (first_derivative_4(at, start, step, self.period) for step in steps)
         if self.gradient_function is None:
-            self.refuse_singular(
+            self.refuse(
                 ~(np.abs(finer - found) <= WRONG * size),
                 first_row,
-                lambda k, row: (
-                    f"{row}: differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
+                lambda k: (
+                    f"differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
                     f"gradient, {found[k]:.3g} and {finer[k]:.3g}: it vanishes, or the function varies faster. "
                     "Move the atoms, give the length over which it varies (length=...), or its gradient"
                 ),
@@ -250,7 +249,7 @@ class Custom(PythonRows):
             )
 
         wrong = ~(np.abs(_contract(slope, along) - found) <= WRONG * size)
-        self.refuse_input(wrong, first_row, worst, "gradient")
+        self.refuse(wrong, first_row, worst, "gradient")
 
 
 class ImplicitSurface(Custom):
@@ -349,7 +348,7 @@ class CustomVelocity(PythonRows, VelocityRows):
         Differences are taken at steps of at most 1e-3 `length`, and, with `time_dependent`, of `time_step`.
     """
 
-    singular = "{row}: the coefficients are zero or not finite; move the atoms"
+    singular = "the coefficients are zero or not finite; move the atoms"
     functions: ClassVar[tuple[str, ...]] = ("coefficients",)
 
     def __init__(
@@ -384,18 +383,13 @@ class CustomVelocity(PythonRows, VelocityRows):
         return np.asarray(self._checked(found, "coefficients", (self.width, 3), k))
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        bent = [self._changes(k, r[k], v[k], time) for k in range(self.n_rows)]
-        return _contract(np.array(bent).reshape(v.shape), v)
-
-    def _changes(self, k: int, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        """Rate of the coefficients of row `k` along v."""
-        speed = float(np.sqrt(np.sum(v * v)))
+        speed = float(np.sqrt(_contract(v, v).max(initial=0.0)))
         if speed == 0:
-            return np.zeros_like(r)
+            return np.zeros(self.n_rows)
         step = 1e-3 * self.length / speed
         if self.time_dependent:
             step = exact_step(min(step, self.time_step), time)
-        return first_derivative_4(lambda s: self.row_gradient(k, r + s * v, time + s), 0.0, step)
+        return first_derivative_4(lambda s: _contract(self.gradient(r + s * v, time + s), v), 0.0, step)
 
 
 @cache

@@ -26,7 +26,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from kcons.constraints.functions.straight_line import ELEMENTARY, Operand, Tape, differentiated
+from kcons.constraints.functions.straight_line import Operand, Tape, differentiated
 from kcons.errors import InputError, UnsupportedError
 
 #: Characters of a formula, and levels of its tree (a sum of n terms has n).
@@ -272,16 +272,19 @@ def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bo
     rng = np.random.default_rng(0)
     r, faster, p = (rng.normal(size=(size, 40, 2)) @ [1.0, 1.0j] for size in (2 * n, 2 * n, parameters + 1))
     signs = rng.choice([-1.0, 1.0], (len(tape.steps), 40))
-    text = _function("found", tape, [_text(each) for each in tape.results[:-1]])
 
     def looked(places: Any) -> Any:
-        some = iter(signs)
-        known: dict[str, Any] = {name: getattr(np, name) for name in (*ELEMENTARY, "inf", "nan")}
-        made: dict[str, Any] = {}
-        exec(text, known | {"copysign": lambda _, x: next(some)}, made)
-        out = np.empty((len(tape.results) - 1, 40), complex)
-        made["found"](places, p, p[-1], out)
-        return out
+        some, done = iter(signs), list[Any]()
+        known: dict[str, Any] = {"r": places, "p": p, "t": p[-1:], "k": done}
+        own: dict[str, Any] = {"absolute": lambda x: next(some) * x, "copysign": lambda _, x: next(some)}
+        own["arctan2"] = lambda a, b: np.arctan(a / b)
+
+        def number(operand: Operand) -> Any:
+            return known[operand[0]][operand[1]] if isinstance(operand, tuple) else np.float64(operand)
+
+        for name, operands in tape.steps:
+            done.append((own.get(name) or getattr(np, name))(*map(number, operands)))
+        return np.array([np.broadcast_to(number(each), 40) for each in tape.results[:-1]])
 
     with np.errstate(all="ignore"):
         value, *slopes = looked(r)

@@ -20,8 +20,11 @@ MUTANTS = {
         ("if not (accelerated() «or→and» is_built()):", "device_integrator::which_steps_are_made_on_the_device"),
     ],
     "plan/clusters_alike.py": [
-        ("key=lambda k: («k in last, →»k)", "rows::levels_have_rows_that_share_no_entry"),
-        ("= «max(level[min(mine)], level[place] + 1)→level[place] + 1»", "rows::levels_have_rows_that_share_no_entry"),
+        (
+            "if k not in beside and not «(k in last and coupled[k] - last)→False»",
+            "rows::levels_have_rows_that_share_no_entry",
+        ),
+        ("if «k not in beside→True» and not", "rows::levels_have_rows_that_share_no_entry"),
     ],
     "openmm/device/clusters.py": [
         ('"there« && last→»"', "surfaces_on_the_device::the_device_holds_the_same_surfaces"),
