@@ -56,8 +56,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
 
 
 def _list(given: InputFile) -> int:
-    """Say what would be run. Coordinates are looked at, calculators are not."""
-    given.sampler.begin()
+    """Say what would be run. Coordinates have been looked at, calculators are not."""
     sides = 2 if given.options.get("both_sides", True) else 1
     parts = {name: getattr(given.settings, name) for name in ("pull", "equilibration", "production")}
     told = ", ".join(f"{name} {steps:,}" for name, steps in parts.items())

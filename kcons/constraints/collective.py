@@ -68,7 +68,6 @@ class CenterOfMass(MassWeighted, LinearRows):
     kind = RowKind.LINEAR
     translation_invariant = False
     positive = ""
-    held_in_place = True
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"directions": (3,)}
     directions: FloatArray
 

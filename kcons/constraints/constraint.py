@@ -118,8 +118,6 @@ class Constraint:
     reversible: ClassVar[bool] = False
     #: Whether rows fix all of an atom, three rows each, so that it moves as with infinite mass.
     fixes_atoms: ClassVar[bool] = False
-    #: Whether the target is a position, so that replicas of the atoms take theirs from where they are.
-    held_in_place: ClassVar[bool] = False
 
     #: What its numbers are in, where it was given Quantities; None for any consistent units.
     units: str | None = None

@@ -25,7 +25,6 @@ class LinearRows(Constraint, base=True):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
     kind = RowKind.LINEAR
-    held_in_place = True
     coefficients: FloatArray
 
     def _settle(self) -> None:

@@ -7,17 +7,15 @@ ones, g being the statistical inefficiency (from `kcons.thermostats.correlated_s
 
 from __future__ import annotations
 
-import logging
 import warnings
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from kcons.constraints.arguments import FloatArray, as_float_array
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, spread
 
 #: Fewest values that an error is taken from.
@@ -50,28 +48,6 @@ class Mean:
     n: int
     n_effective: float
     inefficiency: FloatArray
-
-
-def pymbar() -> ModuleType:
-    """The package pymbar, imported when it is needed.
-
-    Raises
-    ------
-    UnsupportedError
-        It is not installed.
-    """
-    # It logs general advice when it is imported, some of it through the logger of a module.
-    loud = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        import pymbar
-    except ModuleNotFoundError:
-        raise UnsupportedError(
-            "BAR is left to pymbar, which is not installed: python -m pip install 'kcons[free-energy]'"
-        ) from None
-    finally:
-        logging.disable(loud)
-    return pymbar  # type: ignore[no-any-return]
 
 
 def finite(values: ArrayLike, item: str, row: str = "sample") -> FloatArray:

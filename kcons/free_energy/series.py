@@ -142,25 +142,30 @@ class Series:
 class Collector:
     """Configurations of one cell that wait to be looked at together, which costs a tenth of one after another."""
 
-    def __init__(self, coordinates: HeldCoordinates, series: Series) -> None:
-        self.coordinates, self.series = coordinates, series
+    def __init__(self, coordinates: HeldCoordinates) -> None:
+        self.coordinates, self._series = coordinates, Series(coordinates.names, coordinates.periods)
         self._waiting: list[tuple[FloatArray, FloatArray, FloatArray, float]] = []
 
     def add(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float) -> None:
         """Positions, velocities and applied forces at a time; arrays are copied."""
         x, v, f = (np.array(array, dtype=np.float64) for array in (x, v, f))
         self._waiting.append((x, v, f, time))
-        if len(self._waiting) == min(AT_ONCE, 1 + _ATOMS // len(self._waiting[0][0])):
+        if len(self._waiting) == min(AT_ONCE, 1 + _ATOMS // len(x)):
             self.look()
 
     def look(self) -> None:
         """Put samples of all that waits into the series."""
         waiting, self._waiting = self._waiting, []
         for sample in self.coordinates.samples(*zip(*waiting, strict=True)) if waiting else ():
-            self.series.append(sample)
+            self._series.append(sample)
+
+    @property
+    def series(self) -> Series:
+        self.look()
+        return self._series
 
 
-class Recorder:
+class Recorder(Collector):
     """An observer of `kcons.run` that keeps a `Series`.
 
     Parameters
@@ -177,18 +182,13 @@ class Recorder:
     """
 
     def __init__(self, system: System, coordinates: HeldCoordinates) -> None:
-        self.system, self.coordinates = system, coordinates
-        self._collector = Collector(coordinates, Series(coordinates.names, coordinates.periods))
+        super().__init__(coordinates)
+        self.system = system
 
     def __call__(self, state: State) -> None:
         x, v, forces = self.system.kernel_arrays(state)  # in the cell of the state
         if forces is None:
             forces = self.system.forces(x, v, state.time, state.step)
-        self._collector.add(x, v, forces, state.time)
+        self.add(x, v, forces, state.time)
         if self.system.motion.lattice is not None:  # the next may be in another cell
-            self._collector.look()
-
-    @property
-    def series(self) -> Series:
-        self._collector.look()
-        return self._collector.series
+            self.look()

@@ -54,6 +54,7 @@ FLAT = 2e-3
 LARGE = 50
 #: Among how many atoms nearby three are looked for, and what volume of three unit vectors is enough.
 _NEAR, _ENOUGH = 12, 0.2
+_TRIPLES = np.array(list(combinations(range(_NEAR + 4), 3)))
 #: Waters whose plane is told by less than this are none: |u x w| over the square of the longer arm.
 _LINE = 1e-3
 #: Bases are the first atoms that are this close to the best.
@@ -400,48 +401,40 @@ def _braced(x: FloatArray) -> IntArray:
 
     n = len(x)
     order = np.argsort(np.linalg.norm(x - x[np.argmin(np.linalg.norm(x - x.mean(axis=0), axis=1))], axis=1))
-    first = _first_four(x, order)
+    first = np.append(order[0], _three(x, order[0], iter((order[1:_NEAR], order[_spread(n)[1:]]))))
     order = np.concatenate([first, order[~np.isin(order, first)]])
     place = np.empty(n, np.int64)
     place[order] = np.arange(n)
-    near = cKDTree(x).query(x, min(n, 3 * _NEAR))[1]
-    pairs = [(int(first[i]), int(first[j])) for i in range(4) for j in range(i)]
-    triples = np.array(list(combinations(range(_NEAR + 4), 3)))
-    for k in range(4, n):
-        atom = order[k]
-        known = near[atom][place[near[atom]] < k][:_NEAR]
-        best, volume = _widest(x, atom, known, triples)
-        if volume < _ENOUGH:
-            # A flat or lonely place: look at a few atoms at all distances, and at those that span space.
-            placed = order[:k][np.argsort(np.linalg.norm(x[order[:k]] - x[atom], axis=1))]
-            some = np.unique(np.geomspace(1, k, _NEAR).astype(np.int64)) - 1
-            wider, other = _widest(x, atom, np.unique(np.concatenate([placed[some], first])), triples)
-            best = wider if other > volume else best
-        pairs += [(int(atom), int(base)) for base in best]
-    return np.array(pairs)
+    near = cKDTree(x).query(x, 3 * _NEAR)[1]
+
+    def before(k: int) -> Iterator[IntArray]:
+        """Atoms nearby, and for a flat or lonely place a few at all distances, and those that span space."""
+        yield near[order[k]][place[near[order[k]]] < k][:_NEAR]
+        placed = order[:k][np.argsort(np.linalg.norm(x[order[:k]] - x[order[k]], axis=1))]
+        yield np.unique(np.concatenate([placed[_spread(k)], first]))
+
+    bases = [(order[k], base) for k in range(4, n) for base in _three(x, order[k], before(k))]
+    return np.array([*combinations(first, 2), *bases])
 
 
-def _widest(x: FloatArray, atom: int, known: IntArray, triples: IntArray) -> tuple[IntArray, float]:
-    """The three of `known` that `atom` sees farthest from a plane, and the volume of their directions."""
-    choices = triples[triples[:, 2] < len(known)]
-    if not len(choices):
-        return known[:0], 0.0
-    sight = x[known] - x[atom]
-    sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
-    volume = np.abs(np.linalg.det(sight[choices]))
-    best = int(np.argmax(volume >= _AS_GOOD * volume.max()))
-    return known[choices[best]], float(volume[best])
+def _spread(n: int) -> IntArray:
+    """Numbers below n, dense at 0."""
+    return np.unique(np.geomspace(1, n, _NEAR).astype(np.int64)) - 1
 
 
-def _first_four(x: FloatArray, order: IntArray) -> IntArray:
-    """The first of `order`, and three of the atoms nearest to it that span space well."""
-    nearest = order[: max(_NEAR, 4)]
-    rest = np.array(list(combinations(range(1, len(nearest)), 3)))
-    for several in (nearest, order[np.unique(np.geomspace(1, len(order), len(nearest)).astype(np.int64)) - 1]):
-        best, volume = _widest(x, int(several[0]), several[1:], rest[rest[:, 2] < len(several)] - 1)
-        if volume >= _ENOUGH:
+def _three(x: FloatArray, atom: int, choices: Iterator[IntArray]) -> IntArray:
+    """The three atoms that `atom` sees farthest from a plane, of the first choice where that is far enough."""
+    best, largest = np.zeros(0, np.int64), -1.0
+    for known in choices:
+        sight = x[known] - x[atom]
+        triples = _TRIPLES[_TRIPLES[:, 2] < len(known)]
+        volume = np.abs(np.linalg.det((sight / np.linalg.norm(sight, axis=1, keepdims=True))[triples]))
+        if volume.max(initial=-1.0) > largest:
+            largest = volume.max()
+            best = known[triples[np.argmax(volume >= _AS_GOOD * largest)]]
+        if largest >= _ENOUGH:
             break
-    return np.concatenate([several[:1], best])
+    return best
 
 
 def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:

@@ -41,9 +41,8 @@ class Fake:
     angles: tuple[bool, ...] = (True,)
     kJ: float = 1.0
     scales: np.ndarray = field(default_factory=lambda: np.ones(1))
-
-    def begin(self):
-        return np.zeros(1), np.full(1, 2 * np.pi)
+    start: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    periods: np.ndarray = field(default_factory=lambda: np.full(1, 2 * np.pi))
 
     def sample(self, window, settings, file):
         with Path(self.diary).open("a") as diary:

@@ -79,12 +79,6 @@ class Axis:
         return integral(place) - integral(0.0) + turns[:, None] * turn, spline(place) / self.length
 
 
-def difference(values: FloatArray, covariance: FloatArray) -> Estimate:
-    """Of the second value from the first."""
-    variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
-    return Estimate(float(values[1] - values[0]), math.sqrt(max(float(variance), 0.0)))
-
-
 def inside(x: ArrayLike, low: FloatArray, high: FloatArray, periods: Sequence[float | None], item: str) -> FloatArray:
     """Places (m, d) within the range of the windows; into it by periods where there is one.
 
@@ -262,6 +256,16 @@ class Learned:
     def __init__(self, best: GradientProcess, others: Sequence[GradientProcess], weights: FloatArray) -> None:
         #: Of the most likely hyperparameters; others, and weights of these whose sum is 1.
         self.best, self.others, self.weights = best, others, weights
+
+    def differences(self, x: FloatArray, zero: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Free energies at places (n, d) against that at `zero` (d,), and their covariance."""
+        F, c = self.posterior((np.vstack([x, zero]), [-1]))
+        return F[:-1] - F[-1], c[:-1, :-1] - c[:-1, -1:] - c[-1:, :-1] + c[-1, -1]
+
+    def difference(self, a: FloatArray, b: FloatArray) -> Estimate:
+        """F(b) - F(a) of two places (d,)."""
+        (F,), ((variance,),) = self.differences(b[None], a)
+        return Estimate(float(F), math.sqrt(max(float(variance), 0.0)))
 
     def closed(self) -> Learned:
         """The same without constant slopes."""

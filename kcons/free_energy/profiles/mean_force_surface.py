@@ -21,7 +21,7 @@ from kcons.constraints.arguments import FloatArray, as_float_array, positive
 from kcons.constraints.target import nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
-from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, difference, inside, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, inside, learn
 from kcons.thermostats import Estimate
 
 #: Sizes of the field that is no gradient, relative to the gradient, among which the most likely one is looked for.
@@ -70,9 +70,8 @@ class Surface:
         F, variance = np.zeros(len(places)), np.zeros(len(places))
         for k in range(0, len(places), _TOGETHER):
             part = slice(k, k + _TOGETHER)
-            values, covariance = self._process.posterior((np.vstack([places[part], self.zero]), [-1]))
-            F[part] = values[:-1] - values[-1]
-            variance[part] = np.diag(covariance)[:-1] - 2 * covariance[:-1, -1] + covariance[-1, -1]
+            F[part], covariance = self._process.differences(places[part], self.zero)
+            variance[part] = np.diag(covariance)
         return F, np.sqrt(np.maximum(variance, 0.0))
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
@@ -80,7 +79,7 @@ class Surface:
         ends = [as_float_array(place, item) for place, item in ((a, "a"), (b, "b"))]
         if any(end.shape != self.low.shape for end in ends):
             raise InputError(f"a and b must be places of {len(self.low)} coordinates", item="a")
-        return difference(*self._process.posterior((self._places(np.stack(ends)), [-1])))
+        return self._process.difference(*self._places(np.stack(ends)))
 
     def minima(self) -> list[Minimum]:
         """Minima inside of the range, lowest first; each is what a search from some window comes to."""
@@ -146,12 +145,9 @@ def fit_surface(
         The mean forces are not the gradient of any free energy.
     """
     places, forces, covariances, turns = _checked(x, f, errors, periods)
-    d = places.shape[1]
-    low = places.min(axis=0)
-    high = np.array(
-        [top if p is None else start + p for top, start, p in zip(places.max(axis=0), low, turns, strict=True)]
-    )
-    axes = [Axis(float(a), float(b - a), p is not None) for a, b, p in zip(low, high, turns, strict=True)]
+    d, low = places.shape[1], places.min(axis=0)
+    lengths = np.array([spread if p is None else p for spread, p in zip(np.ptp(places, axis=0), turns, strict=True)])
+    axes = [Axis(float(a), float(b), p is not None) for a, b, p in zip(low, lengths, turns, strict=True)]
     process = learn(places, forces, covariances, axes, [p is None for p in turns])
     if d > 1:
         _warn_of_rotation(process.best)
@@ -161,7 +157,7 @@ def fit_surface(
         lowest = as_float_array(zero, "zero")
         if lowest.shape != (d,) or not np.isfinite(lowest).all():
             raise InputError(f"zero must be {d} finite numbers", item="zero")
-    surface = Surface(places, forces, low, high, turns, lowest, process)
+    surface = Surface(places, forces, low, low + lengths, turns, lowest, process)
     surface._places(lowest[None])
     return surface
 
@@ -200,15 +196,11 @@ def _checked(
     bad = np.flatnonzero((sizes[:, 0] < -1e-9 * np.abs(sizes[:, -1])) | (skew > 1e-9 * np.abs(sizes).max(axis=1)))
     if len(bad):
         raise InputError(f"the covariance of window {bad[0]} is not symmetric and positive", item="errors")
-    turns = (None,) * d if periods is None else tuple(periods)
+    turns = tuple(None if p is None else positive(p, "periods") for p in ((None,) * d if periods is None else periods))
     if len(turns) != d:
         raise InputError(f"periods must be {d} positive numbers or None", item="periods")
-    turns = tuple(None if p is None else positive(p, "periods") for p in turns)
-    for j, period in enumerate(turns):
-        spread = float(np.ptp(places[:, j]))
-        reason = "" if spread > 0 else "all windows are at one value of"
-        if period is not None and spread > period * (1 + 1e-9):
-            reason = "windows are further apart than the period in"
-        if reason:
+    for j, (spread, period) in enumerate(zip(np.ptp(places, axis=0), turns, strict=True)):
+        if spread == 0 or (period is not None and spread > period * (1 + 1e-9)):
+            reason = "windows are further apart than the period in" if spread else "all windows are at one value of"
             raise InputError(f"{reason} coordinate {j}; check the units, or leave it out", item="x")
     return places, forces, covariances, turns

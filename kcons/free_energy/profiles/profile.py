@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import FloatArray, checked, positive, whole_number
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
-from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, inside, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, Learned, inside, learn
 from kcons.thermostats import Estimate
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Profile:
     def difference(self, a: float, b: float) -> Estimate:
         """F(b) - F(a) with its standard error."""
         ends = inside([[a], [b]], self.x[:1], self.x[-1:], [self.period], "ends of the difference")
-        return difference(*self._process.posterior((ends, [-1])))
+        return self._process.difference(*ends)
 
     def lower_than(self, energy: float) -> NDArray[np.bool_]:
         """At which places of the profile F is at most so much above its lowest value."""
@@ -165,7 +165,7 @@ def integrate(
     axis = Axis(low, high - low, period is not None, _COEFFICIENTS if len(places) >= _MANY else 1)
     process, closure = learn(places[:, None], forces[:, None], errors[:, None, None] ** 2, [axis], [True]), None
     if period is not None:
-        closure = difference(*process.posterior((np.array([[low], [high]]), [-1])))
+        closure = process.difference(np.array([low]), np.array([high]))
         if abs(closure.value) > _CLOSES * closure.error and abs(closure.value) > 1e-9 * period * np.abs(forces).max():
             warnings.warn(
                 f"the mean force has the integral {closure.value:.4g} ± {closure.error:.2g} over the period, which "
@@ -177,11 +177,9 @@ def integrate(
     grid = np.linspace(low, high, _POINTS)
     if zero is None:
         zero = float(grid[np.argmin(process.mean(grid[:, None], [-1])[0])])
-    at = np.append(grid[:, None], inside([[zero]], grid[:1], grid[-1:], [period], "zero"), axis=0)
-    F, covariance = process.posterior((at, [-1]))
-    less = covariance[:-1, :-1] - covariance[:-1, -1:] - covariance[-1:, :-1] + covariance[-1, -1]
-    error = np.sqrt(np.maximum(np.diag(less), 0.0))
-    return Profile(grid, F[:-1] - F[-1], error, less, zero, places, forces, errors, period, closure, process)
+    F, covariance = process.differences(grid[:, None], inside([[zero]], grid[:1], grid[-1:], [period], "zero")[0])
+    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Profile(grid, F, error, covariance, zero, places, forces, errors, period, closure, process)
 
 
 def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> list[FloatArray]:

@@ -12,6 +12,7 @@ which `Windows.pull` adds.
 
 from __future__ import annotations
 
+import logging
 import math
 import warnings
 from dataclasses import dataclass
@@ -21,8 +22,8 @@ from numpy.typing import ArrayLike
 from scipy.special import expit, logsumexp
 
 from kcons.constraints.arguments import FloatArray, positive
-from kcons.errors import InputError
-from kcons.free_energy.averages import finite, pymbar
+from kcons.errors import InputError, UnsupportedError
+from kcons.free_energy.averages import finite
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT, Estimate
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
@@ -126,7 +127,17 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike | None = None, *, t
 def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
     """Difference and its error, over kT. Works without a spread, where pymbar finds no bounds, are the difference."""
     if max(np.ptp(ahead), np.ptp(back)) > _NO_SPREAD:
-        found = pymbar().bar(ahead, back)
+        loud = logging.root.manager.disable
+        logging.disable(logging.WARNING)  # general advice at its import
+        try:
+            import pymbar
+        except ModuleNotFoundError:
+            raise UnsupportedError(
+                "BAR is left to pymbar, which is not installed: python -m pip install 'kcons[free-energy]'"
+            ) from None
+        finally:
+            logging.disable(loud)
+        found = pymbar.bar(ahead, back)
         return float(found["Delta_f"]), float(found["dDelta_f"])
     lost = float(ahead.mean() + back.mean())
     if abs(lost) > _NO_SPREAD:

@@ -7,9 +7,10 @@ with the distances of the atoms. No bonds need to be known, and weak contacts ha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
@@ -68,23 +69,22 @@ class Internals:
         ]
         turns = np.array(quads, dtype=np.int64).reshape(-1, 4)
         turns = turns[self._sines(x, turns[:, 1:]) >= STRAIGHT]
-        self._straight = table[sine < STRAIGHT]
+        straight = table[sine < STRAIGHT]
         self._families: list[Constraint] = [Distance(pairs), Angle(bent), Dihedral(turns)]
-        self._periods = np.repeat([0.0, 2 * np.pi, 0.0], [len(pairs) + len(bent), len(turns), 2 * len(self._straight)])
+        self._periods = np.repeat([0.0, 2 * np.pi, 0.0], [len(pairs) + len(bent), len(turns), 2 * len(straight)])
         # From now on each term keeps its images: in a small cell, others may come as near.
-        tables = [*(item.atoms for item in self._families), self._straight]
-        self._images = [lined_up(x[atoms], lattice) - x[atoms] for atoms in tables]
+        self._tables = [*(item.atoms for item in self._families), straight]
+        self._images = [lined_up(x[atoms], lattice) - x[atoms] for atoms in self._tables]
         self._frames = self._sideways(x)
-        energy = units.Hartree
-        stretch = STRETCH * close[*pairs.T] * energy / units.Bohr**2
-        bend = BEND * close[*bent[:, :2].T] * close[*bent[:, 1:].T] * energy
-        turn = TURN * close[*turns[:, :2].T] * close[*turns[:, 1:3].T] * close[*turns[:, 2:].T] * energy
-        flat = BEND * close[*self._straight[:, :2].T] * close[*self._straight[:, 1:].T] * energy
+        constants = [
+            strength * math.prod((close[*table[:, k : k + 2].T] for k in range(table.shape[1] - 1)), start=1.0)
+            for strength, table in zip((STRETCH / units.Bohr**2, BEND, TURN, BEND), self._tables, strict=True)
+        ]
         #: In eV and angstrom or radian; and the atoms of each.
-        self.constants: FloatArray = np.concatenate([stretch, bend, turn, flat, flat])
+        self.constants: FloatArray = units.Hartree * np.concatenate([*constants, constants[-1]])
         self.terms = [tuple(row) for item in self._families for row in item.atoms.tolist()]
         # The two directions across a straight angle are those of this structure alone.
-        self.terms += [(*row, -1, side) for side in (0, 1) for row in self._straight.tolist()]
+        self.terms += [(*row, -1, side) for side in (0, 1) for row in straight.tolist()]
 
     def remapped(self, data: FloatArray, terms: Sequence[tuple[int, ...]]) -> FloatArray:
         """Data for other terms, shape (..., m), as data for these; zero for terms that were not among them."""
@@ -98,8 +98,7 @@ class Internals:
 
     def _gathered(self, x: FloatArray) -> list[FloatArray]:
         """The atoms of each distance, angle, dihedral and straight angle, in the images next to each other."""
-        tables = [*(item.atoms for item in self._families), self._straight]
-        return [x[atoms] + images for atoms, images in zip(tables, self._images, strict=True)]
+        return [x[atoms] + images for atoms, images in zip(self._tables, self._images, strict=True)]
 
     def _sines(self, x: FloatArray, triples: IntArray) -> FloatArray:
         r = lined_up(x[triples], self.lattice)
@@ -130,15 +129,16 @@ class Internals:
         """dq/dx, shape (n, 3 n_atoms)."""
         table = np.zeros((len(self.constants), self.n_atoms, 3))
         *gathered, r = self._gathered(x)
-        rows = iter(np.split(np.arange(len(table)), np.cumsum([*(c.n_rows for c in self._families), len(r)])))
+        first = 0
         for item, part in zip(self._families, gathered, strict=True):
-            table[next(rows)[:, None], item.atoms] = item.gradient(part, 0.0)
-        for side, mine in zip(self._frames, rows, strict=True):
+            table[first + np.arange(item.n_rows)[:, None], item.atoms] = item.gradient(part, 0.0)
+            first += item.n_rows
+        for side, mine in zip(self._frames, np.arange(first, len(table)).reshape(2, -1), strict=True):
             for end in (0, 2):
                 arm = r[:, end] - r[:, 1]
                 slope = side / norm(arm)[:, None] - arm * (dot(side, arm) / norm(arm) ** 3)[:, None]
-                table[mine, self._straight[:, end]] += slope
-                table[mine, self._straight[:, 1]] -= slope
+                table[mine, self._tables[-1][:, end]] += slope
+                table[mine, self._tables[-1][:, 1]] -= slope
         return table.reshape(len(table), 3 * self.n_atoms)
 
 
@@ -183,17 +183,18 @@ def one_thread() -> Iterator[None]:
         yield
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Relaxed:
     """A minimum on constraints, its energy in eV, and the largest force along them that is left, in eV/angstrom."""
 
-    positions: FloatArray
-    energy: float
-    largest: float
-    #: Moves and changes of the slopes along internal coordinates, (m, 2, n): what was learned of the curvature.
-    memory: FloatArray
+    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    energy: float = math.nan
+    largest: float = math.nan
     #: Calls of energy and forces.
-    evaluations: int
+    evaluations: int = 0
+    #: Moves and changes of the slopes along internal coordinates, (m, 2, n): what was learned of the curvature.
+    memory: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    terms: list[tuple[int, ...]] = field(default_factory=list)
 
 
 class _Place:
@@ -295,7 +296,8 @@ class Descent:
                 radius = min(radius, longest) / (2 if ratio > 0 else 4)
             if gain <= 0 or ratio > 0 or there.largest <= fmax:
                 here = there
-        return Relaxed(here.x, here.energy, here.largest, np.array(self._memory[-MEMORY:]), self.evaluations)
+        memory = np.array(self._memory[-MEMORY:])
+        return Relaxed(here.x, here.energy, here.largest, self.evaluations, memory, self.internals.terms)
 
     def _given_up(self, here: _Place, fmax: float, why: str) -> ConvergenceError:
         error = ConvergenceError(

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,7 @@ from kcons.errors import (
     NonFiniteError,
     UnreadableError,
 )
-from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals
+from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals, Relaxed
 from kcons.free_energy.scans.scan_result import Attempt, Grid, Point, Scan
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.minimization import minimize
@@ -118,53 +117,58 @@ def scan(
     lists = [values] if isinstance(coordinates, Constraint) else list(values)  # type: ignore[arg-type]
     grid = Grid(items, lists)  # type: ignore[arg-type]
     fmax, evaluations = positive(fmax, "fmax"), whole_number(evaluations, "evaluations")
-    surface = _Surface(atoms, grid, constraints_in(held, "held"))
     settings: dict[str, Any] = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
-    results = None
-    if folder is not None:
-        plan = {
-            "symbols": str(atoms.symbols),
-            "positions": atoms.positions.tolist(),
-            "cell": atoms.cell.array.tolist(),
-            "pbc": atoms.pbc.tolist(),
-            "calculator": described(atoms.calc, atoms),
-            "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
-            "values": [axis.tolist() for axis in grid.values],
-            "held": [item.todict() for item in surface.held],
-            "settings": settings,
-        }
-        results = ResultFolder(folder, PLAN, plan, FILES, "a scan")
-        results.refuse_others()
-    with nullcontext() if results is None else results.taken():
-        place = None if results is None else results.path / PLACE
-        if place is not None:
-            place.mkdir(exist_ok=True)
-        return _Wavefront(surface, place, settings, progress).run()
+    wavefront = _Wavefront(atoms, grid, constraints_in(held, "held"), settings, progress)
+    if folder is None:
+        return wavefront.run()
+    plan = {
+        "symbols": str(atoms.symbols),
+        "positions": atoms.positions.tolist(),
+        "cell": atoms.cell.array.tolist(),
+        "pbc": atoms.pbc.tolist(),
+        "calculator": described(atoms.calc, atoms),
+        "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
+        "values": [axis.tolist() for axis in grid.values],
+        "held": [item.todict() for item in wavefront.scan.held],
+        "settings": settings,
+    }
+    results = ResultFolder(folder, PLAN, plan, FILES, "a scan")
+    results.refuse_others()
+    with results.taken():
+        wavefront.place = results.path / PLACE
+        wavefront.place.mkdir(exist_ok=True)
+        return wavefront.run()
 
 
-class _Surface:
-    """Energy and forces of the atoms, and what is held at each point."""
+class _Wavefront:
+    """What is held at each point, its energies and forces; which point is relaxed next, and from where."""
 
-    def __init__(self, atoms: Atoms, grid: Grid, held: list[Constraint]) -> None:
+    def __init__(
+        self,
+        atoms: Atoms,
+        grid: Grid,
+        held: list[Constraint],
+        settings: dict[str, Any],
+        progress: Progress | None,
+    ) -> None:
         if atoms.calc is None:
             raise InputError("the atoms have no calculator; give them one: atoms.calc = ...", item="calculator")
-        self.grid = grid
+        self.grid, self.settings, self.progress = grid, settings, progress
         self.atoms = atoms.copy()
         self.atoms.calc = atoms.calc
         forces_only = [item for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
         held = [*translated(atoms, [item for item in atoms.constraints if item not in forces_only]), *held]
         self.atoms.set_constraint(forces_only)
         self.start = self.atoms.get_positions()
-        #: At the start, without calculator and constraints.
-        self.bare = self.atoms.copy()
-        self.bare.set_constraint()
+        bare = self.atoms.copy()
+        bare.set_constraint()
         kept = Constraints(held)
-        rank = kept.engine(self.bare).rank
-        #: With the targets that were left open.
-        self.held = list(kept.constraints)
+        rank = kept.engine(bare).rank
+        # With the targets that were left open.
+        self.scan = Scan(grid, bare, list(kept.constraints))
         for n, item in enumerate(grid.coordinates):
             # Says what is undefined at the start, and which atoms there are not.
-            with_it = self._engine([*self.held, *(c.with_target(None) for c in grid.coordinates[: n + 1])])
+            with_it = self._engine([c.with_target(None) for c in grid.coordinates[: n + 1]])
             if with_it.rank != rank + n + 1:
                 raise ConstraintError(
                     f"{item.row_name(0)} depends on what else is held; it cannot take other values. Leave out "
@@ -174,13 +178,22 @@ class _Surface:
             r = self.start[item.atoms]
             for v in grid.values[n]:
                 item.with_target(float(v)).check(r, 0.0, 0)
-        measured = self._engine([c.with_target(None) for c in grid.coordinates]).constraint_set
-        self.place = [float(v) for v in measured.measure(self.start)]
+        measured = Constraints([c.with_target(None) for c in grid.coordinates]).engine(bare).constraint_set
+        self._measured = [float(v) for v in measured.measure(self.start)]
         self._bonds = bonds_of(self.atoms)
         warn_of_gaps({item.row_name(0): item for item in grid.coordinates}, self._bonds)
+        #: Where relaxations are kept.
+        self.place: Path | None = None
+        #: The attempt whose structure a point has handed on to its neighbors.
+        self._handed: dict[Point, int] = {}
+        self._queue: deque[tuple[Point, int | None]] = deque()
+        self._tried: set[tuple[Point, int | None]] = set()
+        self._tried_now: set[Point] = set()
+        self._first: KconsError | None = None
 
     def _engine(self, rows: list[Constraint]) -> Motion:
-        return Constraints(rows).engine(self.bare)
+        """Of these rows, beside all that is held at each point."""
+        return Constraints([*self.scan.held, *rows]).engine(self.scan.atoms)
 
     def evaluate(self, x: FloatArray) -> tuple[float, FloatArray]:
         """Energy and forces."""
@@ -201,14 +214,15 @@ class _Surface:
             raise NonFiniteError(f"the force on atom {atom} is not finite: {forces[atom]}", item="force", atom=atom)
         return energy, forces
 
-    def relaxed(self, attempt: Attempt, source: Attempt | None, fmax: float, evaluations: int) -> None:
-        """Fill an attempt that starts from the structure of another, or from the first one."""
+    def relaxed(self, point: Point, source: Attempt | None) -> Relaxed:
+        """The minimum at a point, from the structure of another relaxation or from the first one."""
+        fmax, evaluations = self.settings["fmax"], self.settings["evaluations"]
         before = self.start if source is None else source.positions
         reset = getattr(self.atoms.calc, "reset", None)
         if reset is not None:
             # What a calculator remembers, such as a density, would make the bits depend on what was done before.
             reset()
-        motion = self._engine([*self.held, *self.grid.held_at(attempt.point)])
+        motion = self._engine(self.grid.held_at(point))
         try:
             x = motion.restore_positions(before, bonds=self._bonds)
         except InfeasibleError:
@@ -218,37 +232,17 @@ class _Surface:
             found = minimize(
                 motion, lambda y, _: self.evaluate(y)[1], x, tolerance=fmax, longest=FIRST, steps=evaluations
             )
-            attempt.positions, attempt.largest = found.positions, found.largest
-            attempt.evaluations, attempt.energy = found.evaluations, self.evaluate(found.positions)[0]
-            return
-        internals = Internals(self.atoms.numbers, x, motion.lattice)
-        memory = None
+            energy = self.evaluate(found.positions)[0]
+            return Relaxed(found.positions, energy, found.largest, found.evaluations)
+        internals, memory = Internals(self.atoms.numbers, x, motion.lattice), None
         if source is not None and len(source.memory):
             memory = internals.remapped(source.memory, source.terms)
-        done = Descent(motion, self.evaluate, internals, memory).relaxed(x, fmax, evaluations)
-        for name in ("positions", "energy", "largest", "evaluations", "memory"):
-            setattr(attempt, name, getattr(done, name))
-        attempt.terms = internals.terms
+        return Descent(motion, self.evaluate, internals, memory).relaxed(x, fmax, evaluations)
 
-
-class _Wavefront:
-    """Which point is relaxed next, and from where."""
-
-    def __init__(
-        self, surface: _Surface, place: Path | None, settings: dict[str, Any], progress: Progress | None
-    ) -> None:
-        self.surface, self.place, self.settings, self.progress = surface, place, settings, progress
-        self.grid = surface.grid
-        self.scan = Scan(self.grid, surface.bare, surface.held)
-        #: The attempt whose structure a point has handed on to its neighbors.
-        self._handed: dict[Point, int] = {}
-        self._queue: deque[tuple[Point, int | None]] = deque()
-        self._tried: set[tuple[Point, int | None]] = set()
-        self._tried_now: set[Point] = set()
-        self._first: KconsError | None = None
+    # -- from point to point --------------------------------------------------------------------
 
     def run(self) -> Scan:
-        for point in sorted(self.grid.points, key=lambda p: self.grid.apart(p, self.surface.place)):
+        for point in sorted(self.grid.points, key=lambda p: self.grid.apart(p, self._measured)):
             self._queue.append((point, None))
             self._drain()
             if self.scan.best:
@@ -286,10 +280,9 @@ class _Wavefront:
             )
         if attempt is None:
             self._tried_now.add(point)
-            attempt = Attempt(len(attempts), point, source)
-            how = self.settings["fmax"], self.settings["evaluations"]
+            attempt = Attempt(number=len(attempts), point=point, source=source)
             try:
-                self.surface.relaxed(attempt, None if source is None else attempts[source], *how)
+                vars(attempt).update(vars(self.relaxed(point, None if source is None else attempts[source])))
             except KconsError as error:
                 attempt.error = f"{self.grid.said(point)}: {type(error).__name__}: {error}"
                 self._first = self._first or error

@@ -25,6 +25,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.arguments import ANGLE, LENGTH, as_float_array
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, UnreadableError, UnsupportedError
+from kcons.free_energy.scans.relaxation import Relaxed
 from kcons.steppers.files import in_one_piece, stored_arrays, text
 
 if TYPE_CHECKING:
@@ -142,23 +143,16 @@ def _axis(item: Constraint, given: ArrayLike) -> tuple[FloatArray, bool]:
 _ARRAYS = ("positions", "memory")
 
 
-@dataclass
-class Attempt:
-    """One relaxation, of energy in eV and the largest force left on an atom in eV/angstrom."""
+@dataclass(eq=False, kw_only=True)
+class Attempt(Relaxed):
+    """One relaxation."""
 
     number: int
     point: Point
     #: The attempt whose structure it began from; None for the structure that was given.
     source: int | None
-    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    energy: float = float("nan")
-    largest: float = float("nan")
-    evaluations: int = 0
     #: Why it failed.
     error: str | None = None
-    #: What was learned of the curvature, see `relaxation`.
-    memory: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 0)))
-    terms: list[tuple[int, ...]] = field(default_factory=list)
 
     def save(self, path: Path) -> None:
         """Write it; the file is there as a whole, or not at all."""
@@ -175,7 +169,7 @@ class Attempt:
                 data = stored_arrays(file)
             head = json.loads(str(data["head"])) | {name: data[name] for name in _ARRAYS}
             head |= {"point": tuple(head["point"]), "terms": [tuple(term) for term in head["terms"]]}
-            return cls(number, **head)
+            return cls(number=number, **head)
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise UnreadableError(f"{path} cannot be read ({error}); remove it", item="folder") from error
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from ase import Atoms, units
-from ase.calculators.calculator import all_properties
 from ase.md.md import MolecularDynamics
 
 from kcons.ase import (
@@ -27,22 +26,17 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
+from kcons.free_energy.windows.window import Sampler, Settings, Window, digest_of
 from kcons.motion import minimize
 from kcons.motion.motion import Motion
 from kcons.thermostats import IsokineticSpheres
 
-#: Names in `Atoms.info` that files have for something else.
-_TAKEN = {*all_properties, "Lattice", "Properties", "pbc"}
 #: Largest force left by a relaxation, eV/angstrom, and the longest way of an atom in one of its steps, angstrom.
 _FORCE, _STRIDE = 0.1, 0.1
 
 
 class AseRecorder:
-    """An observer of ASE's dynamics that keeps a `Series`, and shows the last sample on the atoms.
-
-    Attach it before whatever writes the trajectory, at the same interval. ``atoms.info`` then has each coordinate by
-    its name, ``"multiplier of <name>"`` and ``"ln det Z"``, which trajectories and extended XYZ files keep.
+    """An observer of ASE's dynamics that keeps a `Series`.
 
     Parameters
     ----------
@@ -59,7 +53,7 @@ class AseRecorder:
     Raises
     ------
     InputError
-        The atoms carry no constraints of kcons, or do not hold a coordinate; a name that files cannot keep.
+        The atoms carry no constraints of kcons, or do not hold a coordinate.
     UnsupportedError
         At a sample: velocities on isokinetic spheres, where the multipliers need thermal ones.
 
@@ -69,14 +63,7 @@ class AseRecorder:
     """
 
     def __init__(self, dynamics: MolecularDynamics, coordinates: Mapping[str, Constraint]) -> None:
-        self.dynamics = dynamics
-        self.coordinates = named(coordinates)
-        for name in self.coordinates:
-            if "=" in name or name in _TAKEN:
-                raise InputError(
-                    f"a coordinate is called {name!r}, which extended XYZ files cannot keep; give it another name",
-                    item=name,
-                )
+        self.dynamics, self.coordinates = dynamics, named(coordinates)
         self._motion: Motion | None = None
         self._held = self._bound()
         self.series = Series(self._held.names, self._held.periods)
@@ -103,14 +90,10 @@ class AseRecorder:
         return self._held
 
     def __call__(self) -> None:
-        dynamics, atoms, held = self.dynamics, self.dynamics.atoms, self._bound()
-        forces = dynamics.state.forces if isinstance(dynamics, ConstrainedDynamics) else None
-        if forces is None:
-            forces = applied_forces(atoms)
+        dynamics, held = self.dynamics, self._bound()
         if isinstance(dynamics, IsokineticDynamics):  # known once it runs
             self.series.isokinetic_degrees_of_freedom = dynamics.thermostat_degrees_of_freedom
-        x, v, time = atoms.positions, velocities_of(atoms), dynamics.get_time()
-        sample = held.sample(x, v, forces, time)
+        sample = held.sample(*_state(dynamics))
         spheres = isinstance(getattr(dynamics, "stepper", None), IsokineticSpheres)
         if spheres and not np.isfinite(sample.mean_kinetic).all():
             raise UnsupportedError(
@@ -118,9 +101,14 @@ class AseRecorder:
                 "need them: their mean is found without only for up to 60 rows at rest. Take bath='langevin'"
             )
         self.series.append(sample)
-        for name, value, multiplier in zip(held.names, sample.value, sample.multiplier, strict=True):
-            atoms.info[name], atoms.info[f"multiplier of {name}"] = float(value), float(multiplier)
-        atoms.info["ln det Z"] = sample.log_det_z
+
+
+def _state(dynamics: MolecularDynamics) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Positions, velocities, applied forces and time."""
+    forces = dynamics.state.forces if isinstance(dynamics, ConstrainedDynamics) else None
+    if forces is None:
+        forces = applied_forces(dynamics.atoms)
+    return dynamics.atoms.positions, velocities_of(dynamics.atoms), forces, dynamics.get_time()
 
 
 class AseWindows(Sampler):
@@ -142,7 +130,7 @@ class AseWindows(Sampler):
     InputError
         A calculator instead of what makes one; coordinates without names.
     KconsError
-        At `begin`: a coordinate that is undefined at the structure or depends on the other constraints.
+        A coordinate that is undefined at the structure or depends on the other constraints.
     """
 
     kJ = units.mol / units.kJ
@@ -159,11 +147,11 @@ class AseWindows(Sampler):
                 f"calculator is {calculator!r:.80}; give what makes one, such as functools.partial(EMT)",
                 item="calculator",
             )
-        super().__init__(coordinates, 1.0)
-        self.atoms = atoms.copy()
-        self.calculator = calculator
-        self.held = [*from_ase_constraints(self.atoms), *held]
+        self.atoms, self.calculator = atoms.copy(), calculator
+        rows = [*from_ase_constraints(self.atoms), *held]
         self.atoms.set_constraint()
+        where = (atoms.get_positions(), atoms.get_masses(), atoms.cell.array if atoms.pbc.any() else None, atoms.pbc)
+        super().__init__(coordinates, rows, *where, *2 * (bonds_of(self.atoms),))
 
     @property
     def digest(self) -> str:
@@ -177,25 +165,18 @@ class AseWindows(Sampler):
         frame.append(self.atoms.get_masses())
         return digest_of(frame, maker, self.held, list(self.coordinates.values()))
 
-    def rows(self) -> Held:
-        atoms = self.atoms
-        cell = atoms.cell.array if atoms.pbc.any() else None
-        where = (atoms.positions.copy(), atoms.get_masses(), cell, atoms.pbc)
-        bonds = bonds_of(atoms)
-        return Held(self.coordinates, self.held, *where, bonds, bonds)
-
-    def simulation(self, held: Held, window: Window, settings: Settings) -> _Simulation:
-        return _Simulation(self, held, window, settings)
+    def simulation(self, window: Window, settings: Settings) -> _Simulation:
+        return _Simulation(self, window, settings)
 
 
 class _Simulation:
     """A run in ASE."""
 
-    def __init__(self, sampler: AseWindows, held: Held, window: Window, settings: Settings) -> None:
-        self.held, self._settings = held, settings
+    def __init__(self, sampler: AseWindows, window: Window, settings: Settings) -> None:
+        self._sampler, self._settings = sampler, settings
         self.atoms = atoms = sampler.atoms.copy()
         atoms.calc = sampler.calculator()
-        motion, x = held.placed(window.start)
+        motion, x = sampler.placed(window.start)
 
         def force(x: FloatArray, _: float) -> FloatArray:
             atoms.positions = x
@@ -212,10 +193,11 @@ class _Simulation:
         self._dynamics: Any = None
 
     def hold(self, begin: Sequence[float], end: Sequence[float], seed: int, velocities: int | None) -> None:
-        settings, held, dt = self._settings, self.held, self._settings.timestep * units.fs
-        still, rows = ([*held.others, *part] for part in (held.at(begin), held.towards(begin, end, settings.pull * dt)))
+        settings, sampler, dt = self._settings, self._sampler, self._settings.timestep * units.fs
         if velocities is not None:
+            still = [*sampler.held, *sampler.at(begin)]
             draw_velocities(self.atoms, settings.temperature, velocities, constraints=still)
+        rows = [*sampler.held, *sampler.towards(begin, end, settings.pull * dt)]
         bath = settings.temperature, settings.friction / (1000 * units.fs)
         self._dynamics = ConstrainedLangevin(self.atoms, dt, *bath, rng=seed, constraints=rows)
 
@@ -229,6 +211,4 @@ class _Simulation:
         self._dynamics.run(steps)
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        forces = self._dynamics.state.forces
-        forces = applied_forces(self.atoms) if forces is None else np.array(forces)
-        return self.atoms.get_positions(), np.array(velocities_of(self.atoms)), forces, self._dynamics.get_time()
+        return _state(self._dynamics)

@@ -58,42 +58,25 @@ _SHOWN = {True: "degrees", False: "angstrom", None: "own unit"}
 _PER = {**_SHOWN, True: "radian"}
 
 
-@dataclass(frozen=True)
-class WindowResult:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WindowResult(MeanForce):
     """The mean force where one or several coordinates were held, in kJ/mol, angstrom and radian.
+
+    Where both sides differ by more than chance (p < 0.01), neither knows its own error: half their difference is one
+    error more.
 
     Attributes
     ----------
     number : int
-    value, force, error : ndarray, shape (d,)
-        The coordinates, dF/dq and its standard error.
-    covariance : ndarray, shape (d, d)
-        Of the mean force. Where the sides differ by more than chance (p < 0.01), neither knows its own error: half
-        their difference is one error more.
     sides : dict of str to MeanForce
-        From below and from above.
+        From below and from above, in the units of the MD engine.
     p_value : float
         Probability of a larger difference between the sides if both were equilibrated; NaN with one side.
-    raw : ndarray, shape (d,)
-        The plain mean of the multipliers, for comparison.
     """
 
     number: int
-    value: FloatArray
-    force: FloatArray
-    covariance: FloatArray
     sides: dict[str, MeanForce]
     p_value: float
-    raw: FloatArray
-
-    @property
-    def error(self) -> FloatArray:
-        return np.sqrt(np.diagonal(self.covariance))
-
-    @property
-    def independent(self) -> float:
-        """Independent samples of all sides."""
-        return sum(side.n_effective for side in self.sides.values())
 
 
 @dataclass
@@ -196,7 +179,7 @@ class FreeEnergy:
                 *(f"{q:.4g}" for q in shown),
                 *(f"{f:.2f} ± {e:.2f}" for f, e in zip(window.force, window.error, strict=True)),
                 ", ".join(f"{raw:.2f}" for raw in window.raw),
-                f"{window.independent:.0f}",
+                f"{window.n_effective:.0f}",
                 "" if np.isnan(window.p_value) else f"{window.p_value:.2g}{mark}",
             )
         return made
@@ -209,7 +192,7 @@ class FreeEnergy:
                 f"runs from below and from above differ by more than chance in window {doubtful} (marked !): something "
                 "slow is not equilibrated there; sample longer, or look for the other coordinate"
             )
-        if poor := ", ".join(str(w.number) for w in self.windows if w.independent < FEW_INDEPENDENT):
+        if poor := ", ".join(str(w.number) for w in self.windows if w.n_effective < FEW_INDEPENDENT):
             lines.append(
                 f"fewer than {FEW_INDEPENDENT} independent samples in window {poor}: errors there are not to be relied "
                 "on; sample longer"
@@ -251,8 +234,8 @@ class FreeEnergy:
                     "covariance": w.covariance.tolist(),
                     "raw multiplier": w.raw.tolist(),
                     "p_value": w.p_value,
-                    "samples": sum(side.n for side in w.sides.values()),
-                    "independent samples": w.independent,
+                    "samples": w.n,
+                    "independent samples": w.n_effective,
                 }
                 for w in self.windows
             ],
@@ -288,7 +271,14 @@ def combine_sides(number: int, target: FloatArray, sides: dict[str, MeanForce], 
         if chance < UNLIKELY:
             half = (forces[0] - forces[1]) / 2
             covariance = covariance + np.outer(half, half)
-    return WindowResult(number, target, forces.mean(axis=0), covariance, sides, chance, raws.mean(axis=0))
+    mean, raw = forces.mean(axis=0), raws.mean(axis=0)
+    names, (n, effective) = (
+        next(iter(sides.values())).names,
+        np.sum([(s.n, s.n_effective) for s in sides.values()], axis=0),
+    )
+    return WindowResult(
+        names, target, mean, covariance, raw, int(n), effective, number=number, sides=sides, p_value=chance
+    )
 
 
 class Windows:
@@ -343,13 +333,12 @@ class Windows:
         self.workers = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         self.settings = settings or Settings()
         self.both_sides, self.seed = both_sides, seed_from(rng)
-        self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
         self._failed: dict[str, str] = {}
         self.approach = approach_of(approach, sampler.names)
         mine: dict[str, Any] = {"coordinates": list(sampler.names), "system": sampler.digest}
         mine |= {"settings": asdict(self.settings), "seed": self.seed, "both sides": both_sides}
-        mine |= {"approach": self.approach.tolist(), "start": self.start.tolist()}
+        mine |= {"approach": self.approach.tolist(), "start": sampler.start.tolist()}
         self._results = ResultFolder(folder, "settings.json", mine, FILES, "windows")
         self._results.refuse_others()
         self.folder = self._results.path
@@ -483,7 +472,7 @@ class Windows:
         file = self.file(window)
         if not file.exists():
             return False
-        away = nearest_image(Series.load(file).value[:1] - np.array(window.target), self.periods)
+        away = nearest_image(Series.load(file).value[:1] - np.array(window.target), self.sampler.periods)
         if np.abs(away).max(initial=0.0) > 1e-4:
             wanted = ", ".join(f"{q:g}" for q in self._targets[window.number])
             raise OccupiedError(
@@ -540,7 +529,7 @@ class Windows:
             if sides:
                 found.append(combine_sides(number, np.array(target), sides, self.sampler))
         found.sort(key=lambda w: w.value.tolist())
-        return FreeEnergy(self.sampler.names, self.periods, found, problems, tuple(self.sampler.angles))
+        return FreeEnergy(self.sampler.names, self.sampler.periods, found, problems, tuple(self.sampler.angles))
 
 
 #: What is said of a window whose process was killed, and errors of Dask that say so.

@@ -19,7 +19,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Held, Sampler, Settings, Window, digest_of
+from kcons.free_energy.windows.window import Sampler, Settings, Window, digest_of
 from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, hold
 from kcons.openmm.callback_rows import CarriedConstraints, constraints_about, refuse_virtual_sites
 from kcons.openmm.device.device_integrator import choose
@@ -193,9 +193,9 @@ class OpenMMWindows(Sampler):
     InputError
         A Topology of another number of atoms, or of another box.
     UnsupportedError
-        A barostat; at `begin`, a coordinate of virtual sites, or of several rows.
+        A barostat; a coordinate of virtual sites, or of several rows.
     KconsError
-        At `begin`: a coordinate that is undefined at the structure or depends on the constraints of the System.
+        A coordinate that is undefined at the structure or depends on the constraints of the System.
     """
 
     kJ = 1.0
@@ -211,11 +211,14 @@ class OpenMMWindows(Sampler):
         properties: Mapping[str, str] | None = None,
     ) -> None:
         _refuse_another(topology, system)
-        super().__init__(coordinates, 10.0)
-        self.positions = nanometers(positions, system.getNumParticles())
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
-        self._bonds: IntArray = bonds_of(system, self.positions)
+        x, masses = nanometers(positions, system.getNumParticles()), masses_of(system)
+        bonds, others = bonds_of(system, x), _beside(system, list(named(coordinates).values()), masses)
+        wraps = system.usesPeriodicBoundaryConditions()
+        cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
+        where = (x, np.where(masses > 0, masses, 1.0), cell, True)
+        super().__init__(coordinates, others, *where, bonds, _turning(system, bonds, masses), angstrom=10.0)
 
     @property
     def digest(self) -> str:
@@ -225,26 +228,17 @@ class OpenMMWindows(Sampler):
         """A copy."""
         return openmm.XmlSerializer.deserialize(self._system)
 
-    def rows(self) -> Held:
-        system = self.system()
-        masses = masses_of(system)
-        others = _beside(system, list(self.coordinates.values()), masses)
-        wraps = system.usesPeriodicBoundaryConditions()
-        cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
-        where = (self.positions, np.where(masses > 0, masses, 1.0), cell, True)
-        return Held(self.coordinates, others, *where, self._bonds, _turning(system, self._bonds, masses))
-
-    def simulation(self, held: Held, window: Window, settings: Settings) -> _Simulation:
-        return _Simulation(self, held, window, settings)
+    def simulation(self, window: Window, settings: Settings) -> _Simulation:
+        return _Simulation(self, window, settings)
 
 
 class _Simulation:
     """A run in OpenMM."""
 
-    def __init__(self, sampler: OpenMMWindows, held: Held, window: Window, settings: Settings) -> None:
-        self._sampler, self.held, self._settings = sampler, held, settings
-        self._x, self._v = held.placed(window.start)[1], np.zeros_like(sampler.positions)
-        self._seen = held.measured(window.target).seen
+    def __init__(self, sampler: OpenMMWindows, window: Window, settings: Settings) -> None:
+        self._sampler, self._settings = sampler, settings
+        self._x, self._v = sampler.placed(window.start)[1], np.zeros_like(sampler.positions)
+        self._seen = sampler.measured(window.target).seen
         if settings.relax:
             self.hold(window.start, window.start, window.seed, None)
             self._integrator.minimizeEnergy(self._context, _FORCE, settings.relax)
@@ -254,7 +248,7 @@ class _Simulation:
         settings, sampler, dt = self._settings, self._sampler, self._settings.timestep / 1000
         system = sampler.system()
         ensemble = Langevin(settings.temperature, settings.friction)
-        parts: list[Any] = list(self.held.towards(begin, end, settings.pull * dt))
+        parts: list[Any] = list(sampler.towards(begin, end, settings.pull * dt))
         self._on_device = choose(None, dt, parts=parts, ensemble=ensemble)[0] is DeviceIntegrator
         if not self._on_device:
             parts = [hold(system, parts, self._x)]

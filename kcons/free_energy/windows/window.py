@@ -13,21 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, MovingTarget
-from kcons.constraints.arguments import (
-    ANGLE,
-    LENGTH,
-    Count,
-    FromZero,
-    Positive,
-    as_float_array,
-    checked,
-)
+from kcons.constraints.arguments import ANGLE, LENGTH, Count, FromZero, Positive, as_float_array, checked
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
-from kcons.free_energy.series import Collector, Series
+from kcons.free_energy.series import Collector
 from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.motion import Motion
 
@@ -100,9 +92,23 @@ Settings.__init__ = checked(Settings.__init__)  # type: ignore[method-assign]
 class Sampler(ABC):
     """What samples windows in an MD engine; it is sent to other processes, so it can be pickled.
 
+    Warns of torsions over no bonds, and refuses what is undefined at the initial structure or depends on other rows.
+
+    Parameters
+    ----------
+    coordinates : mapping of str to Constraint
+        Each of one row that holds positions.
+    held : sequence of Constraint
+        What is held beside them.
+    positions, masses, cell, pbc
+        The structure that all windows start from, in the units of the engine.
+    bonds, turning : ndarray of int, shape (n, 2)
+        Of the molecules, and those by which groups may be turned; None where something is held otherwise.
+    angstrom : float
+        In the engine's unit of length: how many angstrom it has.
+
     Attributes
     ----------
-    coordinates : dict of str to Constraint
     names : tuple of str
     kJ : float
         The engine's unit of energy in kJ/mol.
@@ -110,16 +116,40 @@ class Sampler(ABC):
         The units of the coordinates in angstrom and radian; formulas stay in the units they are written in.
     angles : tuple of bool or None
         Which coordinates are angles; None where the unit is that of a formula or a function.
+    start, periods : ndarray, shape (d,)
+        The coordinates at the initial structure; 0 for those without a period.
     """
 
     kJ: float
 
-    def __init__(self, coordinates: Mapping[str, Constraint], angstrom: float) -> None:
-        self.coordinates = named(coordinates)
+    def __init__(
+        self,
+        coordinates: Mapping[str, Constraint],
+        held: Sequence[Constraint],
+        positions: FloatArray,
+        masses: FloatArray,
+        cell: FloatArray | None,
+        pbc: Any,
+        bonds: IntArray,
+        turning: IntArray | None,
+        angstrom: float = 1.0,
+    ) -> None:
+        for name, item in named(coordinates).items():
+            if item.n_rows != 1 or not item.holonomic:
+                raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row that holds positions")
+        self.coordinates = {name: item.with_target(None) for name, item in coordinates.items()}
         self.names = tuple(self.coordinates)
-        rows = self.coordinates.values()
-        self.scales = np.array([angstrom if c.held is LENGTH else 1.0 for c in rows])
-        self.angles = tuple({ANGLE: True, LENGTH: False}.get(c.held) for c in rows)
+        kinds = [item.held for item in self.coordinates.values()]
+        self.scales = np.array([angstrom if kind is LENGTH else 1.0 for kind in kinds])
+        self.angles = tuple({ANGLE: True, LENGTH: False}.get(kind) for kind in kinds)
+        self._frame = {"masses": masses, "cell": cell, "pbc": pbc}
+        self.positions, self.bonds, self.turning = positions, bonds, turning
+        everything = self._set([*held, *self.coordinates.values()])
+        #: With the targets that were left open.
+        self.held = list(everything.constraints[: len(held)])
+        there = HeldCoordinates(everything, self.coordinates, positions)
+        self.start, self.periods = everything.measure(positions)[there.rows], there.periods
+        warn_of_gaps(self.coordinates, bonds)
 
     @property
     @abstractmethod
@@ -127,11 +157,7 @@ class Sampler(ABC):
         """Of structure, forces and constraints: what a folder of windows belongs to."""
 
     @abstractmethod
-    def rows(self) -> Held:
-        """What is held, over the initial structure."""
-
-    @abstractmethod
-    def simulation(self, held: Held, window: Window, settings: Settings) -> Any:
+    def simulation(self, window: Window, settings: Settings) -> Any:
         """A run at the start of a window, relaxed there, and without velocities.
 
         It has ``hold(begin, end, seed, velocities)``, to go on with the coordinates moving from `begin` to `end` in the
@@ -140,47 +166,82 @@ class Sampler(ABC):
         with the state after every so many steps; and ``state()``: positions, velocities, forces and time.
         """
 
-    def begin(self) -> tuple[FloatArray, FloatArray]:
-        """Coordinates at the initial structure, and their periods, shape (d,); warns of torsions over no bonds.
-
-        Raises
-        ------
-        KconsError
-            A window cannot be made: a coordinate is undefined here or depends on the other constraints.
-        """
-        rows = self.rows()
-        warn_of_gaps(self.coordinates, rows.bonds)
-        return rows.found, rows.periods
-
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
         """Run the window, and write its `Series` to `file` once it is finished."""
-        run = self.simulation(self.rows(), window, settings)
+        run = self.simulation(window, settings)
         if settings.pull:
             run.hold(window.start, window.target, window.seed, window.seed)
             run.step(settings.pull)
         # New velocities: those of the pull's end have its rate.
         run.hold(window.target, window.target, window.seed + 2, window.seed + 1)
         run.step(settings.equilibration)
-        self._recorded(run, window, settings.production, settings.every).save(file)
+        collector = Collector(self.measured(window.target))
+        run.run(settings.production, settings.every, collector.add)
+        collector.series.save(file)
 
     def pull(self, window: Window, settings: Settings, file: Path) -> None:
         """Equilibrate at the start, pull to the target, and write the `Series` of the pull, every step of it."""
-        run = self.simulation(self.rows(), window, settings)
+        run = self.simulation(window, settings)
         run.hold(window.start, window.start, window.seed + 2, window.seed)
         run.step(settings.equilibration)
         run.hold(window.start, window.target, window.seed, None)
-        self._recorded(run, window, settings.pull, 1, start=True).save(file)
+        collector = Collector(self.measured(window.target))
+        collector.add(*run.state())
+        run.run(settings.pull, 1, collector.add)
+        collector.series.save(file)
 
-    def _recorded(self, run: Any, window: Window, steps: int, every: int, *, start: bool = False) -> Series:
-        """Take steps and record the coordinates, with `start` before the first one, too."""
-        held = run.held.measured(window.target)
-        series = Series(held.names, held.periods)
-        collector = Collector(held, series)
-        if start:
-            collector.add(*run.state())
-        run.run(steps, every, collector.add)
-        collector.look()
-        return series
+    # -- what is held ---------------------------------------------------------------------------
+
+    def _set(self, rows: list[Constraint]) -> ConstraintSet:
+        return ConstraintSet(rows, self.positions, **self._frame)
+
+    def measured(self, values: ArrayLike) -> HeldCoordinates:
+        """What samples are taken by."""
+        return HeldCoordinates(
+            self._set([*self.held, *self.at(values)]), self.coordinates, self.positions, bonds=self.turning
+        )
+
+    def at(self, values: ArrayLike) -> list[Constraint]:
+        """The coordinates held at `values`."""
+        pairs = zip(self.coordinates.values(), np.asarray(values), strict=True)
+        return [item.with_target([float(value)]) for item, value in pairs]
+
+    def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
+        """The coordinates moved at a constant rate from time 0 on; at rest where both ends are the same."""
+        if tuple(begin) == tuple(end):
+            return self.at(begin)
+        rows = zip(self.coordinates.values(), begin, end, strict=True)
+        return [
+            item.with_target(MovingTarget(lambda t, a=a, b=b: a + (b - a) / duration * t))  # type: ignore[misc]
+            for item, a, b in rows
+        ]
+
+    def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
+        """The engine of a window, and the initial structure with groups turned and moved so that it is there.
+
+        Within a ring nothing turns without bending angles. There it goes to the nearest point by small steps.
+
+        Raises
+        ------
+        InfeasibleError
+            Neither way keeps the bonds.
+        """
+        motion = Motion(self._set([*self.held, *self.at(values)]), self.positions)
+        try:
+            return motion, motion.restore_positions(self.positions, bonds=self.bonds)
+        except InfeasibleError:
+            x = self.positions
+            way = nearest_image(np.asarray(values, dtype=np.float64) - self.start, self.periods)
+            for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
+                rows = self._set([*self.held, *self.at(self.start + share * way)])
+                x = Motion(rows, x).restore_positions(x, bonds=[])
+            held = {frozenset(row) for item in self.coordinates.values() for row in item.atoms.tolist()}
+            bonds = [pair for pair in self.bonds.tolist() if frozenset(pair) not in held]
+            lengths = self._set([Distance(np.array(bonds).reshape(-1, 2))])
+            change = lengths.measure(x) / lengths.measure(self.positions) - 1
+            if np.abs(change).max(initial=0.0) >= _STRETCHED:
+                raise
+            return motion, motion.restore_positions(x, bonds=[])
 
 
 def digest_of(*parts: Any) -> str:
@@ -217,87 +278,3 @@ def approach_of(approach: ArrayLike, names: Sequence[str]) -> FloatArray:
             f"approach is {approach!r}; give a finite number, or one for each of {', '.join(names)}", item="approach"
         )
     return np.broadcast_to(given, (len(names),))
-
-
-@dataclass
-class Held:
-    """The rows of a window over the structure that all windows start from."""
-
-    #: One row each.
-    coordinates: Mapping[str, Constraint]
-    #: What is held beside them, targets found at `positions` where they were left open.
-    others: list[Constraint]
-    positions: FloatArray
-    masses: FloatArray
-    cell: FloatArray | None
-    pbc: Any
-    #: Of the molecules, shape (n, 2), and those by which groups may be turned; None where something is held otherwise.
-    bonds: IntArray
-    turning: IntArray | None
-
-    def __post_init__(self) -> None:
-        for name, item in self.coordinates.items():
-            if item.n_rows != 1 or not item.holonomic:
-                raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row that holds positions")
-        self.coordinates = {name: item.with_target(None) for name, item in self.coordinates.items()}
-        # Refuses what is undefined here, or depends on the other constraints.
-        everything = self._set([*self.others, *self.coordinates.values()])
-        self.others = list(everything.constraints[: len(self.others)])
-        held = HeldCoordinates(everything, self.coordinates, self.positions)
-        self.found = everything.measure(self.positions)[held.rows]
-        self.periods = held.periods
-
-    def _set(self, rows: list[Constraint]) -> ConstraintSet:
-        return ConstraintSet(rows, self.positions, self.masses, cell=self.cell, pbc=self.pbc)
-
-    def measured(self, values: ArrayLike) -> HeldCoordinates:
-        """What samples are taken by."""
-        rows = self._set([*self.others, *self.at(values)])
-        return HeldCoordinates(rows, self.coordinates, self.positions, bonds=self.turning)
-
-    def at(self, values: ArrayLike) -> list[Constraint]:
-        """The coordinates held at `values`."""
-        pairs = zip(self.coordinates.values(), np.asarray(values), strict=True)
-        return [item.with_target([float(value)]) for item, value in pairs]
-
-    def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
-        """The coordinates moved at a constant rate from time 0 on; at rest where both ends are the same."""
-        if tuple(begin) == tuple(end):
-            return self.at(begin)
-        rows = zip(self.coordinates.values(), begin, end, strict=True)
-        return [
-            item.with_target(MovingTarget(lambda t, a=a, b=b: a + (b - a) / duration * t))  # type: ignore[misc]
-            for item, a, b in rows
-        ]
-
-    def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
-        """The engine of a window, and the initial structure with groups turned and moved so that it is there.
-
-        Within a ring nothing turns without bending angles. There it goes to the nearest point by small steps.
-
-        Raises
-        ------
-        InfeasibleError
-            Neither way keeps the bonds.
-        """
-        motion = Motion(self._set([*self.others, *self.at(values)]), self.positions)
-        try:
-            return motion, motion.restore_positions(self.positions, bonds=self.bonds)
-        except InfeasibleError:
-            x = self._walked(np.asarray(values, dtype=np.float64))
-            if x is None:
-                raise
-            return motion, motion.restore_positions(x, bonds=[])
-
-    def _walked(self, values: FloatArray) -> FloatArray | None:
-        """The initial structure brought to `values` by small steps; None where a bond would change too much."""
-        way = nearest_image(values - self.found, self.periods)
-        x = self.positions
-        for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
-            rows = [*self.others, *self.at(self.found + share * way)]
-            x = Motion(self._set(rows), x).restore_positions(x, bonds=[])
-        held = {frozenset(row) for item in self.coordinates.values() for row in item.atoms.tolist()}
-        bonds = [pair for pair in self.bonds.tolist() if frozenset(pair) not in held]
-        lengths = self._set([Distance(np.array(bonds).reshape(-1, 2))])
-        change = lengths.measure(x) / lengths.measure(self.positions) - 1
-        return x if np.abs(change).max(initial=0.0) < _STRETCHED else None

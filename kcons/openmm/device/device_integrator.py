@@ -20,9 +20,8 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError, UnsupportedError
 from kcons.openmm.device import build
-from kcons.openmm.device.held_rows import constraints_of, function_on_device
-from kcons.openmm.device.kernel_rows import KernelRows
 from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
+from kcons.openmm.device.rows import KernelRows, constraints_of, function_on_device
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
 from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle

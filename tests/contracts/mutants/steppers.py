@@ -141,7 +141,7 @@ MUTANTS = {
         ("BOND_LIKE = «1→0».5", "images::a_polymer_that_closes_through_the_boundary"),
     ],
     "plan/plan.py": [
-        ("«eliminate_last[rows[order]] = left_over→pass»", "plan::dependent_rows_are_eliminated_last"),
+        ("«plan.eliminate_last[rows[order]] = left_over→pass»", "plan::dependent_rows_are_eliminated_last"),
     ],
     "motion/certificate.py": [
         ("SPEED = 1«0.→e1»0", "certificate::a_solver_that_is_wrong_without_knowing_is_found_in_the_first_step"),

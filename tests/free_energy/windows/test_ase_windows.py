@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
@@ -31,7 +32,7 @@ def sampler(**more):
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")  # about the fixed atom
 def test_a_window_far_from_the_structure(tmp_path):
     """From 180 to 60 degrees in one go; the same file whenever it is made."""
-    start, periods = sampler().begin()
+    start, periods = sampler().start, sampler().periods
     assert start == pytest.approx([np.pi]) and periods == pytest.approx([2 * np.pi])
     window = Window(0, "up", (1.0,), (np.pi / 3,), 5)
     atoms = molecule("CH3OH")
@@ -66,24 +67,21 @@ def test_a_window_without_a_pull(tmp_path):
 )
 def test_torsions_over_atoms_that_are_not_bonded(four, said):
     """Of butane, whose chain is 0-1-2-3."""
-    windows = AseWindows(molecule("trans-butane"), CALCULATOR, {"turn": Dihedral([four])})
-    if said is None:
-        windows.begin()
-    else:
-        with pytest.warns(UserWarning, match=f"turn is a torsion over .* and {said}; give the atoms in the order"):
-            windows.begin()
+    match = f"turn is a torsion over .* and {said}; give the atoms in the order"
+    with pytest.warns(UserWarning, match=match) if said else nullcontext():
+        AseWindows(molecule("trans-butane"), CALCULATOR, {"turn": Dihedral([four])})
 
 
 def test_torsions_over_atoms_that_form_no_bonds():
     """Nobody knows which order of metal atoms is meant."""
-    AseWindows(molecule("Si2H6"), CALCULATOR, {"turn": Dihedral([[2, 0, 1, 5]])}).begin()
+    AseWindows(molecule("Si2H6"), CALCULATOR, {"turn": Dihedral([[2, 0, 1, 5]])})
     copper = Atoms("Cu4", [[0, 0, 0], [2.5, 0, 0], [2.5, 2.5, 0], [2.5, 2.5, 2.5]])
-    AseWindows(copper, CALCULATOR, {"turn": Dihedral([[0, 1, 2, 3]])}).begin()
+    AseWindows(copper, CALCULATOR, {"turn": Dihedral([[0, 1, 2, 3]])})
 
 
 def test_coordinates_that_cannot_be_held():
     with pytest.raises(SingularGeometryError, match="turn depends on the other"):
-        sampler(held=[PIECES, Distance([[2, 3]])]).begin()
+        sampler(held=[PIECES, Distance([[2, 3]])])
 
 
 def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,7 +40,8 @@ def test_sides_that_differ_by_more_than_chance_widen_the_error():
 
 
 def result(place, slope, d=1):
-    return WindowResult(0, np.full(d, place), np.full(d, slope), 1e-4 * np.eye(d), {}, np.nan, np.full(d, slope))
+    at, force = np.full(d, place), np.full(d, slope)
+    return WindowResult("ab", at, force, 1e-4 * np.eye(d), force, 1, 1.0, number=0, sides={}, p_value=np.nan)
 
 
 def found(degrees, names=("torsion",), periods=(PERIOD,)):
@@ -83,10 +85,8 @@ def test_a_turn_with_gaps_of_any_width_is_closed():
 
 
 def test_surfaces_of_a_part_of_a_turn_have_no_minima_beyond():
-    windows = [
-        WindowResult(0, np.radians(p), 9 * np.sin(np.radians(p)), 1e-4 * np.eye(2), {}, np.nan, np.zeros(2))
-        for p in [(a, b) for a in (40, 60, 80, 100) for b in (-40, -15, 15, 40)]
-    ]
+    places = [(a, b) for a in (40, 60, 80, 100) for b in (-40, -15, 15, 40)]
+    windows = [replace(result(0, 0, 2), value=np.radians(p), force=9 * np.sin(np.radians(p))) for p in places]
     surface = FreeEnergy(("a", "b"), np.full(2, PERIOD), windows).surface
     assert surface.periods == (None, None) and surface.minima() == []
 

@@ -71,7 +71,7 @@ def test_an_input_for_ase(folder):
         "most": 20,
         "below": 40,
     }
-    assert found.sampler.begin()[0] == pytest.approx([np.pi])
+    assert found.sampler.start == pytest.approx([np.pi])
     assert found.sampler.held[0].n_rows == 4
 
 
@@ -97,7 +97,7 @@ def test_a_difference_of_distances(folder):
     assert found.options["approach"] == pytest.approx([np.radians(6), 0.2])
     assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4])
     atoms = molecule("CH3OH")
-    assert found.sampler.begin()[0][1] == pytest.approx(atoms.get_distance(0, 1) - atoms.get_distance(3, 1))
+    assert found.sampler.start[1] == pytest.approx(atoms.get_distance(0, 1) - atoms.get_distance(3, 1))
 
 
 def test_pulls(folder):
@@ -141,7 +141,7 @@ def test_an_input_for_openmm(folder):
     np.testing.assert_allclose(found.targets, [[2.8, 0.3], [3.0, 0.3], [3.2, 0.3], [3.4, 0.3]])
     x = np.array(pdb.positions.value_in_unit(openmm.unit.nanometer))
     first, second = np.linalg.norm(x[[4, 8]] - x[14], axis=1)
-    assert found.sampler.begin()[0] == pytest.approx([first, first - second])
+    assert found.sampler.start == pytest.approx([first, first - second])
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_an_input_runs_no_code_that_nobody_allowed(folder, monkeypatch):
     with pytest.raises(InputError, match="--allow-module strange "):
         read(folder, INPUT.replace(FORCES, 'calculator = "strange:made"\n'))
     found = read_input(folder / "input.toml", allow_modules=["strange"])
-    assert found.sampler.begin()[0] == pytest.approx([np.pi])
+    assert found.sampler.start == pytest.approx([np.pi])
     assert not (folder / "strange.ran").exists()
     Windows(found.sampler, folder / "out", found.settings)  # about to run
     assert (folder / "strange.ran").exists()

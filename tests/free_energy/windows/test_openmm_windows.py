@@ -32,7 +32,7 @@ def sampler(coordinates, of=None):
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")
 def test_two_torsions_far_from_the_structure(tmp_path):
     windows = pickle.loads(pickle.dumps(sampler({"phi": PHI, "psi": PSI})))
-    assert windows.begin()[0] == pytest.approx([np.pi, np.pi], abs=1e-3)
+    assert windows.start == pytest.approx([np.pi, np.pi], abs=1e-3)
     steps = {"relax": 5, "pull": 20, "equilibration": 20, "production": 320, "every": 10}
     settings = Settings(timestep=2.0, **steps)
     windows.sample(Window(0, "up", (-1.2, 1.9), (-1.1, 2.0), 7), settings, tmp_path / "window.npz")
@@ -65,7 +65,7 @@ def test_windows_on_the_device_are_those_of_the_program(tmp_path, monkeypatch):
 
 def test_a_torsion_over_atoms_that_are_not_bonded():
     with pytest.warns(UserWarning, match="phi is a torsion over the atoms 6, 4, 8, 14, .* and 4-8 is no bond"):
-        sampler({"phi": Dihedral([[6, 4, 8, 14]])}).begin()
+        sampler({"phi": Dihedral([[6, 4, 8, 14]])})
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_coordinates_that_cannot_be_held():
     for i, j in ((4, 6), (6, 8), (4, 8), (8, 14), (6, 14), (4, 14)):
         tight.addConstraint(i, j, openmm.unit.norm(x[i] - x[j]))
     with pytest.raises(SingularGeometryError, match="q depends on the other"):
-        sampler({"q": Angle([[4, 6, 8]])}, tight).begin()
+        sampler({"q": Angle([[4, 6, 8]])}, tight)
 
 
 def test_structures_that_are_not_of_the_system():

@@ -10,15 +10,20 @@ from ase.calculators.emt import EMT
 from kcons.constraints import Dihedral, Distance, Formula
 from kcons.errors import InfeasibleError
 from kcons.free_energy import AseWindows, Window
-from kcons.free_energy.windows.window import Held, digest_of
+from kcons.free_energy.windows.window import digest_of
 
 X = np.array([[0.0, 1.0, 0.1], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.6, 1.0, 0.2], [2.0, -0.6, 0.8]])
 TURN = Dihedral([[0, 1, 2, 3]])
 BONDS = [[0, 1], [1, 2], [2, 3], [2, 4]]
 
 
+def of_atoms(x, coordinates, others, bonds):
+    atoms = Atoms(f"H{len(x)}", x, info={"bonds": np.array(bonds)})
+    return AseWindows(atoms, EMT, coordinates, others)
+
+
 def held(coordinates=None, others=()):
-    return Held(coordinates or {"turn": TURN}, list(others), X, np.ones(5), None, True, np.array(BONDS), None)
+    return of_atoms(X, coordinates or {"turn": TURN}, others, BONDS)
 
 
 def test_names_and_units():
@@ -31,7 +36,7 @@ def test_names_and_units():
 
 def test_groups_are_turned_and_keep_their_shape():
     rows = held(others=[Distance([[0, 1]])])
-    start = float(rows.found[0])
+    start = float(rows.start[0])
     motion, x = rows.placed([start + 2.0])
     assert motion.constraint_set.measure(x)[-1] == pytest.approx(start + 2.0 - 2 * np.pi * (start + 2.0 > np.pi))
     for i, j in [*BONDS, [3, 4], [1, 3], [1, 4]]:
@@ -46,13 +51,13 @@ AROUND = [[0, 1], [1, 2], [2, 3], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]]
 
 def ring(bonds=AROUND, others=()):
     pucker = {"pucker": Dihedral([[0, 1, 2, 3]])}
-    return Held(pucker, list(others), RING, np.ones(8), None, True, np.array(bonds), None)
+    return of_atoms(RING, pucker, others, bonds)
 
 
 def test_a_ring_comes_to_its_window_by_small_steps():
     """No part of a ring can be turned; bonds change little, and those that are held not at all."""
     rows = ring(others=[Distance(AROUND[:2])])
-    start = float(rows.found[0])
+    start = float(rows.start[0])
     assert abs(start) == pytest.approx(0.278, abs=1e-3)
     motion, x = rows.placed([-start])  # to its mirror image
     assert motion.constraint_set.measure(x)[-1] == pytest.approx(-start, abs=1e-10)

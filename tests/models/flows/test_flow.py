@@ -38,6 +38,7 @@ def own_jacobian(t, X):
 
 def test_jacobian_by_differences():
     X = np.array([0.4, -1.2])
+    np.testing.assert_allclose(jacobian_by_differences(lambda t, X: X @ X, 0.0, 100 * X), 200 * X, rtol=1e-9)
     assert jacobian_by_differences(own, 0.5, X) == pytest.approx(own_jacobian(0.5, X), abs=1e-11)
     assert Flow(own, 2).jacobian(0.5, X) == pytest.approx(Flow(own, 2, own_jacobian).jacobian(0.5, X), abs=1e-11)
     assert Flow(own, 2).divergence(0.5, X) == pytest.approx(np.sin(-1.2) + 0.05, abs=1e-11)
