@@ -131,6 +131,8 @@ class ConstraintSet:
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)
         together = whole_bodies(marked, y, self.lattice)
+        if self.images is not None:
+            together[self.images.atoms] = y[self.images.atoms]
         bound: list[Constraint] = []
         for start, item in zip(self.starts, marked, strict=False):
             r = self.gather(item, x, y)
@@ -139,12 +141,11 @@ class ConstraintSet:
             if isinstance(item.target, MovingTarget):
                 item.target.check(repr(item), time, item.n_rows, item.period)
             if item.target is None:
-                item = item.with_target(
-                    item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)
-                )
+                found = item.measure(self.gather(item, x, together), time) if item.holonomic else np.zeros(item.n_rows)
+                item = item.with_target(found)
             bound.append(item)
-        found = [item.target is None for item in marked]
-        self.constraints: tuple[Constraint, ...] = tuple(agreed_targets(bound, found, self.starts, time))
+        open_ = [item.target is None for item in marked]
+        self.constraints: tuple[Constraint, ...] = tuple(agreed_targets(bound, open_, self.starts, time))
         self._set_scale(x, time)
 
     def _set_scale(self, x: FloatArray, time: float) -> None:
@@ -594,16 +595,6 @@ class ConstraintSet:
             ),
             "translation_invariant",
         )
-
-    def _one_piece(self, item: Constraint, r: FloatArray, together: FloatArray) -> FloatArray:
-        """`r` of open rows from positions in one piece, where these mean the same images."""
-        if self.lattice is None or not item.relative:
-            return r
-        near = together[item.atoms]
-        same = ~np.round(np.diff(near, axis=1) @ self.lattice[1]).any(axis=(1, 2))
-        if item.whole is not None:
-            same &= ~item.whole
-        return np.where(same[:, None, None], near, r)
 
     def __len__(self) -> int:
         return self.n_rows
