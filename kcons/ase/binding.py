@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import pickle
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
-from threading import local
-from typing import Any, TypeAlias
+from typing import Any
 
 import ase.constraints
 import numpy as np
@@ -24,18 +22,11 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 
-#: Engines of the last objects that are kept for other objects with the same rows, as frames of a file have.
-RECENT = 2
-
 #: What objects of ASE hold, by the names of their attributes.
 _HELD = "index", "mask", "dir", "pairs", "bondlengths", "triples", "bonds", "angles", "dihedrals", "bondcombos"
 
 #: ASE objects that only add forces, so that they get along with any constraint.
 FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
-
-
-#: Constraints on atoms, each with what it holds.
-Company: TypeAlias = tuple[tuple[Any, Any], ...]
 
 _PLURAL = {"position": "positions", "momentum": "momenta", "force": "forces"}
 _FLOAT = np.dtype(np.float64)
@@ -48,34 +39,17 @@ class Binding:
     motion: Motion
     given: tuple[Constraint, ...]
     touched: IntArray
-    n_atoms: int
-    mass_array: str
-    masses: bytes
+    made_for: tuple[Any, ...]
     periodic: bool
-    pbc: bytes
     cell: bytes
     #: m and 1/m (0 for fixed atoms) for each component, and room for velocities; None if only some atoms are held.
     weights: tuple[FloatArray, FloatArray, FloatArray] | None
     #: Other constraints on the atoms, and what these held when they were looked at.
-    others: Company = ()
-    #: The object that may take the engine to another cell, if it is still there.
-    owner: Callable[[], object] = lambda: None
+    others: tuple[Any, ...] = ()
 
     def fits(self, atoms: Atoms) -> bool:
         """Whether number of atoms, periodicity and masses are still the same."""
-        # Every hook comes through here: compare bytes, which costs a fraction of a microsecond, and build nothing.
-        arrays = atoms.arrays
-        name = "masses" if "masses" in arrays else "numbers"
-        return (
-            len(arrays["positions"]) == self.n_atoms
-            and atoms.pbc.tobytes() == self.pbc
-            and name == self.mass_array
-            and arrays[name].tobytes() == self.masses
-        )
-
-    def serves(self, holder: object, cell: FloatArray) -> bool:
-        """Whether `holder`, whose cell is this, can go on with the engine: copies share it while all are in one."""
-        return not self.periodic or self.owner() is holder or cell.tobytes() == self.cell
+        return _read_by_engine(atoms) == self.made_for
 
     def follow_cell(self, atoms: Atoms, cell: FloatArray) -> None:
         """Let the engine know the cell, if it has changed; an `InputError` leaves it as it was."""
@@ -99,11 +73,19 @@ class Binding:
                     item=what,
                 )
             array = np.array(values, np.float64, order="C")
-        if array.shape != (self.n_atoms, 3):
-            raise InputError(f"{_PLURAL[what]} must have shape ({self.n_atoms}, 3), not {array.shape}", item=what)
+        wanted = (self.motion.n_atoms, 3)
+        if array.shape != wanted:
+            raise InputError(f"{_PLURAL[what]} must have shape {wanted}, not {array.shape}", item=what)
         if self.weights is None and not isfinite(np.vdot(array, array)):
             refuse_not_finite(array, what)
         return array
+
+
+def _read_by_engine(atoms: Atoms) -> tuple[Any, ...]:
+    """What an engine is made of besides rows and cell; every hook asks: bytes, compared in part of a microsecond."""
+    arrays = atoms.arrays
+    name = "masses" if "masses" in arrays else "numbers"
+    return len(arrays["positions"]), atoms.pbc.tobytes(), name, arrays[name].tobytes()
 
 
 def refuse_not_finite(values: FloatArray, what: str) -> None:
@@ -117,11 +99,7 @@ def refuse_not_finite(values: FloatArray, what: str) -> None:
         )
 
 
-def bind(
-    given: Sequence[Constraint],
-    atoms: Atoms,
-    time: float = 0.0,
-) -> Binding:
+def bind(given: Sequence[Constraint], atoms: Atoms, time: float = 0.0) -> Binding:
     """A new engine for `given` on `atoms`."""
     periodic = bool(atoms.pbc.any())
     x = atoms.arrays["positions"]
@@ -130,52 +108,15 @@ def bind(
     )
     motion = Motion(held, x, time=time)
     touched = touched_atoms(held.constraints)
-    name = "masses" if "masses" in atoms.arrays else "numbers"
     return Binding(
         motion=motion,
         given=held.constraints,
         touched=touched,
-        n_atoms=len(atoms),
-        mass_array=name,
-        masses=atoms.arrays[name].tobytes(),
+        made_for=_read_by_engine(atoms),
         periodic=periodic,
-        pbc=atoms.pbc.tobytes(),
         cell=atoms.cell.array.tobytes(),
         weights=_weights(motion) if len(touched) == len(atoms) else None,
     )
-
-
-class _Recent(local):
-    """Engines that were built last in this thread, each with the rows as they were given."""
-
-    def __init__(self) -> None:
-        self.known: deque[tuple[bytes, Binding]] = deque(maxlen=RECENT)
-
-
-_recent = _Recent()
-
-
-def shared(given: Sequence[Constraint], atoms: Atoms) -> Binding:
-    """An engine as `bind` gives it, or one that was built before for the same rows, masses and cell.
-
-    Frames of a file need one engine together. Only rows whose engine depends on no positions have it in common: targets
-    are given, nothing was converted to linear rows, and minimum images say all.
-    """
-    settled = all(item.target is not None for item in given)
-    try:
-        content = pickle.dumps(tuple(given)) if settled else b""
-    except (pickle.PicklingError, AttributeError, TypeError):  # functions of the user
-        content = b""
-    for known, bound in _recent.known:
-        same_cell = not bound.periodic or atoms.cell.array.tobytes() == bound.cell
-        if content == known and same_cell and bound.fits(atoms):
-            return bound
-    bound = bind(given, atoms)
-    motion = bound.motion
-    plain = motion.constraint_set.images is None and all(item.cell_offsets is None for item in bound.given)
-    if content and plain and not motion.conversions:
-        _recent.known.append((content, bound))
-    return bound
 
 
 def holding(item: Any) -> Any:
@@ -187,31 +128,22 @@ def holding(item: Any) -> Any:
     return None if isinstance(item, FORCES_ONLY) else pickle.dumps([own.get(name) for name in _HELD])
 
 
-def company(present: Sequence[Any]) -> Company:
-    """Constraints, each with what it holds now."""
+def company(present: Sequence[Any]) -> tuple[tuple[Any, Any], ...]:
+    """Constraints, each with what it holds now; equal as long as they are the same objects and hold the same."""
     return tuple((item, holding(item)) for item in present)
-
-
-def same_company(present: Sequence[Any], known: Company) -> bool:
-    """Whether these are the same constraints, and hold what they held."""
-    if len(present) != len(known):
-        return False
-    for item, (one, held) in zip(present, known, strict=True):
-        if item is not one or ((now := holding(item)) is not held and now != held):
-            return False
-    return True
 
 
 def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
     """Refuse ASE constraints that share atoms with `own`: ASE would apply them one after the other."""
-    if same_company(present, bound.others):
+    now = company(present)
+    if now == bound.others:
         return
     for other in present:
         if other is own or isinstance(other, FORCES_ONLY):
             continue
         if type(other) is ase.constraints.FixCom and all(c.translation_invariant for c in bound.given):
             continue  # a common shift of all atoms changes no row
-        both = np.intersect1d(_acted_on(other, bound.n_atoms), bound.touched)
+        both = np.intersect1d(_acted_on(other, bound.motion.n_atoms), bound.touched)
         if len(both):
             raise UnsupportedError(
                 f"{type(other).__name__} acts on atom {both[0]}, which kcons holds too; ASE would apply the two "
@@ -219,7 +151,7 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
                 "does so for what is on the atoms; for new rows, held = from_ase_constraints(atoms), "
                 "atoms.set_constraint(), constrain(atoms, [*held, *new])"
             )
-    bound.others = company(present)
+    bound.others = now
 
 
 def _acted_on(other: Any, n_atoms: int) -> IntArray:

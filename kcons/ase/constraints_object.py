@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 from weakref import ref
 
@@ -20,17 +20,15 @@ from kcons.ase.binding import (
     bind,
     check_company,
     refuse_not_finite,
-    shared,
     touched_atoms,
     unchanged_on_failure,
 )
 from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions, fulfilled, virial_of
 from kcons.ase.topology import bonds_of, constraints_of, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, file_form, translated
-from kcons.constraints import Constraint
+from kcons.constraints import Constraint, FixedAtoms
 from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.certificate import CHECK_EVERY
@@ -58,8 +56,6 @@ class Constraints(FixConstraint):
     constraints : sequence of Constraint
         What is held (or the plain data that `todict` writes). Fixed atoms belong here too, as
         `FixedAtoms`.
-    repeated : optional
-        Set in files that were written between `repeat` and the first use; not for people.
 
     Raises
     ------
@@ -74,18 +70,11 @@ class Constraints(FixConstraint):
     velocities from the difference of positions, which loses accuracy far from the origin.
     """
 
-    def __init__(
-        self,
-        constraints: Constraint | Iterable[Constraint | Mapping[str, Any]] = (),
-        *,
-        repeated: tuple[Sequence[int], int] | None = None,
-    ) -> None:
+    def __init__(self, constraints: Constraint | Iterable[Constraint | Mapping[str, Any]] = ()) -> None:
         self.constraints = listed(constraints)
-        self._repeated: tuple[tuple[int, int, int], int] | None = None
-        if repeated is not None:
-            (a, b, c), n = repeated
-            self._repeated = ((a, b, c), n)
         self._binding: Binding | None = None
+        #: Whether the engine is this object's; copies share one while all are in its cell.
+        self._own = False
         #: The atoms that the positions known of belong to; one object may be on several.
         self._last: ref[Atoms] | None = None
         self._accepted = UNKNOWN
@@ -124,26 +113,27 @@ class Constraints(FixConstraint):
         if bound is None or bound.given is not self.__dict__["constraints"] or not bound.fits(atoms):
             bound = self._bind(atoms)
         elif bound.periodic:
-            if bound.serves(self, atoms.cell.array):
-                bound.follow_cell(atoms, atoms.cell.array)
-            else:
-                bound = self._bind(atoms)
+            bound = self._in_cell(atoms, atoms.cell.array)
         if len(atoms.constraints) > 1:
             check_company(atoms.constraints, self, bound)
         return bound
 
-    def _bind(self, atoms: Atoms, make: Callable[..., Binding] = shared) -> Binding:
-        given = self.constraints if self._repeated is None else _led_across(self.constraints, atoms, *self._repeated)
-        _refuse_moving(given)
-        bound = make(given, atoms)
-        if bound.owner() is None:
-            bound.owner = ref(self)
-        if make is bind:  # for another cell alone: rows, and what knows them, stay
+    def _bind(self, atoms: Atoms) -> Binding:
+        _refuse_moving(self.constraints)
+        bound = bind(self.constraints, atoms)
+        self._forget(atoms)
+        self.constraints, self._binding, self._own = bound.given, bound, True
+        return bound
+
+    def _in_cell(self, atoms: Atoms, cell: FloatArray) -> Binding:
+        """The engine, which knows the cell; an `InputError` leaves it as it was."""
+        bound = self._binding
+        assert bound is not None
+        if not self._own and cell.tobytes() != bound.cell:
+            bound = bind(self.constraints, atoms)
             bound.given = self.constraints
-        else:
-            self._forget(atoms)
-        self.constraints = bound.given
-        self._repeated, self._binding = None, bound
+            self._binding, self._own = bound, True
+        bound.follow_cell(atoms, cell)
         return bound
 
     def _forget(self, atoms: Atoms) -> None:
@@ -174,8 +164,9 @@ class Constraints(FixConstraint):
         if changed:
             accepted.refuse_taken_along(motion, old, cell)
         found = accepted.ask(motion.constraint_set, old, x)
-        frame = found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched)
-        if not frame:
+        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched):
+            motion.project_positions(x, accepted.asked, out=x)
+        else:
             try:
                 if changed or found & ELSEWHERE:
                     accepted.look(motion, old, cell, elsewhere=True)
@@ -183,13 +174,9 @@ class Constraints(FixConstraint):
                 motion.project_positions(x, old, out=x)
             except (ConvergenceError, InputError, UnsupportedError) as error:
                 refuse_not_finite(x, "position")
-                frame = fulfilled(motion.constraint_set, x, bound.touched)
-                if not frame:
-                    if isinstance(error, ConvergenceError):
-                        error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
-                    raise
-        if frame:
-            motion.project_positions(x, accepted.asked, out=x)
+                if isinstance(error, ConvergenceError):
+                    error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
+                raise
         if self._positions_due <= 0:
             try:
                 motion.certify(x)
@@ -258,10 +245,8 @@ class Constraints(FixConstraint):
 
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
-        bound = self._binding
-        if bound is not None and bound.fits(atoms):
-            new = as_float_array(cell, "cell")
-            (bound if bound.serves(self, new) else self._bind(atoms, bind)).follow_cell(atoms, new)
+        if self._binding is not None and self._binding.fits(atoms):
+            self._in_cell(atoms, as_float_array(cell, "cell"))
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
@@ -293,30 +278,28 @@ class Constraints(FixConstraint):
         IndexError
             If no row is left; ASE then drops the object.
         """
-        if self._repeated is not None:
-            self._bind(atoms)
         kept = _within(self.constraints, np.arange(len(atoms))[ind], len(atoms))
         if not kept:
             raise IndexError("no constraint lies within the slice")
         self.constraints = kept
         self._binding = None
 
-    def repeat(self, m: int | Sequence[int], n: int) -> Constraints:
-        """Hold all replicas of a cell of `n` atoms repeated `m` times; changes and returns this object.
-
-        Rows across a periodic boundary are paired with the right replica at the next use.
+    def repeat(self, m: Any, n: int) -> Constraints:
+        """Hold the fixed atoms of all replicas of a cell of `n` atoms, `m` times along each axis; returns this object.
 
         Raises
         ------
         UnsupportedError
-            For surfaces and other rows with a place in space, of which ASE does not say where the
-            replicas lie.
+            For other rows, whose atoms may be in different replicas; nor does ASE repeat its own bonds and angles.
         """
-        times = (m, m, m) if isinstance(m, int | np.integer) else (int(m[0]), int(m[1]), int(m[2]))
-        if self._repeated is not None:
-            raise UnsupportedError("repeated twice before the first use; repeat once, by the product of the numbers")
-        self.constraints = _tiled(self.constraints, times, n)
-        self._repeated = (times, int(n))
+        for item in self.constraints:
+            if not item.fixes_atoms:
+                raise UnsupportedError(
+                    f"{item!r} cannot be repeated; take the constraints off with atoms.set_constraint(), and hold the "
+                    "rows of all replicas afterwards"
+                )
+        copies = int(np.prod(np.broadcast_to(m, 3)))
+        self.constraints = (FixedAtoms((self.touched + n * np.arange(copies)[:, None]).ravel()),)
         self._binding = None
         return self
 
@@ -327,7 +310,7 @@ class Constraints(FixConstraint):
         # Calculators copy the atoms at every step, so this is quick. Rows never change, and of an engine only the cell;
         # each object takes a new engine where it needs one.
         twin = object.__new__(type(self))
-        twin.__dict__.update(self.__dict__, _last=None, _accepted=UNKNOWN)
+        twin.__dict__.update(self.__dict__, _own=False, _last=None, _accepted=UNKNOWN)
         return twin
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Constraints:
@@ -431,17 +414,13 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
 
 
 def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    repeated, bound = held._repeated, held._binding
+    bound = held._binding
     # ASE counts rows as they are given, also those that depend on others.
-    independent = bound is None or bound.motion.rank == sum(item.n_rows for item in held.constraints)
-    if repeated is None and independent:
+    if bound is None or bound.motion.rank == sum(item.n_rows for item in held.constraints):
         form = file_form(held.constraints)
         if form is not None:
             return form
-    kwargs: dict[str, Any] = {"constraints": rows}
-    if repeated is not None:
-        kwargs["repeated"] = [list(repeated[0]), repeated[1]]
-    return {"name": REGISTERED_NAME, "kwargs": kwargs}
+    return {"name": REGISTERED_NAME, "kwargs": {"constraints": rows}}
 
 
 def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
@@ -461,7 +440,7 @@ def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -
     return result
 
 
-def _within(constraints: Sequence[Constraint], atoms: IntArray, n_atoms: int) -> tuple[Constraint, ...]:
+def _within(constraints: Iterable[Constraint], atoms: IntArray, n_atoms: int) -> tuple[Constraint, ...]:
     """Rows all of whose atoms are among `atoms`, of n_atoms, with these renumbered in their order."""
     new_index = np.full(n_atoms, -1, dtype=np.int64)
     new_index[atoms] = np.arange(len(atoms))
@@ -471,48 +450,6 @@ def _within(constraints: Sequence[Constraint], atoms: IntArray, n_atoms: int) ->
         if len(inside):
             kept.append((item if len(inside) == item.n_rows else item.select(inside)).renumbered(new_index))
     return tuple(kept)
-
-
-def _tiled(constraints: Sequence[Constraint], times: tuple[int, int, int], n: int) -> tuple[Constraint, ...]:
-    """The rows of all replicas of a cell of `n` atoms; `UnsupportedError` as of `Constraints.repeat`."""
-    copies = times[0] * times[1] * times[2]
-    result = []
-    for item in constraints:
-        if not (item.translation_invariant or item.held_in_place):
-            raise UnsupportedError(
-                f"{item!r} has a place in space and cannot be repeated; remove it with atoms.set_constraint() "
-                "and add one for each replica afterwards"
-            )
-        rows = item.select(np.tile(np.arange(item.n_rows), copies))
-        rows.atoms = rows.atoms + n * np.repeat(np.arange(copies), item.n_rows)[:, None]
-        result.append(rows if item.translation_invariant else rows.with_target(None))
-    return tuple(result)
-
-
-def _led_across(
-    constraints: Sequence[Constraint], atoms: Atoms, times: tuple[int, int, int], n: int
-) -> tuple[Constraint, ...]:
-    """Rows of a repeated cell of `n` atoms, those across its old boundary led to the neighboring replica."""
-    copies = times[0] * times[1] * times[2]
-    if not atoms.pbc.any() or len(atoms) < n * copies:
-        return tuple(constraints)
-    x = atoms.arrays["positions"]
-    cell = atoms.cell.array / np.array(times)[:, None]
-    first = [item.select(np.arange(item.n_rows // copies)) for item in constraints]
-    one = ConstraintSet(first, x[:n], atoms.get_masses()[:n], cell=cell, pbc=atoms.pbc)
-    assert one.lattice is not None
-    result = []
-    for item, bound in zip(constraints, one.constraints, strict=True):
-        if item.relative:
-            replica, base = np.divmod(item.atoms, n)
-            place = np.stack(np.unravel_index(replica, times), axis=-1)
-            apart = one.gather(bound, x[:n]) - x[bound.atoms]
-            cells = np.round((apart - apart[:, :1]) @ one.lattice[1]).astype(np.int64)
-            place = (place + np.tile(cells, (copies, 1, 1))) % np.array(times)
-            item = item.with_target(item.target)
-            item.atoms = np.ravel_multi_index(tuple(np.moveaxis(place, -1, 0)), times) * n + base
-        result.append(item)
-    return tuple(result)
 
 
 def _refuse_moving(given: Iterable[Constraint]) -> None:

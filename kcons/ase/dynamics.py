@@ -17,11 +17,9 @@ from ase.md.md import MolecularDynamics
 from kcons.ase.binding import (
     FORCES_ONLY,
     Binding,
-    Company,
     applied_forces,
     bind,
     company,
-    same_company,
     unchanged_on_failure,
 )
 from kcons.ase.constraints_object import Constraints, listed
@@ -121,13 +119,12 @@ class ConstrainedDynamics(MolecularDynamics):
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         require_stepper(self.stepper)
         self._more = listed(constraints)
-        self._present: Company | None = None
+        self._present: tuple[Any, ...] | None = None
         self._bound: Binding | None = None
         self._system: System | None = None
         self._state: State | None = None
         self._cell: tuple[bytes, ...] = ()
         self._asked: tuple[Any, ...] = ()  # calculators, and where each keeps what it found
-        self._size = len(atoms)
         self._momenta = self._masses = np.zeros((0, 3))  # momenta as written last; masses, 0 for fixed atoms
         with unchanged_on_failure(atoms):
             self._prepare(atoms, timestep, state)
@@ -360,18 +357,21 @@ class ConstrainedDynamics(MolecularDynamics):
     def _systems(self) -> System:
         """The system for the atoms as they are; built anew if masses, constraints or periodicity changed."""
         atoms = self.atoms
-        present = atoms.constraints
-        known, bound = self._present, self._bound
-        if known is None or not same_company(present, known):
-            bound = None
-        if bound is None or not bound.fits(atoms):
-            self._refuse_fewer(len(atoms))
-            rows = [*_rows(atoms, present), *self._more]
+        present, bound = company(atoms.constraints), self._bound
+        if bound is None or present != self._present or not bound.fits(atoms):
+            gone = 0 if bound is None else bound.motion.n_atoms - len(atoms)
+            if gone > 0 and self._more:
+                raise InputError(
+                    f"{gone} of {len(atoms) + gone} atoms were removed, and constraints that the dynamics was given "
+                    "name atoms by their numbers, which are others now; make a new one",
+                    item="atoms",
+                )
+            rows = [*_rows(atoms), *self._more]
             bound = bind(rows, atoms, self.time)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
-            self._bound, self._present, self._state = bound, company(present), None
-            self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
+            self._bound, self._present, self._state = bound, company(atoms.constraints), None
+            self._only_forces = any(isinstance(item, FORCES_ONLY) for item in atoms.constraints)
             self._system = self._made(bound.motion)
             self._system.time_unit = ("fs", units.fs)
             self._mover.check(self._system)
@@ -381,16 +381,6 @@ class ConstrainedDynamics(MolecularDynamics):
             bound.follow_cell(atoms, atoms.cell.array)
         assert self._system is not None
         return self._system
-
-    def _refuse_fewer(self, now: int) -> None:
-        """Refuse fewer atoms than before where something was given by their numbers."""
-        before, self._size = self._size, now
-        if now < before and self._more:
-            raise InputError(
-                f"{before - now} of {before} atoms were removed, and constraints that the dynamics was given name "
-                "atoms by their numbers, which are others now; make a new one",
-                item="atoms",
-            )
 
     def _made(self, motion: Motion) -> System:
         return System(motion, self._force, potential=self._energy, far=FAR)
@@ -407,8 +397,8 @@ class ConstrainedDynamics(MolecularDynamics):
         return self.atoms.get_forces(apply_constraint=False)
 
 
-def _rows(atoms: Atoms, present: Iterable[Any]) -> list[Constraint]:
-    holding = [item for item in present if not isinstance(item, FORCES_ONLY)]
+def _rows(atoms: Atoms) -> list[Constraint]:
+    holding = [item for item in atoms.constraints if not isinstance(item, FORCES_ONLY)]
     for item in holding:
         if isinstance(item, Constraints):
             item.engine(atoms)  # settles targets that are open

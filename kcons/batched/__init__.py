@@ -5,11 +5,9 @@ said by the engines (`kcons.Motion`) of the systems. Gradients go through positi
 the equations at the solution.
 
 - `row_functions`: families of constraints on tensors
-- `clusters`: the equations of clusters that look alike
-- `lanes`, `levels`: how they are solved: elimination written out, or sparse elimination by levels
+- `clusters`: the equations of clusters that look alike, by elimination written out, or sparse elimination by levels
 - `groups`: where the clusters of a batch are in its tensors
-- `projections`: projections that torch differentiates
-- `batch`: many systems, and what is asked of them
+- `batch`: many systems, what is asked of them, and projections that torch differentiates
 - `steps`: RATTLE and Langevin dynamics
 """
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcons.batched.clusters import Problem
 from kcons.batched.groups import Group, kinds_of
-from kcons.batched.projections import Projection, Task
 from kcons.constraints.arguments import IntArray, whole_number
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -22,6 +22,10 @@ from kcons.motion.report import Report
 ACCEPTED, ROUNDINGS = 1e-10, 1e3
 #: Projections after which failures are looked for, where looking waits for the device.
 CHECK_EVERY = 100
+#: Newton iterations after which there is no solution near, and those that are made where nobody looks.
+MAX_ITERATIONS, UNWATCHED = 30, 5
+#: Roundings that a row may be off by for the iterations to end.
+ENOUGH = 2
 
 
 class Solved(NamedTuple):
@@ -235,8 +239,7 @@ class Batch:
                 raise InputError(f"{item} of a Batch were written to; give other ones as {item}= of a call", item=item)
         t, t_start = (torch.full((), each, dtype=self.dtype, device=self.device) for each in (time, start))
         groups = self._groups if flight or not of_positions else self._position_groups
-        own = self._inverse_masses, self.targets if of_positions else self._still
-        return Task(of_positions, flight != 0, groups, t, t_start, self._lattice, self._tree_cells, own)
+        return Task(self, groups, of_positions, flight != 0, t, t_start)
 
     def _with_fixed(self, y: Tensor, rows: Tensor) -> Tensor:
         """With what the rows of fixed atoms say of these."""
@@ -396,3 +399,96 @@ def _starts(counts: Sequence[int]) -> IntArray:
 
 def _by_copy(rows: Tensor, like: Tensor) -> Tensor:
     return rows.reshape(like.shape[0], -1) if like.ndim == 3 else rows
+
+
+# -- projections as functions that torch differentiates ------------------------------------------------
+
+
+class Task(NamedTuple):
+    """What is solved for: `of_positions` or of velocities, and whether rows of velocities count in positions (`flies`).
+
+    At times of what is projected and of where directions are taken.
+    """
+
+    batch: Batch
+    groups: Sequence[Group]
+    of_positions: bool
+    flies: bool
+    t: Tensor
+    t_start: Tensor
+
+    def problem(self, group: Group, x: Tensor, start: Tensor, held: Tensor, w: Tensor) -> Problem:
+        """Of the clusters of a group, at positions x with directions of a start, which may be the same tensor."""
+        batch = self.batch
+        there = group.coordinates(start, batch._lattice, batch._tree_cells)
+        here = there if x is start else group.coordinates(x, batch._lattice, batch._tree_cells)
+        flies = self.flies and any(not row.function.holonomic for row in group.pattern.rows)
+        # Inverse masses and targets of the batch do not change from call to call.
+        weights = group.lanes(w, group.atoms, w is batch._inverse_masses)
+        wanted = group.lanes(held, group.rows, held is batch.targets or held is batch._still)
+        return Problem(here[0], there[0], here[1], there[1], flies, weights, wanted, group.p, self.t, self.t_start)
+
+
+def _solve(group: Group, of: Problem) -> tuple[Tensor, Tensor]:
+    """Multipliers, and how far they move the atoms, by Newton's method; notes by how much rows are off then.
+
+    On a processor residuals are looked at in each iteration; on a GPU that would wait for it.
+    """
+    eps, watched = torch.finfo(of.x.dtype).eps, of.x.device.type == "cpu"
+    count, before = MAX_ITERATIONS if watched else UNWATCHED, torch.inf
+    following = of.x.new_zeros(group.pattern.rank, of.x.shape[-1])
+    for _ in range(count + 1):
+        lam = following
+        following, moved, size = group.solver.newton(of, lam)
+        worst = float((size / group.scale).max()) if watched else torch.inf
+        # Near the end an iteration that gains nothing shows what rounding leaves.
+        if not worst > ENOUGH * eps or eps**0.5 > worst > 0.5 * before:
+            break
+        before = worst
+    group.worst = torch.maximum(group.worst, size / group.scale)
+    return lam, moved
+
+
+class Projection(torch.autograd.Function):
+    """Positions or velocities on the rows, by how much they were moved, and multipliers by row.
+
+    Of what is projected, of positions whose gradients give the directions, of what rows are held at, and of inverse
+    masses. Derivatives are those of the equations at the solution; nothing of the iterations is kept.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, given: Tensor, place: Tensor, held: Tensor, w: Tensor, task: Task) -> Any:
+        push, multipliers = torch.zeros_like(given), torch.zeros_like(held)
+        for group in task.groups:
+            of = task.problem(group, given if task.of_positions else place, place, held, w)
+            if task.of_positions:
+                lam, moved = _solve(group, of)
+            else:
+                lam, moved = group.solver.tangent(of, given.reshape(-1)[group.flat])
+            group.put(push, moved)
+            multipliers[group.rows[: group.pattern.rank]] = lam
+        found = given + push
+        ctx.task = task
+        ctx.save_for_backward(found, place, held, w, multipliers)
+        ctx.set_materialize_grads(False)
+        return found, push, multipliers
+
+    @staticmethod
+    def backward(ctx: Any, by_found: Any, by_push: Any, by_multipliers: Any) -> Any:
+        found, place, held, w, multipliers = ctx.saved_tensors
+        task = ctx.task
+        by_found = torch.zeros_like(found) if by_found is None else by_found
+        pushed = by_found if by_push is None else by_found + by_push
+        sums = [torch.zeros_like(each) for each in (found, place, held, w)]
+        for group in task.groups:
+            of = task.problem(group, found if task.of_positions else place, place, held, w)
+            adjoint = group.solver.newton_adjoint if task.of_positions else group.solver.tangent_adjoint
+            rows = group.rows[: group.pattern.rank]
+            bent = torch.zeros_like(multipliers[rows]) if by_multipliers is None else by_multipliers[rows]
+            here, h = found.reshape(-1)[group.flat], pushed.reshape(-1)[group.flat]
+            parts = adjoint(of, multipliers[rows], h, bent, here)
+            for k, (part, index) in enumerate(zip(parts, (group.flat, group.flat, rows, group.atoms), strict=True)):
+                # Atoms that are fixed may belong to several clusters.
+                flat = sums[k].reshape(-1).index_add(0, index.reshape(-1), part.expand(index.shape).reshape(-1))
+                sums[k] = flat.reshape(sums[k].shape)
+        return by_found + sums[0], *sums[1:], None

@@ -1,26 +1,29 @@
 """Clusters that look alike, side by side: the equations of their multipliers, by positions, velocities and gradients.
 
 Vectors of small clusters are lists with a tensor of shape (clusters,) for each number, and their elimination is written
-out (`lanes`); those of larger ones are tensors, and rows that share nothing are eliminated together, by levels
-(`levels`). What is done with these is written once, for both.
+out (`Lanes`), so that one kernel does all of a step; those of larger ones are tensors, and rows that share nothing are
+eliminated together (`Levels`). What is done with these is written once, for both.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from kcons.batched.row_functions import RowFunction
+from kcons.plan.clusters_alike import elimination
 
 #: Rows, and atoms in all rows, up to which elimination is written out.
 LANES_ROWS, LANES_PLACES = 6, 24
 
-#: A list of tensors, or a tensor.
+#: A list of tensors, or a tensor; lists of rows with None where two share no atom, or a tensor (entries, n).
 Vector = Any
+Matrix = Any
 
 
 class Row(NamedTuple):
@@ -276,3 +279,178 @@ def _times(one: Vector, other: Vector) -> Vector:
 
 def _dot(one: Vector, other: Vector) -> Any:
     return sum((a * b).sum() for a, b in zip(one, other, strict=True))
+
+
+class Lanes(Clusters):
+    """Clusters with a tensor for each number; gradients are lists of numbers by row."""
+
+    def unpacked(self, packed: Tensor) -> Vector:
+        return list(packed.unbind(0))
+
+    def take(self, vector: Vector, numbers: Any) -> list[Any]:
+        return [vector[k] for k in numbers]
+
+    def packed(self, vector: Vector, like: Tensor) -> Tensor:
+        lane = like[0]
+        return torch.stack([each.expand_as(lane) if isinstance(each, Tensor) else lane * 0 + each for each in vector])
+
+    def couple(self, left: Any, right: Any, weights: Vector) -> Matrix:
+        rows = self.pattern.rows[: self.pattern.rank]
+        slot = [{a: 3 * i for i, a in enumerate(row.atoms) if a not in self.pattern.fixed} for row in rows]
+        heavy = [
+            {a: [weights[3 * a] * right[k][i + c] for c in range(3)] for a, i in mine.items()}
+            for k, mine in enumerate(slot)
+        ]
+
+        def entry(k: int, other: int) -> Any:
+            terms = [
+                left[k][i + c] * each
+                for atom, i in slot[k].items()
+                for c, each in enumerate(heavy[other].get(atom, ()))
+            ]
+            return sum(terms[1:], terms[0]) if terms else None
+
+        return [[entry(k, other) for other in range(len(rows))] for k in range(len(rows))]
+
+    def solve(self, s: Matrix, b: Vector, transposed: bool = False) -> Vector:
+        n, b = len(b), list(b)
+        s = [[s[j][i] if transposed else s[i][j] for j in range(n)] for i in range(n)]
+        for k in range(n):
+            s[k][k] = 1.0 / s[k][k]
+            for i in range(k + 1, n):
+                if s[i][k] is None:
+                    continue
+                factor = s[i][k] * s[k][k]
+                for j in range(k + 1, n):
+                    if s[k][j] is not None:
+                        s[i][j] = -factor * s[k][j] if s[i][j] is None else s[i][j] - factor * s[k][j]
+                b[i] = b[i] - factor * b[k]
+        for k in reversed(range(n)):
+            for j in range(k + 1, n):
+                if s[k][j] is not None:
+                    b[k] = b[k] - s[k][j] * b[j]
+            b[k] = b[k] * s[k][k]
+        return b
+
+    def diagonal(self, s: Matrix) -> Vector:
+        return [s[k][k] for k in range(len(s))]
+
+    def spread(self, slope: Any, lam: Vector) -> Vector:
+        found: Vector = [0.0] * (3 * self.pattern.n_atoms)
+        for row, steep, each in zip(self.pattern.rows, slope, lam, strict=False):
+            for i, k in enumerate(3 * atom + c for atom in row.atoms for c in range(3)):
+                found[k] = found[k] + steep[i] * each
+        return found
+
+    def contract(self, slope: Any, v: Vector) -> Vector:
+        return [
+            sum(steep[3 * i + c] * v[3 * atom + c] for i, atom in enumerate(row.atoms) for c in range(3))
+            for row, steep in zip(self.pattern.rows, slope, strict=True)
+        ]
+
+
+class Levels(Clusters):
+    """Clusters whose numbers are all in one tensor; gradients have shape (atoms in rows, 3, n).
+
+    A level of elimination has rows that are eliminated at once, their factors, and products of these with what is
+    beside the pivots. A factor has its entry, the row and a later row; a product the factor, the entry beside, and that
+    it is taken from. The entry beyond the diagonal from one is `across`.
+    """
+
+    def __init__(self, pattern: Pattern, device: torch.device) -> None:
+        super().__init__(pattern)
+        rows = pattern.rows
+        moving = [tuple(a for a in row.atoms if a not in pattern.fixed) for row in rows[: pattern.rank]]
+        found = elimination(moving, set())
+        place, later = found.rows.tolist(), [found.rows[some].tolist() for some in found.later]
+        pairs = [pair for here, some in zip(place, later, strict=True) for i in some for pair in ((here, i), (i, here))]
+        entries = {pair: k for k, pair in enumerate([*((k, k) for k in range(len(place))), *pairs])}
+        self.levels = []
+        for begin, end in zip(found.levels[:-1], found.levels[1:], strict=True):
+            factor: list[tuple[int, int, int]] = []
+            product: list[tuple[int, int, int]] = []
+            for here, some in zip(place[begin:end], later[begin:end], strict=True):
+                for there in some:
+                    product += [(len(factor), entries[here, j], entries[there, j]) for j in some]
+                    factor.append((entries[there, here], here, there))
+            done = torch.tensor(place[begin:end], device=device)
+            self.levels.append((done, _table(factor, 3, device), _table(product, 3, device)))
+        self.across = torch.tensor([entries[j, i] for i, j in entries], device=device)
+        alike: dict[Any, list[Any]] = {}
+        for kind in self.kinds:
+            alike.setdefault((kind[0].function, kind[0].relative, kind[0].period), []).append(kind)
+        self.kinds = []
+        for some in alike.values():
+            first, *numbers = zip(*some, strict=True)
+            tables = [torch.tensor(each, dtype=torch.long, device=device).movedim(0, -1) for each in numbers]
+            self.kinds.append((first[0], *tables))
+        order = [k for kind in self.kinds for k in kind[1].tolist()]
+        self.order = torch.tensor(order, device=device).argsort()
+        ends = np.cumsum([0, *(len(row.atoms) for row in rows)]).tolist()
+        self.slots = torch.tensor([i for k in order for i in range(*ends[k : k + 2])], device=device).argsort()
+        self.atom, self.row = _table(((a, k) for k, row in enumerate(rows) for a in row.atoms), 2, device)
+        products = [
+            (entry, ends[k] + i, ends[other] + j, 3 * atom)
+            for (k, other), entry in entries.items()
+            for i, atom in enumerate(rows[k].atoms)
+            for j, same in enumerate(rows[other].atoms)
+            if atom == same and atom not in pattern.fixed
+        ]
+        self.products = _table(products, 4, device)
+
+    def unpacked(self, packed: Tensor) -> Vector:
+        return packed
+
+    def packed(self, vector: Any, like: Tensor) -> Tensor:
+        return vector.expand(len(vector), like.shape[-1])
+
+    def take(self, vector: Any, numbers: Tensor) -> list[Any]:
+        return list(vector[numbers].unbind(0))
+
+    def evaluate(self, of: Problem, u: Vector | None) -> tuple[Any, Any]:
+        values, slopes = super().evaluate(of, u)
+        sizes = [len(kind[1]) for kind in self.kinds]
+
+        def whole(value: Any, size: int) -> Tensor:
+            return (of.x.new_zeros(()) + value).expand(size, of.x.shape[-1])
+
+        steep = [torch.stack([whole(e, n) for e in some], 1) for some, n in zip(slopes, sizes, strict=True)]
+        off = torch.cat([whole(value, n) for value, n in zip(values, sizes, strict=True)])[self.order]
+        return off, torch.cat([each.reshape(-1, 3, of.x.shape[-1]) for each in steep])[self.slots]
+
+    def couple(self, left: Any, right: Any, weights: Any) -> Tensor:
+        entry, one, other, atom = self.products
+        terms = (left[one] * (weights[atom].unsqueeze(1) * right[other])).sum(1)
+        return _summed(terms, entry, len(self.across))
+
+    def solve(self, s: Tensor, b: Any, transposed: bool = False) -> Vector:
+        s, b = (s[self.across] if transposed else s.clone()), b.clone()
+        for _, (entry, here, there), (which, beside, taken) in self.levels:
+            factor = s[entry] / s[here]
+            s.index_add_(0, taken, factor[which] * s[beside], alpha=-1)
+            b.index_add_(0, there, factor * b[here], alpha=-1)
+        for rows, (entry, here, there), _ in reversed(self.levels):
+            b.index_add_(0, here, s[self.across[entry]] * b[there], alpha=-1)
+            b[rows] = b[rows] / s[rows]
+        return b
+
+    def diagonal(self, s: Tensor) -> Vector:
+        return s[: self.pattern.rank]
+
+    def spread(self, slope: Any, lam: Any) -> Vector:
+        some = self.row < len(lam)
+        terms = slope[some] * lam[self.row[some]].unsqueeze(1)
+        return _summed(terms, self.atom[some], self.pattern.n_atoms).reshape(3 * self.pattern.n_atoms, -1)
+
+    def contract(self, slope: Any, v: Any) -> Vector:
+        places = v.reshape(self.pattern.n_atoms, 3, -1)[self.atom]
+        return _summed((slope * places).sum(1), self.row, len(self.pattern.rows))
+
+
+def _summed(terms: Tensor, index: Tensor, count: int) -> Tensor:
+    return terms.new_zeros(count, *terms.shape[1:]).index_add(0, index, terms)
+
+
+def _table(entries: Iterable[Iterable[int]], width: int, device: torch.device) -> Tensor:
+    rows = [list(each) for each in entries]
+    return torch.tensor(rows, dtype=torch.long, device=device).reshape(len(rows), width).T

@@ -11,9 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcons.batched.clusters import Clusters, Pattern, Row
-from kcons.batched.lanes import Lanes
-from kcons.batched.levels import Levels
+from kcons.batched.clusters import Clusters, Lanes, Levels, Pattern, Row
 from kcons.batched.row_functions import row_function
 from kcons.constraints.arguments import FloatArray, IntArray
 from kcons.errors import UnsupportedError
@@ -36,10 +34,7 @@ _KNOWN: WeakKeyDictionary[Motion, dict[bool, dict[Pattern, Kind]]] = WeakKeyDict
 def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
     """Clusters of an engine by pattern, with or without rows of velocities; looked for once.
 
-    Raises
-    ------
-    UnsupportedError
-        Rows that cannot be run on tensors; rows that depend on others in clusters where these are not known.
+    Refuses rows that cannot be run on tensors, and rows that depend on others in clusters where these are not known.
     """
     known = _KNOWN.setdefault(motion, {})
     if velocity_rows in known:
@@ -144,12 +139,8 @@ class Group:
     def coordinates(self, x: Tensor, lattice: Tensor | None, tree: Any) -> tuple[Tensor, Tensor | None]:
         """Of the atoms of clusters, and by how much the images that relative rows mean stand off: see `Problem`.
 
-        Parameters
-        ----------
-        x : Tensor, shape (all atoms, 3)
-        lattice : Tensor, shape (n_systems, 2, 3, 3), or None
-        tree : callable
-            Gives whole cells by which atoms of whole rows stand off where they are stored, of the shape of x, or None.
+        The lattice has shape (n_systems, 2, 3, 3); `tree` gives whole cells by which atoms of whole rows stand off
+        where they are stored, of the shape of x, or None.
         """
         flat, n = x.reshape(-1), self.atoms.shape[1]
         if lattice is None or not len(self._begin):

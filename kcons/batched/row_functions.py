@@ -79,13 +79,7 @@ class RowFunction(NamedTuple):
 
 
 def row_function(item: Constraint) -> RowFunction:
-    """The function of an object's rows.
-
-    Raises
-    ------
-    UnsupportedError
-        A function of Python that is not written with NumPy's elementary functions.
-    """
+    """The function of an object's rows; refuses what is not written with NumPy's elementary functions."""
     found = function_of(item)
     if found is not None:
         return RowFunction(found.tape(), item.width, item.holonomic)

@@ -15,7 +15,6 @@ import inspect
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -88,9 +87,7 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
 
 def finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
     """A copy of values for each atom, shape (n_atoms, 3); `InputError` where they are not finite."""
-    array: FloatArray = np.array(as_float_array(values, item), order="C")
-    if array.shape != (n_atoms, 3):
-        raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
+    array = as_array(np.array(as_float_array(values, item)), (n_atoms, 3), item)
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
         atom = int(np.argmax(bad))
@@ -98,15 +95,16 @@ def finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArra
     return array
 
 
-def out_of_range(values: FloatArray) -> tuple[int, str] | None:
-    """The first row with a value that is not finite or larger than `LARGEST`, and what to say of it; None without."""
+def check_range(values: FloatArray, say: str, item: str, atoms: IntArray | None = None) -> None:
+    """Refuse values that are not finite or larger than `LARGEST`; `say` has {row} for the first of these."""
     good = np.abs(values) <= LARGEST
-    if good.all():
-        return None
-    first = np.argwhere(~good)[0]
-    value = float(values[tuple(first)])
-    said = f"{value:g}, of which the square overflows; choose other units" if math.isfinite(value) else "not finite"
-    return int(first[0]) if len(first) else 0, said
+    if not good.all():
+        row, *others = np.argwhere(~good)[0] if values.ndim else (0,)
+        value = float(values[(row, *others)] if values.ndim else values)
+        said = f"{value:g}, of which the square overflows; choose other units" if math.isfinite(value) else "not finite"
+        raise InputError(
+            f"{say.format(row=row)} is {said}", item=item, atoms=() if atoms is None else atoms[row].tolist()
+        )
 
 
 def read_only_view(array: FloatArray) -> FloatArray:
@@ -340,33 +338,16 @@ _PLAIN = (int, float, bool, str, type(None))
 
 
 class Kind(NamedTuple):
-    """What a number is.
-
-    Attributes
-    ----------
-    words : str
-        For messages.
-    exponents : tuple of (str, int), or None
-        Base dimensions by their names in OpenMM; None for any.
-    """
+    """What a number is: in words, for messages, and its base dimensions by their names in OpenMM; None for any."""
 
     words: str
     exponents: tuple[tuple[str, int], ...] | None
-
-    def per_time(self, power: int = 1) -> Kind:
-        """Its rate of change, or with 2 its acceleration."""
-        if self.exponents is None:
-            return self
-        exponents = dict(self.exponents)
-        exponents["time"] = exponents.get("time", 0) - power
-        per = "ps" if power == 1 else f"ps**{power}"
-        return Kind(f"{self.words}/{per}", tuple((name, n) for name, n in exponents.items() if n))
 
 
 ANY = Kind("any unit", None)
 NUMBER = Kind("a plain number", ())
 LENGTH = Kind("nm", (("length", 1),))
-SPEED = LENGTH.per_time()
+SPEED = Kind("nm/ps", (("length", 1), ("time", -1)))
 ANGLE = Kind("radian", (("angle", 1),))
 TIME = Kind("ps", (("time", 1),))
 #: A vector of which only the direction counts.
@@ -425,33 +406,9 @@ def refuse_units(values: Any, item: str) -> None:
     if has_units(values):
         raise InputError(
             f"{item} has units ({quantity_text(values)}), and only kcons.openmm knows what the other numbers are in; "
-            "give plain numbers in the units of the run",
+            "give plain numbers in the units of the run (nm and ps in OpenMM)",
             item=item,
         )
-
-
-@dataclass(frozen=True)
-class Unitless:
-    """A function whose results are taken without their units; for those that may return Quantities."""
-
-    function: Callable[..., Any]
-    item: str
-    kind: Kind
-
-    def __call__(self, *arguments: Any) -> Any:
-        found = self.function(*arguments)
-        if type(found) is tuple:  # several results, each of its own kind
-            return tuple(without_units(part, self.item, ANY)[0] for part in found)
-        return without_units(found, self.item, self.kind)[0]
-
-
-def plain_target(target: Any, item: str, kind: Kind) -> tuple[Any, bool]:
-    """`without_units` for what may also be a `MovingTarget`, whose time step is looked at."""
-    step = getattr(target, "time_step", None)
-    if not has_units(step):
-        return without_units(target, item, kind)
-    plain, matters = without_units(step, f"{item}: time_step", TIME)
-    return target.with_time_step(float(plain)), matters
 
 
 # -- arguments looked at by what their annotations say ----------------------------------------------
@@ -461,9 +418,10 @@ Rule: TypeAlias = Callable[[Any, str], Any]
 
 
 class Rules(NamedTuple):
-    """What an annotation says of an argument: its units, or `NUMBER`; whether None may pass, unseen; rules."""
+    """What an annotation says of an argument."""
 
     kind: Kind
+    #: Whether None may pass, unseen.
     optional: bool
     rules: tuple[Rule, ...]
 
@@ -505,7 +463,7 @@ def checked(function: Callable[P, R], *, units: bool = False) -> Callable[P, R]:
             kind, optional, asked = rules[name]
             item = f"{type(self).__name__}: {name}" if units else name
             if units:
-                value, matters = plain_target(value, item, self.held if kind is HELD else kind)
+                value, matters = without_units(value, item, self.held if kind is HELD else kind)
                 remembered |= matters
             for rule in () if optional and value is None else asked:
                 value = rule(value, item)

@@ -44,7 +44,7 @@ class MassWeighted(Constraint, base=True):
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         with np.errstate(invalid="ignore"):
             weightless = np.asarray(np.isnan(self.weights()).any(axis=1))
-        self.refuse_input(
+        self.refuse(
             weightless, first_row, lambda k: "all atoms of a group have mass 0; give one of them a mass", "masses"
         )
         super().check(r, time, first_row)
@@ -68,7 +68,6 @@ class CenterOfMass(MassWeighted, LinearRows):
     kind = RowKind.LINEAR
     translation_invariant = False
     positive = ""
-    held_in_place = True
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"directions": (3,)}
     directions: FloatArray
 
@@ -103,7 +102,7 @@ class CenterDistance(MassWeighted):
         Distance held.
     """
 
-    singular = "the two centers of {row}, coincide: gradient undefined; move the groups apart"
+    singular = "the two centers coincide: gradient undefined; move the groups apart"
     shared = ("split",)
     split: int
 
@@ -161,7 +160,7 @@ class RadiusOfGyration(MassWeighted):
         Whether the weights are the masses (default) or all equal.
     """
 
-    singular = "all atoms of {row}, coincide: gradient undefined; move them apart"
+    singular = "all of its atoms coincide: gradient undefined; move them apart"
     shared = ("mass_weighted",)
 
     def __init__(self, atoms: ArrayLike, target: Target = None, *, mass_weighted: bool = True) -> None:

@@ -1,7 +1,8 @@
 """Compiled kernels: where they are kept, what is said while they are made, and what needs none.
 
 Numba compiles a kernel when it is first called, and keeps the result on disk, so that a machine compiles it once. Each
-processor has results of its own in the same folder, and several processes may use it at once.
+processor has results of its own in the same folder, and several processes may use it at once. For all kernels of kcons,
+which `njit` and `cfunc` of this module make:
 
 - Where the folder of kcons cannot be written to, Numba keeps results below the user's home; where that cannot be
   written to either, in ``$NUMBA_CACHE_DIR``. Without any of these they are kept for one process only.
@@ -10,12 +11,9 @@ processor has results of its own in the same folder, and several processes may u
 - A damaged file counts as missing.
 - A kernel is compiled anew when its own source has changed or that of any kernel it may call: Numba by itself looks at
   its own file only, and what was kept would call others as they were.
-- All of this holds for what `njit` and `cfunc` of this module make, which all kernels of kcons are.
 - Compiling that has taken a second is announced, once in a process, by the logger ``kcons`` (on standard error unless
   logging is set up otherwise).
-- Garbage is not collected while a kernel is compiled: almost nothing of what the compiler makes is garbage before it
-  is done, and to look for it takes a fifth of the time.
-- What is done once for a set of constraints is left to Python where there are few rows (`plain_if_small`).
+- Garbage is not collected while a kernel is compiled, which takes a fifth of the time.
 """
 
 from __future__ import annotations
@@ -217,11 +215,8 @@ class _Compiler(compiler.Compiler):  # type: ignore[misc]
     def compile_extra(self, func: Any) -> Any:
         self.state.library = _Library(self.state.targetctx.codegen(), func.__qualname__)
         self.state.library.enable_object_caching()
-        announcer.begin()
-        try:
+        with announcer.watching():
             return super().compile_extra(func)
-        finally:
-            announcer.end()
 
 
 def njit(function: Any = None, /, *, cache: bool = False, **options: Any) -> Any:
@@ -271,43 +266,36 @@ def keep_somewhere() -> bool:
 class Announcer:
     """Says that kernels of kcons are compiled, the first that begins after `PATIENCE`; keeps garbage meanwhile.
 
-    Attributes
-    ----------
-    seconds : float
-        What compiling has taken in this process.
-    announced : bool
+    `seconds` is what compiling has taken in this process, and `keeps` whether other processes find what is compiled.
     """
 
     def __init__(self, keeps: bool = True) -> None:
-        self.seconds = 0.0
-        self.announced = False
-        #: Whether other processes find what is compiled.
-        self.keeps = keeps
-        # Numba compiles in one thread at a time.
-        self._depth, self._begun, self._collected = 0, 0.0, False
+        self.seconds, self.announced, self.keeps = 0.0, False, keeps
+        self._depth, self._begun = 0, 0.0  # Numba compiles in one thread at a time
 
     @property
     def compiling(self) -> bool:
         """Whether a kernel is being compiled."""
         return self._depth > 0
 
-    def begin(self) -> None:
-        """A kernel begins to be compiled; it may be a part of another one."""
-        now = time.perf_counter()
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """While a kernel is compiled, which may be a part of another one."""
+        now, collected = time.perf_counter(), gc.isenabled()
+        gc.disable()
         if not self._depth:
-            self._begun, self._collected = now, gc.isenabled()
-            gc.disable()
+            self._begun = now
         self._depth += 1
-        if not self.announced and self.seconds + now - self._begun >= PATIENCE:
-            self._announce()
-
-    def end(self) -> None:
-        """It is compiled, or has failed."""
-        self._depth -= 1
-        if not self._depth:
-            self.seconds += time.perf_counter() - self._begun
-            if self._collected:
+        try:
+            if not self.announced and self.seconds + now - self._begun >= PATIENCE:
+                self._announce()
+            yield
+        finally:
+            self._depth -= 1
+            if collected:
                 gc.enable()
+            if not self._depth:
+                self.seconds += time.perf_counter() - self._begun
 
     def _announce(self) -> None:
         self.announced = True

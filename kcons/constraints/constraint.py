@@ -29,14 +29,13 @@ from kcons.constraints.arguments import (
     Kind,
     as_float_array,
     atom_table,
+    check_range,
     checked,
-    out_of_range,
-    plain_target,
     read_only,
+    without_units,
 )
 from kcons.constraints.compilation import has_a_file, njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
-from kcons.constraints.vectors import first_true
 from kcons.errors import ConstraintError, InputError, SingularGeometryError, UnsupportedError
 
 IntArray = NDArray[np.int64]
@@ -111,16 +110,14 @@ class Constraint:
     held: ClassVar[Kind] = LENGTH
     #: What the target is called where it has to be above zero; nothing where it may be any number.
     positive: str = ""
-    #: Where the gradient is undefined, and the remedy, with {row} and {atoms}.
-    singular: ClassVar[str] = "{row}: its gradient is undefined; move the atoms"
+    #: Where the gradient is undefined, and the remedy, with {atom} for the first one.
+    singular: ClassVar[str] = "its gradient is undefined; move the atoms"
     #: Whether the coordinate depends on the masses of its atoms.
     uses_masses: ClassVar[bool] = False
     #: Whether the same atoms in reverse order name the same coordinate.
     reversible: ClassVar[bool] = False
     #: Whether rows fix all of an atom, three rows each, so that it moves as with infinite mass.
     fixes_atoms: ClassVar[bool] = False
-    #: Whether the target is a position, so that replicas of the atoms take theirs from where they are.
-    held_in_place: ClassVar[bool] = False
 
     #: What its numbers are in, where it was given Quantities; None for any consistent units.
     units: str | None = None
@@ -152,6 +149,7 @@ class Constraint:
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
         self.atoms: IntArray = read_only(atom_table(atoms, type(self).__name__, self.row_width))
+        target = 0.0 if target is None and not self.holonomic else target
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
         self._keep(**data)
         self._settle()
@@ -172,10 +170,7 @@ class Constraint:
                 f"{self.family}: {name} has shape {array.shape}; give {shape[1:] or 'one number'} for all, or {shape}",
                 item=name,
             ) from None
-        wrong = out_of_range(array)
-        if wrong is not None:
-            row, said = wrong
-            raise InputError(f"{self.family}: {name} of row {row} is {said}", item=name, atoms=self.atoms[row])
+        check_range(array, f"{self.family}: {name} of row {{row}}", name, self.atoms)
         return array
 
     def __setstate__(self, own: dict[str, Any]) -> None:
@@ -222,13 +217,7 @@ class Constraint:
         return out.T
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        """q, shape (n_rows,), and dq/dr, shape (n_rows, width, 3); of velocity rows 0 and the coefficients of v.
-
-        Parameters
-        ----------
-        r : ndarray, shape (n_rows, width, 3)
-        time : float
-        """
+        """q, shape (n_rows,), and dq/dr, of the shape of `r`, (n_rows, width, 3); of velocity rows 0 and a."""
         with np.errstate(all="ignore"):  # either may be undefined where the other is not
             out = self._evaluated(r, time)
         return out[0], np.ascontiguousarray(out[1:].T).reshape(r.shape)
@@ -262,11 +251,6 @@ class Constraint:
             changes = self._evaluated(r + step * v, time + step, self.rate)[0].imag / _COMPLEX_STEP
             return rate, self._bent(r + 0j, v, time + step) + changes
 
-    def acceleration_terms(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        """`curvature` and the second of `time_terms` together, shape (n_rows,); of position rows."""
-        curvature = self.curvature(r, v, time)
-        return curvature + self.time_terms(r, v, time)[1] if self.moving else curvature
-
     def scale(self, time: float = 0.0) -> FloatArray:
         """Natural size of each row, shape (n_rows,): the length held, or 1 radian for angles.
 
@@ -294,8 +278,9 @@ class Constraint:
         return target
 
     def parameters(self) -> FloatArray:
-        """Numbers for the compiled kernels, shape (n_rows, p); see `RowKind`."""
-        return np.zeros((self.n_rows, 0))
+        """Numbers for `row` and the compiled kernels, shape (n_rows, p): the width, where `alike`, and the data."""
+        data = [getattr(self, name).reshape(self.n_rows, -1) for name in self.per_row]
+        return np.hstack([np.full((self.n_rows, min(self.alike, 1)), float(self.width)), *data])
 
     @property
     def linked(self) -> IntArray:
@@ -318,10 +303,10 @@ class Constraint:
             value, slope = self.value_and_gradient(r, time)
             size = np.sqrt(np.einsum("kai,kai->k", slope, slope))
         bad = ~(np.isfinite(value) & np.isfinite(size) & (size > 0))
-        self.refuse_singular(bad, first_row, lambda k, row: self.undefined(k, row, r[k], time))
+        self.refuse(bad, first_row, lambda k: self.undefined(k, r[k], time))
         if self.positive and self.target is not None:
             length = self.target_at(time)
-            self.refuse_input(
+            self.refuse(
                 ~(length > 0),
                 first_row,
                 lambda k: (
@@ -331,25 +316,26 @@ class Constraint:
                 self.positive,
             )
 
-    def undefined(self, k: int, row: str, r: FloatArray, time: float) -> str:
-        """What is said of row `k`, which is called `row` and has no gradient at `r`, shape (width, 3)."""
-        return self.singular.format(row=row, atoms=" and ".join(str(a) for a in self.atoms[k, :6]))
+    def undefined(self, k: int, r: FloatArray, time: float) -> str:
+        """What is said of row `k`, which has no gradient at `r`, shape (width, 3)."""
+        return self.singular.format(atom=self.atoms[k, 0])
 
-    def refuse_singular(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int, str], str]) -> None:
-        """Raise `SingularGeometryError` for the first row that is marked; `say` gets it and its name, and tells why."""
-        k = first_true(bad)
-        if k is not None:
-            row = first_row + k
-            name = f"row {row}, {self.row_name(k)}"
-            raise SingularGeometryError(say(k, name), rows=[row], atoms=self.atoms[k].tolist())
+    def refuse(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int], str], item: str = "") -> None:
+        """Raise for the first row that is marked, with what `say` says of it.
 
-    def refuse_input(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int], str], item: str) -> None:
-        """Raise `InputError` for the first row that is marked, with what `say` says of it; `item` is at fault."""
-        k = first_true(bad)
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: {say(k)}", item=item, atoms=self.atoms[k].tolist()
-            )
+        `InputError` where an `item` is at fault, else `SingularGeometryError`.
+        """
+        if bad.any():
+            k = int(np.argmax(bad))
+            message, atoms = f"row {first_row + k}, {self.row_name(k)}: {say(k)}", self.atoms[k].tolist()
+            if item:
+                raise InputError(message, item=item, atoms=atoms)
+            raise SingularGeometryError(message, rows=[first_row + k], atoms=atoms)
+
+    def refuse_zero(self, coefficients: FloatArray) -> None:
+        """Refuse rows whose coefficients, shape (n_rows, width, 3), are all zero."""
+        zero = ~np.any(coefficients, axis=(1, 2))
+        self.refuse(zero, 0, lambda k: f"all coefficients of row {k} are zero; remove the row", "coefficients")
 
     def changed(self, **own: Any) -> Self:
         """Copy with other attributes, of which nothing is checked."""
@@ -365,7 +351,7 @@ class Constraint:
 
     def with_target(self, target: Target) -> Self:
         """Copy of this object held at another target."""
-        plain, matters = plain_target(target, f"{self.family}: target", self.held)
+        plain, matters = without_units(target, f"{self.family}: target", self.held)
         return self.changed(target=as_target(plain, self.n_rows), units=MD_UNITS if matters else self.units)
 
     def rescaled(self, factor: float) -> Self:
@@ -450,11 +436,16 @@ class Constraint:
         if cls.functions or found != names:
             wrong = sorted(names.symmetric_difference(found)) or list(cls.functions)
             raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
+        item = cls._rebuilt(data)
+        item.units = data.get("units")
+        return item
+
+    @classmethod
+    def _rebuilt(cls, data: Mapping[str, Any]) -> Self:
         item = object.__new__(cls)
         for name in cls.shared:
             setattr(item, name, data[name])
         Constraint.__init__(item, data["atoms"], data["target"], **{name: data[name] for name in cls.per_row})
-        item.units = data.get("units")
         return item
 
     def __repr__(self) -> str:

@@ -14,17 +14,21 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_float_array, finite_number, read_only, refuse_other
-from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.contradictions import found_as_given, refuse_contradictions
-from kcons.constraints.periodic.images import Images, find_images, image_error
-from kcons.constraints.periodic.one_piece import lattice_of, lined_up, make_whole, minimum_image, spanning_tree
+from kcons.constraints.arguments import as_float_array, finite_number, read_only
+from kcons.constraints.constraint import Constraint, IntArray, constraints_in
+from kcons.constraints.contradictions import agreed_targets
+from kcons.constraints.periodic.images import Images, find_images
+from kcons.constraints.periodic.one_piece import lattice_of, lined_up, make_whole, spanning_tree
 from kcons.constraints.target import FloatArray, MovingTarget, nearest_image
-from kcons.constraints.vectors import extent
-from kcons.errors import InputError
+from kcons.constraints.vectors import extent, norm
+from kcons.errors import ImageError, InputError, KconsError
 
+#: Parts of the cell at which a link that nothing holds is taken to have reached half of it.
+_HALF = 0.5 - 1e-9
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
 MOST_STRAIN = 0.1
+#: What is taken for rounding of a sum of gradients, relative to their sizes, and of values, to gradients times lengths.
+CANCELS = 1e-7
 
 
 class Residuals(NamedTuple):
@@ -78,11 +82,6 @@ class ConstraintSet:
         They cannot be changed: make a new set for others.
     lattice : ndarray, shape (2, 3, 3), or None
         Cell vectors as rows, and the inverse with zeros for directions without periodicity.
-    images : Images or None
-        The tree along which atoms of whole rows are made whole; see `kcons.constraints.periodic.images`.
-    moved : ndarray, shape (n_atoms, 3), or None
-        Whole cells by which the positions that the set is given were moved from where they are stored, in solvers:
-        rows with a place in space take them off.
 
     References
     ----------
@@ -90,7 +89,10 @@ class ConstraintSet:
     """
 
     lattice: FloatArray | None
+    #: The tree along which atoms of whole rows are made whole; see `kcons.constraints.periodic.images`.
     images: Images | None
+    #: Whole cells by which the positions that the set is given were moved from where they are stored, in solvers,
+    #: shape (n_atoms, 3): rows with a place in space take them off.
     moved: FloatArray | None = None
     #: What an engine converted to make this set from another one; see `Motion.conversions`.
     conversions: tuple[Any, ...] = ()
@@ -105,11 +107,8 @@ class ConstraintSet:
         pbc: bool | Sequence[bool] = True,
         time: float = 0.0,
     ) -> None:
-        refuse_other(constraints, (Constraint, Iterable), "constraints", "a kcons constraint, or a list of them")
-        given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        given = constraints_in(constraints, "constraints")
         for item in given:
-            if not isinstance(item, Constraint):
-                raise InputError(f"{item!r} is no kcons constraint", item="constraints")
             if item.units is not None:
                 raise InputError(
                     f"{item!r} was given Quantities and is in {item.units}, and nobody knows what the positions are "
@@ -126,43 +125,45 @@ class ConstraintSet:
         self.n_atoms = len(x)
         self.masses = read_only(m)  # engines know their inverse
         self._set_cell(cell, pbc)
-        _check_atoms(given, x, m)
-
-        self.constraints: tuple[Constraint, ...] = ()
         self.starts = _starts(given)
+        _check_atoms(given, self.starts, x, m)
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)
         together = whole_bodies(marked, y, self.lattice)
+        if self.images is not None:
+            together[self.images.atoms] = y[self.images.atoms]
         bound: list[Constraint] = []
         for start, item in zip(self.starts, marked, strict=False):
-            r = self._gather(item, x, y)
+            r = self.gather(item, x, y)
             item.check(r, time, int(start))
+            self._refuse_cut(item, r, time, int(start))
             if isinstance(item.target, MovingTarget):
                 item.target.check(repr(item), time, item.n_rows, item.period)
             if item.target is None:
-                item = item.with_target(
-                    item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)
-                )
+                found = item.measure(self.gather(item, x, together), time) if item.holonomic else np.zeros(item.n_rows)
+                item = item.with_target(found)
             bound.append(item)
-        refuse_contradictions(bound, self.starts, time)
-        self.constraints = tuple(found_as_given(bound, [item.target is None for item in marked], time))
+        open_ = [item.target is None for item in marked]
+        self.constraints: tuple[Constraint, ...] = tuple(agreed_targets(bound, open_, self.starts, time))
         self._set_scale(x, time)
 
     def _set_scale(self, x: FloatArray, time: float) -> None:
         """Rows that hold no length take sum |dq/dx_i| |x_i|; at the origin, the size of the system; then 1."""
         scale = self._rows(lambda c: c.scale(time))
         if not np.all(scale > 0):
-            y = self.whole(x)
-            size = self._rows(lambda c: self._reach(c, x, y, time))
-            length = extent(x)
+            size, length = self._reach(x, time), extent(x)
             size = np.where(size > 0, size, length if length > 0 else 1.0)
             scale = np.where(scale > 0, scale, size)
         self.scale: FloatArray = scale
 
-    def _reach(self, item: Constraint, x: FloatArray, whole: FloatArray, time: float) -> FloatArray:
-        gradient = np.linalg.norm(item.gradient(self._gather(item, x, whole), time), axis=2)
-        return np.sum(gradient * np.linalg.norm(x[item.atoms], axis=2), axis=1)
+    def _reach(self, x: FloatArray, time: float) -> FloatArray:
+        """sum |dq/dx_i| |x_i| of each row."""
+
+        def reach(c: Constraint, r: FloatArray, t: float) -> FloatArray:
+            return np.sum(norm(c.gradient(r, t)) * norm(x[c.atoms]), axis=1)
+
+        return self._of_rows(x, time, reach)
 
     # -- rows -----------------------------------------------------------------------------------
 
@@ -191,13 +192,11 @@ class ConstraintSet:
     @cached_property
     def touched(self) -> IntArray:
         """Atoms that some row touches, sorted."""
-        return _distinct(self.incidence.indices, self.n_atoms)
+        return np.flatnonzero(np.bincount(self.incidence.indices, minlength=self.n_atoms))
 
     @cached_property
     def n_moving(self) -> int:
         """Atoms that count for degrees of freedom: all but virtual sites (no mass, and no row touches them)."""
-        if np.all(self.masses != 0):
-            return self.n_atoms
         sites = self.masses == 0
         sites[self.touched] = False
         return self.n_atoms - int(np.sum(sites))
@@ -236,7 +235,7 @@ class ConstraintSet:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
         time, x = finite_number(time, "time"), self._positions(x)
         y, pattern = self.whole(x), self.incidence
-        data = joined([c.gradient(self._gather(c, x, y), time).ravel() for c in self.constraints])
+        data = joined([c.gradient(self.gather(c, x, y), time).ravel() for c in self.constraints])
         columns = (3 * pattern.indices[:, None] + np.arange(3)).ravel()
         return sp.csr_array((data, columns, 3 * pattern.indptr), shape=(self.n_rows, 3 * self.n_atoms))
 
@@ -253,15 +252,18 @@ class ConstraintSet:
         time = finite_number(time, "time")
         x = self._positions(x)
         y = self.whole(x)
-        return self._rows(lambda c: _speed_of(c, self._gather(c, x, y), time) if c.moving else _rate_of(c, time))
+        return self._rows(lambda c: _speed_of(c, self.gather(c, x, y), time) if c.moving else _rate_of(c, time))
 
     def acceleration_target(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """b with A a = b (notes eqs. 90-92, time terms included), shape (n_rows,)."""
         velocities = self._positions(v, "velocities")
 
-        return self._of_rows(
-            x, time, lambda c, r, t: _rate_of(c, t, 2) - c.acceleration_terms(r, velocities[c.atoms], t)
-        )
+        def wanted(c: Constraint, r: FloatArray, t: float) -> FloatArray:
+            v = velocities[c.atoms]
+            bent = c.curvature(r, v, t)
+            return _rate_of(c, t, 2) - (bent + c.time_terms(r, v, t)[1] if c.moving else bent)
+
+        return self._of_rows(x, time, wanted)
 
     def curvature(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """v^T (d2q/dx2) v of position rows at fixed time, shape (n_rows,)."""
@@ -270,35 +272,30 @@ class ConstraintSet:
 
     def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
-        time = finite_number(time, "time")
-        x = self._positions(x)
-        y = self.whole(x)
-        rounding = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, y, time))
-        return np.maximum(1e-14 * self.scale, rounding)
+        return np.maximum(1e-14 * self.scale, 2 * np.finfo(float).eps * self._reach(self._positions(x), time))
 
     def residuals(self, x: FloatArray, v: FloatArray | None = None, time: float = 0.0) -> Residuals:
         """sigma, and A v - c, with what counts as held, in one pass over the constraint objects."""
-        time = finite_number(time, "time")
         x, v = self._positions(x), v if v is None else self._positions(v, "velocities")
-        y = self.whole(x)
-        sigma, reach, rates, speeds, norms, sizes = [], [], [], [], [], []
-        for c in self.constraints:
-            r = self._gather(c, x, y)
-            value, gradient = c.value_and_gradient(r, time)
+
+        def rows(c: Constraint, r: FloatArray, t: float) -> FloatArray:
+            value, gradient = c.value_and_gradient(r, t)
             square = np.einsum("kai,kai->ka", gradient, gradient)
-            size = np.sqrt(square)
-            norms.append(np.sqrt(square.sum(axis=1)))
-            sizes.append(size.sum(axis=1))
-            sigma.append(nearest_image(value - c.target_at(time), c.period) if c.holonomic else np.zeros(c.n_rows))
-            reach.append(np.sum(size * np.linalg.norm(x[c.atoms], axis=2), axis=1))
+            size, found = np.sqrt(square), np.zeros((6, c.n_rows))
+            if c.holonomic:
+                found[0] = nearest_image(value - c.target_at(t), c.period)
+            found[1] = np.sum(size * norm(x[c.atoms]), axis=1)
+            found[4], found[5] = np.sqrt(square.sum(axis=1)), size.sum(axis=1)
             if v is not None:
-                u = v[c.atoms]
-                wanted = _speed_of(c, r, time)
-                rates.append(np.einsum("kai,kai->k", gradient, u) - wanted)
-                speeds.append(np.abs(wanted) + np.sum(size * np.linalg.norm(u, axis=2), axis=1))
-        allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * joined(reach))
-        found = [None if v is None else joined(parts) for parts in (rates, speeds)]
-        return Residuals(joined(sigma), allowed, found[0], found[1], joined(norms), joined(sizes))
+                u, wanted = v[c.atoms], _speed_of(c, r, t)
+                found[2] = np.einsum("kai,kai->k", gradient, u) - wanted
+                found[3] = np.abs(wanted) + np.sum(size * norm(u), axis=1)
+            return found
+
+        found = self._of_rows(x, time, rows) if self.constraints else np.zeros((6, 0))
+        allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * found[1])
+        rates, speeds = (None, None) if v is None else found[2:4]
+        return Residuals(found[0], allowed, rates, speeds, found[4], found[5])
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -315,16 +312,14 @@ class ConstraintSet:
             if hi > lo
         ]
         used = np.concatenate([p.atoms.ravel() for p in pieces] or [np.zeros(0, np.int64)])
-        atoms = _distinct(used, self.n_atoms)
+        atoms = np.unique(used)
         images = None
         if self.images is not None:
             wholes = [p.atoms.ravel() for p in pieces if p.whole is not None]
             if wholes:
                 between = self.images.ancestors(np.concatenate(wholes), self.n_atoms)
-                atoms = _distinct(np.concatenate([atoms, between]), self.n_atoms)
-            numbers = np.zeros(self.n_atoms, np.int64)
-            numbers[atoms] = np.arange(len(atoms))
-            images = self.images.among(atoms, numbers, rows)
+                atoms = np.union1d(atoms, between)
+            images = self.images.among(atoms, rows)
         renumbered = [p.changed(atoms=read_only(np.searchsorted(atoms, p.atoms))) for p in pieces]
         part = self._other(len(atoms), self.masses[atoms], renumbered)
         part.images, part.scale = images, self.scale[rows]
@@ -365,7 +360,7 @@ class ConstraintSet:
         """A function of each constraint, the positions of its atoms and the time, for all rows."""
         time, positions = finite_number(time, "time"), self._positions(x)
         whole = self.whole(positions)
-        return self._rows(lambda c: function(c, self._gather(c, positions, whole), time))
+        return self._rows(lambda c: function(c, self.gather(c, positions, whole), time))
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
         array = as_float_array(x, item)
@@ -390,36 +385,61 @@ class ConstraintSet:
             raise InputError(f"pbc is {pbc!r:.60}; give True, False, or one for each lattice vector", item="pbc")
         self.lattice = lattice_of(matrix, pbc)
 
-    def with_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True) -> None:
-        """Change the cell in place (barostats); targets are unchanged.
+    def with_cell(
+        self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True, positions: FloatArray | None = None
+    ) -> None:
+        """Change the cell in place (barostats); targets are unchanged, and so is everything where this is refused.
 
         Raises
         ------
         InputError
             A degenerate cell; a first cell, or a new periodic direction, for rows that have to be sorted by their
-            images, which needs positions; a change by more than a tenth for atoms that nothing ties together.
+            images, which needs positions; a change by more than a tenth for atoms that nothing ties together; a
+            constant distance that was shorter than half the box and is so no longer.
+        ImageError
+            Atoms that nothing ties together are half the box apart at `positions`, or have other images than before.
         """
         before = self.lattice
         self._set_cell(cell, pbc)
-        if self.lattice is None or all(c.holds_length and not c.moving for c in self.constraints if c.relative):
+        try:
+            self._check_cell(before)
+            if positions is not None and self.lattice is not None:
+                self.refuse_unheld_links(self.whole(positions))
+                if before is not None:
+                    self.refuse_other_images(positions, before, None)
+        except KconsError:
+            self.lattice = before
+            raise
+
+    def _check_cell(self, before: FloatArray | None) -> None:
+        if self.lattice is None:
             return
-        if before is not None and self.images is not None and np.any(self.images.unheld >= 0):
-            change = np.linalg.norm(self.lattice[0] - before[0], axis=1) / np.linalg.norm(before[0], axis=1)
-            change = change[self.lattice[1].any(axis=0)]  # the vector of a direction without periodicity is arbitrary
-            if np.any(change > MOST_STRAIN):
-                self.lattice = before
+        periodic = self.lattice[1].any(axis=0)
+        if any(c.relative and (c.moving or not c.holds_length) for c in self.constraints):
+            if before is None or np.any(periodic & ~before[1].any(axis=0)):
+                raise InputError(
+                    "this set was made without this periodic direction, and which images its rows mean has to be found "
+                    "anew; make a new ConstraintSet with the cell",
+                    item="cell",
+                )
+            change = norm(self.lattice[0] - before[0]) / norm(before[0])
+            change = change[periodic]  # the vector of a direction without periodicity is arbitrary
+            if self.images is not None and np.any(self.images.unheld >= 0) and np.any(change > MOST_STRAIN):
                 raise InputError(
                     f"the cell changes by {change.max():.0%} at once, more than a tenth: which images rows mean among "
                     "atoms that nothing ties together cannot be followed; make a new ConstraintSet with the cell",
                     item="cell",
                 )
-        periodic = np.zeros(3, bool) if before is None else before[1].any(axis=0)
-        if np.any(self.lattice[1].any(axis=0) & ~periodic):
-            self.lattice = before
+        (longest, row), half = self._longest_plain, self.half_width
+        tied = 0.0 if self.images is None else self.images.longest
+        if max(longest, tied) >= half:
+            what, item = f"a distance of {tied:g} that ties atoms", "cell"
+            if longest >= half:
+                what, item = f"row {self.row_name(row)}: target {longest:g}", "target"
             raise InputError(
-                "this set was made without this periodic direction, and which images its rows mean has to be found "
-                "anew; make a new ConstraintSet with the cell",
-                item="cell",
+                f"{what} is not shorter than half the box ({half:g}), and its minimum image is ambiguous; use a larger "
+                "cell, or make a new ConstraintSet in this one",
+                item=item,
             )
 
     @property
@@ -437,65 +457,25 @@ class ConstraintSet:
         """
         if self.images is None or self.lattice is None:
             return
-        link = self.images.reached_half(whole, self.lattice)
-        if link >= 0:
-            pair = np.array([self.images.parents[link], self.images.atoms[link]])
-            row = int(self.images.unheld[link])
-            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
-
-    def check_half_box(self, positions: FloatArray | None = None, before: FloatArray | None = None) -> None:
-        """Check against half the box that images are unambiguous; without `positions`, of held distances only.
-
-        Parameters
-        ----------
-        positions : ndarray, shape (n_atoms, 3), optional
-        before : ndarray, shape (2, 3, 3), optional
-            The cell before it changed: atoms that nothing ties together must keep their images.
-
-        Raises
-        ------
-        InputError
-            A constant distance that was shorter than half the box is so no longer.
-        ImageError
-            Atoms that nothing ties together are half the box apart.
-        """
-        if self.lattice is None:
+        links = np.flatnonzero(self.images.unheld >= 0)
+        if not len(links):
             return
-        longest, row = self._longest_plain
-        if self.images is not None and self.images.longest >= self.half_width > longest:
-            raise InputError(
-                f"distances of {self.images.longest:g} tie the atoms of longer rows together, and are not shorter than "
-                f"half the box ({self.half_width:g}); use a larger cell, or make a new ConstraintSet in this one",
-                item="cell",
-            )
-        if longest >= self.half_width:
-            raise InputError(
-                f"row {self.row_name(row)}: target {longest:g} is not shorter than half the box "
-                f"({self.half_width:g}); its minimum image is ambiguous. Use a larger cell, or make a new "
-                "ConstraintSet in this one",
-                item="target",
-                atoms=self.row_atoms(row),
-            )
-        if positions is None:
-            return
-        self.refuse_unheld_links(self.whole(positions))
-        if before is not None:
-            self.refuse_other_images(positions, before, None)
-        for item, start in zip(self.constraints, self.starts, strict=False):
-            if not item.relative or item.holds_length or item.n_rows == 0:
-                continue
-            length = np.linalg.norm(minimum_image(np.diff(positions[item.atoms], axis=1), self.lattice), axis=2)
-            if item.whole is not None:
-                length[item.whole] = 0.0
-            k, slot = (int(i) for i in np.unravel_index(int(np.argmax(length)), length.shape))
-            if length[k, slot] >= self.half_width:
-                raise InputError(
-                    f"row {start + k}, {item.row_name(k)}: neighboring atoms are {length[k, slot]:g} apart, not less "
-                    f"than half the box ({self.half_width:g}), although a shorter distance is held between them; "
-                    "bring the positions onto the constraints first",
-                    item="positions",
-                    atoms=item.atoms[k, slot : slot + 2],
-                )
+        pairs = np.stack([self.images.parents[links], self.images.atoms[links]])
+        reached = np.abs((whole[pairs[1]] - whole[pairs[0]]) @ self.lattice[1]).max(axis=1)
+        worst = int(np.argmax(reached))
+        if reached[worst] >= _HALF:
+            raise self._image_error(int(self.images.unheld[links[worst]]), pairs[:, worst], numbers)
+
+    def _image_error(self, row: int, pair: IntArray, numbers: IntArray | None) -> ImageError:
+        """The error for two atoms of a row that have drifted half the cell apart."""
+        atoms = pair if numbers is None else numbers[pair]
+        return ImageError(
+            f"row {self.row_name(row)}: atoms {atoms[0]} and {atoms[1]}, which nothing ties together, are half the "
+            f"cell apart ({self.half_width:g} in its narrowest direction); further on the row would mean other "
+            "periodic images. Use a larger cell, make the ConstraintSet without a cell and keep positions unwrapped, "
+            "or hold what ties these atoms together",
+            atoms=atoms,
+        )
 
     def refuse_other_images(
         self, x: FloatArray, before: FloatArray, time: float | None, numbers: IntArray | None = None
@@ -517,7 +497,7 @@ class ConstraintSet:
         def miss(c: Constraint, whole: FloatArray) -> FloatArray:
             if time is None and c.moving:
                 return np.ones(c.n_rows)
-            return np.abs(self._sigma(c, self._gather(c, x, whole), 0.0 if time is None else time))
+            return np.abs(self._sigma(c, self.gather(c, x, whole), 0.0 if time is None else time))
 
         here = self._rows(lambda c: miss(c, y)) / self.scale
         there = self._rows(lambda c: miss(c, as_before)) / self.scale
@@ -527,19 +507,20 @@ class ConstraintSet:
             row = int(np.argmax(np.where(bad, here, -1.0)))
             atoms = self.row_atoms(row)
             pair = atoms[[0, int(np.argmax(changed[atoms]))]]
-            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
+            raise self._image_error(row, pair, numbers)
 
     @cached_property
     def _longest_plain(self) -> tuple[float, int]:
         """Longest constant distance that was shorter than half the box at set-up, and its row."""
-        longest, row = 0.0, 0
-        for item, start in zip(self.constraints, self.starts, strict=False):
-            if not item.holds_length or item.moving or item.n_rows == 0:
-                continue
-            lengths = item.target_at(0.0) if item.whole is None else np.where(item.whole, 0.0, item.target_at(0.0))
-            if lengths.max() > longest:
-                longest, row = float(lengths.max()), int(start + np.argmax(lengths))
-        return longest, row
+
+        def lengths(c: Constraint) -> FloatArray:
+            if not c.holds_length or c.moving:
+                return np.zeros(c.n_rows)
+            return c.target_at(0.0) if c.whole is None else np.where(c.whole, 0.0, c.target_at(0.0))
+
+        length = self._rows(lengths)
+        row = int(np.argmax(length)) if len(length) else 0
+        return float(length.max(initial=0.0)), row
 
     def whole(self, x: FloatArray) -> FloatArray:
         """Positions in which atoms of whole rows stand in the images that these rows mean; see `periodic.images`.
@@ -568,15 +549,15 @@ class ConstraintSet:
         moved[self.placed] = cells
         return moved
 
-    def gather(self, item: Constraint, x: FloatArray) -> FloatArray:
-        """Positions of a constraint's atoms, shape (n_rows, width, 3), in the images that its rows mean."""
-        return self._gather(item, x, self.whole(x))
+    def gather(self, item: Constraint, x: FloatArray, whole: FloatArray | None = None) -> FloatArray:
+        """Positions of a constraint's atoms, shape (n_rows, width, 3), in the images that its rows mean.
 
-    def _gather(self, item: Constraint, x: FloatArray, whole: FloatArray) -> FloatArray:
+        `whole` are those of `x` by the method of this name, where they are known.
+        """
         if not item.relative:
             # A place in space is that of the positions as they are stored.
             return x[item.atoms] if self.moved is None else x[item.atoms] - self.moved[item.atoms]
-        r = whole[item.atoms]
+        r = (self.whole(x) if whole is None else whole)[item.atoms]
         if self.lattice is None:
             return r
         if item.whole is None:
@@ -588,15 +569,32 @@ class ConstraintSet:
             r[item.whole] += item.cell_offsets[item.whole] @ self.lattice[0]
         return r
 
-    def _one_piece(self, item: Constraint, r: FloatArray, together: FloatArray) -> FloatArray:
-        """`r` of open rows from positions in one piece, where these mean the same images."""
-        if self.lattice is None or not item.relative:
-            return r
-        near = together[item.atoms]
-        same = ~np.round(np.diff(near, axis=1) @ self.lattice[1]).any(axis=(1, 2))
-        if item.whole is not None:
-            same &= ~item.whole
-        return np.where(same[:, None, None], near, r)
+    def _refuse_cut(self, item: Constraint, r: FloatArray, time: float, start: int) -> None:
+        """Refuse rows whose atoms lie in other images than the nearest, and nobody has said that images do not count.
+
+        Such rows depend on differences of positions only, as their gradients tell here and in the nearest images, and
+        have another value there.
+        """
+        if self.lattice is None or item.relative or item.width == 1 or not item.holonomic:
+            return
+        cut = np.round(np.diff(r, axis=1) @ self.lattice[1]).any(axis=(1, 2))
+        if not cut.any():
+            return
+        near = lined_up(r.copy(), self.lattice)
+        for place in (r, near):
+            slope = item.gradient(place, time)
+            cut &= norm(slope.sum(axis=1)) <= CANCELS * norm(slope).sum(axis=1)
+        apart = nearest_image(item.measure(near, time) - item.measure(r, time), item.period)
+        reach = norm(slope).sum(axis=1) * norm(near - near[:, :1]).max(axis=1)
+        item.refuse(
+            cut & (np.abs(apart) > CANCELS * reach),
+            start,
+            lambda k: (
+                f"its atoms are cut by a face of the cell, and where they lie the value differs by {apart[k]:.3g} from "
+                "that of the nearest images; pass translation_invariant=True, or put the atoms next to each other"
+            ),
+            "translation_invariant",
+        )
 
     def __len__(self) -> int:
         return self.n_rows
@@ -611,7 +609,8 @@ def _starts(constraints: Sequence[Constraint]) -> IntArray:
 
 
 def joined(pieces: Sequence[FloatArray]) -> FloatArray:
-    return np.concatenate(pieces) if pieces else np.zeros(0)
+    """Rows of all pieces, which are the last axis."""
+    return np.concatenate(pieces, axis=-1) if pieces else np.zeros(0)
 
 
 def contiguous(values: ArrayLike, item: str) -> FloatArray:
@@ -621,10 +620,8 @@ def contiguous(values: ArrayLike, item: str) -> FloatArray:
 def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
     """Positions in which what open plain rows tie together is not cut by the boundary; `x` itself where nothing is.
 
-    `x` has the atoms of whole rows in the images that these mean.
-
-    Each atom is rounded once, so that lengths and angles of one body fit each other to rounding wherever its atoms are
-    stored. Rows that close through the boundary still do.
+    `x` has the atoms of whole rows in the images that these mean. Each atom is rounded once, so that lengths and angles
+    of one body fit each other to rounding wherever its atoms are stored.
     """
     pairs = [
         np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
@@ -640,39 +637,35 @@ def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: Floa
     return make_whole(x, *spanning_tree(links, len(x)), lattice)
 
 
-def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:
+def _check_atoms(given: Sequence[Constraint], starts: IntArray, x: FloatArray, m: FloatArray) -> None:
     """Raise `InputError` where rows name atoms that do not exist, have no place, or no mass."""
-    start = 0
     held = np.zeros(len(x), dtype=bool)
-    for item in given:
-        if item.fixes_atoms:
-            held[item.atoms[item.atoms < len(x)]] = True
-    for item in given:
-        atoms = item.atoms
-        if atoms.size and atoms.max() >= len(x):
-            row, slot = np.argwhere(atoms >= len(x))[0]
+    for item, start in zip(given, starts, strict=False):
+        if item.atoms.max(initial=-1) >= len(x):
+            row = int(np.argmax(item.atoms.max(axis=1) >= len(x)))
             raise InputError(
-                f"row {start + row}, {item.row_name(int(row))}: there is no atom {atoms[row, slot]}; "
+                f"row {start + row}, {item.row_name(row)}: there is no atom {item.atoms[row].max()}; "
                 f"the system has atoms 0 to {len(x) - 1}",
                 item="atoms",
-                atoms=atoms[row],
+                atoms=item.atoms[row],
             )
-        used = atoms.ravel()
-        bad = ~np.isfinite(x[used]).all(axis=1)
-        if bad.any():
-            atom = int(used[np.argmax(bad)])
-            raise InputError(f"position of atom {atom} is not finite: {x[atom]}", item="positions", atoms=[atom])
-        # Fixed atoms move with infinite mass, whatever theirs is.
-        bad = ~(np.isfinite(m[used]) & ((m[used] > 0) | (held[used] & (m[used] == 0))))
-        if bad.any():
-            atom = int(used[np.argmax(bad)])
-            raise InputError(
-                f"atom {atom} has mass {m[atom]:g}; constrained atoms need positive mass "
-                "(fix it with FixedAtoms, or make it a virtual site)",
-                item="masses",
-                atoms=[atom],
-            )
-        start += item.n_rows
+        if item.fixes_atoms:
+            held[item.atoms] = True
+    used = np.concatenate([np.zeros(0, np.int64), *(item.atoms.ravel() for item in given)])
+    bad = ~np.isfinite(x[used]).all(axis=1)
+    if bad.any():
+        atom = int(used[np.argmax(bad)])
+        raise InputError(f"position of atom {atom} is not finite: {x[atom]}", item="positions", atoms=[atom])
+    # Fixed atoms move with infinite mass, whatever theirs is.
+    bad = ~(np.isfinite(m[used]) & ((m[used] > 0) | (held[used] & (m[used] == 0))))
+    if bad.any():
+        atom = int(used[np.argmax(bad)])
+        raise InputError(
+            f"atom {atom} has mass {m[atom]:g}; constrained atoms need positive mass "
+            "(fix it with FixedAtoms, or make it a virtual site)",
+            item="masses",
+            atoms=[atom],
+        )
 
 
 def _rate_of(c: Constraint, time: float, order: int = 1) -> FloatArray:
@@ -691,15 +684,6 @@ def _speed_of(c: Constraint, r: FloatArray, time: float) -> FloatArray:
     return rate - c.time_terms(r, np.zeros_like(r), time)[0] if c.moving and c.holonomic else rate
 
 
-def _distinct(numbers: IntArray, limit: int) -> IntArray:
-    """Sorted distinct numbers below `limit`; by marks where that is cheaper than sorting."""
-    if 10 * len(numbers) < limit:
-        return np.unique(numbers).astype(np.int64)
-    marked = np.zeros(limit, dtype=bool)
-    marked[numbers] = True
-    return np.flatnonzero(marked)
-
-
 def rows_like(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
     """The rows of the set that `wanted` names, whatever they are held at; `name` is what errors call it."""
     if not wanted.holonomic:
@@ -709,12 +693,10 @@ def rows_like(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
         )
     found = []
     for k in range(wanted.n_rows):
-        for start, item in zip(held.starts, held.constraints, strict=False):
-            rows = start + np.flatnonzero(same_rows(item, wanted, k))
-            if len(rows):
-                found.append(int(rows[0]))
-                break
-        else:
+        same = [same_rows(item, wanted, k) for item in held.constraints]
+        rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *same]))
+        found.extend(rows[:1].tolist())
+        if not len(rows):
             raise InputError(
                 f"{name}, {wanted.row_name(k)}, is not among the {held.n_rows} rows that are held; hold it, or name a "
                 "constraint that is",
@@ -726,13 +708,12 @@ def rows_like(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
 
 def same_rows(item: Constraint, wanted: Constraint, k: int) -> NDArray[np.bool_]:
     """Which rows of `item` are row k of `wanted`, whatever they are held at, shape (n_rows,)."""
-    same = np.zeros(item.n_rows, dtype=bool)
-    if item.family != wanted.family or item.width != wanted.width:
-        return same
-    if any(getattr(item, f, None) is not getattr(wanted, f, None) for f in wanted.functions):
-        return same
-    if any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared):
-        return same
+    if (
+        (item.family, item.width) != (wanted.family, wanted.width)
+        or any(getattr(item, f, None) is not getattr(wanted, f, None) for f in wanted.functions)
+        or any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared)
+    ):
+        return np.zeros(item.n_rows, dtype=bool)
     same = np.all(item.atoms == wanted.atoms[k], axis=1)
     if wanted.reversible:
         same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)

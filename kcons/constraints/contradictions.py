@@ -17,52 +17,37 @@ _SAME = 1e-10
 _CHUNK = 2_000_000
 
 
-def refuse_contradictions(items: Sequence[Constraint], starts: IntArray, time: float) -> None:
-    """Raise if targets of `items`, which have them, contradict each other at a time; `starts` are their first rows.
+def agreed_targets(
+    items: Sequence[Constraint], found: Sequence[bool], starts: IntArray, time: float
+) -> list[Constraint]:
+    """The items, which have targets, where one found from positions is the one given of the same row.
 
-    Looks for the same distance, angle or dihedral held at two values (`ContradictionError`), and for triangles of
-    distances that violate the triangle inequality (`InfeasibleError`): about 0.1 s for 10^5 distances.
-    """
-    for family in {type(item): None for item in items if item.reversible}:
-        chosen = [(item, start) for item, start in zip(items, starts, strict=False) if type(item) is family]
-        # A row and its reverse (j, i), (k, j, i), (l, k, j, i) name the same coordinate.
-        atoms = np.concatenate([item.atoms for item, _ in chosen])
-        atoms = np.where((atoms[:, :1] > atoms[:, -1:]), atoms[:, ::-1], atoms)
-        rows = np.concatenate([start + np.arange(item.n_rows) for item, start in chosen])
-        target = np.concatenate([item.target_at(time) for item, _ in chosen])
-        order = np.lexsort(atoms.T[::-1])
-        atoms, rows, target = atoms[order], rows[order], target[order]
-        _refuse_two_targets(atoms, rows, target, chosen[0][0].period)
-        if chosen[0][0].holds_length:
-            _refuse_impossible_triangles(atoms, rows, target)
-
-
-def found_as_given(items: Sequence[Constraint], found: Sequence[bool], time: float) -> list[Constraint]:
-    """Lengths that were found from positions (as `found` says of each item) as given where another row gives the same
-    one.
-
-    They differ by the rounding of positions, by which both could not be held.
+    They differ by the rounding of positions, by which both could not be held. `found` says it of each item, `starts`
+    are their first rows. Refused are the same distance, angle or dihedral held at two values, and distances that
+    violate the triangle inequality (0.1 s for 10^5 of them).
     """
     result = list(items)
-    numbers = [n for n, item in enumerate(items) if item.holds_length and not item.moving]
-    if not any(found[n] for n in numbers) or all(found[n] for n in numbers):
-        return result
-    pairs = np.concatenate([np.sort(items[n].atoms, axis=1) for n in numbers])
-    width = int(pairs.max(initial=0)) + 1
-    key = pairs[:, 0] * width + pairs[:, 1]
-    length = np.concatenate([items[n].target_at(time) for n in numbers])
-    open_ = np.concatenate([np.full(items[n].n_rows, found[n]) for n in numbers])
-    given, first = np.unique(key[~open_], return_index=True)
-    if not len(given):
-        return result
-    place = np.minimum(np.searchsorted(given, key), len(given) - 1)
-    same = open_ & (given[place] == key)
-    if same.any():
-        length[same] = length[~open_][first][place[same]]
-        ends = np.cumsum([items[n].n_rows for n in numbers])
-        for n, part in zip(numbers, np.split(length, ends[:-1]), strict=True):
-            if found[n]:
-                result[n] = items[n].with_target(part)
+    for family in {type(item): None for item in items if item.reversible and item.n_rows}:
+        numbers = [n for n, item in enumerate(items) if type(item) is family]
+        chosen = [items[n] for n in numbers]
+        # A row and its reverse (j, i), (k, j, i), (l, k, j, i) name the same coordinate.
+        atoms = np.concatenate([item.atoms for item in chosen])
+        atoms = np.where((atoms[:, :1] > atoms[:, -1:]), atoms[:, ::-1], atoms)
+        rows = np.concatenate([starts[n] + np.arange(items[n].n_rows) for n in numbers])
+        target = np.concatenate([item.target_at(time) for item in chosen])
+        open_ = np.repeat([found[n] for n in numbers], [item.n_rows for item in chosen])
+        order = np.lexsort((open_, *atoms.T[::-1]))
+        atoms, rows, target, open_ = atoms[order], rows[order], target[order], open_[order]
+        _refuse_two_targets(atoms, rows, target, chosen[0].period)
+        first = np.flatnonzero(np.concatenate([[True], (atoms[1:] != atoms[:-1]).any(axis=1)]))
+        if chosen[0].holds_length:
+            _refuse_impossible_triangles(atoms[first], rows[first], target[first])
+        agreed = np.where(open_, np.repeat(target[first], np.diff([*first, len(atoms)])), target)
+        if np.any(agreed != target):
+            back = np.empty_like(agreed)
+            back[order] = agreed
+            for n, part in zip(numbers, np.split(back, np.cumsum([item.n_rows for item in chosen])), strict=False):
+                result[n] = items[n].with_target(part) if found[n] else items[n]
     return result
 
 
@@ -72,24 +57,23 @@ def _refuse_two_targets(atoms: IntArray, rows: IntArray, target: FloatArray, per
     bad = np.abs(difference) > _SAME * np.maximum(np.abs(target[repeated]), np.abs(target[repeated + 1]))
     if bad.any():
         k = int(repeated[np.argmax(bad)])
+        (one, first), (other, second) = sorted((int(rows[n]), float(target[n])) for n in (k, k + 1))
         raise ContradictionError(
-            f"constraints #{rows[k]} and #{rows[k + 1]} on atoms {tuple(atoms[k].tolist())} have different targets "
-            f"{float(target[k])!r}, {float(target[k + 1])!r}; remove one of them",
-            rows=rows[k : k + 2].tolist(),
+            f"constraints #{one} and #{other} on atoms {tuple(atoms[k].tolist())} have different targets {first!r}, "
+            f"{second!r}; remove one of them",
+            rows=[one, other],
             atoms=atoms[k].tolist(),
         )
 
 
 def _refuse_impossible_triangles(pairs: IntArray, rows: IntArray, length: FloatArray) -> None:
-    """Triangle inequality over all triangles of held distances; `pairs` sorted, smaller atom first.
+    """Triangle inequality over all triangles of held distances; `pairs` sorted, each once, smaller atom first.
 
     The least sum of squared deviations of a triangle with the excess e = d_3 - d_1 - d_2 is e^2/3: each
     side takes a third of the excess.
     """
     if len(pairs) < 3:
         return
-    first = np.concatenate([[True], (pairs[1:] != pairs[:-1]).any(axis=1)])
-    pairs, rows, length = pairs[first], rows[first], length[first]
     atoms, ends = np.unique(pairs, return_inverse=True)
     i, j = ends.reshape(pairs.shape).T
     side = np.arange(1.0, len(pairs) + 1)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy import arctan2, sqrt
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANGLE, as_float_array, read_only
+from kcons.constraints.arguments import ANGLE, as_float_array, atom_array, read_only
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, norm
@@ -49,7 +49,6 @@ class Distance(Constraint):
     reversible = True
     translation_invariant = True
     kind = RowKind.DISTANCE
-    singular = "atoms {atoms} coincide: distance gradient undefined ({row}); move them apart"
 
     def __init__(self, pairs: ArrayLike, target: Target = None) -> None:
         super().__init__(pairs, target)
@@ -58,6 +57,10 @@ class Distance(Constraint):
     def pairs(self) -> IntArray:
         """The one pair of each row, shape (n_rows, 1, 2)."""
         return self.atoms[:, None]
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        _refuse_coincident(self, r, first_row, [(0, 1)])
+        super().check(r, time, first_row)
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
@@ -92,42 +95,39 @@ class DistanceDifference(Constraint):
     """
 
     translation_invariant = True
+    singular = "its gradient vanishes: its atoms lie on a line; bend them, or hold a distance"
     shared = ("slots", "weights")
     #: Which atoms of a row are the pairs, and the weight of each pair.
     slots: tuple[tuple[int, int], ...]
     weights: tuple[float, ...]
 
     def __init__(self, pairs: ArrayLike, target: Target = None, *, weights: ArrayLike = (1.0, -1.0)) -> None:
-        try:
-            table = np.asarray(pairs)
-        except ValueError:
-            table = np.zeros(0)
-        if table.ndim == 2:
-            table = table[None]
+        table = atom_array(pairs, self.family, "pairs")
+        table = table[None] if table.ndim == 2 else table
         if table.ndim != 3 or table.shape[2] != 2 or not table.size or not np.issubdtype(table.dtype, np.integer):
             raise InputError(
                 "DistanceDifference: pairs are pairs of atoms, [[0, 1], [1, 2]] for one row; for more rows of as many "
                 "pairs each, a list of such",
                 item="pairs",
             )
-        found = [_in_one_list(row.tolist()) for row in table]
-        for k, (_, slots) in enumerate(found):
-            if slots != found[0][1]:
-                raise InputError(
-                    f"DistanceDifference: rows 0 and {k} share atoms in different ways; use one object for each",
-                    item="pairs",
-                )
-        self.slots, self.weights = (
-            found[0][1],
-            tuple(np.atleast_1d(as_float_array(weights, "weights")).ravel().tolist()),
-        )
-        super().__init__([atoms for atoms, _ in found], target)
+        atoms = [_walk(row)[0] for row in table.tolist()]
+        slots = [
+            tuple((named.index(i), named.index(j)) for i, j in row)
+            for named, row in zip(atoms, table.tolist(), strict=True)
+        ]
+        if other := [k for k, found in enumerate(slots) if found != slots[0]]:
+            raise InputError(
+                f"DistanceDifference: rows 0 and {other[0]} share atoms in different ways; use one object for each",
+                item="pairs",
+            )
+        self.slots, self.weights = slots[0], tuple(np.ravel(as_float_array(weights, "weights")).tolist())
+        super().__init__(atoms, target)
 
     def _settle(self) -> None:
         try:
             self.slots = tuple((int(i), int(j)) for i, j in self.slots)
             self.weights = tuple(float(w) for w in self.weights)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError):  # of files
             raise InputError("DistanceDifference: slots are pairs and weights are numbers", item="slots") from None
         n = len(self.slots)
         if len(self.weights) != n or not np.all(np.isfinite(self.weights)) or not all(self.weights):
@@ -181,20 +181,10 @@ class DistanceDifference(Constraint):
         return np.tile(row, (self.n_rows, 1))
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        _refuse_coincident(self, r, first_row, self.slots)
         super().check(r, time, first_row)
-        slope = self.gradient(r, time)
-        self.refuse_singular(
-            np.sqrt(np.einsum("kai,kai->k", slope, slope)) < COLLINEAR * np.abs(self.weights).max(),
-            first_row,
-            lambda k, row: f"the gradient of {row}, vanishes: its atoms lie on a line; bend them, or hold a distance",
-        )
-
-    def undefined(self, k: int, row: str, r: FloatArray, time: float) -> str:
-        for i, j in self.slots:
-            if not np.any(r[i] - r[j]):
-                i, j = self.atoms[k, i], self.atoms[k, j]
-                return f"atoms {i} and {j} of {row}, coincide: gradient undefined; move them apart"
-        return f"the gradient of {row}, vanishes; move its atoms"
+        size = np.linalg.norm(self.gradient(r, time), axis=(1, 2))
+        self.refuse(size < COLLINEAR * np.abs(self.weights).max(), first_row, lambda k: self.singular)
 
 
 def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], list[tuple[int, int]]]:
@@ -219,13 +209,6 @@ def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], list[tuple[int, in
                 links.append((place[before], place[atom]))
             ways += [(atom, other) for other in reversed(neighbors[atom])]
     return list(place), links
-
-
-def _in_one_list(pairs: list[list[int]]) -> tuple[list[int], tuple[tuple[int, int], ...]]:
-    """Atoms that pairs name, and the pairs by their places in this list."""
-    atoms, _ = _walk(pairs)
-    place = {atom: k for k, atom in enumerate(atoms)}
-    return atoms, tuple((place[i], place[j]) for i, j in pairs)
 
 
 def angle_between(ux: Any, uy: Any, uz: Any, wx: Any, wy: Any, wz: Any) -> tuple[Any, ...]:
@@ -272,12 +255,12 @@ class Angle(Constraint):
         out[7], out[8], out[9] = bx, by, bz
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        _refuse_coincident(self, r, first_row)
+        _refuse_coincident(self, r, first_row, [(0, 1), (1, 2)])
         self._refuse_straight(self.measure(r, time), "is", first_row)
         if self.target is None:
             return
         target = self.target_at(time)
-        self.refuse_input(
+        self.refuse(
             (target < -COLLINEAR) | (target > np.pi + COLLINEAR),
             first_row,
             lambda k: f"target {target[k]:g} is no angle between 0 and pi; targets are in radian",
@@ -286,15 +269,15 @@ class Angle(Constraint):
         self._refuse_straight(target, "has the target", first_row)
 
     def _refuse_straight(self, angle: FloatArray, verb: str, first_row: int) -> None:
-        def said(k: int, row: str) -> str:
-            degrees = 180 if angle[k] > 1 else 0
-            remedy = " (LinearRelation with the end atoms as bases)" if degrees else ", or distances"
-            return (
-                f"angle constraint singular at {degrees} deg, use a linear constraint{remedy}: {row}, {verb} "
-                f"{np.degrees(angle[k]):.9g} deg"
-            )
-
-        self.refuse_singular(np.sin(angle) < COLLINEAR, first_row, said)
+        degrees = np.degrees(angle)
+        self.refuse(
+            np.sin(angle) < COLLINEAR,
+            first_row,
+            lambda k: (
+                f"angle constraint singular at {degrees[k]:.0f} deg, use a linear constraint (LinearRelation with the "
+                f"end atoms as bases at 180 deg), or distances: it {verb} {degrees[k]:.9g} deg"
+            ),
+        )
 
 
 class Dihedral(Constraint):
@@ -344,35 +327,35 @@ class Dihedral(Constraint):
         out[10], out[11], out[12] = gb * bx, gb * by, gb * bz
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        _refuse_coincident(self, r, first_row)
+        _refuse_coincident(self, r, first_row, [(0, 1), (1, 2), (2, 3)])
         if self.target is not None and not self.moving:
             target = self.target_at(time)
-            self.refuse_input(
+            self.refuse(
                 np.abs(target) > MOST_TURNED,
                 first_row,
                 lambda k: f"target {target[k]:g} is over three turns, and in radian; give np.radians({target[k]:g})",
                 "target",
             )
+        legs = np.diff(r, axis=1)
+        sizes = norm(cross(legs[:, :-1], legs[:, 1:])), norm(legs)
         for first in (0, 1):
-            one, other = r[:, first] - r[:, first + 1], r[:, first + 2] - r[:, first + 1]
-            self.refuse_singular(
-                norm(cross(one, other)) < COLLINEAR * norm(one) * norm(other),
+            self.refuse(
+                sizes[0][:, first] < COLLINEAR * sizes[1][:, first] * sizes[1][:, first + 1],
                 first_row,
-                lambda k, row, first=first: (  # type: ignore[misc]
-                    f"dihedral constraint singular: atoms {', '.join(map(str, self.atoms[k, first : first + 3]))} of "
-                    f"{row}, are collinear; bend them, or hold a dihedral of other atoms"
+                lambda k, first=first: (  # type: ignore[misc]
+                    f"dihedral constraint singular: atoms {', '.join(map(str, self.atoms[k, first : first + 3]))} are "
+                    "collinear; bend them, or hold a dihedral of other atoms"
                 ),
             )
 
 
-def _refuse_coincident(item: Constraint, r: FloatArray, first_row: int) -> None:
-    """Neighboring atoms of a row at one point leave an angle undefined."""
-    for slot in range(item.width - 1):
-        item.refuse_singular(
-            norm(r[:, slot] - r[:, slot + 1]) == 0,
+def _refuse_coincident(item: Constraint, r: FloatArray, first_row: int, slots: Sequence[tuple[int, int]]) -> None:
+    """Two atoms at one point leave a direction undefined."""
+    for i, j in slots:
+        item.refuse(
+            np.all(r[:, i] == r[:, j], axis=1),
             first_row,
-            lambda k, row, slot=slot: (  # type: ignore[misc]
-                f"atoms {item.atoms[k, slot]} and {item.atoms[k, slot + 1]} coincide: gradient of {row}, undefined; "
-                "move them apart"
+            lambda k, i=i, j=j: (  # type: ignore[misc]
+                f"atoms {item.atoms[k, i]} and {item.atoms[k, j]} coincide: gradient undefined; move them apart"
             ),
         )

@@ -47,15 +47,6 @@ class PseudoInverse(NamedTuple):
     rank: int
 
 
-class PenroseResiduals(NamedTuple):
-    """Largest violation of each of Penrose's four conditions, see `penrose_residuals`."""
-
-    inner: float
-    outer: float
-    left_symmetry: float
-    right_symmetry: float
-
-
 class BottDuffinSolution(NamedTuple):
     """What solves the Bott-Duffin problem: the acceleration and the constraint force."""
 
@@ -66,45 +57,29 @@ class BottDuffinSolution(NamedTuple):
 # -- generalized inverses (appendix A.1) ------------------------------------------------------------
 
 
-def pseudo_inverse(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> PseudoInverse:
+def pseudo_inverse(matrix: ArrayLike) -> PseudoInverse:
     """A+, through the singular values of the row-normalized matrix (notes eqs. 154-158).
 
-    The rank is found on rows of unit length, so that it does not depend on the units of the rows. With V
-    an orthonormal basis of the row space, A = (A V) V^H is a full-rank factorisation and A+ = V (A V)+.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (s, n)
-        Real or complex.
-    rtol : float
-        Singular values below this part of the largest count as zero.
-
-    Raises
-    ------
-    InputError
-        No matrix, or a NaN or infinity in it.
+    The rank is found on rows of unit length, so that it does not depend on the units of the rows. With V an orthonormal
+    basis of the row space, A = (A V) V^H is a full-rank factorisation and A+ = V (A V)+.
     """
     A = _matrix(matrix)
-    V = row_space(A, rtol)
+    V = row_space(A)
     return PseudoInverse(V @ _left_inverse(A @ V), V.shape[1])
 
 
-def rank(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> int:
+def rank(matrix: ArrayLike) -> int:
     """Number of independent rows, by the singular values of the row-normalized matrix."""
-    return int(row_space(matrix, rtol).shape[1])
+    return int(row_space(matrix).shape[1])
 
 
-def row_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+def row_space(matrix: ArrayLike) -> NumberArray:
     """Orthonormal basis V of the space that the (conjugate) rows span, shape (n, rank); A+A = V V^H."""
-    return _bases(matrix, rtol)[1]
+    A = _matrix(matrix)
+    return _row_space(A / _row_sizes(A)[:, None])
 
 
-def column_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
-    """Orthonormal basis of the range of the row-normalized matrix, shape (s, rank)."""
-    return _bases(matrix, rtol)[0]
-
-
-def full_rank_factors(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> tuple[NumberArray, NumberArray]:
+def full_rank_factors(matrix: ArrayLike) -> tuple[NumberArray, NumberArray]:
     """A = F G with F (s, r) and G (r, n), both of rank r (notes eq. 159).
 
     By QR with row exchanges, without any singular values: a second way to the rank and to A+.
@@ -115,7 +90,7 @@ def full_rank_factors(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> tuple[
     sizes = _row_sizes(A)
     Q, R, order = scipy.linalg.qr((A / sizes[:, None]).conj().T, mode="economic", pivoting=True)
     pivots = np.abs(np.diag(R))
-    r = int(np.sum(pivots > rtol * pivots[0])) if pivots[0] > 0 else 0
+    r = int(np.sum(pivots > RANK_TOLERANCE * pivots[0])) if pivots[0] > 0 else 0
     F = np.empty((len(A), r), dtype=A.dtype)
     F[order] = R[:r].conj().T
     return F * sizes[:, None], np.ascontiguousarray(Q[:, :r].conj().T)
@@ -131,76 +106,63 @@ def full_rank_pseudo_inverse(F: ArrayLike, G: ArrayLike) -> NumberArray:
     return np.asarray(Gh @ np.linalg.solve(G @ Gh, np.linalg.solve(Fh @ F, Fh)))
 
 
-def penrose_residuals(matrix: ArrayLike, inverse: ArrayLike) -> PenroseResiduals:
-    """How far X is from being A+ (notes eqs. 154-157).
+def penrose_residuals(matrix: ArrayLike, inverse: ArrayLike) -> FloatArray:
+    """How far X is from being A+: violations of A X A = A, X A X = X, (A X)^H = A X, (X A)^H = X A (eqs. 154-157).
 
-    The four conditions A X A = A, X A X = X, (A X)^H = A X, (X A)^H = X A. Each residual is taken with the
-    rows of A scaled to unit length (and X accordingly), relative to the size of the products it is made of:
-    it counts roundings, whatever the units of the rows.
+    Each residual is taken with the rows of A scaled to unit length (and X accordingly), relative to the size of the
+    products it is made of: it counts roundings, whatever the units of the rows.
     """
     A, X = _matrix(matrix), _matrix(inverse)
     if X.shape != A.shape[::-1]:
         raise InputError(f"the inverse of a {A.shape} matrix has shape {A.shape[::-1]}, not {X.shape}", item="inverse")
     if A.size == 0:
-        return PenroseResiduals(0.0, 0.0, 0.0, 0.0)
+        return np.zeros(4)
     sizes = _row_sizes(A)
     U, Y = A / sizes[:, None], X * sizes
     UY, YU = U @ Y, Y @ U
-    u, y = float(np.linalg.norm(U, 2)), float(np.linalg.norm(Y, 2))
+    u, y = np.linalg.norm(U, 2), np.linalg.norm(Y, 2)
     # A X = D (U Y) D^-1: its symmetry is one of D and U Y together.
     ratio = sizes[:, None] / sizes
-    return PenroseResiduals(
-        inner=_relative(UY @ U - U, u * y * u + u),
-        outer=_relative(YU @ Y - Y, y * u * y + y),
-        left_symmetry=_relative((ratio * UY - (ratio * UY).conj().T) / (ratio + ratio.T), u * y),
-        right_symmetry=_relative(YU - YU.conj().T, u * y),
-    )
+    left = (ratio * UY - (ratio * UY).conj().T) / (ratio + ratio.T)
+    off = [np.max(np.abs(R)) for R in (UY @ U - U, YU @ Y - Y, left, YU - YU.conj().T)]
+    scale = np.array([u * y * u + u, y * u * y + y, u * y, u * y])
+    return np.where(scale > 0, off / np.where(scale > 0, scale, 1.0), np.where(off, np.inf, 0.0))
 
 
-def general_solution(matrix: ArrayLike, b: ArrayLike, y: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+def general_solution(matrix: ArrayLike, b: ArrayLike, y: ArrayLike) -> NumberArray:
     """x = A+ b + (1 - A+ A) y, every solution of A x = b as y runs over all vectors (notes eq. 163).
 
     Where A x = b has none, every x that makes the residual b - A x least; A+ b is the shortest (notes eqs. 167, 168).
     """
     A = _matrix(matrix)
     y = _numbers(y, "y")
-    x = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b") + parallel_projector(A, rtol) @ y.ravel()
+    x = pseudo_inverse(A).matrix @ _vector(b, len(A), "b") + parallel_projector(A) @ y.ravel()
     return np.asarray(x).reshape(y.shape)
 
 
 # -- solvability (eq. 95) ---------------------------------------------------------------------------
 
 
-def solvability_residual(matrix: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
-    """A A+ b - b row by row, rows of A scaled to unit length, shape (s,) (notes eqs. 95, 162)."""
+def _unsolved(matrix: ArrayLike, b: ArrayLike) -> FloatArray:
+    """|A A+ b - b| row by row, rows of A scaled to unit length, shape (s,); 0 where it is within the tolerance."""
     A = _matrix(matrix)
-    b = _vector(b, len(A), "b") / _row_sizes(A)
-    W = column_space(A, rtol)
-    return np.asarray(W @ (W.conj().T @ b) - b)
+    sizes = _row_sizes(A)
+    b = _vector(b, len(A), "b") / sizes
+    W = _row_space((A / sizes[:, None]).conj().T)
+    miss = np.abs(W @ (W.conj().T @ b) - b)
+    return miss * (miss > SOLVABILITY_TOLERANCE * np.max(np.abs(b), initial=0.0))
 
 
-def is_solvable(
-    matrix: ArrayLike, b: ArrayLike, tolerance: float = SOLVABILITY_TOLERANCE, rtol: float = RANK_TOLERANCE
-) -> bool:
-    """Whether A A+ b = b: the rows do not contradict each other (notes eq. 95)."""
-    A = _matrix(matrix)
-    size = np.max(np.abs(_vector(b, len(A), "b")) / _row_sizes(A), initial=0.0)
-    return bool(np.all(np.abs(solvability_residual(A, b, rtol)) <= tolerance * size))
+def is_solvable(matrix: ArrayLike, b: ArrayLike) -> bool:
+    """Whether A A+ b = b: the rows do not contradict each other (notes eqs. 95, 162)."""
+    return not _unsolved(matrix, b).any()
 
 
-def require_solvable(
-    matrix: ArrayLike, b: ArrayLike, tolerance: float = SOLVABILITY_TOLERANCE, rtol: float = RANK_TOLERANCE
-) -> None:
-    """Refuse rows that contradict each other.
-
-    Raises
-    ------
-    ContradictionError
-        If A A+ b differs from b (notes eq. 95); it names the rows that are off.
-    """
-    if is_solvable(matrix, b, tolerance, rtol):
+def require_solvable(matrix: ArrayLike, b: ArrayLike) -> None:
+    """Raise `ContradictionError`, which names the rows that are off, where A A+ b differs from b (notes eq. 95)."""
+    miss = _unsolved(matrix, b)
+    if not miss.any():
         return
-    miss = np.abs(solvability_residual(matrix, b, rtol))
     worst = int(np.argmax(miss))
     rows = np.flatnonzero(miss > 1e-3 * miss[worst])
     raise ContradictionError(
@@ -214,77 +176,67 @@ def require_solvable(
 # -- projectors (eqs. 96, 97) -----------------------------------------------------------------------
 
 
-def perpendicular_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+def perpendicular_projector(matrix: ArrayLike) -> NumberArray:
     """P_perp = A+ A onto the space of constraint forces (notes eq. 97)."""
-    V = row_space(matrix, rtol)
+    V = row_space(matrix)
     return np.asarray(V @ V.conj().T)
 
 
-def parallel_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+def parallel_projector(matrix: ArrayLike) -> NumberArray:
     """P_par = 1 - A+ A onto the space of admissible displacements (notes eq. 96)."""
-    P = perpendicular_projector(matrix, rtol)
+    P = perpendicular_projector(matrix)
     return np.eye(len(P)) - P
 
 
-def project_velocities(
-    matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0, rtol: float = RANK_TOLERANCE
-) -> FloatArray:
+def project_velocities(matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0) -> FloatArray:
     """The nearest velocities, in the mass metric, with A v = c: v - M^-1/2 B+ (A v - c)."""
-    A, root, B = _weighted(matrix, masses)
+    A, L, B = _weighted(matrix, masses)
     flat = _vector(v, A.shape[1], "v", real=True)
     off = A @ flat - np.broadcast_to(_numbers(c, "c", real=True), (len(A),))
-    return np.asarray(flat - root.from_weighted(pseudo_inverse(B, rtol).matrix @ off)).reshape(np.shape(v))
+    return np.asarray(flat - _back(L, pseudo_inverse(B).matrix @ off)).reshape(np.shape(v))
 
 
 # -- dynamics (eqs. 99-107) -------------------------------------------------------------------------
 
 
-def constrained_inverse(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+def constrained_inverse(matrix: ArrayLike, masses: ArrayLike) -> FloatArray:
     """M_par+ = (P_par M P_par)+ = M^-1/2 (1 - B+ B) M^-1/2, shape (3N, 3N) (notes eqs. 106, 107).
 
     With independent rows it is M^-1 - M^-1 A^T (A M^-1 A^T)^-1 A M^-1.
     """
-    _, root, B = _weighted(matrix, masses)
-    return root.from_weighted(root.from_weighted(parallel_projector(B, rtol)).T)
+    _, L, B = _weighted(matrix, masses)
+    return _back(L, _back(L, parallel_projector(B)).T)
 
 
-def multipliers(
-    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
-) -> FloatArray:
+def multipliers(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """The multipliers of z = A^T lambda, shape (s,); of least norm, in the rows as they are (notes eqs. 101-103).
 
     (A M^-1 A^T) lambda = b - A M^-1 f, solved by (B B^T)+ = (B+)^T B+.
     """
-    A, root, B = _weighted(matrix, masses)
-    B_plus = pseudo_inverse(B, rtol).matrix
-    return np.asarray(B_plus.T @ (B_plus @ _lacking(A, root, f, b)))
+    A, L, B = _weighted(matrix, masses)
+    B_plus = pseudo_inverse(B).matrix
+    return np.asarray(B_plus.T @ (B_plus @ _lacking(A, L, f, b)))
 
 
-def constraint_force(
-    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
-) -> FloatArray:
+def constraint_force(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """The force z = A^T (A M^-1 A^T)^-1 (b - A M^-1 f) = M^1/2 B+ (b - A M^-1 f), as f (notes eq. 104)."""
-    A, root, B = _weighted(matrix, masses)
-    z = root.factor @ (pseudo_inverse(B, rtol).matrix @ _lacking(A, root, f, b))
+    A, L, B = _weighted(matrix, masses)
+    z = L @ (pseudo_inverse(B).matrix @ _lacking(A, L, f, b))
     return np.asarray(z).reshape(np.shape(f))
 
 
-def acceleration(
-    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
-) -> FloatArray:
+def acceleration(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """M_par+ f + M^-1 A^T (A M^-1 A^T)^-1 b, in the shape of f (notes eq. 105, corrected).
 
     The notes lost the M^-1 in front of A^T. In mass-weighted form the second term is M^-1/2 B+ b.
     """
-    A, root, B = _weighted(matrix, masses)
-    free = constrained_inverse(A, masses, rtol) @ _vector(f, A.shape[1], "f", real=True)
-    driven = root.from_weighted(pseudo_inverse(B, rtol).matrix @ _vector(b, len(A), "b", real=True))
+    A, L, B = _weighted(matrix, masses)
+    free = constrained_inverse(A, masses) @ _vector(f, A.shape[1], "f", real=True)
+    driven = _back(L, pseudo_inverse(B).matrix @ _vector(b, len(A), "b", real=True))
     return np.asarray(free + driven).reshape(np.shape(f))
 
 
-def bott_duffin(
-    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
-) -> BottDuffinSolution:
+def bott_duffin(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> BottDuffinSolution:
     """Acceleration and constraint force as one linear problem (notes eqs. 98-100).
 
     M (a_par + A+ b) = f + z with a_par in V_par and z in V_perp. Both parts sit in one vector u, with
@@ -295,9 +247,9 @@ def bott_duffin(
     A = _matrix(matrix, real=True)
     n = A.shape[1]
     M = _mass_matrix(masses, n)
-    P_perp = perpendicular_projector(A, rtol)
+    P_perp = perpendicular_projector(A)
     P_par = np.eye(n) - P_perp
-    a_perp = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b", real=True)
+    a_perp = pseudo_inverse(A).matrix @ _vector(b, len(A), "b", real=True)
     # P_perp u may be given any unit: one of mass keeps both parts of the matrix of one size.
     diagonal = np.diagonal(M)[np.diagonal(M) > 0]
     unit = float(np.exp(np.mean(np.log(diagonal)))) if len(diagonal) else 1.0
@@ -319,7 +271,7 @@ def gauss_function(trial: ArrayLike, masses: ArrayLike, f: ArrayLike) -> float:
     """
     a = _numbers(trial, "trial", real=True).ravel()
     off = _mass_matrix(masses, len(a)) @ a - _vector(f, len(a), "f", real=True)
-    return float(0.5 * off @ _Root(masses, len(a)).solve(off))
+    return float(0.5 * off @ scipy.linalg.cho_solve((_root(masses, len(a)), True), off))
 
 
 # -- pieces -----------------------------------------------------------------------------------------
@@ -357,38 +309,33 @@ def _vector(values: ArrayLike, length: int, item: str, real: bool = False) -> Nu
     return array
 
 
-class _Root:
-    """M^1/2: the Cholesky factor L, M = L L^T, of a diagonal M its square roots."""
-
-    def __init__(self, masses: ArrayLike, n: int) -> None:
-        try:
-            self.factor = np.linalg.cholesky(_mass_matrix(masses, n))
-        except np.linalg.LinAlgError:
-            raise InputError(
-                "the mass matrix is not positive definite; where it is so along what the constraints leave free, "
-                "use bott_duffin, or kcons.models.Multibody",
-                item="masses",
-            ) from None
-
-    def from_weighted(self, x: FloatArray) -> FloatArray:
-        """L^-T x."""
-        return np.asarray(scipy.linalg.solve_triangular(self.factor, x, lower=True, trans="T"))
-
-    def solve(self, x: FloatArray) -> FloatArray:
-        """M^-1 x."""
-        return np.asarray(scipy.linalg.cho_solve((self.factor, True), x))
+def _root(masses: ArrayLike, n: int) -> FloatArray:
+    """M^1/2, of a full M its Cholesky factor L, M = L L^T, shape (n, n)."""
+    try:
+        return np.asarray(np.linalg.cholesky(_mass_matrix(masses, n)), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "the mass matrix is not positive definite; where it is so along what the constraints leave free, "
+            "use bott_duffin, or kcons.models.Multibody",
+            item="masses",
+        ) from None
 
 
-def _weighted(matrix: ArrayLike, masses: ArrayLike) -> tuple[FloatArray, _Root, FloatArray]:
-    """A, M^1/2, and B = A L^-T."""
+def _back(L: FloatArray, x: FloatArray) -> FloatArray:
+    """L^-T x."""
+    return np.asarray(scipy.linalg.solve_triangular(L, x, lower=True, trans="T"))
+
+
+def _weighted(matrix: ArrayLike, masses: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A, M^1/2 = L, and B = A L^-T."""
     A = _matrix(matrix, real=True)
-    root = _Root(masses, A.shape[1])
-    return A, root, np.asarray(scipy.linalg.solve_triangular(root.factor, A.T, lower=True).T)
+    L = _root(masses, A.shape[1])
+    return A, L, np.asarray(scipy.linalg.solve_triangular(L, A.T, lower=True).T)
 
 
-def _lacking(A: FloatArray, root: _Root, f: ArrayLike, b: ArrayLike) -> FloatArray:
+def _lacking(A: FloatArray, L: FloatArray, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """b - A M^-1 f."""
-    free = root.solve(_vector(f, A.shape[1], "f", real=True))
+    free = scipy.linalg.cho_solve((L, True), _vector(f, A.shape[1], "f", real=True))
     return np.asarray(_vector(b, len(A), "b", real=True) - A @ free)
 
 
@@ -415,12 +362,11 @@ def _row_sizes(A: NumberArray) -> FloatArray:
     return np.where(sizes > 0, sizes, 1.0)
 
 
-def _bases(matrix: ArrayLike, rtol: float) -> tuple[NumberArray, NumberArray]:
-    """Orthonormal bases of the range and of the row space of the row-normalized matrix."""
-    A = _matrix(matrix)
-    w, singular, vt = np.linalg.svd(A / _row_sizes(A)[:, None], full_matrices=False)
-    kept = (singular > rtol * singular.max(initial=0.0)) & (singular > 0)
-    return np.ascontiguousarray(w[:, kept]), np.ascontiguousarray(vt[kept].conj().T)
+def _row_space(A: NumberArray) -> NumberArray:
+    """Orthonormal basis of what the conjugate rows span, by singular values."""
+    _, singular, vt = np.linalg.svd(A, full_matrices=False)
+    kept = (singular > RANK_TOLERANCE * singular.max(initial=0.0)) & (singular > 0)
+    return np.ascontiguousarray(vt[kept].conj().T)
 
 
 def _left_inverse(F: NumberArray) -> NumberArray:
@@ -428,15 +374,6 @@ def _left_inverse(F: NumberArray) -> NumberArray:
 
     By QR with the long rows first and columns exchanged, which keeps the digits of short rows.
     """
-    if F.size == 0:
-        return np.zeros(F.shape[::-1], dtype=F.dtype)
     order = np.argsort(-_row_sizes(F) * np.any(F, axis=1), kind="stable")
-    Q, R, columns = scipy.linalg.qr(F[order], mode="economic", pivoting=True)
-    inverse = np.empty(F.shape[::-1], dtype=F.dtype)
-    inverse[np.ix_(columns, order)] = scipy.linalg.solve_triangular(R, Q.conj().T)
-    return inverse
-
-
-def _relative(residual: NumberArray, size: float) -> float:
-    largest = float(np.max(np.abs(residual)))
-    return largest / size if size > 0 else (np.inf if largest > 0 else 0.0)
+    found = scipy.linalg.lstsq(F[order], np.eye(len(F))[order], cond=0.0, lapack_driver="gelsy")
+    return np.asarray(found[0])

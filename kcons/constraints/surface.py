@@ -21,7 +21,7 @@ from kcons.constraints.arguments import (
     PositiveLengths,
     as_float_array,
     atom_column,
-    out_of_range,
+    check_range,
     read_only,
     unit,
 )
@@ -44,9 +44,6 @@ class Surface(Constraint, base=True):
     def __init__(self, atoms: ArrayLike, target: Target, **data: ArrayLike) -> None:
         Constraint.__init__(self, atom_column(atoms, self.family), target, **data)
 
-    def parameters(self) -> FloatArray:
-        return np.hstack([getattr(self, name).reshape(self.n_rows, -1) for name in self.per_row])
-
 
 class Sphere(Surface):
     """Distance from a point, q = |r - c|.
@@ -67,7 +64,7 @@ class Sphere(Surface):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR}
     length_powers = {"center": 1}
-    singular = "atom {atoms} lies at the center of the sphere: gradient of {row}, undefined; move the atom"
+    singular = "atom {atom} lies at the center of the sphere: gradient undefined; move the atom"
     center: FloatArray
 
     def __init__(self, atoms: ArrayLike, center: Lengths, radius: Target = None) -> None:
@@ -97,7 +94,7 @@ class Cylinder(Surface):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"point": _VECTOR, "axis": _VECTOR}
     length_powers = {"point": 1}
-    singular = "atom {atoms} lies on the axis of the cylinder: gradient of {row}, undefined; move the atom"
+    singular = "atom {atom} lies on the axis of the cylinder: gradient undefined; move the atom"
     point: FloatArray
     axis: FloatArray
 
@@ -132,9 +129,7 @@ class Torus(Surface):
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR, "axis": _VECTOR, "major_radius": ()}
     length_powers = {"center": 1, "major_radius": 1}
-    singular = (
-        "atom {atoms} lies on the axis or on the core circle of the torus: gradient of {row}, undefined; move the atom"
-    )
+    singular = "atom {atom} lies on the axis or on the core circle of the torus: gradient undefined; move the atom"
     center: FloatArray
     axis: FloatArray
     major_radius: FloatArray
@@ -150,7 +145,7 @@ class Torus(Surface):
         super().__init__(atoms, minor_radius, center=center, axis=axis, major_radius=major_radius)
 
     def _settle(self) -> None:
-        self.refuse_input(
+        self.refuse(
             ~(self.major_radius > 0),
             0,
             lambda k: f"major_radius {self.major_radius[k]:g} is not positive",
@@ -197,7 +192,7 @@ class Ellipsoid(Surface):
         "rotation": (3, 3),
     }
     length_powers = {"center": 1, "inverse_axes": -1}
-    singular = "atom {atoms} lies at the center of the ellipsoid: gradient of {row}, undefined; move the atom"
+    singular = "atom {atom} lies at the center of the ellipsoid: gradient undefined; move the atom"
     center: FloatArray
     inverse_axes: FloatArray
     rotation: FloatArray
@@ -258,7 +253,7 @@ class Ellipsoid(Surface):
         if self.target is None:
             return
         target = self.target_at(time)
-        self.refuse_input(
+        self.refuse(
             ~(target > -self.scale()),
             first_row,
             lambda k: f"target {target[k]:g} lies beyond the center of the ellipsoid; use 0 for its surface",
@@ -334,7 +329,5 @@ def _for_each(vectors: ArrayLike, count: int, name: str) -> FloatArray:
 
 def _held(item: LinearRows, point: ArrayLike) -> FloatArray:
     points = _for_each(point, item.n_rows, "point")
-    wrong = out_of_range(points)
-    if wrong is not None:
-        raise InputError(f"{item.family}: point is {wrong[1]}", item="point")
+    check_range(points, f"{item.family}: point of row {{row}}", "point")
     return read_only(np.asarray(np.einsum("ki,ki->k", item.coefficients[:, 0], points)))

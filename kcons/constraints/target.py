@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import HELD, as_float_array, check_call, has_units, out_of_range, positive, read_only
+from kcons.constraints.arguments import HELD, as_float_array, check_call, check_range, positive, read_only
 from kcons.constraints.arguments import FloatArray as FloatArray
 from kcons.errors import InputError
 
@@ -46,12 +46,7 @@ class MovingTarget:
             ("acceleration of the ", self.acceleration),
         ):
             check_call(f"the {name}target", function, ("t",))
-        if not has_units(self.time_step):
-            positive(self.time_step, "the time_step of the target")
-
-    def with_time_step(self, time_step: float) -> MovingTarget:
-        """The same with other steps of the differences."""
-        return replace(self, time_step=time_step)
+        positive(self.time_step, "the time_step of the target")
 
     def at(self, time: float, rows: int) -> FloatArray:
         """Target at `time`, shape (rows,)."""
@@ -124,9 +119,7 @@ def _per_row(target: Any, rows: int, when: str = "") -> FloatArray:
         array = array.ravel()  # for example (n, 3) for three rows an atom
     if array.ndim > 1 or array.size not in (1, rows):
         raise InputError(f"the target{when} has shape {array.shape}; give one number or {rows}", item="target")
-    wrong = out_of_range(array)
-    if wrong is not None:
-        raise InputError(f"the target of row {wrong[0]}{when} is {wrong[1]}", item="target")
+    check_range(array, f"the target of row {{row}}{when}", "target")
     return np.broadcast_to(array, (rows,))
 
 

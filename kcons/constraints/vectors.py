@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
 from kcons.constraints.arguments import FloatArray
 
@@ -38,8 +37,3 @@ def extent(x: FloatArray) -> float:
     """The largest difference of coordinates along an axis; 0 for no atoms."""
     # Column by column: a reduction over the rows of a narrow array is twenty times slower.
     return float(np.ptp(np.ascontiguousarray(x.T), axis=1).max()) if len(x) else 0.0
-
-
-def first_true(bad: NDArray[np.bool_]) -> int | None:
-    """First True entry, or None."""
-    return int(np.argmax(bad)) if bad.any() else None

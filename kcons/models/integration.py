@@ -35,16 +35,32 @@ class _Along(DenseOutput):
         return np.asarray(self._at(t) if t.ndim == 0 else np.stack([self._at(s) for s in t], axis=1))
 
 
-def projecting(
+def integrate(
+    slope: Callable[[float, FloatArray], FloatArray],
+    span: tuple[float, float],
+    start: FloatArray,
     method: type[OdeSolver],
     project: Callable[[float, FloatArray], FloatArray],
     known: Callable[[float, FloatArray], Motion | None] = lambda t, y: None,
-) -> type[OdeSolver]:
-    """SciPy's method, with a projection of the end of each step, from which the next one starts, and of values between.
+    **options: Any,
+) -> Any:
+    """What SciPy's ``solve_ivp`` gives, with a projection of the end of each step, and of values between.
 
-    `known` is asked before each step. Once nothing is left to integrate it gives a function of time, which is the
-    solution from there on.
+    The next step starts from the projection. `known` is asked before each step: once nothing is left to integrate, it
+    gives a function of time, which is the solution from there on.
+
+    A trial step may go too far, to a singular place or to numbers that are not finite, and is then made shorter. What
+    was wrong there is raised if the run ends there.
     """
+    told: list[Exception] = []
+
+    def tried(t: float, y: FloatArray) -> FloatArray:
+        if np.isfinite(y).all():
+            try:
+                return slope(t, y)
+            except (ContradictionError, NonFiniteError, SingularGeometryError) as error:
+                told[:] = [error]
+        return np.full(len(y), np.nan)
 
     class Projecting(method):  # type: ignore[misc, valid-type]
         t: float
@@ -63,6 +79,7 @@ def projecting(
             success, message = super()._step_impl()
             if success:
                 y = project(self.t, self.y)
+                told.clear()
                 if isinstance(self, BDF):
                     self.D[0] += y - self.y
                 else:
@@ -76,41 +93,8 @@ def projecting(
             between = super()._dense_output_impl()
             return _Along(self.t_old, self.t, lambda t: project(t, between(t)))
 
-    Projecting.__name__ = method.__name__
-    return Projecting
-
-
-def integrate(
-    slope: Callable[[float, FloatArray], FloatArray],
-    span: tuple[float, float],
-    start: FloatArray,
-    method: type[OdeSolver],
-    project: Callable[[float, FloatArray], FloatArray],
-    known: Callable[[float, FloatArray], Motion | None],
-    **options: Any,
-) -> Any:
-    """What SciPy's ``solve_ivp`` gives with projections, as of `projecting`.
-
-    A trial step may go too far, to a singular place or to numbers that are not finite, and is then made shorter. What
-    was wrong there is raised if the run ends there.
-    """
-    told: list[Exception] = []
-
-    def tried(t: float, y: FloatArray) -> FloatArray:
-        if np.isfinite(y).all():
-            try:
-                return slope(t, y)
-            except (ContradictionError, NonFiniteError, SingularGeometryError) as error:
-                told[:] = [error]
-        return np.full(len(y), np.nan)
-
-    def placed(t: float, y: FloatArray) -> FloatArray:
-        there = project(t, y)
-        told.clear()
-        return there
-
     try:
-        found = solve_ivp(tried, span, start, projecting(method, placed, known), **options)
+        found = solve_ivp(tried, span, start, Projecting, **options)
     except ValueError:  # implicit methods: no numbers in their matrix
         if not told:
             raise
@@ -135,28 +119,25 @@ def check_run(
         )
     if not isinstance(method, str) or method not in METHODS:
         raise InputError(f"there is no method {method!r}; choose from {', '.join(METHODS)}", item="method")
-    try:
-        t0, t1 = (float(t) for t in t_span)
-    except (TypeError, ValueError):
-        raise InputError(f"t_span is a pair of times, not {t_span!r}", item="t_span") from None
-    if not (np.isfinite(t0) and np.isfinite(t1)):
-        raise InputError("t_span is not finite", item="t_span")
+    ends = as_float_array(t_span, "t_span")
+    if ends.shape != (2,) or not np.all(np.isfinite(ends)):
+        raise InputError(f"t_span is a pair of finite times, not {t_span!r:.80}", item="t_span")
+    t0, t1 = ends.tolist()
     times = None if t_eval is None else as_float_array(t_eval, "t_eval")
     if times is not None:
-        if times.ndim != 1 or not np.all((times >= min(t0, t1)) & (times <= max(t0, t1))):
-            raise InputError("t_eval is one-dimensional and within t_span", item="t_eval")
-        if np.any(np.diff(times) * (1 if t1 >= t0 else -1) <= 0):
-            raise InputError("t_eval is not sorted from the start to the end of t_span", item="t_eval")
+        forward = times if t1 >= t0 else -times
+        inside = times.ndim == 1 and np.all((times >= min(t0, t1)) & (times <= max(t0, t1)))
+        if not (inside and np.all(np.diff(forward) > 0)):
+            raise InputError(
+                "t_eval is one-dimensional and within t_span, sorted from its start to its end", item="t_eval"
+            )
     for name, least in (("rtol", LEAST_RTOL), ("atol", 0.0), ("max_step", 0.0), ("first_step", 0.0)):
         if sizes.get(name) is None:
             continue
         given, step = as_float_array(sizes[name], name), name.endswith("step")
         if given.shape not in ((), () if step else (n,)) or not np.all(given > least if step else given >= least):
-            raise InputError(
-                f"{name} is {sizes[name]!r:.60}; give a "
-                + ("positive number" if step else f"number of {least:g} or more, or {n} of them"),
-                item=name,
-            )
+            wanted = "positive number" if step else f"number of {least:g} or more, or {n} of them"
+            raise InputError(f"{name} is {sizes[name]!r:.60}; give a {wanted}", item=name)
     return METHODS[method], (t0, t1), times
 
 
@@ -205,7 +186,6 @@ def check_derivative(
     *,
     rounding: float = 0.0,
     smooth: float = WRONG,
-    remedy: str = "or leave it out",
 ) -> None:
     """Refuse a derivative that differences with a step and with half of it contradict.
 
@@ -225,6 +205,6 @@ def check_derivative(
         k = tuple(np.argwhere(wrong)[0].tolist())
         raise InputError(
             f"{item} gives {given[k]:.6g} for entry {list(k)}, but differences of {of} give {fine[k]:.6g}; "
-            f"correct it, {remedy}",
+            "correct it, or leave it out",
             item=item,
         )

@@ -24,22 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import lapack
 
-from kcons.constraints.arguments import (
-    FloatArray,
-    IntArray,
-    as_float_array,
-    check_call,
-    positive,
-    read_only_view,
-)
+from kcons.constraints.arguments import FloatArray, IntArray, as_float_array, check_call, positive, read_only_view
 from kcons.constraints.target import WRONG, first_derivative_4, second_derivative
-from kcons.errors import (
-    ConstraintError,
-    ConvergenceError,
-    InputError,
-    NonFiniteError,
-    SingularGeometryError,
-)
+from kcons.errors import ConstraintError, ConvergenceError, InputError, NonFiniteError, SingularGeometryError
 from kcons.models.integration import check_derivative, check_run, integrate
 
 #: Rows of G, of unit length, depend on others where no more than this part of them is left beside these.
@@ -63,9 +50,8 @@ class MultibodySolution(NamedTuple):
     accelerations: FloatArray
     #: lambda of M q'' = f + G^T lambda, shape (k, m).
     multipliers: FloatArray
-    #: Evaluations of the accelerations, and steps, that were taken to integrate.
+    #: Of the accelerations, to integrate.
     evaluations: int
-    steps: int
 
 
 class _Place(NamedTuple):
@@ -231,39 +217,32 @@ class Multibody:
         )
         q, v = self._state(q, v)
         n, rank = len(q), len(self._start(q, v, t0).rows)
-        latest: dict[str, Any] = {}
+        place = self._placed(q, t0, rank)
 
         def project(t: float, y: FloatArray) -> FloatArray:
-            latest["place"] = place = self._placed(read_only_view(y[:n]), t, rank)
+            nonlocal place
+            place = self._placed(read_only_view(y[:n]), t, rank)
             return np.concatenate([place.q, self._tangent(place, y[n:])])
 
         def slope(t: float, y: FloatArray) -> FloatArray:
-            place, q, v = latest["place"], read_only_view(y[:n]), read_only_view(y[n:])
-            if place.t != t or not np.array_equal(place.q, q):
-                place = self._place(q, t, rank)
-            f = self._called("force", (n,), q, v, t)
-            return np.concatenate([v, place.solve(f, self._b(q, v))])
-
-        def count(t: float, y: FloatArray) -> None:
-            latest["steps"] += 1
+            q, v = read_only_view(y[:n]), read_only_view(y[n:])
+            here = place if place.t == t and np.array_equal(place.q, q) else self._place(q, t, rank)
+            return np.concatenate([v, here.solve(self._called("force", (n,), q, v, t), self._b(q, v))])
 
         start = project(t0, np.concatenate([q, v]))
-        self._motion(latest["place"], read_only_view(start[n:]))  # what is wrong at the start is told at once
-        latest["steps"] = 0
+        self._motion(place, read_only_view(start[n:]))  # what is wrong at the start is told at once
         options |= {"t_eval": wanted, "rtol": rtol, "atol": atol}
-        ode = integrate(slope, (t0, t1), start, solver, project, count, **options)
+        ode = integrate(slope, (t0, t1), start, solver, project, **options)
         if ode.status < 0:
             raise ConvergenceError(
-                f"the run ended at t = {latest['place'].t:.8g}: {ode.message} Stiff forces: method='Radau'; forces "
+                f"the run ended at t = {place.t:.8g}: {ode.message} Stiff forces: method='Radau'; forces "
                 "that jump: end the run there; or a larger tolerance"
             )
         q, v = np.split(np.reshape(ode.y, (2 * n, -1)).T, 2, axis=1)
-        motions = [
-            self._motion(self._place(read_only_view(x), t, rank), read_only_view(w))
-            for t, x, w in zip(ode.t, q, v, strict=True)
-        ] or [(np.zeros(n), np.zeros(self.m or 0))]
-        a, multipliers = (np.array(part)[: len(q)] for part in zip(*motions, strict=True))
-        return MultibodySolution(np.asarray(ode.t), q, v, a, multipliers, ode.nfev, latest["steps"])
+        a, multipliers = np.zeros((len(q), n)), np.zeros((len(q), self.m or 0))
+        for k, (t, x, w) in enumerate(zip(ode.t, q, v, strict=True)):
+            a[k], multipliers[k] = self._motion(self._place(read_only_view(x), t, rank), read_only_view(w))
+        return MultibodySolution(np.asarray(ode.t), q, v, a, multipliers, ode.nfev)
 
     def _place(self, q: FloatArray, t: float, rank: int | None) -> _Place:
         """Factors at `q`, with so many independent rows, by default as many as there are."""
@@ -373,10 +352,9 @@ class Multibody:
     def _G(self, q: FloatArray) -> FloatArray:
         if self.m and self.jacobian is not None:
             return self._called("jacobian", (self.m, len(q)), q)
-        step = 1e-3 * self.length
 
         def along(e: FloatArray) -> FloatArray:
-            return first_derivative_4(lambda s: self._g(q + s * e), 0.0, step)
+            return first_derivative_4(lambda s: self._g(q + s * e), 0.0, 1e-3 * self.length)
 
         return np.stack([along(e) for e in np.eye(len(q))], axis=1)
 
@@ -393,19 +371,15 @@ class Multibody:
 
     def _state(self, q: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """A state as arrays, after all functions were seen to fit it."""
-        found = []
-        for item, given in (("q", q), ("v", v)):
-            array = as_float_array(given, item)
-            n = np.size(q) if callable(self.mass) else len(self.mass)
-            if array.shape != (n,) or n == 0:
+        place, speed = (read_only_view(as_float_array(given, item)) for item, given in (("q", q), ("v", v)))
+        n = place.size if callable(self.mass) else len(self.mass)
+        for item, array in (("q", place), ("v", speed)):
+            if array.shape != (n,) or n == 0 or not np.isfinite(array).all():
                 raise InputError(
-                    f"{item} has shape {array.shape}; give a number for each coordinate, ({n},)", item=item
+                    f"{item} is {_shown(array)}; give a finite number for each coordinate, shape ({n},)", item=item
                 )
-            if not np.isfinite(array).all():
-                raise InputError(f"{item}[{int(np.argmin(np.isfinite(array)))}] is not finite", item=item)
-            found.append(read_only_view(array))
-        self._check_functions(found[0])
-        return found[0], found[1]
+        self._check_functions(place)
+        return place, speed
 
     def _check_functions(self, q: FloatArray) -> None:
         """Count the constraints; refuse derivatives that differences contradict, which would give wrong motion."""
@@ -419,21 +393,10 @@ class Multibody:
         bare = copy(self)
         bare.jacobian = bare.curvature = None
         own, found = ((body._G(q), -body._b(q, along)) for body in (self, bare))
-        slope = _largest(found[0])
-        for name, mine, differences, unit in (
-            ("jacobian", own[0], found[0], 0.0),
-            ("curvature", own[1], found[1], self.length),
-        ):
+        bent = WRONG * self.length * _largest(found[0])
+        for k, (name, rounding) in enumerate((("jacobian", 0.0), ("curvature", bent))):
             if getattr(self, name) is not None:
-                check_derivative(
-                    name,
-                    "the constraints",
-                    mine,
-                    differences,
-                    differences,
-                    rounding=WRONG * unit * slope,
-                    remedy="or give the length over which they bend (length=...)",
-                )
+                check_derivative(name, "the constraints (see `length`)", own[k], found[k], found[k], rounding=rounding)
 
 
 def _factors(A: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:

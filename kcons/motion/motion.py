@@ -150,15 +150,10 @@ class Motion:
         ContradictionError
             A row between fixed atoms is off in this cell: it lies across a face that moves, and the atoms stay.
         """
-        held = self.constraint_set
-        before = held.lattice
-        try:
-            held.with_cell(cell, pbc)
-            held.check_half_box(None if positions is None else as_array(positions, self._shape, "positions"), before)
-            self._share(held.lattice)
-        except KconsError:
-            held.lattice = before
-            raise
+        before = self.constraint_set.lattice
+        x = None if positions is None else as_array(positions, self._shape, "positions")
+        self.constraint_set.with_cell(cell, pbc, x)
+        self._share(self.constraint_set.lattice)
         self._solve.unchecked = before if positions is None else None
 
     def _share(self, lattice: FloatArray | None) -> None:

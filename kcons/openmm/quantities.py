@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterable
 from typing import Any, TypeVar
@@ -13,9 +12,9 @@ from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints import FixedAtoms
-from kcons.constraints.arguments import ANY, Unitless, has_units, quantity_text
+from kcons.constraints.arguments import has_units, quantity_text
 from kcons.constraints.constraint import Constraint
-from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 #: Boltzmann's constant times Avogadro's number, kJ/mol/K.
@@ -113,24 +112,8 @@ T = TypeVar("T")
 
 
 def accepted(constraints: Iterable[T]) -> list[T]:
-    """Constraints in nm, ps, dalton, radian from here on, whose functions may return Quantities; other things as is."""
-    return [_accepted(item) if isinstance(item, Constraint) else item for item in constraints]
-
-
-def _accepted(item: Any) -> Any:
-    taken = copy.copy(item)
-    taken.units = None
-    target = item.target
-    if isinstance(target, MovingTarget):
-        what, held = f"{item.family}: target", item.held
-        rate = target.rate and Unitless(target.rate, what, held.per_time())
-        acceleration = target.acceleration and Unitless(target.acceleration, what, held.per_time(2))
-        taken.target = MovingTarget(Unitless(target.value, what, held), rate, acceleration, target.time_step)
-    for name in item.functions:
-        function = getattr(item, name)
-        if function is not None and not isinstance(function, Unitless):
-            setattr(taken, name, Unitless(function, f"{item.family}: {name}", ANY))
-    return taken
+    """Constraints in nm, ps, dalton, radian from here on; other things as is."""
+    return [item.changed(units=None) if isinstance(item, Constraint) else item for item in constraints]
 
 
 # -- the state of a Context, in nm, ps and kJ/mol ---------------------------------------------------

@@ -214,8 +214,7 @@ def make_plan(
     inverse_masses[pinned] = 0.0
     labels = cluster_labels(constraint_set, pinned)
     driven = constraint_set.moving or not bool(constraint_set.holonomic.all())
-    rank = len(pinned_rows)
-    plan = Plan(constraint_set, named, [], labels, pinned, pinned_rows, inverse_masses, rank, driven)
+    plan = Plan(constraint_set, named, [], labels, pinned, pinned_rows, inverse_masses, len(pinned_rows), driven)
     plan.eliminate_last = np.zeros(constraint_set.n_rows, np.bool_)
     loose = labels < 0
     loose[pinned_rows] = False
@@ -230,28 +229,29 @@ def make_plan(
     whole_positions, placed = constraint_set.whole(positions), constraint_set.placed
     moved = None if placed is None else constraint_set.moved_places(positions[placed], whole_positions)
     for shape, whole in _shapes(constraint_set, labels, inverse_masses):
-        solver = solver_of(shape, constraint_set, inverse_masses, labels, time)
-        if shape.independent:
-            rank = shape.rows.size
-        else:
+        solver, rank = _solver(plan, shape, time), shape.rows.size
+        if not shape.independent:
             lattice = None if whole else constraint_set.lattice
             if isinstance(solver, GeneralClusters):
                 rank = solver.rank(whole_positions, time, moved)
             elif isinstance(solver, SparseDistances | SparseRows | SingleRows):
                 rank = solver.rank(whole_positions, lattice, time, moved)
             else:
-                rank = rank_of_small(shape, inverse_masses, whole_positions, lattice)
-            seen = rank
+                rank = _rank_of_small(shape, inverse_masses, whole_positions, lattice)
         if shape.kind == "SingleRows" and rank < shape.rows.size:
             shape = replace(shape, kind="SparseRows")
         alone = shape.independent or shape.kind == "SingleRows"
         clusters = [] if alone else _by_cluster(shape.rows.ravel(), labels)
-        if clusters and shape.kind in ("SparseDistances", "SparseRows") and small_enough(clusters):
-            # The pivots of an order that knows nothing of dependence say less.
-            rank = mark_dependent_rows(constraint_set, clusters, inverse_masses, positions, time, plan.eliminate_last)
-            if seen < rank and shape.kind == "SparseRows":
-                # Rows so nearly parallel that elimination, which sees squares, takes them for dependent.
-                solver = GeneralClusters(constraint_set, shape.rows, labels[shape.rows], inverse_masses)
+        sizes = [len(rows) for rows in clusters] or [0]
+        sparse = shape.kind in ("SparseDistances", "SparseRows")
+        if (sparse or rank < shape.rows.size) and max(sizes) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL:
+            marked = _mark_dependent_rows(plan, clusters, positions, time)
+            if sparse and clusters:
+                # The pivots of an order that knows nothing of dependence say less.
+                seen, rank = rank, marked
+                if seen < rank and shape.kind == "SparseRows":
+                    # Rows so nearly parallel that elimination, which sees squares, takes them for dependent.
+                    solver = GeneralClusters(constraint_set, shape.rows, labels[shape.rows], inverse_masses)
         if rank < shape.rows.size:
             plan.dependent += clusters
             if shape.kind in ("RigidTriangles", "SmallClusters"):
@@ -259,10 +259,8 @@ def make_plan(
                 flat = shape.rows.ravel()
                 ends = shape.atoms[:, shape.pairs].reshape(-1, 2)
                 shape = Shape("SparseDistances", flat, shape.clusters, False, pairs=ends)
-            if not plan.eliminate_last[shape.rows].any() and small_enough(clusters):
-                mark_dependent_rows(constraint_set, clusters, inverse_masses, positions, time, plan.eliminate_last)
             if not isinstance(solver, GeneralClusters):
-                solver = solver_of(shape, constraint_set, inverse_masses, labels, time, plan.eliminate_last)
+                solver = _solver(plan, shape, time)
         plan.solvers.append(solver)
         plan.whole.append(whole and not (isinstance(solver, GeneralClusters) and solver.winds))
         plan.rank += rank
@@ -271,34 +269,23 @@ def make_plan(
     return plan
 
 
-def solver_of(
-    shape: Shape,
-    constraint_set: ConstraintSet,
-    inverse_masses: FloatArray,
-    labels: IntArray,
-    time: float,
-    eliminate_last: BoolArray | None = None,
-) -> ClusterSolver:
+def _solver(plan: Plan, shape: Shape, time: float) -> ClusterSolver:
     """The table: which solver serves which shape."""
-    rows = shape.rows
+    rows, inverse_masses = shape.rows, plan.inverse_masses
     if shape.kind == "GeneralClusters":
-        return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
+        return GeneralClusters(plan.constraint_set, rows, plan.labels[rows], inverse_masses)
     if shape.kind == "SingleRows":
-        return SingleRows(constraint_set, rows, inverse_masses)
+        return SingleRows(plan.constraint_set, rows, inverse_masses)
     if shape.kind == "SparseRows":
-        return SparseRows(
-            constraint_set, rows, inverse_masses, None if eliminate_last is None else eliminate_last[rows]
-        )
-    targets = constraint_set.target(time)[rows]
+        return SparseRows(plan.constraint_set, rows, inverse_masses, plan.eliminate_last[rows])
+    targets = plan.constraint_set.target(time)[rows]
     if shape.kind == "RigidTriangles":
         return RigidTriangles(rows, shape.atoms, targets, inverse_masses[shape.atoms[0]])
     if shape.kind == "SmallClusters":
         return SmallClusters(rows, shape.atoms, shape.pairs, targets, inverse_masses[shape.atoms[0]])
     if shape.kind == "Chains":
         return Chains(rows, shape.starts, shape.atoms, targets, inverse_masses[shape.atoms])
-    return SparseDistances(
-        rows, shape.pairs, targets, inverse_masses, None if eliminate_last is None else eliminate_last[rows]
-    )
+    return SparseDistances(rows, shape.pairs, targets, inverse_masses, plan.eliminate_last[rows])
 
 
 def _shapes(
@@ -320,24 +307,12 @@ def _shapes(
             yield shape, kind
 
 
-def small_enough(clusters: list[IntArray]) -> bool:
-    sizes = [len(rows) for rows in clusters]
-    return max(sizes, default=0) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL
-
-
-def mark_dependent_rows(
-    constraint_set: ConstraintSet,
-    clusters: list[IntArray],
-    inverse_masses: FloatArray,
-    positions: FloatArray,
-    time: float,
-    eliminate_last: BoolArray,
-) -> int:
+def _mark_dependent_rows(plan: Plan, clusters: list[IntArray], positions: FloatArray, time: float) -> int:
     """Independent rows of small clusters, by pivoted QR; marks those that the best conditioned rows leave over."""
     from scipy.linalg import qr  # slow to import
 
-    jacobian = constraint_set.jacobian(positions, time)
-    root_w = np.repeat(np.sqrt(inverse_masses), 3)
+    jacobian = plan.constraint_set.jacobian(positions, time)
+    root_w = np.repeat(np.sqrt(plan.inverse_masses), 3)
     found = 0
     for rows in clusters:
         part = jacobian[rows]
@@ -350,12 +325,12 @@ def mark_dependent_rows(
         diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
         # The diagonal of the triangle stands for the singular values: it does not grow, and is their size.
         left_over = ~independent(diagonal)
-        eliminate_last[rows[order]] = left_over
+        plan.eliminate_last[rows[order]] = left_over
         found += int(np.sum(~left_over))
     return found
 
 
-def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
+def _rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
     """Rank of many small clusters of distances at once, from the singular values of their B."""
     ends = shape.atoms[:, shape.pairs]  # (n_clusters, K, 2) global atoms
     difference = positions[ends[..., 0]] - positions[ends[..., 1]]

@@ -9,9 +9,9 @@ The difference is the solvability condition A A+ b = b (notes eq. 95): at a sing
 kind there are admissible velocities, A v = 0, for which no acceleration exists. With omega^T A = 0 this
 reads omega . (v^T d2sigma/dx2 v) = 0, which is tested here for random v.
 
-A group of atoms held rigid by such rows is collinear or planar, and what the rows mean is linear:
-x_a = (1 - c) x_i + c x_j on a line, x_a = c_i x_i + c_j x_j + c_k x_k in a plane, with one distance or
-three between the bases. These rows are regular and hold all distances in the group.
+A group of atoms held rigid by such rows is collinear or planar, or has a part that is, and what the rows mean is
+linear: x_a = sum_i c_i x_i over two bases on a line, three in a plane, four in space, with one, three or six
+distances between the bases. These rows are regular and hold all distances in the group.
 """
 
 from __future__ import annotations
@@ -61,6 +61,13 @@ UNSOLVABLE = 1e-4
 FLAT = 1e-6
 #: Relative misfit between the targets and a flat geometry above which the conversion is refused.
 MISFIT = 1e-6
+#: Of rigid groups of one, two and three dimensions: where they lie, what they are, their degrees of freedom, and what
+#: holds them.
+_GROUPS = (
+    ("on a line", "linear", "collinear", 5, "one distance and x_b = c x_a + (1-c) x_c (LinearRelation)"),
+    ("in a plane", "planar", "coplanar", 6, "three distances and x_a = c_i x_i + c_j x_j + c_k x_k (LinearRelation)"),
+    ("in space", "rigid", "in part coplanar", 6, "six distances and x_a = sum of four c_i x_i (LinearRelation)"),
+)
 
 
 def without_second_order_rows(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> ConstraintSet:
@@ -233,40 +240,27 @@ def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -
         if len(rows) == 0:
             return
     for k in np.flatnonzero(large).tolist():
-        _check_large(constraint_set, members[starts[k] : starts[k + 1]], positions, time)
+        _check_large(LocalRows(constraint_set, members[starts[k] : starts[k + 1]], positions, time))
 
 
-def _check_large(constraint_set: ConstraintSet, rows: IntArray, positions: FloatArray, time: float) -> None:
+def _check_large(block: LocalRows) -> None:
     """Refuse a block too large for dense algebra whose rank is lower here than at positions nearby."""
-    part, atoms = constraint_set.subset(rows)
-    x = positions[atoms]
-    free = ~np.isin(atoms, fixed_atoms(constraint_set))
-    shortest = float(part.measure(x, time).min())
-    rng = np.random.default_rng(20090131)
-    away = x + DISPLACEMENT * shortest * rng.standard_normal(x.shape) * free[:, None]
-    here, nearby = (_lost_rows(part, y, free, time) for y in (x, away))
-    if here > nearby:
-        names = ", ".join(constraint_set.row_name(int(r)) for r in rows[:4])
-        raise SingularGeometryError(
-            f"constraint set singular at this geometry: the {len(rows)} rows {names}, ... have rank "
-            f"{len(rows) - here} here but {len(rows) - nearby} at positions nearby. Hold collinear and coplanar "
-            "groups by x_a = sum c_i x_i (LinearRelation) instead of all their distances",
-            rows=rows,
-            atoms=atoms,
-        )
+    here, nearby = (_sparse_rank(block, x) for x in (block.x, block.nearby(np.random.default_rng(20090131))))
+    if here < nearby:
+        raise _unresolved(block, here, nearby)
 
 
-def _lost_rows(part: ConstraintSet, x: FloatArray, free: BoolArray, time: float) -> int:
-    """Rows less rank: eigenvalues of A A^T below LOST^2, counted by Sylvester's law of inertia."""
-    a = part.jacobian(x, time)
-    a.data *= np.repeat(free, 3)[a.indices]
+def _sparse_rank(block: LocalRows, x: FloatArray) -> int:
+    """Eigenvalues of A A^T above LOST^2, counted by Sylvester's law of inertia."""
+    a = block.part.jacobian(x, block.time)
+    a.data *= ~np.repeat(block.pinned, 3)[a.indices]
     norms = row_norms(a)
     a.data *= np.repeat(1.0 / np.where(norms > 0, norms, 1.0), np.diff(a.indptr))
-    shifted = (a @ a.T - LOST**2 * sp.eye_array(part.n_rows)).tocsc()
+    shifted = (a @ a.T - LOST**2 * sp.eye_array(block.part.n_rows)).tocsc()
     from scipy.sparse.linalg import splu  # slow to import, seldom needed
 
     factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return int(np.sum(factor.U.diagonal() < 0))
+    return int(np.sum(factor.U.diagonal() > 0))
 
 
 # -- one block ----------------------------------------------------------------------------------------------
@@ -298,18 +292,7 @@ def unsolvable(unit: FloatArray, curvature: Callable[[FloatArray], FloatArray], 
 
 
 class LocalRows:
-    """One block of rows on its own atoms, with dense algebra.
-
-    Parameters
-    ----------
-    constraint_set : ConstraintSet
-    rows : ndarray of int
-        Rows of the block, sorted.
-    positions : ndarray, shape (n_atoms, 3)
-    time : float
-    pinned : ndarray of bool, optional
-        Fixed atoms of the block; by default those that FixedAtoms of the set hold.
-    """
+    """One block of rows (sorted) on its own atoms; `pinned` are the fixed ones, by default those of the set."""
 
     def __init__(
         self,
@@ -324,10 +307,7 @@ class LocalRows:
         self.set = constraint_set
         self.part, self.atoms = constraint_set.subset(rows)
         self.x = positions[self.atoms]
-        if pinned is None:
-            pinned = np.isin(self.atoms, fixed_atoms(constraint_set))
-        self.pinned: BoolArray = pinned
-        self.row_atoms = [self.part.row_atoms(k) for k in range(self.part.n_rows)]
+        self.pinned: BoolArray = np.isin(self.atoms, fixed_atoms(constraint_set)) if pinned is None else pinned
 
     def inside(self, atoms: IntArray) -> IntArray:
         """Rows (block numbering) that a rigid group of `atoms` (block numbering) makes superfluous."""
@@ -340,9 +320,11 @@ class LocalRows:
         unit, norms, curvature = _Stack(self.part, self.time, *every, np.flatnonzero(self.pinned)).dense(x)
         return unit[0], norms[0], lambda v: curvature(v[None])[0]
 
-    def decomposed(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, int]:
-        """u, s and v^T of these rows, all singular vectors, and their rank."""
-        u, s, vt = np.linalg.svd(self.linear(x)[0], full_matrices=True)
+    def decomposed(
+        self, x: FloatArray, rows: IntArray | slice = slice(None)
+    ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+        """u, s and v^T of these rows (all by default), all singular vectors, and their rank."""
+        u, s, vt = np.linalg.svd(self.linear(x)[0][rows], full_matrices=True)
         return u, s, vt, int(np.sum(s > LOST * s[0]))
 
     def singular(self, x: FloatArray, rows: IntArray | None = None) -> bool:
@@ -352,11 +334,6 @@ class LocalRows:
             return False
         unit, _, curvature = self.linear(x)
         return bool(unsolvable(unit[None, rows], lambda v: curvature(v[0])[None, rows], np.array([extent_of(x)]))[0])
-
-    def rank(self, x: FloatArray, rows: IntArray | None = None) -> int:
-        unit = self.linear(x)[0]
-        s = np.linalg.svd(unit if rows is None else unit[rows], compute_uv=False)
-        return int(np.sum(s > LOST * s[0])) if len(s) else 0
 
     def restored(self) -> LocalRows:
         """The same block at positions that fulfil its targets, as nearly as Gauss-Newton gets there."""
@@ -374,17 +351,20 @@ class LocalRows:
         other.x = x
         return other
 
+    def nearby(self, rng: np.random.Generator) -> FloatArray:
+        """Positions of the movable atoms displaced at random, by less than rows are long."""
+        wide = [c for c in self.part.constraints if c.width > 1 and c.n_rows]
+        sides = [np.linalg.norm(np.diff(self.part.gather(c, self.x), axis=1), axis=2).min() for c in wide]
+        step = DISPLACEMENT * min(sides, default=extent_of(self.x))
+        return self.x + step * rng.standard_normal(self.x.shape) * ~self.pinned[:, None]
+
     def rigid_pairs(self) -> tuple[BoolArray, int]:
         """Pairs of atoms that keep their distance at positions nearby, and the rank there."""
         rng = np.random.default_rng(20090131)
         n = len(self.atoms)
-        wide = [c for c in self.part.constraints if c.width > 1 and c.n_rows]
-        sides = [np.linalg.norm(np.diff(self.part.gather(c, self.x), axis=1), axis=2).min() for c in wide]
-        step = DISPLACEMENT * min(sides, default=extent_of(self.x))
         best, rigid = -1, np.eye(n, dtype=bool)
         for _ in range(3):
-            x = self.x + step * rng.standard_normal(self.x.shape)
-            x[self.pinned] = self.x[self.pinned]
+            x = self.nearby(rng)
             _, _, vt, rank = self.decomposed(x)
             if rank <= best:
                 continue
@@ -416,14 +396,14 @@ def extent_of(x: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class FlatBody:
-    """Atoms on a line (two bases) or in a plane (three), and what holds them regularly.
+    """A rigid group on a line (two bases), in a plane (three) or in space (four), and what holds it regularly.
 
     Attributes
     ----------
     atoms, rows : ndarray of int
         The atoms, and the rows that the linear ones replace.
-    bases : ndarray of int, shape (2,) or (3,)
-    pairs, lengths : ndarray, shape (1, 2), (1,) or (3, 2), (3,)
+    bases : ndarray of int, shape (n_bases,)
+    pairs, lengths : ndarray, shape (n_pairs, 2) and (n_pairs,)
         Distances between the bases.
     tied : ndarray of int, shape (n,)
         The other atoms.
@@ -443,7 +423,7 @@ class FlatBody:
         """For example 'atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows'."""
         distances, linear = len(self.pairs), 3 * len(self.tied)
         return (
-            f"atoms {_listed(self.atoms)} {'on a line' if len(self.bases) == 2 else 'in a plane'}: {distances} "
+            f"atoms {_listed(self.atoms)} {_GROUPS[len(self.bases) - 2][0]}: {distances} "
             f"distance{'s' if distances > 1 else ''} and {linear} linear rows in place of {len(self.rows)} rows"
         )
 
@@ -460,7 +440,7 @@ class FlatBody:
 
 
 def find_flat_bodies(block: LocalRows) -> list[FlatBody]:
-    """Linear and planar rigid groups that make a block singular at second order.
+    """Rigid groups that make a block singular at second order, as linear rows.
 
     Raises
     ------
@@ -469,18 +449,10 @@ def find_flat_bodies(block: LocalRows) -> list[FlatBody]:
     """
     rigid, generic = block.rigid_pairs()
     x = block.unwrapped(block.x)
-    u, _, _, rank = block.decomposed(block.x)
-    stressed = np.flatnonzero((u[:, rank:] ** 2).sum(axis=1) > 1e-10)  # rows with a part in some omega^T A = 0
-    loaded = np.unique(np.concatenate([block.row_atoms[k] for k in stressed]))
-    found: list[IntArray] = []
-    for body in _cliques(rigid):
-        subsets = [body] if affine_dimension(x[body]) <= 2 else _flat_subsets(x, np.intersect1d(body, loaded))
-        found += [atoms for atoms in subsets if block.singular(block.x, block.inside(atoms))]
-    groups = _merged(found, x)
+    groups = [atoms for atoms in _cliques(rigid) if block.singular(block.x, block.inside(atoms))]
     if not groups:
-        raise _unresolved(block, generic)
-    bodies = [_body(block, atoms, x) for atoms in groups]
-    bodies = _without_repeats(block, bodies)
+        raise _unresolved(block, block.decomposed(block.x)[3], generic)
+    bodies = _without_repeats(block, [_body(block, atoms, x) for atoms in groups])
     _check_result(block, bodies, generic)
     return [body.renumbered(block.atoms, block.rows) for body in bodies]
 
@@ -508,59 +480,14 @@ def _cliques(rigid: BoolArray) -> list[IntArray]:
     return [np.flatnonzero(b) for b in bodies]
 
 
-def _flat_subsets(x: FloatArray, atoms: IntArray) -> list[IntArray]:
-    """Largest coplanar (four atoms and more) and collinear (three and more) subsets of a rigid body."""
-    y = x[atoms]
-    size = extent_of(y)
-    found: dict[bytes, IntArray] = {}
-    for i, j in combinations(range(len(atoms)), 2):
-        axis = (y[j] - y[i]) / np.linalg.norm(y[j] - y[i])
-        away = y - y[i]
-        across = away - np.outer(away @ axis, axis)
-        off = np.linalg.norm(across, axis=1)
-        line = off < FLAT * size
-        if line.sum() >= 3:
-            found.setdefault(line.tobytes(), atoms[line])
-        for k in range(j + 1, len(atoms)):
-            if line[k]:
-                continue
-            normal = np.cross(axis, across[k] / off[k])
-            plane = np.abs(away @ normal) < FLAT * size
-            if plane.sum() >= 4:
-                found.setdefault(plane.tobytes(), atoms[plane])
-    return list(found.values())
-
-
-def _merged(found: list[IntArray], x: FloatArray) -> list[IntArray]:
-    """Groups on the same line (two common atoms) or in the same plane (three off a line) become one."""
-    groups = [set(atoms.tolist()) for atoms in found]
-    changed = True
-    while changed:
-        changed = False
-        for a, b in combinations(range(len(groups)), 2):
-            shared = sorted(groups[a] & groups[b])
-            if len(shared) < 2:
-                continue
-            union = sorted(groups[a] | groups[b])
-            same_line = affine_dimension(x[union]) == 1
-            same_plane = len(shared) >= 3 and affine_dimension(x[union]) == 2 and affine_dimension(x[shared]) == 2
-            contained = groups[a] <= groups[b] or groups[b] <= groups[a]
-            if same_line or same_plane or contained:
-                groups[a] = set(union)
-                del groups[b]
-                changed = True
-                break
-    return [np.array(sorted(g), dtype=np.int64) for g in groups]
-
-
 def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
-    """What holds a flat group: bases, their distances, and the weights of the other atoms."""
+    """What holds a group: bases, their distances, and the weights of the other atoms."""
     inside = block.inside(atoms)
     located = [block.part.locate(int(k)) for k in inside]
     if any(isinstance(item.target, MovingTarget) for item, _ in located):
         raise _refused(block, atoms, inside, x, "since a target among these atoms is a function of time")
     plane = _fitted(block, atoms, inside, x)
-    bases, weights = _bases(block, atoms, inside, plane)
+    bases, weights = _bases(block, atoms, plane)
     held = np.array(list(combinations(bases, 2)))
     lengths = np.linalg.norm(plane[held[:, 0]] - plane[held[:, 1]], axis=1)
     pairs, others = atoms[held], np.setdiff1d(np.arange(len(atoms)), bases)
@@ -573,9 +500,9 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
 
 
 def _fitted(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray) -> FloatArray:
-    """Coordinates along the line or in the plane that fulfil the targets, shape (n, 1) or (n, 2).
+    """Coordinates along the line, in the plane or in space that fulfil the targets, shape (n, dimension).
 
-    Gauss-Newton within the plane, where the rows are regular; starts from the present positions.
+    Gauss-Newton along a line or within a plane, where the rows are regular; starts from the present positions.
     """
     center, flat = x[atoms].mean(axis=0), affine_dimension(x[atoms])
     axes = np.linalg.svd(x[atoms] - center)[2][:flat]
@@ -597,54 +524,35 @@ def _fitted(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray) 
         plane = plane + np.linalg.lstsq(a / scale[:, None], -sigma, rcond=STEP_CUT)[0].reshape(plane.shape)
     if not miss <= MISFIT:
         name = block.set.row_name(int(block.rows[inside[worst]]))
-        why = (
-            f"since the targets do not fit a {('linear', 'planar')[flat - 1]} group: row {name} stays off by {miss:.2g}"
-        )
+        why = f"since the targets do not fit a {_GROUPS[flat - 1][1]} group: row {name} stays off by {miss:.2g}"
         raise _refused(block, atoms, inside, x, f"{why} (relative)")
     return best
 
 
-def _bases(block: LocalRows, atoms: IntArray, inside: IntArray, plane: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Two or three bases far apart (fixed atoms and pairs already held preferred), and all atoms' weights."""
-    n, flat = plane.shape
-    held = {tuple(sorted(block.row_atoms[k])) for k in inside if len(block.row_atoms[k]) == 2}
-    fixed = block.pinned[atoms]
-    candidates = list(range(n))
-    if flat == 2 and n > 40:
-        # The outermost atoms in a few directions; all triples of a large sheet would be too many.
-        angles = np.linspace(0, np.pi, 16, endpoint=False)
-        reach = plane @ np.stack([np.cos(angles), np.sin(angles)])
-        outer = np.concatenate([np.argmax(reach, 0), np.argmin(reach, 0), np.flatnonzero(fixed)[:8]])
-        candidates = np.unique(outer).tolist()
-    choices = list(combinations(candidates, flat + 1))
-    corners = plane[np.array(choices)]
-    edges = corners[:, 1:] - corners[:, :1]
-    size = np.abs(edges[:, 0, 0]) if flat == 1 else np.abs(np.linalg.det(edges))
-    good = np.flatnonzero(size >= 0.5 * size.max()) if flat == 2 else np.flatnonzero(size >= 0.999 * size.max())
+def _bases(block: LocalRows, atoms: IntArray, plane: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Bases far apart, one more than dimensions, fixed atoms preferred; and all atoms' weights."""
+    from scipy.linalg import qr  # slow to import
 
-    def merit(k: int) -> tuple[int, int, float]:
-        pairs = combinations(choices[k], 2)
-        kept = sum(tuple(sorted((atoms[i], atoms[j]))) in held for i, j in pairs)
-        return int(fixed[list(choices[k])].sum()), kept, float(size[k])
-
-    bases = list(choices[max(good.tolist(), key=merit)])
-    system = np.vstack([plane[bases].T, np.ones(flat + 1)])
-    weights = np.linalg.solve(system, np.vstack([plane.T, np.ones(n)])).T
+    system = np.vstack([plane.T / np.abs(plane).max(), np.ones(len(plane))])
+    order = qr(system * np.where(block.pinned[atoms], 2.0, 1.0), mode="r", pivoting=True)[1]
+    bases = np.sort(order[: len(system)])
+    weights = np.linalg.solve(system[:, bases], system).T
     # Round so that the weights sum to one: the relation then does not depend on the origin.
     weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
-    return np.array(bases), weights
+    return bases, weights
 
 
 def _without_repeats(block: LocalRows, bodies: list[FlatBody]) -> list[FlatBody]:
     """Leave out base distances that other bodies hold already (two planar groups with a common edge)."""
     if len(bodies) < 2:
         return bodies
+    rank = _rebuilt(block, bodies).decomposed(block.x)[3]
     for b in range(len(bodies)):
         for k in reversed(range(len(bodies[b].pairs))):
             body = bodies[b]
             fewer = replace(body, pairs=np.delete(body.pairs, k, axis=0), lengths=np.delete(body.lengths, k))
             trial = [*bodies[:b], fewer, *bodies[b + 1 :]]
-            if _rebuilt(block, trial).rank(block.x) == _rebuilt(block, bodies).rank(block.x):
+            if _rebuilt(block, trial).decomposed(block.x)[3] == rank:
                 bodies = trial
     return bodies
 
@@ -661,21 +569,12 @@ def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> Non
     distances between them resist the fold at second order.
     """
     new = _rebuilt(block, bodies)
-    u, s, vt, rank = new.decomposed(block.x)
-    old, _, bend = block.linear(block.x)
-    curvature = new.linear(block.x)[2]
-    if np.abs(old @ vt[rank:].T).max(initial=0.0) > 1e-4 or new.singular(block.x):
-        raise _unresolved(block, generic)
-    rng = np.random.default_rng(20060921)
-    for _ in range(3):
-        v = rng.standard_normal(len(vt) - rank) @ vt[rank:]
-        a = -((u[:, :rank].T @ curvature(v)) / s[:rank]) @ vt[:rank]
-        bent = bend(v)
-        miss = old @ a + bent
-        # Rigid motion has no curvature but rounding.
-        size = np.linalg.norm(bent) + 1e-5 * (v @ v) / extent_of(block.x)
-        if np.linalg.norm(miss) > UNSOLVABLE * size:
-            raise _unresolved(block, generic)
+    _, _, vt, rank = new.decomposed(block.x)
+    apart = np.abs(block.linear(block.x)[0] @ vt[rank:].T).max(initial=0.0)
+    both = new.part.replaced([*new.part.constraints, *block.part.constraints], block.x, block.time)
+    together = LocalRows(both, np.arange(both.n_rows), block.x, block.time, pinned=block.pinned)
+    if apart > 1e-4 or new.singular(block.x) or together.singular(block.x):
+        raise _unresolved(block, block.decomposed(block.x)[3], generic)
 
 
 def with_flat_bodies(
@@ -697,7 +596,7 @@ def with_flat_bodies(
     first.sort()
     if len(first):
         pieces.append(Distance(pairs[first], lengths[first]))
-    for n_bases in (2, 3):
+    for n_bases in (2, 3, 4):
         same = [b for b in bodies if len(b.bases) == n_bases and len(b.tied)]
         if same:
             pieces.append(
@@ -718,28 +617,19 @@ def _listed(atoms: IntArray) -> str:
 
 def _refused(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, why: str) -> SingularGeometryError:
     """The error for a flat group that cannot be converted."""
-    linearized = 3 * int(np.sum(~block.pinned[atoms])) - block.rank(block.x, inside)
-    freedom, shape, remedy = (
-        (5, "collinear", "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead")
-        if affine_dimension(x[atoms]) == 1
-        else (
-            6,
-            "coplanar",
-            "hold three distances and x_a = c_i x_i + c_j x_j + c_k x_k (LinearRelation) for the other atoms instead",
-        )
-    )
+    linearized = 3 * int(np.sum(~block.pinned[atoms])) - block.decomposed(block.x, inside)[3]
+    _, _, shape, freedom, remedy = _GROUPS[affine_dimension(x[atoms]) - 1]
     named = block.atoms[atoms]
     return SingularGeometryError(
         f"constraint set singular at this geometry: {linearized} linearized degrees of freedom but the rigid body "
-        f"has {freedom} (atoms {_listed(named)} are {shape}); {remedy}; it cannot be converted, {why}",
+        f"has {freedom} (atoms {_listed(named)} are {shape}); hold {remedy} instead; it cannot be converted, {why}",
         rows=block.rows[inside],
         atoms=named,
     )
 
 
-def _unresolved(block: LocalRows, generic: int) -> SingularGeometryError:
+def _unresolved(block: LocalRows, here: int, generic: int) -> SingularGeometryError:
     names = ", ".join(block.set.row_name(int(r)) for r in block.rows[:4]) + (", ..." if len(block.rows) > 4 else "")
-    here = block.rank(block.x)
     free = 3 * int(np.sum(~block.pinned))
     return SingularGeometryError(
         f"constraint set singular at this geometry: {free - here} linearized degrees of freedom here but "

@@ -54,6 +54,7 @@ FLAT = 2e-3
 LARGE = 50
 #: Among how many atoms nearby three are looked for, and what volume of three unit vectors is enough.
 _NEAR, _ENOUGH = 12, 0.2
+_TRIPLES = np.array(list(combinations(range(_NEAR + 4), 3)))
 #: Waters whose plane is told by less than this are none: |u x w| over the square of the longer arm.
 _LINE = 1e-3
 #: Bases are the first atoms that are this close to the best.
@@ -122,16 +123,9 @@ class VirtualSites:
 
 @dataclass(frozen=True, eq=False)
 class Waters:
-    """Rigid waters of a system.
+    """Rigid waters of a system: oxygen and hydrogens, and massless sites."""
 
-    Attributes
-    ----------
-    triples : ndarray of int, shape (n, 3)
-        Oxygen and hydrogens.
-    sites : VirtualSites
-    """
-
-    triples: IntArray
+    triples: IntArray  # shape (n, 3)
     sites: VirtualSites
 
     def among(self, atoms: BoolArray) -> Waters:
@@ -157,24 +151,12 @@ def find_waters(
     model_site: float = 0.0,
     geometry: tuple[float, float] | None = None,
 ) -> Waters:
-    """Waters by residue name and composition: one oxygen, two hydrogens, massless sites.
+    """Waters by residue name (in capitals) and composition: one oxygen, two hydrogens, massless sites.
 
-    Waters of one oxygen alone, as in crystal structures, are left out.
-
-    Parameters
-    ----------
-    names : frozenset of str
-        Residue names, in capitals.
-    model_site : float
-        Length O-M in angstrom where the geometry was given by name; 0 takes the sites where they are.
-    geometry : tuple of float, optional
-        O-H length in angstrom and H-O-H angle in degrees at which the waters are held; None as they are.
-
-    Raises
-    ------
-    InputError
-        A residue that is called water and is composed otherwise; it is named. Sites that are not at their water, or
-        whose water has no plane.
+    Waters of one oxygen alone, as in crystal structures, are left out. `model_site` is the length O-M in angstrom of a
+    geometry that was given by name, 0 takes the sites where they are; `geometry` is the O-H length and the H-O-H angle
+    in degrees at which the waters are held, None as they are. Refused, with its name, is a residue that is called water
+    and is composed otherwise; so are sites that are not at their water, or whose water has no plane.
     """
     topology = snapshot.topology
     kinds, kind = np.unique(topology.residue_names, return_inverse=True)
@@ -283,12 +265,9 @@ def residue_bodies(snapshot: Snapshot, names: Sequence[str]) -> list[IntArray]:
 
 
 def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]) -> list[IntArray]:
-    """Checked lists of atoms, grouped by their size.
+    """Lists of atoms, grouped by their size.
 
-    Raises
-    ------
-    InputError
-        Atoms that do not exist or come twice; bodies of one atom.
+    Refused are atoms that do not exist or come twice, and bodies of one atom.
     """
     by_size: dict[int, list[IntArray]] = {}
     for k, body in enumerate(bodies):
@@ -304,17 +283,8 @@ def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]
 def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint]:
     """Rows that hold every group rigid: distances between bases, and relations for all other atoms.
 
-    Bodies that are linear or planar up to `FLAT` are held exactly so; positions may be off by that much.
-
-    Parameters
-    ----------
-    groups : sequence of ndarray, shape (n_bodies, n_atoms)
-        Bodies of one size each.
-
-    Raises
-    ------
-    SingularGeometryError
-        Two atoms of a body at one point.
+    Groups are arrays of shape (n_bodies, n_atoms), bodies of one size each. Those that are linear or planar up to
+    `FLAT` are held exactly so; positions may be off by that much. Two atoms of a body at one point are refused.
     """
     pairs: list[IntArray] = []
     lengths: list[FloatArray] = []
@@ -329,7 +299,12 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint
         center = r.mean(axis=1, keepdims=True)
         _, s, axes = np.linalg.svd(r - center, full_matrices=False)
         dimension = 1 + (s[:, 1:3] > FLAT * s[:, :1]).sum(axis=1) if n > 2 else np.ones(len(atoms), np.int64)
-        _refuse_coincident(snapshot, atoms, s)
+        points = np.flatnonzero(s[:, 0] < 1e-6 * snapshot.angstrom)
+        if len(points):
+            body, name = atoms[points[0]].tolist(), snapshot.topology.atom_name
+            raise SingularGeometryError(
+                f"the atoms of a rigid body coincide: {name(body[0])} and {name(body[1])}; give positions", atoms=body
+            )
         for d in np.unique(dimension).tolist():
             these = np.flatnonzero(dimension == d)
             if d == 3 and n > LARGE:
@@ -365,8 +340,10 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint
             tied[d + 1].append((named.ravel(), bases_of, np.swapaxes(w, 1, 2).reshape(-1, d + 1)))
     rows: list[Constraint] = []
     if pairs:
-        joined, first = _each_once(np.concatenate(pairs))
-        rows.append(Distance(joined, np.concatenate(lengths)[first]))
+        joined = np.sort(np.concatenate(pairs), axis=1)
+        # Each once, in the order in which they came.
+        first = np.sort(np.unique(joined @ [int(joined.max()) + 1, 1], return_index=True)[1])
+        rows.append(Distance(joined[first], np.concatenate(lengths)[first]))
     for parts in tied.values():
         if parts:
             rows.append(LinearRelation(*(np.concatenate([part[k] for part in parts]) for k in range(3))))
@@ -400,48 +377,40 @@ def _braced(x: FloatArray) -> IntArray:
 
     n = len(x)
     order = np.argsort(np.linalg.norm(x - x[np.argmin(np.linalg.norm(x - x.mean(axis=0), axis=1))], axis=1))
-    first = _first_four(x, order)
+    first = np.append(order[0], _three(x, order[0], iter((order[1:_NEAR], order[_spread(n)[1:]]))))
     order = np.concatenate([first, order[~np.isin(order, first)]])
     place = np.empty(n, np.int64)
     place[order] = np.arange(n)
-    near = cKDTree(x).query(x, min(n, 3 * _NEAR))[1]
-    pairs = [(int(first[i]), int(first[j])) for i in range(4) for j in range(i)]
-    triples = np.array(list(combinations(range(_NEAR + 4), 3)))
-    for k in range(4, n):
-        atom = order[k]
-        known = near[atom][place[near[atom]] < k][:_NEAR]
-        best, volume = _widest(x, atom, known, triples)
-        if volume < _ENOUGH:
-            # A flat or lonely place: look at a few atoms at all distances, and at those that span space.
-            placed = order[:k][np.argsort(np.linalg.norm(x[order[:k]] - x[atom], axis=1))]
-            some = np.unique(np.geomspace(1, k, _NEAR).astype(np.int64)) - 1
-            wider, other = _widest(x, atom, np.unique(np.concatenate([placed[some], first])), triples)
-            best = wider if other > volume else best
-        pairs += [(int(atom), int(base)) for base in best]
-    return np.array(pairs)
+    near = cKDTree(x).query(x, 3 * _NEAR)[1]
+
+    def before(k: int) -> Iterator[IntArray]:
+        """Atoms nearby, and for a flat or lonely place a few at all distances, and those that span space."""
+        yield near[order[k]][place[near[order[k]]] < k][:_NEAR]
+        placed = order[:k][np.argsort(np.linalg.norm(x[order[:k]] - x[order[k]], axis=1))]
+        yield np.unique(np.concatenate([placed[_spread(k)], first]))
+
+    bases = [(order[k], base) for k in range(4, n) for base in _three(x, order[k], before(k))]
+    return np.array([*combinations(first, 2), *bases])
 
 
-def _widest(x: FloatArray, atom: int, known: IntArray, triples: IntArray) -> tuple[IntArray, float]:
-    """The three of `known` that `atom` sees farthest from a plane, and the volume of their directions."""
-    choices = triples[triples[:, 2] < len(known)]
-    if not len(choices):
-        return known[:0], 0.0
-    sight = x[known] - x[atom]
-    sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
-    volume = np.abs(np.linalg.det(sight[choices]))
-    best = int(np.argmax(volume >= _AS_GOOD * volume.max()))
-    return known[choices[best]], float(volume[best])
+def _spread(n: int) -> IntArray:
+    """Numbers below n, dense at 0."""
+    return np.unique(np.geomspace(1, n, _NEAR).astype(np.int64)) - 1
 
 
-def _first_four(x: FloatArray, order: IntArray) -> IntArray:
-    """The first of `order`, and three of the atoms nearest to it that span space well."""
-    nearest = order[: max(_NEAR, 4)]
-    rest = np.array(list(combinations(range(1, len(nearest)), 3)))
-    for several in (nearest, order[np.unique(np.geomspace(1, len(order), len(nearest)).astype(np.int64)) - 1]):
-        best, volume = _widest(x, int(several[0]), several[1:], rest[rest[:, 2] < len(several)] - 1)
-        if volume >= _ENOUGH:
+def _three(x: FloatArray, atom: int, choices: Iterator[IntArray]) -> IntArray:
+    """The three atoms that `atom` sees farthest from a plane, of the first choice where that is far enough."""
+    best, largest = np.zeros(0, np.int64), -1.0
+    for known in choices:
+        sight = x[known] - x[atom]
+        triples = _TRIPLES[_TRIPLES[:, 2] < len(known)]
+        volume = np.abs(np.linalg.det((sight / np.linalg.norm(sight, axis=1, keepdims=True))[triples]))
+        if volume.max(initial=-1.0) > largest:
+            largest = volume.max()
+            best = known[triples[np.argmax(volume >= _AS_GOOD * largest)]]
+        if largest >= _ENOUGH:
             break
-    return np.concatenate([several[:1], best])
+    return best
 
 
 def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:
@@ -458,26 +427,6 @@ def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:
 def _farthest(distance: FloatArray) -> IntArray:
     """The first atom as far as the farthest, up to rounding: the same choice whatever the unit of length."""
     return np.argmax(distance >= _AS_GOOD * distance.max(axis=1, keepdims=True), axis=1).astype(np.int64)
-
-
-def _each_once(pairs: IntArray) -> tuple[IntArray, IntArray]:
-    """Pairs sorted within and listed once, in their order, and where they came first."""
-    ordered = np.sort(pairs, axis=1)
-    code = ordered[:, 0] * (int(ordered.max()) + 1) + ordered[:, 1]
-    _, first = np.unique(code, return_index=True)
-    first = np.sort(first)
-    return ordered[first], first
-
-
-def _refuse_coincident(snapshot: Snapshot, atoms: IntArray, s: FloatArray) -> None:
-    points = np.flatnonzero(s[:, 0] < 1e-6 * snapshot.angstrom)
-    if len(points):
-        body = atoms[points[0]]
-        raise SingularGeometryError(
-            f"the atoms of a rigid body coincide: {snapshot.topology.atom_name(int(body[0]))} and "
-            f"{snapshot.topology.atom_name(int(body[1]))}; give positions",
-            atoms=body.tolist(),
-        )
 
 
 def body_numbers(n_atoms: int, groups: Sequence[IntArray]) -> Iterator[IntArray]:

@@ -19,7 +19,7 @@ from torch_sim.models.interface import ModelInterface
 from torch_sim.units import unit_factor_from_annotation
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
-from kcons.torchsim.constraints_object import Constraints, constraints_of
+from kcons.torchsim.holding import Constraints, constraints_of
 
 __all__ = ["Integrator", "NoseHooverState", "langevin", "nose_hoover", "nve"]
 

@@ -90,7 +90,6 @@ def test_the_object_follows_what_it_holds():
         assert fixed_in(twin) == [0, 1, 2, 3]
         assert repr(twin.constraints) == repr(atoms.constraints)
     assert fixed_in(atoms[[2, 12, 13, 5]]) == [0]
-    assert fixed_in(atoms.repeat((2, 1, 1))) == [0, 1, 2, 3, 14, 15, 16, 17]
     (molecule_alone,) = atoms[12:].constraints
     assert type(molecule_alone) is Constraints and not isinstance(molecule_alone, FixAtoms)
     held.constraints = (Distance([[12, 13]]),)

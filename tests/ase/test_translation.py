@@ -28,7 +28,7 @@ from ase.constraints import (
 from ase.db import connect
 from ase.io import read, write
 from ase.md.verlet import VelocityVerlet
-from ase_systems import AS_ASE, loose_waters, off, rigid
+from ase_systems import AS_ASE, loose_waters, rigid
 
 from kcons.ase import ConstrainedDynamics, Constraints, attach, constrain, from_ase_constraints, rigid_water
 from kcons.constraints import (
@@ -38,7 +38,6 @@ from kcons.constraints import (
     FixedAtoms,
     ImplicitSurface,
     LinearCombination,
-    Sphere,
 )
 from kcons.errors import UnsupportedError
 
@@ -293,46 +292,14 @@ def test_slicing_keeps_whole_rows_only():
     assert np.array_equal(targets(atoms[[2, 1, 0]]), targets(atoms)[:3])
 
 
-@pytest.mark.parametrize("used", [True, False])
-def test_repeat(used):
+def test_rows_are_not_repeated_but_fixed_atoms_are():
     atoms = loose_waters(1)
     atoms.set_cell([4.0, 5.0, 6.0])
     atoms.pbc = True
-    atoms.set_constraint(Constraints([rigid_water(atoms), FixedAtoms([0])]))
-    if used:
-        atoms.get_number_of_degrees_of_freedom()
-    large = atoms.repeat((2, 1, 3))
-    assert large.get_number_of_degrees_of_freedom() == 6 * (9 - 6)
-    assert off(large, large.constraints[0]) <= 1e-14
-    assert len(large.constraints[0].touched) == 18
-
-
-@pytest.mark.parametrize("used", [True, False])
-@pytest.mark.parametrize("through_file", [False, True])
-def test_repeat_across_the_boundary(used, through_file, tmp_path):
-    cell = np.array([[5.0, 0, 0], [1.0, 5.5, 0], [-0.5, 0.7, 6.0]])
-    atoms = molecule("H2O")
-    atoms.set_cell(cell)
-    atoms.pbc = True
-    atoms.positions -= atoms.positions[0] + [0.1, 0.1, 0.1]
-    atoms.wrap()
-    lengths = atoms.get_all_distances(mic=True)[[0, 0, 1], [1, 2, 2]]
-    assert np.abs(np.diff(atoms.get_scaled_positions(), axis=0)).max() > 0.5
-    atoms.set_constraint(Constraints(rigid_water(atoms)))
-    if used:
-        atoms.get_number_of_degrees_of_freedom()
-    large = atoms.repeat((2, 3, 2))
-    if through_file:
-        large = _through(large, tmp_path / "large.json")
-    assert targets(large) == pytest.approx(np.tile(lengths, 12), abs=1e-12)
-    assert off(large, large.constraints[0]) <= 1e-13
-    assert large.get_number_of_degrees_of_freedom() == 12 * 6
-    rows = large.constraints[0].constraints[0].atoms
-    assert len(np.unique(np.sort(rows, axis=1), axis=0)) == 36
-
-
-def test_repeat_of_a_surface_is_refused():
-    atoms = Atoms("H", positions=[[1, 0, 0]], cell=[4, 4, 4], pbc=True)
-    constrain(atoms, Sphere([0], [0, 0, 0]))
-    with pytest.raises(UnsupportedError, match="place in space"):
+    constrain(atoms, [FixedAtoms([0]), rigid_water(atoms)])
+    with pytest.raises(UnsupportedError, match=r"Distance.* cannot be repeated.*set_constraint\(\)"):
         atoms.repeat(2)
+    atoms.set_constraint(Constraints(FixedAtoms([0, 2])))
+    large = atoms.repeat((2, 1, 3))
+    assert large.constraints[0].index.tolist() == [k for k in range(18) if k % 3 != 1]
+    assert np.array_equal(targets(large), large.positions[large.constraints[0].index].ravel())

@@ -124,22 +124,6 @@ def test_bondcombos_become_this_row_and_go_back():
     assert other.measure(atoms.positions[other.atoms], 0.0) == pytest.approx([wanted], abs=1e-14)
 
 
-def test_replicas_each_have_their_own():
-    atoms = proton()
-    atoms.set_cell([6.0, 5.0, 5.0])
-    atoms.pbc = True
-    atoms.positions[:, 0] += 4.9  # Br is in the next cell
-    atoms.wrap()
-    constrain(atoms, DistanceDifference(TRANSFER))
-    value = atoms.constraints[0].constraints[0].target_at(0.0)
-    twice = atoms.repeat((2, 1, 1))
-    (held,) = twice.constraints
-    rows = held.engine(twice).constraint_set
-    assert rows.target() == pytest.approx(np.repeat(value, 2), abs=1e-12)
-    lengths = lengths_in(twice.cell.array, twice.positions, rows.constraints[0].atoms[:, :2].tolist())
-    assert lengths == pytest.approx(2 * [proton().get_distance(0, 1)], abs=1e-12)
-
-
 def test_a_proton_goes_over_within_a_molecule_that_stays_as_it_is():
     """Malonaldehyde, halfway between its two enols: no atom but the proton moves by more than 0.03."""
     places = [[-1.29, 0.55, 0], [-0.60, 1.27, 0], [1.27, 0.75, 0], [-1.16, -0.74, 0], [0.05, -1.40, 0]]

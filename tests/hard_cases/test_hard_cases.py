@@ -22,7 +22,7 @@ FULL = {"H01", "H06", "H07", "H08", "H13", "H16", "H26", "H30", "H31", "H32", "H
 SAID = {
     "H02": r"ContradictionError: constraints #0 and #1 on atoms \(0, 1\) have different targets 1\.0, 1\.001; remove",
     "H17": "InputError: atom 3 has mass 0; constrained atoms need positive mass .*FixedAtoms",
-    "H18": "SingularGeometryError: atoms 0 and 1 coincide: distance gradient undefined",
+    "H18": r"SingularGeometryError: row 0, Distance\(0, 1\): atoms 0 and 1 coincide: gradient undefined",
     "H19": "InputError: position of atom 2 is not finite",
     "H20": "OverdeterminedError: rank 12 leaves no degree of freedom.*hold fewer rows",
     "H21": r"InfeasibleError: infeasible: residual cannot go below 0\.333333.*sum of squares.*Correct the longest",
@@ -33,7 +33,7 @@ SAID = {
     "H36": "BudgetError: the start is already at equilibrium.*start elsewhere",
     "H39": "warned: total momentum is not zero.*Take it out",
     "H40": "InputError: the cutoff 1 must be above 0 and at most half the box",
-    "X06": "SingularGeometryError: angle constraint singular at 180 deg, use a linear constraint",
+    "X06": "SingularGeometryError: row 2, Angle.*: angle constraint singular at 180 deg, use a linear constraint",
     "X10": "SingularGeometryError: .*10 linearized degrees of freedom here but 9 at positions nearby",
     "X33": r"InputError: initial positions are off row #0 Distance\(0, 1\) by 0\.2; pass project=True",
     "X34": "InputError: initial velocities violate the constraints: atom 4 .*pass project=True",

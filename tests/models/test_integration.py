@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.models.integration import METHODS, check_run, jacobian_by_differences, projecting
+from kcons.models.integration import METHODS, check_run, integrate
 
 
 def turn(t, y):
@@ -22,36 +21,28 @@ def test_the_next_step_starts_from_the_projection(method):
         seen.append(y / np.linalg.norm(y))
         return seen[-1]
 
-    found = solve_ivp(turn, (0, 2), [1.0, 0.0], projecting(METHODS[method], project), rtol=1e-5, atol=1e-6)
+    options = {"method": METHODS[method], "rtol": 1e-5, "atol": 1e-6}
+    found = integrate(turn, (0, 2), [1.0, 0.0], project=project, **options)
     np.testing.assert_array_equal(found.y[:, 1:].T, seen)
     np.testing.assert_allclose(found.y[:, -1], [np.cos(2), np.sin(2)], rtol=0, atol=1e-3)
     # Values between the steps are projected as well.
-    stepper = projecting(METHODS[method], project)
-    dense = solve_ivp(turn, (0, 2), [1.0, 0.0], stepper, dense_output=True, rtol=1e-5, atol=1e-6).sol
+    dense = integrate(turn, (0, 2), [1.0, 0.0], project=project, dense_output=True, **options).sol
     np.testing.assert_allclose(np.linalg.norm(dense(np.linspace(0, 2, 33)), axis=0), 1.0, rtol=1e-15)
     # What projects to another place moves the rest of the run: here it counts the steps.
-    stepper = projecting(METHODS[method], lambda t, y: y + 1)
-    counted = solve_ivp(lambda t, y: 0 * y, (0, 2), [0.0], stepper, max_step=0.1)
+    counted = integrate(lambda t, y: 0 * y, (0, 2), [0.0], METHODS[method], lambda t, y: y + 1, max_step=0.1)
     np.testing.assert_allclose(counted.y[0], np.arange(len(counted.t)), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("end", [2.0, -2.0])
 def test_a_motion_that_is_known_is_taken_as_it_is(end):
     known = lambda t, y: (lambda s: np.array([s, 7.0])) if abs(t) > 0.5 else None  # noqa: E731
-    stepper = projecting(METHODS["RK45"], lambda t, y: y, known)
     passed = lambda t, y: t - 0.75 * end  # noqa: E731
-    found = solve_ivp(turn, (0, end), [1.0, 0.0], stepper, max_step=0.1, dense_output=True, events=passed)
+    options = {"max_step": 0.1, "dense_output": True, "events": passed}
+    found = integrate(turn, (0, end), [1.0, 0.0], METHODS["RK45"], lambda t, y: y, known, **options)
     assert found.success and found.t[-1] == end
     np.testing.assert_array_equal(found.sol(0.9 * end), [0.9 * end, 7.0])
     np.testing.assert_allclose(found.t_events[0], [0.75 * end], rtol=1e-14)
     np.testing.assert_allclose(found.sol(0.2 * end), [np.cos(0.2 * end), np.sin(0.2 * end)], atol=1e-5)
-
-
-def test_differences_of_one_number_and_of_many():
-    X = np.array([0.4, -120.0])
-    found = jacobian_by_differences(lambda t, X: [X[0] * X[1], np.sin(X[0]) + t], 0.5, X)
-    np.testing.assert_allclose(found, [[-120.0, 0.4], [np.cos(0.4), 0.0]], atol=1e-11)
-    np.testing.assert_allclose(jacobian_by_differences(lambda t, X: X @ X, 0.0, X), 2 * X, rtol=1e-9)
 
 
 def run(t_span=(0.0, 1.0), t_eval=None, method="RK45", **sizes):

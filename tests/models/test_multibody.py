@@ -137,7 +137,7 @@ def test_no_time_and_no_times():
     still = body.solve(*hung(SWING), (1, 1))
     np.testing.assert_array_equal(still.q[-1], hung(SWING)[0])
     nothing = body.solve(*hung(SWING), (0, 0.1), [])
-    assert nothing.q.shape == (0, 3) and nothing.multipliers.shape == (0, 2) and nothing.steps > 0
+    assert nothing.q.shape == (0, 3) and nothing.multipliers.shape == (0, 2) and nothing.evaluations > 0
 
 
 # -- the same motion in other coordinates ------------------------------------------------------------
@@ -218,9 +218,6 @@ def test_one_place_against_the_theory(rank, singular):
         np.testing.assert_allclose(moved, projection.project_velocities(G, M, v), rtol=0, atol=1e-10)
 
 
-# -- dependent rows ----------------------------------------------------------------------------------
-
-
 # -- what is refused ---------------------------------------------------------------------------------
 
 
@@ -255,7 +252,7 @@ def test_a_crossing_of_two_ways_is_passed_straight_on():
     body = Multibody(np.ones(3), lambda q, v, t: np.zeros(3), lambda q: np.array([q[2], q[2] - q[0] * q[1]]))
     found = body.solve([-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], (0, 3), **steps_of(0.25))
     np.testing.assert_allclose(found.q[-1], [2.0, 0.0, 0.0], rtol=0, atol=1e-12)
-    assert found.steps > 12
+    assert len(found.t) > 13
     for near in (0.0, 1e-11):  # where rounding alone decides whether something is left of the second row, and beside it
         with pytest.raises(SingularGeometryError, match="only 1 constraints are independent, and 2 at the start"):
             body._place(np.array([0.0, near, 0.0]), 0.0, 2)
@@ -319,7 +316,6 @@ def test_what_ends_a_run_is_told_not_what_was_got_over():
         ({"v": [0.0, np.inf, 0.0]}, "v"),
         ({"v": np.zeros((3, 1))}, "v"),
         ({"rtol": np.nan}, "rtol"),
-        ({"max_step": -1.0}, "max_step"),
     ],
 )
 def test_bad_arguments_are_named(change, item):

@@ -1,7 +1,5 @@
 """Quantities wherever an OpenMM user writes them."""
 
-import pickle
-
 import numpy as np
 import openmm
 import pytest
@@ -15,10 +13,8 @@ from kcons.constraints import (
     FixedAtoms,
     ImplicitSurface,
     KnifeEdge,
-    MovingTarget,
     Sphere,
 )
-from kcons.constraints.arguments import ANY, LENGTH, Unitless
 from kcons.errors import InputError
 from kcons.openmm import (
     CarriedConstraints,
@@ -30,7 +26,7 @@ from kcons.openmm import (
     constraints_of,
     hold,
 )
-from kcons.openmm.quantities import accepted, array, number
+from kcons.openmm.quantities import array, number
 
 nm, ps, angstrom, kelvin = unit.nanometer, unit.picosecond, unit.angstrom, unit.kelvin
 X = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.15, 0.1, 0], [0.3, 0.1, 0.2]])
@@ -73,40 +69,14 @@ def test_rows_are_held_at_what_was_written():
     np.testing.assert_allclose(sigma([FixedAtoms([0], X[:1] * 10 * angstrom)]).target(), X[0])
 
 
-def test_moving_targets_may_return_quantities():
-    plain = MovingTarget(lambda t: 0.1 + 0.2 * t, lambda t: 0.2, lambda t: 0.0)
-    written = MovingTarget(
-        lambda t: (1 + 2 * t) * angstrom, lambda t: 2 * angstrom / ps, lambda t: 0 * nm / ps**2, 20 * unit.femtosecond
-    )
-    for target in (written, lambda t: (0.1 + 0.2 * t) * nm):
-        one, other = (sigma([Distance([[0, 1]], each)]) for each in (plain, target))
-        for time in (0.0, 0.3):
-            np.testing.assert_allclose(one.target(time), other.target(time), rtol=1e-14)
-            np.testing.assert_allclose(one.velocity_target(X, time), other.velocity_target(X, time), rtol=1e-9)
-    with pytest.raises(InputError, match=r"Distance: target is .* K; give it in nm"):
-        sigma([Distance([[0, 1]], lambda t: 300 * kelvin)])
-    with pytest.raises(InputError, match="give it in nm/ps"):
-        sigma([Distance([[0, 1]], MovingTarget(lambda t: 0.1, lambda t: 1 * nm))]).velocity_target(X, 0.0)
-
-
-def level(r):
-    return r[:, 2] * nm
-
-
-def slope(r):
-    return np.tile([0.0, 0.0, 1.0], (len(r), 1)) * unit.dimensionless
-
-
-def test_functions_may_return_quantities_and_can_be_pickled():
-    surface = ImplicitSurface([3], level, slope, target=2 * angstrom)
-    (item,) = pickle.loads(pickle.dumps(accepted([surface])))
-    np.testing.assert_allclose(item.measure(X[3:, None], 0.0), 0.2)
-    np.testing.assert_allclose(sigma([surface]).value(X), 0.0, atol=1e-15)
-    rows = CustomVelocity([[0]], lambda r: np.array([[0, 0, 1.0]]) * unit.dimensionless, target=1 * nm / ps)
-    np.testing.assert_allclose(sigma([rows]).jacobian(X).toarray()[0, :3], [0, 0, 1])
-    both = Unitless(lambda r: (1 * angstrom, 2 * nm), "both", ANY)
-    assert both(None) == (pytest.approx(0.1), 2)
-    assert Unitless(float, "x", LENGTH)("3") == 3.0
+def test_functions_give_plain_numbers():
+    for wrong in (
+        Distance([[0, 1]], lambda t: 0.1 * nm),
+        ImplicitSurface([3], lambda r: r[:, 2] * nm),
+        CustomVelocity([[0]], lambda r: np.array([[0, 0, 1.0]]) * unit.dimensionless),
+    ):
+        with pytest.raises(InputError, match=r"has units \(.*give plain numbers in .* \(nm and ps in OpenMM\)"):
+            sigma([wrong])
 
 
 def test_collective_variables_of_composite_units():

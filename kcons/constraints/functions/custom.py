@@ -51,6 +51,7 @@ class PythonRows(Constraint, base=True):
 
     held = ANY
     time_dependent: bool
+    time_step: float
     length: Any
 
     @property
@@ -72,6 +73,13 @@ class PythonRows(Constraint, base=True):
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         return self.measure(r, time), self.gradient(r, time)
+
+    def _take(self, time_dependent: bool, length: Any, time_step: float, **functions: Any) -> None:
+        """Store what functions are called with, and how far apart; and look at the functions."""
+        self.time_dependent, self.length, self.time_step = bool(time_dependent), length, time_step
+        arguments = ("r", "t") if time_dependent else ("r",)
+        for name, function in functions.items():
+            check_call(f"{self.family}: {name}", function, arguments, TAKES_TIME, needed=name != "gradient")
 
     def _time(self, time: float) -> tuple[float, ...]:
         return (time,) if self.time_dependent else ()
@@ -126,7 +134,7 @@ class Custom(PythonRows):
 
     functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function")
     kind = RowKind.FUNCTION
-    singular = "{row}: value and gradient must be finite, and the gradient not zero; move the atoms"
+    singular = "value and gradient must be finite, and the gradient not zero; move the atoms"
 
     def __init__(
         self,
@@ -142,13 +150,9 @@ class Custom(PythonRows):
         time_step: Duration = 0.02,
     ) -> None:
         super().__init__(atoms, target)
-        self.time_dependent = bool(time_dependent)
-        last = ("t",) if self.time_dependent else ()
-        check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME, needed=True)
-        check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
+        self._take(time_dependent, length, time_step, function=function, gradient=gradient)
         self.function, self.gradient_function = function, gradient
         self.translation_invariant, self.period = bool(translation_invariant), period
-        self.length, self.time_step = length, time_step
 
     @property
     def called(self) -> tuple[Any, ...]:
@@ -179,12 +183,6 @@ class Custom(PythonRows):
         values = np.array([self._values(place, time, first) for place in places])
         slope = np.dot(_DIFFERENCE, nearest_image(values - values[0], self.period).reshape(4, -1))
         return np.ascontiguousarray((slope.reshape(-1, len(r)) / step).T).reshape(r.shape)
-
-    def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
-        """Differenced change of the value along a direction of unit length."""
-        return first_derivative_4(
-            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step, self.period
-        )
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         speed, start, length = np.sqrt(_contract(v, v)), np.zeros(self.n_rows), self._length(r)
@@ -227,13 +225,18 @@ class Custom(PythonRows):
         size = np.sqrt(_contract(slope, slope))
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
-        found, finer = (self._slope(r, along, step * length, time) for step in (1e-3, 0.5e-3))
+
+        def at(s: FloatArray) -> FloatArray:
+            return self.measure(r + s[:, None, None] * along, time)
+
+        steps, start = (1e-3 * length, 0.5e-3 * length), np.zeros(self.n_rows)
+        found, finer = (first_derivative_4(at, start, step, self.period) for step in steps)
         if self.gradient_function is None:
-            self.refuse_singular(
+            self.refuse(
                 ~(np.abs(finer - found) <= WRONG * size),
                 first_row,
-                lambda k, row: (
-                    f"{row}: differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
+                lambda k: (
+                    f"differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
                     f"gradient, {found[k]:.3g} and {finer[k]:.3g}: it vanishes, or the function varies faster. "
                     "Move the atoms, give the length over which it varies (length=...), or its gradient"
                 ),
@@ -250,7 +253,7 @@ class Custom(PythonRows):
             )
 
         wrong = ~(np.abs(_contract(slope, along) - found) <= WRONG * size)
-        self.refuse_input(wrong, first_row, worst, "gradient")
+        self.refuse(wrong, first_row, worst, "gradient")
 
 
 class ImplicitSurface(Custom):
@@ -349,7 +352,7 @@ class CustomVelocity(PythonRows, VelocityRows):
         Differences are taken at steps of at most 1e-3 `length`, and, with `time_dependent`, of `time_step`.
     """
 
-    singular = "{row}: the coefficients are zero or not finite; move the atoms"
+    singular = "the coefficients are zero or not finite; move the atoms"
     functions: ClassVar[tuple[str, ...]] = ("coefficients",)
 
     def __init__(
@@ -364,13 +367,8 @@ class CustomVelocity(PythonRows, VelocityRows):
         time_step: Duration = 1e-3,
     ) -> None:
         super().__init__(atoms, target)
-        last = ("t",) if time_dependent else ()
-        check_call("CustomVelocity: coefficients", coefficients, ("r", *last), TAKES_TIME, needed=True)
-        self.coefficients = coefficients
-        self.time_dependent = bool(time_dependent)
-        self.translation_invariant = bool(translation_invariant)
-        self.length = length
-        self.time_step = time_step
+        self._take(time_dependent, length, time_step, coefficients=coefficients)
+        self.coefficients, self.translation_invariant = coefficients, bool(translation_invariant)
 
     @property
     def called(self) -> tuple[Any, ...]:
@@ -384,18 +382,13 @@ class CustomVelocity(PythonRows, VelocityRows):
         return np.asarray(self._checked(found, "coefficients", (self.width, 3), k))
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        bent = [self._changes(k, r[k], v[k], time) for k in range(self.n_rows)]
-        return _contract(np.array(bent).reshape(v.shape), v)
-
-    def _changes(self, k: int, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        """Rate of the coefficients of row `k` along v."""
-        speed = float(np.sqrt(np.sum(v * v)))
+        speed = float(np.sqrt(_contract(v, v).max(initial=0.0)))
         if speed == 0:
-            return np.zeros_like(r)
+            return np.zeros(self.n_rows)
         step = 1e-3 * self.length / speed
         if self.time_dependent:
             step = exact_step(min(step, self.time_step), time)
-        return first_derivative_4(lambda s: self.row_gradient(k, r + s * v, time + s), 0.0, step)
+        return first_derivative_4(lambda s: _contract(self.gradient(r + s * v, time + s), v), 0.0, step)
 
 
 @cache

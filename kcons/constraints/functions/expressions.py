@@ -18,6 +18,7 @@ import sys
 import tempfile
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -26,7 +27,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from kcons.constraints.functions.straight_line import ELEMENTARY, Operand, Tape, differentiated
+from kcons.constraints.functions.straight_line import Operand, Tape, differentiated
 from kcons.errors import InputError, UnsupportedError
 
 #: Characters of a formula, and levels of its tree (a sum of n terms has n).
@@ -47,13 +48,7 @@ _PI = {"pi": np.float64(np.pi)}
 
 
 def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tuple[ast.expr, set[int]]:
-    """The tree of a formula, which may have velocities or not, and the atoms in it.
-
-    Raises
-    ------
-    InputError
-        What is no formula; unknown names and functions.
-    """
+    """The tree of a formula, which may have velocities or not, and the atoms in it."""
     if len(formula) > MAX_LENGTH:
         raise _too_large(formula, f"has {len(formula)} characters, and at most {MAX_LENGTH} are read")
     try:
@@ -177,22 +172,8 @@ def undefined_part(tree: ast.expr, numbers: Mapping[str, float]) -> str | None:
 class Code:
     """What is computed of a formula with parameters of these names; with `speeds`, of one that is linear in velocities.
 
-    Attributes
-    ----------
-    row, rate : callable
-        As of a `Constraint`; `rate` is None where the time is not in the formula.
-    width : int
-        Atoms a row.
-    invariant : bool
-        Whether a common shift of all atoms changes nothing.
-
-    Raises
-    ------
-    InputError
-        As `parsed`; a formula without atoms, or one that leaves some out; one that does not change with the positions,
-        or is not linear in the velocities.
-    UnsupportedError
-        There is no folder that it can be written to.
+    `row` and `rate` are those of a `Constraint`, `rate` None where the time is not in the formula; `width` are the
+    atoms a row, and `invariant` says whether a common shift of all of them changes nothing.
     """
 
     def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool = False) -> None:
@@ -272,16 +253,19 @@ def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bo
     rng = np.random.default_rng(0)
     r, faster, p = (rng.normal(size=(size, 40, 2)) @ [1.0, 1.0j] for size in (2 * n, 2 * n, parameters + 1))
     signs = rng.choice([-1.0, 1.0], (len(tape.steps), 40))
-    text = _function("found", tape, [_text(each) for each in tape.results[:-1]])
 
     def looked(places: Any) -> Any:
-        some = iter(signs)
-        known: dict[str, Any] = {name: getattr(np, name) for name in (*ELEMENTARY, "inf", "nan")}
-        made: dict[str, Any] = {}
-        exec(text, known | {"copysign": lambda _, x: next(some)}, made)
-        out = np.empty((len(tape.results) - 1, 40), complex)
-        made["found"](places, p, p[-1], out)
-        return out
+        some, done = iter(signs), list[Any]()
+        known: dict[str, Any] = {"r": places, "p": p, "t": p[-1:], "k": done}
+        own: dict[str, Any] = {"absolute": lambda x: next(some) * x, "copysign": lambda _, x: next(some)}
+        own["arctan2"] = lambda a, b: np.arctan(a / b)
+
+        def number(operand: Operand) -> Any:
+            return known[operand[0]][operand[1]] if isinstance(operand, tuple) else np.float64(operand)
+
+        for name, operands in tape.steps:
+            done.append((own.get(name) or getattr(np, name))(*map(number, operands)))
+        return np.array([np.broadcast_to(number(each), 40) for each in tape.results[:-1]])
 
     with np.errstate(all="ignore"):
         value, *slopes = looked(r)
@@ -315,18 +299,19 @@ def _vanishes(sums: Any, *parts: Any) -> bool:
 def _module(text: str) -> ModuleType:
     """The module with this text, which is kept in a file: Numba keeps beside files what it compiles of them."""
     own = text.encode()
-    path = _folder() / f"formula_{hashlib.sha256(own).hexdigest()[:24]}.py"
-    if not path.is_file() or path.read_bytes() != own:
-        unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-        try:
-            unfinished.write_bytes(own)
-            os.replace(unfinished, path)
-        except OSError as error:
-            unfinished.unlink(missing_ok=True)
-            raise UnsupportedError(
-                f"the code of a formula cannot be written to {path.parent}: {error}; set NUMBA_CACHE_DIR to a folder "
-                "with space in it"
-            ) from error
+    try:
+        path = _folder() / f"formula_{hashlib.sha256(own).hexdigest()[:24]}.py"
+        if not path.is_file() or path.read_bytes() != own:
+            unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+            try:
+                unfinished.write_bytes(own)
+                os.replace(unfinished, path)
+            finally:
+                unfinished.unlink(missing_ok=True)
+    except OSError as error:
+        raise UnsupportedError(
+            f"the code of a formula cannot be written: {error}; set NUMBA_CACHE_DIR to a folder with space in it"
+        ) from error
     # Numba looks for what it has kept by the names of modules.
     module = sys.modules[f"kcons_{path.stem}"] = ModuleType(f"kcons_{path.stem}")
     exec(compile(own, path, "exec"), module.__dict__)
@@ -335,20 +320,12 @@ def _module(text: str) -> ModuleType:
 
 def _folder() -> Path:
     """Where code is kept: with Numba's own files, or where caches of the user are, or until the process ends."""
-    given = (
-        os.environ.get("NUMBA_CACHE_DIR")
-        or str(getattr(numba.config, "CACHE_DIR", ""))
-        or os.environ.get("XDG_CACHE_HOME")
-    )
-    for folder in (Path(given or os.path.expanduser("~/.cache")) / "kcons-formulas", _passing):
-        path = Path(folder() if callable(folder) else folder)
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(path, os.W_OK):
-            return path
-    raise UnsupportedError("there is no folder to write the code of a formula to; set NUMBA_CACHE_DIR to one")
+    given = os.environ.get("NUMBA_CACHE_DIR") or getattr(numba.config, "CACHE_DIR", "")
+    caches = given or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    path = Path(caches) / "kcons-formulas"
+    with suppress(OSError):
+        path.mkdir(parents=True, exist_ok=True)
+    return path if os.access(path, os.W_OK) else Path(_passing())
 
 
 @cache

@@ -69,6 +69,7 @@ class Formula(Constraint):
     held = ANY
     kind = RowKind.FUNCTION
     shared: ClassVar[tuple[str, ...]] = ("formula", "names", "period")
+    per_row: Mapping[str, tuple[int, ...]] = {"values": ()}  # type: ignore[misc]
     #: Whether it is linear in velocities, which have names too.
     of_speeds: ClassVar[bool] = False
     values: FloatArray
@@ -103,7 +104,7 @@ class Formula(Constraint):
             plain, matters = without_units(value, f"Formula: {name}", ANY)
             self.units = MD_UNITS if matters else self.units
             columns.append(self._of_each_row(name, plain, ()))
-        self.per_row = {"values": (len(columns),)}  # type: ignore[misc]
+        self.per_row = {"values": (len(columns),)}
         self._keep(values=np.stack(columns, axis=1) if columns else np.zeros((self.n_rows, 0)))
         self.translation_invariant = self.code().invariant
 
@@ -119,10 +120,7 @@ class Formula(Constraint):
     def rate(self) -> Any:  # type: ignore[override]
         return self.code().rate
 
-    def parameters(self) -> FloatArray:
-        return self.values
-
-    def undefined(self, k: int, row: str, r: FloatArray, time: float) -> str:
+    def undefined(self, k: int, r: FloatArray, time: float) -> str:
         axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
         numbers = dict(zip([*axes, "t", *self.names], [*r.ravel(), time, *self.values[k]], strict=True))
         numbers |= {f"v{axis}": 1.0 for axis in axes} | {"pi": np.pi}
@@ -130,26 +128,19 @@ class Formula(Constraint):
         if what is None:
             flat = not self.select([k]).gradient(r[None], time).any()
             what = f"its gradient is {'zero' if flat else 'not finite'}"
-        return f"{row}, {self.formula!r}: {what} at the start; move the atoms, or write another formula"
+        return f"{self.formula!r}: {what} at the start; move the atoms, or write another formula"
 
     @classmethod
-    def restored(cls, data: Mapping[str, Any]) -> Self:
-        wanted = {"family", "atoms", "target", "values", *cls.shared}
-        wrong = sorted(wanted.symmetric_difference(set(data) - {"units"}))
-        if wrong:
-            raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
-        table = as_float_array(data["values"], f"{cls.family}: values")
-        if not isinstance(data["names"], list | tuple) or np.shape(table)[1:] != (len(data["names"]),):
+    def _rebuilt(cls, data: Mapping[str, Any]) -> Self:
+        names, table = data["names"], as_float_array(data["values"], f"{cls.family}: values")
+        if not isinstance(names, list | tuple) or table.shape[1:] != (len(names),):
             raise InputError(
-                f"{cls.family} cannot be read: values have shape {table.shape} for the names {data['names']!r:.80}; "
+                f"{cls.family} cannot be read: values have shape {table.shape} for the names {names!r:.80}; "
                 "give a row of one number a name for each row",
                 item="values",
             )
-        parameters = dict(zip(data["names"], table.T, strict=True))
-        period = {name: data[name] for name in cls.shared if name == "period"}
-        item = cls(data["formula"], data["atoms"], parameters, data["target"], **period)
-        item.units = data.get("units")
-        return item
+        more = {name: data[name] for name in cls.shared if name == "period"}
+        return cls(data["formula"], data["atoms"], dict(zip(names, table.T, strict=True)), data["target"], **more)
 
 
 class VelocityFormula(Formula):
@@ -195,4 +186,4 @@ class VelocityFormula(Formula):
         parameters: Mapping[str, ArrayLike] | None = None,
         target: Target = 0.0,
     ) -> None:
-        super().__init__(formula, atoms, parameters, 0.0 if target is None else target)
+        super().__init__(formula, atoms, parameters, target)

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.periodic.one_piece import BoolArray, connected, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray, nearest_image
-from kcons.errors import ImageError, InputError
+from kcons.errors import InputError
 
 #: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbors in the list.
 ALL_PAIRS_WIDTH = 12
@@ -42,27 +42,20 @@ ALL_PAIRS_WIDTH = 12
 BOND_LIKE = 1.5
 #: Part of half the cell from which a held distance is followed along the tree: off its row it may be longer than half.
 NEARLY = 0.9
-#: Parts of the cell at which an unheld link is taken to have reached half of it.
-_HALF = 0.5 - 1e-9
 
 
 @dataclass(frozen=True)
 class Images:
     """The tree along which the atoms of whole rows, and all atoms tied to them, are made whole.
 
-    Attributes
-    ----------
-    atoms, parents : ndarray of int, shape (k,)
-        Parents come before their children; a root is its own parent and keeps the image it is stored in.
-    unheld : ndarray of int, shape (k,)
-        For unheld links the row they come from, -1 for others.
-    longest : float
-        The longest of the other links.
+    Parents come before their children; a root is its own parent and keeps the image it is stored in.
     """
 
     atoms: IntArray
     parents: IntArray
+    #: For unheld links the row they come from, -1 for others.
     unheld: IntArray
+    #: The longest of the other links.
     longest: float = 0.0
 
     def make_whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
@@ -80,38 +73,20 @@ class Images:
         cells = np.round((y_ref - x_ref)[self.atoms] @ lattice[1]) - np.round(step @ lattice[1])
         return cells @ lattice[0]
 
-    def bodies(self) -> IntArray:
-        """For each atom the first of those that constant distances tie it to."""
-        first = np.arange(int(self.atoms.max(initial=-1)) + 1)
-        for atom, parent, unheld in zip(self.atoms, self.parents, self.unheld, strict=True):
-            if unheld < 0:
-                first[atom] = first[parent]
-        return first
-
-    def reached_half(self, y: FloatArray, lattice: FloatArray) -> int:
-        """An unheld link, as an index into `atoms`, that is as long as half the cell in positions made whole; or -1."""
-        links = np.flatnonzero(self.unheld >= 0)
-        if not len(links):
-            return -1
-        parts = np.abs((y[self.atoms[links]] - y[self.parents[links]]) @ lattice[1]).max(axis=1)
-        worst = int(np.argmax(parts))
-        return int(links[worst]) if parts[worst] >= _HALF else -1
-
-    def among(self, atoms: IntArray, numbers: IntArray, rows: IntArray) -> Images | None:
-        """The part of the tree between `atoms` and between rows `rows`, with atom a called numbers[a].
+    def among(self, atoms: IntArray, rows: IntArray) -> Images | None:
+        """The part of the tree between `atoms` and between rows `rows`, both sorted, by their places among these.
 
         An atom whose parent is not among them becomes a root: no row that is left needs what ties it to others.
         """
-        kept = np.zeros(len(numbers), bool)
-        kept[atoms] = True
-        keep = kept[self.atoms]
+        keep = np.isin(self.atoms, atoms)
         if not keep.any():
             return None
         here, parents, unheld = self.atoms[keep], self.parents[keep], self.unheld[keep]
-        parents = np.where(kept[parents], parents, here)
+        parents = np.where(np.isin(parents, atoms), parents, here)
         # An unheld link may come from a row that is not among these; any of them may name it.
         place = np.minimum(np.searchsorted(rows, unheld), max(len(rows) - 1, 0))
-        return Images(numbers[here], numbers[parents], np.where(unheld < 0, -1, place), self.longest)
+        found = np.searchsorted(atoms, here), np.searchsorted(atoms, parents)
+        return Images(*found, np.where(unheld < 0, -1, place), self.longest)
 
     def ancestors(self, needed: IntArray, n_atoms: int) -> IntArray:
         """`needed` and the atoms by which they are made whole."""
@@ -124,17 +99,6 @@ class Images:
         return self.atoms[keep[self.atoms]]
 
 
-def image_error(row_name: str, atoms: IntArray, half_width: float) -> ImageError:
-    """The error for two atoms of a row that have drifted half the cell apart."""
-    return ImageError(
-        f"row {row_name}: atoms {atoms[0]} and {atoms[1]}, which nothing ties together, are half the cell apart "
-        f"({half_width:g} in its narrowest direction); further on the row would mean other periodic images. Use a "
-        "larger cell, make the ConstraintSet without a cell and keep positions unwrapped, or hold what ties these "
-        "atoms together",
-        atoms=atoms,
-    )
-
-
 def find_images(
     constraints: Sequence[Constraint],
     starts: IntArray,
@@ -144,16 +108,10 @@ def find_images(
     time: float,
     ties: Sequence[Constraint] = (),
 ) -> tuple[list[Constraint], Images | None]:
-    """Sort rows into plain and whole ones and find the tree.
+    """Copies that know which of their rows are whole, with their cell_offsets; and the tree, None if all are plain.
 
     Targets may still be missing; `starts` are the first rows, `ties` what the constraints replace: rows that are held
-    still and tie atoms together. Gives copies that know which of their rows are whole, with their cell_offsets, and the
-    tree, None if all rows are plain.
-
-    Raises
-    ------
-    InputError
-        A link of the tree as long as half the cell: its image is ambiguous.
+    still and tie atoms together. A link of the tree as long as half the cell is refused: its image is ambiguous.
     """
     given = [item.changed(whole=None, cell_offsets=None) for item in constraints]
     if lattice is None:
@@ -165,12 +123,12 @@ def find_images(
     ]
     n_atoms = len(x)
     _accept_small_pieces(tables, n_atoms, half_width)
-    if not tables or all(table.plain_at_once for table in tables):
+    if all(t.held and not (t.whole.any() or t.unsure.any()) for t in tables):
         return given, None
     ties = [item for item in ties if item.holds_length and not item.moving and item.n_rows]
     others = [_Links(item.changed(whole=None, cell_offsets=None), 0, x, lattice, half_width, time) for item in ties]
     held = [t for t in [*tables, *others] if t.held]
-    keys = np.concatenate([np.zeros(0, np.int64), *(t.keys(n_atoms)[t.short] for t in held)])
+    keys = np.concatenate([np.zeros(0, np.int64), *(t.short(n_atoms) for t in held)])
     for table in tables:
         table.sort_rows(keys, n_atoms)
     if not any(table.whole.any() or table.unsure.any() for table in tables):
@@ -180,7 +138,7 @@ def find_images(
     frameworks = np.zeros(int(component.max(initial=-1)) + 1, bool)
     for table in tables:
         table.find_closures(y, lattice, longest, component, frameworks)
-        for k in table.untied(images):
+        for k in table.untied(images, n_atoms):
             long = float(table.lengths[k, 0])
             _refuse_long(given, table.start + int(k), table.item.atoms[k], long, half_width)
     pairs = np.concatenate([t.item.atoms for t in held] or [np.zeros((0, 2), np.int64)])
@@ -230,17 +188,9 @@ class _Links:
             self.whole = ~self.unsure & (self.lengths[:, 0] >= NEARLY * half_width)
         self._local: BoolArray | None = None
 
-    @property
-    def plain_at_once(self) -> bool:
-        return self.held and not (self.whole.any() or self.unsure.any())
-
-    @property
-    def short(self) -> BoolArray:
-        """Rows whose one link is a constant distance shorter than half the cell."""
-        return ~self.whole & (self.lengths[:, 0] < self.half_width)
-
-    def keys(self, n_atoms: int) -> IntArray:
-        pairs = np.sort(self.item.atoms[:, :2], axis=1)
+    def short(self, n_atoms: int) -> IntArray:
+        """Keys of the pairs that constant distances shorter than half the cell tie."""
+        pairs = np.sort(self.item.atoms[~self.whole & (self.lengths[:, 0] < self.half_width)], axis=1)
         return pairs[:, 0] * n_atoms + pairs[:, 1]
 
     def sort_rows(self, keys: IntArray, n_atoms: int) -> None:
@@ -295,13 +245,14 @@ class _Links:
         self._closing = closing & differs.any(axis=1)
         frameworks[label[self._closing]] = True
 
-    def untied(self, images: Images) -> IntArray:
+    def untied(self, images: Images, n_atoms: int) -> IntArray:
         """Distances of half the cell or more that close, through the boundary, what unheld links alone tie."""
         given = self.held and self.item.target is not None
         long = np.flatnonzero(self._closing & self.whole & given)
         if not len(long):
             return long
-        body = images.bodies()
+        tied = images.unheld < 0
+        body, _ = connected(np.stack([images.atoms[tied], images.parents[tied]], axis=1), n_atoms)
         return long[body[self.item.atoms[long, 0]] != body[self.item.atoms[long, 1]]]
 
     def _sigma(self, r: FloatArray) -> FloatArray:
@@ -359,13 +310,7 @@ def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: flo
 def _tree(
     tables: Sequence[_Links], given: Sequence[Constraint], x: FloatArray, lattice: FloatArray, half_width: float
 ) -> tuple[Images, FloatArray, IntArray]:
-    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component.
-
-    Raises
-    ------
-    InputError
-        A link that is needed is as long as half the cell.
-    """
+    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component."""
     from scipy.sparse.csgraph import minimum_spanning_tree  # slow to import
 
     n_atoms = len(x)

@@ -24,11 +24,6 @@ def lattice_of(cell: FloatArray | None, pbc: bool | Sequence[bool] | BoolArray) 
     """Cell vectors as rows, and the inverse with zeros for directions without periodicity, shape (2, 3, 3).
 
     Directions without periodicity get a unit vector normal to the others. None without a periodic direction.
-
-    Raises
-    ------
-    InputError
-        Periodic cell vectors that are zero or not independent.
     """
     # Barostats come here at each trial, with True; the rest takes many times as long.
     periodic = None if pbc is True else np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
@@ -78,29 +73,31 @@ def connected(pairs: IntArray, n_atoms: int) -> tuple[IntArray, int]:
     """Number of the piece of each atom, counted from 0 in the order of their first atoms, and how many."""
     from scipy.sparse.csgraph import connected_components  # slow to import
 
-    links = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
-    count, label = connected_components(links, directed=False)
+    count, label = connected_components(_links(pairs, n_atoms), directed=False)
     return label.astype(np.int64), int(count)
+
+
+def _links(pairs: IntArray, n: int) -> sp.csr_array:
+    return sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n)).tocsr()
 
 
 def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) -> tuple[IntArray, IntArray]:
     """All atoms breadth first along pairs, and their parents, which come before them.
 
-    Parameters
-    ----------
-    roots : ndarray of int, optional
-        All atoms; the first of a piece is its root, which is its own parent. By default the one of lowest number.
+    The first of `roots`, which are all atoms, in a piece is its root and its own parent; by default the lowest number.
     """
     if not len(pairs):
         return np.arange(n_atoms), np.arange(n_atoms)
-    from scipy.sparse.csgraph import breadth_first_order  # slow to import
+    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
 
-    label, _ = connected(pairs, n_atoms)
+    links = _links(pairs, n_atoms + 1)
+    label = connected_components(links, directed=False)[1]
     order = np.arange(n_atoms) if roots is None else roots
-    first = order[np.unique(label[order], return_index=True)[1]]
+    first = np.sort(order[np.unique(label[order], return_index=True)[1]])
     # One more node, from which all pieces hang.
-    ends = np.concatenate([pairs, np.stack([np.full(len(first), n_atoms), first], axis=1)])
-    tree = sp.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n_atoms + 1, n_atoms + 1))
+    ends, starts = np.concatenate([links.indices, first]), links.indptr
+    starts[-1] += len(first)
+    tree = sp.csr_array((np.ones(len(ends)), ends, starts), shape=links.shape)
     found, parent_of = breadth_first_order(tree, n_atoms, directed=False)
     atoms = found[1:].astype(np.int64)
     parents = parent_of[atoms].astype(np.int64)

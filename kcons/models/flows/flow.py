@@ -148,19 +148,23 @@ def phase_volume(
         A = flow.jacobian(t, Y[:n])
         return np.concatenate([flow.velocity(t, Y[:n]), (A @ Y[n:-1].reshape(n, n)).ravel(), [np.trace(A)]])
 
-    for a, b in pairwise(wanted):
-        for c, d in pairwise(np.linspace(a, b, pieces + 1)):
-            start = np.concatenate([state, np.eye(n).ravel(), [0.0]])
-            found = solve_ivp(together, (c, d), start, "DOP853", rtol=rtol, atol=atol)
-            if not found.success:
-                raise ConvergenceError(f"the variational equation could not be integrated beyond t = {found.t[-1]:.6g}")
-            state, J = found.y[:n, -1], found.y[n:-1, -1].reshape(n, n)
-            change, integral = float(np.linalg.slogdet(J)[1]), float(found.y[-1, -1])
-            if not abs(change - integral) <= WRONG * max(1.0, abs(integral)):
-                raise ConvergenceError(
-                    f"from t = {c:.6g} to {d:.6g} the volume changes by exp({integral:.6g}), which its propagator no "
-                    "longer resolves: raise `pieces`"
-                )
-            log_volume, divergence, total = log_volume + change, divergence + integral, J @ total
+    for a, b in pairwise(in_pieces(wanted, pieces)):
+        start = np.concatenate([state, np.eye(n).ravel(), [0.0]])
+        found = solve_ivp(together, (a, b), start, "DOP853", rtol=rtol, atol=atol)
+        if not found.success:
+            raise ConvergenceError(f"the variational equation could not be integrated beyond t = {found.t[-1]:.6g}")
+        state, J = found.y[:n, -1], found.y[n:-1, -1].reshape(n, n)
+        change, integral = float(np.linalg.slogdet(J)[1]), float(found.y[-1, -1])
+        if not abs(change - integral) <= WRONG * max(1.0, abs(integral)):
+            raise ConvergenceError(
+                f"from t = {a:.6g} to {b:.6g} the volume changes by exp({integral:.6g}), which its propagator no "
+                "longer resolves: raise `pieces`"
+            )
+        log_volume, divergence, total = log_volume + change, divergence + integral, J @ total
         rows.append((state, total, log_volume, divergence))
-    return PhaseVolume(wanted, *(np.array(column) for column in zip(*rows, strict=True)))
+    return PhaseVolume(wanted, *(np.array(column)[::pieces] for column in zip(*rows, strict=True)))
+
+
+def in_pieces(times: FloatArray, pieces: int) -> FloatArray:
+    """Times with so many equal pieces between each two of them."""
+    return np.interp(np.arange(pieces * (len(times) - 1) + 1) / pieces, np.arange(len(times)), times)

@@ -22,7 +22,7 @@ from kcons.constraints.arguments import (
     whole_number,
 )
 from kcons.errors import InputError
-from kcons.models.flows.flow import Flow, phase_volume
+from kcons.models.flows.flow import Flow, in_pieces, phase_volume
 from kcons.models.flows.linear import JordanBlocks, JordanForm, LinearFlow, jordan_block
 from kcons.models.flows.mechanics import HamiltonianFlow
 from kcons.models.integration import called
@@ -272,14 +272,13 @@ class Thermostat(Flow):
         extended = Flow(lambda t, Y: np.append(self.velocity(t, Y[:-1]), self.friction(Y[:-1])), self.n + 1)
         wanted, pieces = np.atleast_1d(as_float_array(times, "times")), whole_number(pieces, "pieces")
         Y, volume, rows = np.append(X0, 0.0), 0.0, [(0.0, 0.0)]
-        for a, b in pairwise(wanted):
-            for c, d in pairwise(np.linspace(a, b, pieces + 1)):
-                # Vectors along the surface start anew as orthonormal ones: carried far, they would all turn into one.
-                T = scipy.linalg.block_diag(np.eye(n), scipy.linalg.null_space(Y[None, n:-1]))
-                found = phase_volume(extended, Y, [c, d])
-                carried = found.propagators[-1, :-1, :-1] @ T
-                volume += 0.5 * float(np.linalg.slogdet(carried.T @ carried)[1])
-                Y = found.states[-1]
+        for a, b in pairwise(in_pieces(wanted, pieces)):
+            # Vectors along the surface start anew as orthonormal ones: carried far, they would all turn into one.
+            T = scipy.linalg.block_diag(np.eye(n), scipy.linalg.null_space(Y[None, n:-1]))
+            found = phase_volume(extended, Y, [a, b])
+            carried = found.propagators[-1, :-1, :-1] @ T
+            volume += 0.5 * float(np.linalg.slogdet(carried.T @ carried)[1])
+            Y = found.states[-1]
             rows.append((volume, float(Y[-1])))
-        volumes, frictions = np.array(rows).T
+        volumes, frictions = np.array(rows)[::pieces].T
         return Compression(wanted, volumes, -(g - 1) * frictions, g)

@@ -22,6 +22,7 @@ Wilkinson, SIAM Review 18, 578 (1976). Kagstrom and Ruhe, ACM Trans. Math. Softw
 from __future__ import annotations
 
 from enum import Enum
+from itertools import product
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -242,15 +243,14 @@ def _structures(
     # What the entries of `top` may be off by: from the Schur form, from the exchanges, and from the mean.
     noise = m * EPSILON * float(scipy.linalg.norm(np.triu(top, 1)))
     noise += found.noise
-    stairs = _staircase(top - mean * np.eye(m), NULL * noise)
-    if stairs is None:
+    found_chains = _chains(top - mean * np.eye(m), NULL * noise)
+    if found_chains is None:
         parts = _clusters(values, found.errors[members] / (CLOSER * closer))
         return [piece for part in parts for piece in _structures(found, members[part], CLOSER * closer)]
-    widths, W, V, kept = stairs
-    sizes = tuple(sum(w > k for w in widths) for k in range(widths[0]))
+    chains, kept = found_chains
     certain = closer == 1.0 and kept > STANDS_OUT * NULL * noise
-    chains = np.split(basis @ V @ _chains(W, widths), np.cumsum(sizes)[:-1], axis=1)
-    return [(JordanBlocks(mean, sizes, certain), np.hstack([_of_unit_length(c) for c in chains]))]
+    blocks = JordanBlocks(mean, tuple(chain.shape[1] for chain in chains), certain)
+    return [(blocks, np.hstack([_of_unit_length(basis @ chain) for chain in chains]))]
 
 
 def _of_unit_length(chain: ComplexArray) -> ComplexArray:
@@ -259,49 +259,28 @@ def _of_unit_length(chain: ComplexArray) -> ComplexArray:
     return np.asarray(chain * (abs(largest) / largest) / scipy.linalg.norm(chain))
 
 
-def _staircase(N: ComplexArray, zero: float) -> tuple[list[int], ComplexArray, ComplexArray, float] | None:
-    """Null spaces of a nilpotent matrix and of what is left of it, one after the other.
+def _chains(N: ComplexArray, zero: float) -> tuple[list[ComplexArray], float] | None:
+    """Chains ..., N N x, N x, x of a nilpotent matrix, which end where N does, as columns; longest first.
 
-    Returns the dimensions of them, which never grow, as singular values interlace; W, strictly upper triangular by
-    blocks of these sizes, and the unitary V with V W V^H = N but for what was neglected; and the least singular value
-    that was not taken as zero. None if N is not nilpotent to this accuracy.
+    And the least singular value that was not taken as zero. None if N is not nilpotent to this accuracy.
     """
-    W, V = N.copy(), np.eye(len(N), dtype=np.complex128)
-    widths: list[int] = []
-    start, kept = 0, np.inf
-    while start < len(N):
-        _, singular, vh = np.linalg.svd(W[start:, start:])
-        null = int(np.sum(singular <= zero))
-        if null == 0:
+    levels, kept, rest = [], np.inf, np.eye(len(N), dtype=np.complex128)
+    while rest.shape[1]:  # null spaces of N and of what is left of it, whose dimensions never grow
+        _, singular, vh = np.linalg.svd(rest.conj().T @ N @ rest)
+        null = singular <= zero
+        if not null.any():
             return None
-        kept = min([kept, *singular[:-null]])
-        turn = np.roll(vh, null, axis=0).conj().T
-        W[:, start:], V[:, start:] = W[:, start:] @ turn, V[:, start:] @ turn
-        W[start:, :] = turn.conj().T @ W[start:, :]
-        W[start:, : start + null] = 0.0
-        widths.append(null)
-        start += null
-    return widths, W, V, kept
-
-
-def _chains(W: ComplexArray, widths: list[int]) -> ComplexArray:
-    """C with W C = C J for a nilpotent W in staircase form; longest chains first."""
-    edges = np.concatenate([[0], np.cumsum(widths)])
-    chains: list[list[ComplexArray]] = []
-    for level in reversed(range(len(widths))):
-        for chain in chains:
-            chain.insert(0, W @ chain[0])
-        here = slice(edges[level], edges[level + 1])
+        kept = min([kept, *singular[~null]])
+        levels.append(rest @ vh[null].conj().T)
+        rest = rest @ vh[~null].conj().T
+    chains: list[ComplexArray] = []
+    for level in reversed(levels):
+        chains = [np.column_stack([N @ chain[:, 0], chain]) for chain in chains]
         # What the chains that came down leave free at this level: ends of new chains.
-        free = np.eye(widths[level])
-        if chains:
-            taken = np.stack([chain[0][here] for chain in chains], axis=1)
-            free = np.linalg.qr(taken, mode="complete")[0][:, len(chains) :]
-        for column in free.T:
-            end = np.zeros(len(W), dtype=np.complex128)
-            end[here] = column
-            chains.append([end])
-    return np.stack([vector for chain in chains for vector in chain], axis=1)
+        taken = np.array([level.conj().T @ chain[:, 0] for chain in chains]).reshape(-1, level.shape[1])
+        free = np.linalg.qr(taken.T, mode="complete")[0][:, len(chains) :]
+        chains += [column[:, None] for column in (level @ free).T]
+    return chains, kept
 
 
 # -- stability ----------------------------------------------------------------------------------------
@@ -460,10 +439,9 @@ def find_equilibria(
     if edges.shape != (n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):
         raise InputError(f"the box has shape ({n}, 2), its lower edges first", item="box")
     low, width = edges[:, 0], edges[:, 1] - edges[:, 0]
-    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * n), axis=-1).reshape(-1, n) if n <= 6 else np.zeros((0, n))
-    fixed = np.vstack([np.full((1, n), 0.5), corners])
+    fixed = [[0.5] * n, *(product((0.0, 1.0), repeat=n) if n <= 6 else ())]
     spread = generator_of(rng).random((max(starts - len(fixed), 0), n))
-    points = low + width * np.vstack([fixed, spread])[:starts]
+    points = low + width * np.array([*fixed, *spread])[:starts]
     found: list[FloatArray] = []
     with np.errstate(all="ignore"):
         speeds = [float(np.linalg.norm(flow.velocity(time, p))) for p in points]

@@ -10,12 +10,9 @@ from kcons.models.growth.constrained import ConstrainedGrowth, GrowthSolution, e
 from kcons.models.growth.hypercycle import ConstrainedHypercycle, Hypercycle
 from kcons.models.growth.model import GrowthModel, Logistic, LotkaVolterra, Mixture, Populations
 from kcons.models.growth.rows import (
-    EntropyLaw,
     EntropyRow,
     HolonomicRow,
     LinearRow,
-    NoProduction,
-    Relaxation,
     Row,
     TotalPopulation,
     VelocityRow,
@@ -24,7 +21,6 @@ from kcons.models.growth.rows import (
 __all__ = [
     "ConstrainedGrowth",
     "ConstrainedHypercycle",
-    "EntropyLaw",
     "EntropyRow",
     "GrowthModel",
     "GrowthSolution",
@@ -34,9 +30,7 @@ __all__ = [
     "Logistic",
     "LotkaVolterra",
     "Mixture",
-    "NoProduction",
     "Populations",
-    "Relaxation",
     "Row",
     "TotalPopulation",
     "VelocityRow",

@@ -20,13 +20,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import FloatArray, positive, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.growth.constrained import ConstrainedGrowth
 from kcons.models.growth.model import GrowthModel, Mixture, Populations
-from kcons.models.growth.rows import EntropyLaw, EntropyRow, NoProduction, Relaxation, TotalPopulation
+from kcons.models.growth.rows import EntropyRow, TotalPopulation
 
 #: A motion may count as settled where ln(x/x_eq) is this small and the direction turns this slowly, in parts of the
 #: other times; it does within so many times the tolerance, since so far do integrators stray.
@@ -66,15 +66,11 @@ class Hypercycle(GrowthModel):
 
         The budget T(s_eq - s_0) is computed from the start where it is not given, and checked against it where it is.
         """
-        return self.with_law(Relaxation(tau, budget))
+        return ConstrainedHypercycle(self, [TotalPopulation(self.n), EntropyRow(self.mixture, tau, budget)])
 
     def without_entropy_production(self) -> ConstrainedHypercycle:
         """(c): sum x fixed, no entropy produced in all (notes eq. 150)."""
-        return self.with_law(NoProduction())
-
-    def with_law(self, law: EntropyLaw) -> ConstrainedHypercycle:
-        """sum x fixed, and any law of entropy production."""
-        return ConstrainedHypercycle(self, [TotalPopulation(self.n), EntropyRow(self.mixture, law)])
+        return ConstrainedHypercycle(self, [TotalPopulation(self.n), EntropyRow(self.mixture)])
 
     # -- the closed form of the notes ------------------------------------------------------------------
 
@@ -98,10 +94,6 @@ class Hypercycle(GrowthModel):
         eta1 = b2 - np.sum(reactions * mu)
         return np.asarray(((M0 * eta1 + eta0 * M1) * mu - (eta1 * M1 + eta0 * M2)) / (M0 * M2 - M1 * M1))
 
-    def interior_eigenvalues(self, total: float = 1.0) -> NDArray[np.complex128]:
-        """Eigenvalues at x_i = total/n with the sum fixed: (k_h total/n) exp(2 pi i j/n), j = 1..n-1."""
-        return np.asarray(self.k_h * total / self.n * np.exp(2j * np.pi * np.arange(1, self.n) / self.n))
-
 
 class ConstrainedHypercycle(ConstrainedGrowth):
     """A hypercycle with a fixed sum of populations and, perhaps, a law of entropy production."""
@@ -111,15 +103,6 @@ class ConstrainedHypercycle(ConstrainedGrowth):
     @property
     def entropy_row(self) -> EntropyRow | None:
         return next((row for row in self.rows if isinstance(row, EntropyRow)), None)
-
-    def multipliers(self, t: float, x: ArrayLike) -> FloatArray:
-        """lambda of the rows 1 and mu, as in the notes, shape (m,)."""
-        found = np.array(super().multipliers(t, x))
-        if self.entropy_row is not None:
-            # The entropy row is kept as mu less the mu of the largest population.
-            p = Populations.from_values(t, x)
-            found[0] -= found[1] * self.model.mixture.potentials(p)[np.argmax(p.x)]
-        return found
 
     def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[float], FloatArray] | None:
         """The slow motion from here on, once the state is on it to `tolerance`; None before.
@@ -132,9 +115,9 @@ class ConstrainedHypercycle(ConstrainedGrowth):
         negligible; its direction then stays.
         """
         row = self.entropy_row
-        rho = None if row is None else row.law.relaxation_rate
-        if row is None or rho is None:
+        if row is None:
             return None
+        rho = 0.5 / row.tau
         log_eq, scale = self.model.mixture.equilibrium(row.total), self.model.mixture.kT * row.total
 
         def size(t: float) -> float:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,30 +49,25 @@ class Populations(NamedTuple):
         array = as_float_array(x, "x0").copy()
         if array.ndim not in (1, 2) or array.size == 0:
             raise InputError(f"populations have shape (n,) or (n, k), not {array.shape}", item="x0")
-        for bad, said in (
-            (~np.isfinite(array), "is not finite: {}"),
-            (array < 0, "is negative: {}. Populations are positive"),
-            (
-                array == 0,
-                "is zero and has no logarithm: leave that species out, start it at a small positive number, or give "
-                "the start as log_x0",
-            ),
-        ):
-            if bad.any():
-                species = int(np.argwhere(bad)[0][0])
-                raise InputError(f"population {species} " + said.format(f"{array[bad][0]:.6g}"), item="x0")
+        bad = np.argwhere(~(np.isfinite(array) & (array > 0)))
+        if len(bad):
+            value = array[tuple(bad[0])]
+            raise InputError(
+                f"population {bad[0][0]} is {value:.6g}; populations are positive and finite: leave a species that is "
+                "zero out, start it at a small positive number, or give the start as log_x0",
+                item="x0",
+            )
         return cls(time, array, np.log(array))
 
     @classmethod
     def start(cls, time: float, n: int, x0: ArrayLike | None, log_x0: ArrayLike | None) -> Self:
         """The start of a run with n species, given as populations or as their logarithms."""
-        if (x0 is None) == (log_x0 is None):
+        if x0 is not None and log_x0 is None:
+            p = cls.from_values(time, x0)
+        elif log_x0 is not None and x0 is None:
+            p = cls.from_logarithms(time, as_float_array(log_x0, "log_x0").copy())
+        else:
             raise InputError("give the start either as x0 or as log_x0", item="x0")
-        p = (
-            cls.from_logarithms(time, as_float_array(log_x0, "log_x0").copy())
-            if x0 is None
-            else cls.from_values(time, x0)
-        )
         if p.log_x.shape != (n,):
             raise InputError(f"the start has shape {p.log_x.shape}, not ({n},)", item="x0")
         if not np.all(np.isfinite(p.log_x)):
@@ -123,17 +118,9 @@ class GrowthModel:
             )
         return psi
 
-    def not_finite(self, p: Populations) -> tuple[str, int] | None:
-        """'rate' or 'source', and the first species of which it is not finite; None if all are."""
-        for what, values in (("rate", self.rates(p)), ("source", self.sources(p))):
-            if values is not None and not np.all(np.isfinite(values)):
-                return what, int(np.argmin(np.isfinite(values)))
-        return None
-
     def drift(self, p: Populations) -> FloatArray:
         """Psi + G phi: dx/dt without constraints (notes eq. 124)."""
-        psi = self.sources(p)
-        growth = p.x * self.rates(p)
+        growth, psi = p.x * self.rates(p), self.sources(p)
         return growth if psi is None else growth + psi
 
     def velocity(self, t: float, x: ArrayLike) -> FloatArray:
@@ -171,10 +158,6 @@ class Logistic(GrowthModel):
             since = np.log(-share) / self.alpha
             raise InputError(f"x = {x0:g} at t = 0 came from infinity at t = {since:.6g}; give later times", item="t")
         return np.asarray(self.plateau / left)
-
-    def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
-        """dV/dx, shape (1, 1)."""
-        return np.asarray([[self.alpha - 2.0 * self.beta * as_float_array(x, "x")[0]]])
 
 
 class LotkaVolterra(GrowthModel):
@@ -274,29 +257,18 @@ class Mixture:
         """g_eq = -c kT ln sum exp(-mu0/kT)."""
         return -total * self.kT * self._log_w
 
-    def largest_gibbs_energy(self, total: float = 1.0) -> float:
-        """c max mu0: g is convex, so that its largest values are where one species is alone."""
-        return total * float(np.max(self.mu0))
+    def excess(self, p: Populations, total: float, level: float = 0.0) -> Any:
+        """g - g_eq less `level`, a number a state, to the round-off of the potentials about their mean.
 
-    def excess(self, p: Populations, total: float) -> FloatArray:
-        """g - g_eq as a sum of terms that are never negative, so that nothing cancels near equilibrium; a number a
-        state.
-
-        g_eq is taken at the actual sum X of the populations, near `total`:
-        kT [sum x_eq h(ln x/x_eq) - c h(ln X/c)] with h(u) = u e^u - e^u + 1 and x_eq, c for `total`.
+        g_eq is taken at the actual sum X of the populations, near `total`. The terms of
+        kT [sum (x_eq h(ln x/x_eq) - a x) - c h(ln X/c) + a (X - c)], h(u) = u e^u - e^u + 1, a = level/(c kT)
+        are never negative for level = 0, so that nothing cancels near equilibrium; x_eq and c are those of `total`. Far
+        from it, the part of each population in `level` is taken from its own term, with ln x/x_eq and X - c to twice
+        the precision.
         """
-        log_eq = self.equilibrium(total)
-        terms = np.exp(log_eq) @ entropy_function((p.log_x.T - log_eq).T)
-        over = np.log1p((np.sum(p.x, axis=0) - total) / total)
-        return np.asarray(self.kT * (terms - total * entropy_function(over)))
-
-    def excess_over(self, p: Populations, total: float, level: float) -> float:
-        """`excess` less `level`, to the round-off of the potentials about their mean.
-
-        Far from equilibrium the excess is many times as large as what the populations differ in, and so is its
-        round-off. The part of each population in `level` is therefore taken from its own term: with a = level/(c kT)
-        kT [sum (x_eq h(ln x/x_eq) - a x) - c h(ln X/c) + a (X - c)],  with ln x/x_eq and X - c to twice the precision.
-        """
+        if p.x.ndim == 2:
+            states = zip(p.x.T, p.log_x.T, strict=True)
+            return np.array([self.excess(Populations(p.time, *state), total, level) for state in states])
         log_eq = self.equilibrium(total)
         a = level / (total * self.kT)
         # A trial step of an integrator may overflow; it is then rejected.
@@ -304,22 +276,16 @@ class Mixture:
             u = p.log_x - log_eq
             part = u - p.log_x
             rest = (p.log_x - (u - part)) - (log_eq + part)  # what rounding took from u (Knuth)
-            terms = p.x * ((u - a) + rest) - (p.x - np.exp(log_eq))
             near = np.abs(u) < NEAR
-            terms = np.where(near, np.exp(log_eq) * _series(np.where(near, u + rest, 0.0)) - a * p.x, terms)
+            x_eq = np.exp(log_eq)
+            terms = np.where(
+                near, x_eq * _series(np.where(near, u + rest, 0.0)) - a * p.x, p.x * ((u - a) + rest) - (p.x - x_eq)
+            )
             if not (np.all(np.isfinite(terms)) and np.all(np.isfinite(p.x))):
                 return math.nan
             more = math.fsum([*p.x, -total])
-            over = float(entropy_function(np.log1p(more / total)))
+            over = (1.0 + more / total) * math.log1p(more / total) - more / total
             return self.kT * math.fsum([*terms, -total * over, a * more])
-
-
-def entropy_function(u: ArrayLike) -> FloatArray:
-    """h(u) = u e^u - e^u + 1, which is 0 with zero slope at u = 0 and positive elsewhere, to full relative accuracy."""
-    u = np.asarray(u, dtype=np.float64)
-    near = np.abs(u) < NEAR
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        return np.where(near, _series(np.where(near, u, 0.0)), u * np.exp(u) - np.expm1(u))
 
 
 def _series(u: FloatArray) -> FloatArray:

@@ -5,9 +5,8 @@ state that keeps its value, sigma(x, t) = sigma0 (eq. 126), so that A = d sigma/
 because they have a value, the state can be projected back on them to round-off.
 
 Entropy production is a row as well (eqs. 145-150). Closed system: T ds/dt = -sum mu dx/dt >= 0 (corrected: the notes
-drop the sign in the middle of (149)). A law says what has been produced until t, T(s(t) - s_0); with a fixed sum of x
-it is the same as a law for the excess E(t) = g(x) - g_eq, which falls from E_0 = T(s_eq - s_0). The row is
-sum mu dx/dt = dE/dt.
+drop the sign in the middle of (149)). With a fixed sum of x, what has been produced until t, T(s(t) - s_0), is what the
+excess E = g(x) - g_eq has lost since the start, where E_0 = T(s_eq - s_0). The row is sum mu dx/dt = dE/dt.
 """
 
 from __future__ import annotations
@@ -23,12 +22,11 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import (
     FloatArray,
-    NotNegative,
-    Positive,
     as_float_array,
     check_call,
-    checked,
     finite_number,
+    not_negative,
+    positive,
     refuse_other,
     whole_number,
 )
@@ -57,7 +55,7 @@ class Row(ABC):
         """b."""
 
     def value(self, p: Populations) -> float:
-        """sigma - sigma0, 0 on the constraint."""
+        """sigma - sigma0 of a holonomic row, 0 on the constraint."""
         raise NotImplementedError(f"{self.name} has no value")
 
     def size(self, p: Populations) -> float:
@@ -100,9 +98,7 @@ class HolonomicRow(Row):
     ) -> None:
         for what, given in (("function", function), ("gradient", gradient), ("time_derivative", time_derivative)):
             check_call(f"{name}: {what}", given, ("t", "x"))
-        self._function = function
-        self._gradient = gradient
-        self._time_derivative = time_derivative
+        self._function, self._gradient, self._time_derivative = function, gradient, time_derivative
         self.target = None if target is None else finite_number(target, "target")
         self.name = name
 
@@ -119,9 +115,9 @@ class HolonomicRow(Row):
         return float(np.sum(np.abs(self.gradient(p)) * p.x)) + abs(self.target or 0.0)
 
     def gradient(self, p: Populations) -> FloatArray:
-        if self._gradient is not None:
-            return called(f"gradient of {self.name}", self._gradient, p.x.shape, p.time, p.x, scalar=True)
-        return self._by_differences(p, STEP)
+        if self._gradient is None:
+            return self._by_differences(p, STEP) / p.x
+        return called(f"gradient of {self.name}", self._gradient, p.x.shape, p.time, p.x, scalar=True)
 
     def rate(self, p: Populations) -> float:
         if self._time_derivative is None:
@@ -130,23 +126,20 @@ class HolonomicRow(Row):
 
     def bind(self, p: Populations) -> Self:
         self.check_derivatives(p)
-        if self.target is not None:
-            return self
         bound = copy.copy(self)
-        bound.target = self.measure(p)
+        bound.target = self.measure(p) if self.target is None else self.target
         return bound
 
     def _by_differences(self, p: Populations, step: float) -> FloatArray:
-        """d sigma/dx from differences in ln x."""
-        by_logarithm = jacobian_by_differences(
+        """d sigma/d ln x."""
+        return jacobian_by_differences(
             lambda t, y: self.measure(Populations.from_logarithms(t, y)), p.time, p.log_x, np.full(len(p.x), step)
         )
-        return by_logarithm / p.x
 
     def check_derivatives(self, p: Populations) -> None:
         """Refuse derivatives that differences of sigma contradict: a wrong one moves off the row without a sign."""
-        coarse, fine = (self._by_differences(p, h) * p.x for h in (STEP, STEP / 2))
         given = None if self._gradient is None else self.gradient(p) * p.x
+        coarse, fine = (self._by_differences(p, h) for h in (STEP, STEP / 2))
         rounding = 1e-12 * abs(self.measure(p))
         check_derivative("gradient", f"{self.name}, times x,", given, coarse, fine, rounding=rounding, smooth=SMOOTH)
         self._check_rate(p)
@@ -155,10 +148,12 @@ class HolonomicRow(Row):
         """Compare the derivative in time with differences, slow and fast ones, where these are smooth."""
         size = self.size(p)
 
-        def over_time(function: Callable[[Populations], float]) -> Callable[[float], FloatArray]:
-            return lambda t: np.array([function(Populations.from_logarithms(t, p.log_x))])
+        def rate(t: float) -> FloatArray:
+            return np.array([-self.rate(Populations(t, p.x, p.log_x))])
 
-        rate, value = over_time(lambda q: -self.rate(q)), over_time(lambda q: self.measure(q) + size)
+        def value(t: float) -> FloatArray:
+            return np.array([self.measure(Populations(t, p.x, p.log_x)) + size])
+
         for step in (1e-2, 1e-8):
             found = contradiction(rate, value, p.time, step)
             if found is None:
@@ -197,24 +192,21 @@ class LinearRow(HolonomicRow):
         if c.ndim != 1 or not np.all(np.isfinite(c)) or not np.any(c):
             raise InputError(f"{name}: give n finite coefficients that are not all zero", item="coefficients")
         self.coefficients: FloatArray = c
-        if callable(target):
-            check_call(f"{name}: target", target, ("t",))
-            self.moving = target
-            super().__init__(
-                lambda t, x: c @ x - self._moved(t)[0], None, lambda t, x: -self._moved(t)[1], target=0.0, name=name
-            )
-        else:
+        if not callable(target):
             super().__init__(lambda t, x: c @ x, target=target, name=name)
+            return
+        check_call(f"{name}: target", target, ("t",))
 
-    def _moved(self, t: float) -> FloatArray:
-        """Target and rate."""
-        given = self.moving(t)
-        pair = as_float_array(given, "target")
-        if pair.shape != (2,):
-            raise InputError(
-                f"the target of {self.name} gives {given!r:.80} at t = {t:g}; give (value, rate)", item="target"
-            )
-        return pair
+        def moved(t: float) -> FloatArray:
+            """Target and rate."""
+            pair = as_float_array(given := target(t), "target")
+            if pair.shape != (2,):
+                raise InputError(
+                    f"target of {name} gives {given!r:.80} at t = {t:g}; give (value, rate)", item="target"
+                )
+            return pair
+
+        super().__init__(lambda t, x: c @ x - moved(t)[0], None, lambda t, x: -moved(t)[1], target=0.0, name=name)
 
     def gradient(self, p: Populations) -> FloatArray:
         if len(p.x) != len(self.coefficients):
@@ -249,28 +241,19 @@ class VelocityRow(Row):
     def __init__(
         self, coefficients: OfState | ArrayLike, rate: OfState | float = 0.0, *, name: str = "velocity row"
     ) -> None:
-        for what, given in (("coefficients", coefficients), ("rate", rate)):
-            if callable(given):
-                check_call(f"{name}: {what}", given, ("t", "x"))
-        self._coefficients = (
-            coefficients if callable(coefficients) else as_float_array(coefficients, "coefficients").copy()
-        )
-        self._rate = rate if callable(rate) else finite_number(rate, "rate")
+        row = np.zeros(0) if callable(coefficients) else as_float_array(coefficients, "coefficients").copy()
+        number = 0.0 if callable(rate) else finite_number(rate, "rate")
+        self._coefficients = coefficients if callable(coefficients) else lambda t, x: row
+        self._rate = rate if callable(rate) else lambda t, x: number
+        for what, given in (("coefficients", self._coefficients), ("rate", self._rate)):
+            check_call(f"{name}: {what}", given, ("t", "x"))
         self.name = name
 
     def gradient(self, p: Populations) -> FloatArray:
-        if callable(self._coefficients):
-            return called(f"coefficients of {self.name}", self._coefficients, p.x.shape, p.time, p.x, scalar=True)
-        if self._coefficients.shape != p.x.shape:
-            raise InputError(
-                f"{self.name}: {self._coefficients.shape} coefficients for {len(p.x)} species", item="coefficients"
-            )
-        return self._coefficients
+        return called(f"coefficients of {self.name}", self._coefficients, p.x.shape, p.time, p.x, scalar=True)
 
     def rate(self, p: Populations) -> float:
-        return (
-            float(called(f"rate of {self.name}", self._rate, (), p.time, p.x)) if callable(self._rate) else self._rate
-        )
+        return float(called(f"rate of {self.name}", self._rate, (), p.time, p.x))
 
 
 # -- entropy production --------------------------------------------------------------------------------
@@ -283,129 +266,52 @@ AT_EQUILIBRIUM = 1e-29
 FADED = 1e-2
 
 
-class EntropyLaw(ABC):
-    """What entropy, times T, has been produced since the start; a law of your own is a class with two methods."""
+class EntropyRow(Row):
+    """A mixture produces entropy that relaxes, or none in all; to be used together with `TotalPopulation`.
 
-    #: Rate at which a deviation from equilibrium decays, 0 if it stays; None if there is no such rate.
-    relaxation_rate: float | None = None
+    s(t) = s_0 + (s_eq - s_0)(1 - exp(-t/tau))   (notes eqs. 148, 149)
 
-    @abstractmethod
-    def produced(self, elapsed: float, excess0: float) -> float:
-        """T(s(t) - s_0)."""
-
-    def excess(self, elapsed: float, excess0: float) -> float:
-        """E(t) = E_0 - T(s(t) - s_0); laws that end at E = 0 write it without the difference."""
-        return excess0 - self.produced(elapsed, excess0)
-
-    @abstractmethod
-    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
-        """b = d(g - g_eq)/dt at a state whose excess is `excess`."""
-
-    def check(self, excess0: float, most: float) -> None:
-        """Raise `BudgetError` for a law that the start cannot follow; `most` is the largest excess there is."""
-
-
-class Relaxation(EntropyLaw):
-    """s(t) = s_0 + (s_eq - s_0)(1 - exp(-t/tau)) (notes eqs. 148, 149).
+    Its row of A is mu less the mu of the largest population: a constant common to all species drops out where sum x is
+    kept. So the row fades cleanly where the rank is lost: at equilibrium, and where one species is nearly alone.
 
     Parameters
     ----------
+    mixture : Mixture
     tau : float
+        Relaxation time; infinite, as it is where left out, no entropy is produced (notes eq. 150).
     budget : float, optional
         T(s_eq - s_0), which has to be that of the start, g(x_0) - g_eq.
     """
 
-    @checked
-    def __init__(self, tau: Positive, budget: NotNegative | None = None) -> None:
-        self.tau, self.budget = tau, budget
-        self.relaxation_rate = 1.0 / (2.0 * self.tau)
-
-    def produced(self, elapsed: float, excess0: float) -> float:
-        return -excess0 * math.expm1(-elapsed / self.tau)
-
-    def excess(self, elapsed: float, excess0: float) -> float:
-        return excess0 * math.exp(-elapsed / self.tau)
-
-    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
-        # Told by the state instead of the time: the same on the constraint, but errors fade instead of piling up.
-        return -excess / self.tau
-
-    def check(self, excess0: float, most: float) -> None:
-        budget = self.budget
-        if excess0 <= AT_EQUILIBRIUM * abs(most):
-            raise BudgetError(
-                "the start is already at equilibrium, where no entropy is left to be produced and the row has no "
-                "direction; start elsewhere, or hold the total population alone (with_fixed_total)",
-                budget=0.0 if budget is None else budget,
-                consistent=0.0,
-                time=0.0,
-            )
-        share = 1.0 if budget is None else budget / excess0
-        said, time = "", math.inf
-        if share > 1.0 + BUDGET_TOLERANCE:
-            time = -self.tau * math.log1p(-1.0 / share)
-            said = (
-                f"more than the start can produce, g(x_0) - g_eq = {excess0:.10g}: equilibrium would be reached at "
-                f"t = {time:.6g} with entropy still to be produced. Leave the budget out, it is then computed"
-            )
-        elif share < 1.0 - BUDGET_TOLERANCE:
-            said = (
-                f"less than what lies between the start and equilibrium, g(x_0) - g_eq = {excess0:.10g}: the system "
-                f"would stop producing at an excess of {excess0 * (1.0 - share):.6g}; s_eq would not be the entropy "
-                "at equilibrium. Leave the budget out, it is then computed"
-            )
-        if said and budget is not None:
-            raise BudgetError(f"T(s_eq - s_0) = {budget:.10g} is {said}", budget=budget, consistent=excess0, time=time)
-
-
-class NoProduction(EntropyLaw):
-    """ds = 0 (notes eq. 150)."""
-
-    relaxation_rate = 0.0
-
-    def produced(self, elapsed: float, excess0: float) -> float:
-        return 0.0
-
-    def excess_rate(self, elapsed: float, excess: float, excess0: float) -> float:
-        return 0.0
-
-
-class EntropyRow(Row):
-    """The Gibbs energy of a mixture follows an entropy law; to be used together with `TotalPopulation`.
-
-    Its row of A is mu less the mu of the largest population: a constant common to all species drops out where sum x is
-    kept. So the row fades cleanly where the rank is lost: at equilibrium, and where one species is nearly alone.
-    """
-
     holonomic = True
     name = "entropy production"
-    #: Of the start.
+    #: Of the start; the excess E = g - g_eq there is T(s_eq - s_0).
     start, total, excess0 = 0.0, math.nan, math.nan
 
-    def __init__(self, mixture: Mixture, law: EntropyLaw) -> None:
+    def __init__(self, mixture: Mixture, tau: float = math.inf, budget: float | None = None) -> None:
         refuse_other(mixture, Mixture, "mixture", "a kcons.models.growth.Mixture")
-        refuse_other(law, EntropyLaw, "law", "a law such as kcons.models.growth.Relaxation(tau)")
         self.mixture = mixture
-        self.law = law
+        self.tau = math.inf if tau == math.inf else positive(tau, "tau")
+        self.budget = None if budget is None else not_negative(budget, "budget")
 
-    @property
-    def bound(self) -> bool:
-        """Whether there is a start."""
-        return not math.isnan(self.total)
+    def produced(self, time: float) -> float:
+        """T(s(t) - s_0), for a row that is bound to a start (notes eq. 148)."""
+        return -self.excess0 * math.expm1((self.start - time) / self.tau)
 
     def law_excess(self, time: float) -> float:
-        """E(t) = g - g_eq as the law has it, for a row that is bound to a start."""
-        return self.law.excess(time - self.start, self.excess0)
+        """E(t) = E_0 - T(s(t) - s_0) without the difference, for a row that is bound to a start."""
+        return self.excess0 * math.exp((self.start - time) / self.tau)
 
     def gradient(self, p: Populations) -> FloatArray:
         return self.mixture.relative_potentials(p)
 
     def rate(self, p: Populations) -> float:
-        excess = float(self.mixture.excess(p, self.total if self.bound else float(np.sum(p.x))))
-        return self.law.excess_rate(p.time - self.start, excess, self.excess0 if self.bound else excess)
+        # Told by the state instead of the time: the same on the constraint, but errors fade instead of piling up.
+        total = float(np.sum(p.x)) if math.isnan(self.total) else self.total
+        return -self.mixture.excess(p, total) / self.tau
 
     def value(self, p: Populations) -> float:
-        return self.mixture.excess_over(p, self.total, self.law_excess(p.time))
+        return self.mixture.excess(p, self.total, self.law_excess(p.time))
 
     def size(self, p: Populations) -> float:
         # ln x carries an error of some 1e-16 of itself, which enters through the gradient; squared where there is none.
@@ -415,7 +321,7 @@ class EntropyRow(Row):
         excess = abs(self.law_excess(p.time))
         # Where one species is nearly alone, no ln x must be moved to mend what the rounding of sum x does here.
         slope = excess if slope < FADED * excess else slope
-        # Elsewhere the excess cancels, see Mixture.excess_over; terms of some kT sum x are left.
+        # Elsewhere the excess cancels, see Mixture.excess; terms of some kT sum x are left.
         return max(4.0 * min(excess, self.mixture.kT * self.total), slope)
 
     def bind(self, p: Populations) -> EntropyRow:
@@ -424,8 +330,36 @@ class EntropyRow(Row):
         bound = copy.copy(self)
         bound.start, bound.total = p.time, math.fsum(p.x)
         # In two steps, the second of which sees what the first rounded off.
-        about = float(self.mixture.excess(p, bound.total))
-        bound.excess0 = about + self.mixture.excess_over(p, bound.total, about)
-        most = self.mixture.largest_gibbs_energy(bound.total) - self.mixture.least_gibbs_energy(bound.total)
-        self.law.check(bound.excess0, most)
+        about = self.mixture.excess(p, bound.total)
+        bound.excess0 = about + self.mixture.excess(p, bound.total, about)
+        if self.tau < math.inf:
+            bound._check_budget()
         return bound
+
+    def _check_budget(self) -> None:
+        """Refuse a start that has nothing to produce, or another amount than the budget."""
+        excess0, budget = self.excess0, self.budget
+        # g is convex, so that its largest values are where one species is alone.
+        most = self.total * float(np.max(self.mixture.mu0)) - self.mixture.least_gibbs_energy(self.total)
+        if excess0 <= AT_EQUILIBRIUM * abs(most):
+            raise BudgetError(
+                "the start is already at equilibrium, where no entropy is left to be produced and the row has no "
+                "direction; start elsewhere, or hold the total population alone (with_fixed_total)",
+                budget=budget or 0.0,
+                consistent=0.0,
+                time=0.0,
+            )
+        if budget is None or abs(budget / excess0 - 1.0) <= BUDGET_TOLERANCE:
+            return
+        if budget > excess0:
+            time = -self.tau * math.log1p(-excess0 / budget)
+            said = f"more than the start can produce: equilibrium would be reached at t = {time:.6g}, with"
+        else:
+            time, said = math.inf, "less than what lies between the start and equilibrium: it would stop with"
+        raise BudgetError(
+            f"T(s_eq - s_0) = {budget:.10g} is {said} {abs(excess0 - budget):.6g} still to be produced. Leave the "
+            f"budget out; it is then computed, g(x_0) - g_eq = {excess0:.10g}",
+            budget=budget,
+            consistent=excess0,
+            time=time,
+        )

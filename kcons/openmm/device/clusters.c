@@ -48,8 +48,8 @@ DEVICE void rows_evaluate(ROWS int cluster, mixed time, mixed half_way, int move
 // L and U of J = A(now) M^-1 A(there)^T level by level, and L y = off in the same sweep; then U y. An entry (i, j) holds
 // J_ij and J_ji; what is eliminated before is gathered, so that no two work-items write to one place.
 DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, GLOBAL const mixed* there, GLOBAL const mixed* w) {
-    int levels = rows_cluster[3*cluster+2], top = rows_cluster[3*cluster+5];
-    for (int level = levels; level < top; level++) {
+    int levels = rows_cluster[3*cluster+2], top = rows_cluster[3*cluster+5], level = levels;
+    do {
         int first = rows_level[level];
         if (factors)
             for (int e = ROW(first, 4)+LOCAL_ID; e < ROW(rows_level[level+1], 4); e += LOCAL_SIZE) {
@@ -80,15 +80,16 @@ DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, G
             rows_answer[k] = y;
         }
         SYNC_THREADS;
-    }
-    for (int level = top-1; level >= levels; level--) {
+    } while (++level < top);
+    do {
+        level--;
         for (int k = rows_level[level]+LOCAL_ID; k < rows_level[level+1]; k += LOCAL_SIZE) {
             mixed y = rows_answer[k];
             for (int e = ROW(k, 4)+1; e < ROW(k+1, 4); e++) y -= rows_upper[e]*rows_answer[ENTRY(e, 1)];
             rows_answer[k] = rows_pivot[k]*y;
         }
         SYNC_THREADS;
-    }
+    } while (level > levels);
 }
 
 // d -= M^-1 A^T y, atom by atom.
@@ -139,14 +140,15 @@ DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const 
     for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) rows_sum[k] = 0;
     SYNC_THREADS;
     int missed = rows_measure(ROWS_PASS cluster, h, time, x, d);
-    while ((missed > 0) & (turn < ROWS_TURNS)) {   // one way out: barriers are inside
+    do {
         rows_solve(ROWS_PASS cluster, turn%ROWS_CHORD == 0, rows_now, rows_there, w);
-        rows_push(ROWS_PASS cluster, rows_there, d, w);
-        for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) rows_sum[k] += rows_answer[k];
+        if (missed > 0) {
+            rows_push(ROWS_PASS cluster, rows_there, d, w);
+            for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) rows_sum[k] += rows_answer[k];
+        }
         SYNC_THREADS;
         missed = rows_measure(ROWS_PASS cluster, h, time, x, d);
-        turn++;
-    }
+    } while ((missed > 0) & (++turn < ROWS_TURNS));   // one way out, and one pass at least: barriers are inside
     if (missed && LOCAL_ID == 0) {
         int k = (missed > 0 ? missed : -missed)-1;
         FAIL(ROWS_FIRST_LARGE+k, rows_off[k])
@@ -156,10 +158,10 @@ DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const 
 }
 
 DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL const mixed* x, GLOBAL mixed* v, GLOBAL const mixed* w) {
-    int first = rows_cluster[3*cluster];
+    int first = rows_cluster[3*cluster], pass = 0;
     rows_evaluate(ROWS_PASS cluster, time, 0, 0, x, x, rows_there);
     SYNC_THREADS;
-    for (int pass = 0; pass < 2; pass++) {
+    do {
         for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) {
             int begin = ROW(k, 1), rolls = ROW(k, 6) & 1;
             mixed off = 0;
@@ -177,5 +179,5 @@ DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL co
         rows_push(ROWS_PASS cluster, rows_there, v, w);
         if (rate != 0) for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) rows_sums[ROWS_FIRST_LARGE+k] -= rows_answer[k];
         SYNC_THREADS;
-    }
+    } while (++pass < 2);
 }

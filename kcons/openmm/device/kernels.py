@@ -15,7 +15,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.device.held_rows import Shape
+from kcons.openmm.device.clusters import Array, Shape
 
 #: Platforms whose kernels are plain C++.
 PLAIN = ("Reference", "CPU")
@@ -24,18 +24,6 @@ MOST_GROUPS = 256
 _NONE = np.zeros(0, dtype=np.int64)
 #: Sums over all particles: two times three that are used in turn, and that of the kinetic energy which is told.
 _SUMS = 7
-
-
-class Array(NamedTuple):
-    """An array of 'mixed' or 'int' numbers, which kernels know by its name, and what it begins with.
-
-    One that is `saved` belongs to a state: checkpoints and States have it.
-    """
-
-    name: str
-    kind: str
-    values: FloatArray | IntArray
-    saved: bool = False
 
 
 _COMMON = """
@@ -72,7 +60,13 @@ _COMMON = """
 #else
 #define HELD_TO tolerance
 #endif
+#ifdef RESTING
 #define RESTS(p) ((p) < 0 ? -1-(p) : (p))
+#define IF_RESTS(p) if ((p) < 0)
+#else
+#define RESTS(p) (p)
+#define IF_RESTS(p) if (0)
+#endif
 #define TINY ((mixed) 1e-37f)
 /* The first failure is kept; kernels that are launched later do nothing. */
 #define FAIL(row, residual) \\
@@ -258,30 +252,28 @@ def joined(operations: Sequence[Op]) -> list[Op]:
 
 # -- kernels ------------------------------------------------------------------------------------------
 
-_HALVES = """ SYNC_THREADS;
- for (int span = WG/2; span > 0; span /= 2) {
-  if (LOCAL_ID < span) for (int k = 0; k < COUNT*WG; k += WG) shared[LOCAL_ID+k] += shared[LOCAL_ID+k+span];
-  SYNC_THREADS;
- }
+_SUM = """ SYNC_THREADS;
+ if (LOCAL_ID < 8) for (int k = 0; k < COUNT*WG; k += WG) for (int j = LOCAL_ID+8; j < WG; j += 8)
+  shared[LOCAL_ID+k] += shared[j+k];
+ SYNC_THREADS;
+ if (LOCAL_ID == 0) for (int k = 0; k < COUNT*WG; k += WG) for (int j = 1; j < min(8, WG); j++)
+  shared[k] += shared[j+k];
 """
 
 
 def _summed(names: Sequence[str]) -> str:
-    """Sums over a work-group of what its items have added to some numbers, to ``shared[k*WG]``."""
+    """Sums over a work-group of what its items have added to some numbers, ``shared[k*WG]`` for its first item."""
     stored = "".join(f" shared[LOCAL_ID+{k}*WG] = {name};" for k, name in enumerate(names))
-    return stored + _HALVES.replace("COUNT", str(len(names)))
+    return stored + _SUM.replace("COUNT", str(len(names)))
 
 
 def _taken(count: int, bank: int) -> str:
-    """The sums over all particles, of which each work-group has left its share, as ``sum0``, ``sum1``, ..."""
+    """The sums over all particles, of which each work-group has left its share, for the first item of each."""
     names = [f"acc{k}" for k in range(count)]
     added = "".join(f"{name} += partial[k+{bank + k}*MOST_GROUPS];" for k, name in enumerate(names))
-    sums = ", ".join(f"sum{k}" for k in range(count))
-    kept = "".join(f" sum{k} = shared[{k}*WG];" for k in range(count))
     return (
-        f" mixed {sums};\n {{mixed {' = 0, '.join(names)} = 0;\n"
-        f" for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {{{added}}}\n"
-        f"{_summed(names)}{kept}\n SYNC_THREADS;}}\n"
+        f" {{mixed {' = 0, '.join(names)} = 0;\n"
+        f" for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {{{added}}}\n{_summed(names)} }}\n"
     )
 
 
@@ -293,7 +285,8 @@ def _once(code: str, *names: str) -> str:
 
 
 #: The closed form of `kcons.thermostats.isokinetic`, everything divided by exp(z).
-_CLOSED_FORM = """ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(-z);
+_CLOSED_FORM = """ mixed sum0 = shared[0], sum1 = shared[WG], sum2 = shared[2*WG];
+ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(-z);
  mixed aim = sum0/sqrt(max((mixed) (sum2*sum1), TINY));
  aim = min(max(aim, (mixed) -1), (mixed) 1);
  mixed sinhc = -expm1(-2*z)/(2*z), root = -expm1(-z)/z, scale = max((mixed) (aim*z*sinhc+(1+decay*decay)/2), TINY);
@@ -301,7 +294,7 @@ _CLOSED_FORM = """ mixed z = max((mixed) sqrt(sum1/P_two_k), TINY), decay = exp(
  if (GROUP_ID == 0) {memory[M_growth] += z+log(scale); if (scale < (mixed) 1e-4f) memory[M_lost] += 1;}
 """
 #: Half a push of all links, the first of which then scales velocities, and half a push; see `kcons.openmm.NoseHoover`.
-_CHAIN = """ mixed link[LINKS], factor = 1, place = memory_before[M_chain_place];
+_CHAIN = """ mixed sum = shared[0], link[LINKS], factor = 1, place = memory_before[M_chain_place];
  mixed inertia = P_kT/(P_frequency*P_frequency);
  const mixed parts[PARTS] = {SHARES};
  for (int k = 0; k < LINKS; k++) link[k] = memory_before[M_link1+k];
@@ -314,7 +307,7 @@ _CHAIN = """ mixed link[LINKS], factor = 1, place = memory_before[M_chain_place]
     for (int j = 1; j < LINKS; j++) place += h*link[j];
    }
    mixed damp = k+1 < LINKS ? exp(-h*link[k+1]/4) : (mixed) 1, push;
-   if (k == 0) push = (sum0*factor*factor-P_momenta*P_kT)/(P_momenta*inertia);
+   if (k == 0) push = (sum*factor*factor-P_momenta*P_kT)/(P_momenta*inertia);
    else push = ((k == 1 ? P_momenta : (mixed) 1)*inertia*link[k-1]*link[k-1]-P_kT)/inertia;
    link[k] = (link[k]*damp+h*push/2)*damp;
   }
@@ -430,13 +423,12 @@ class Kernels:
         self.tidy = described["parts"]
         #: Particles whose rows have a place in space: what cells OpenMM has moved them by is taken back for them.
         self.placed = held.placed
-        self.resting = len(held.fixed) > 0  # particles with a mass
         #: Kind of spheres, empty for none, and auxiliary variables of each; spheres of each shape, see `_SPHERES`,
         #: degrees of freedom on them, and where the auxiliary variables of the shape begin.
         self.spheres, self.per_sphere = described["spheres"]
         self.sphere_of: list[tuple[tuple[int, ...], list[int], int]] = []
         self.auxiliary = self.items = self.crowds = self.work = self.particles = 0
-        #: Shapes, and where their clusters are: among the items of a kernel or its groups, in `atoms` and in `work`.
+        #: Shapes, and where their clusters are: among the items of a kernel, in `atoms` and in `work`.
         self.places: list[tuple[Shape, int, int, int]] = []
         self.order: list[IntArray] = []
         everything = np.arange(len(masses))
@@ -444,7 +436,7 @@ class Kernels:
         free = np.setdiff1d(everything, np.concatenate([_NONE, *(shape.atoms.ravel() for shape in held.shapes)]))
         for shape in [*held.shapes, *([Shape(free[:, None])] if len(free) else [])]:
             clusters = len(shape.atoms)
-            self.places.append((shape, self.crowds if shape.together else self.items, self.particles, self.work))
+            self.places.append((shape, self.items, self.particles, self.work))
             atoms = (shape.atoms if shape.together else shape.atoms.T).ravel()
             self.order.append(np.where(np.isin(atoms, held.fixed), -1 - atoms, atoms))
             self.crowds += clusters * shape.together
@@ -490,17 +482,19 @@ class Kernels:
             for some in (op.flights, (end + op.begun for end in op.ends))
         )
         count = len(op.flights)
-        loop = f" {{const mixed lengths[{count}] = {{{lengths}}}, ends[{count}] = {{{ends}}};\n"
-        loop += f" for (int flight = 0; flight < {count}; flight++) {{ROOM const mixed h = lengths[flight]*dt;\n"
-        free = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += h*v[3*a+c];\n }}\n"
+        # Loops of one pass at least: some compilers write what comes after a barrier under a condition twice.
+        loop = f" {{const mixed lengths[{count}] = {{{lengths}}}, ends[{count}] = {{{ends}}}; int flight = 0;\n"
+        loop += " do {ROOM const mixed h = lengths[flight]*dt;\n"
+        free = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += h*v[3*a+c];\n"
         held = (
             " const mixed per_h = 1/h;\n"
             " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
             " SYNC positions_NAME(ROWS_PASS CLUSTER, h, time+ends[flight]*dt, x, d, w);\n"
             " if (failure[0] == 0) EACH if (w[a] != 0) for (int c = 0; c < 3; c++)"
-            " {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n }}\n"
+            " {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n"
         )
-        self._add(loop + free, loop + held)
+        end = f" }} while (++flight < {count});}}\n"
+        self._add(loop + free + end, loop + held + end)
         self._moves = True
 
     def _project(self, op: Op) -> None:
@@ -524,7 +518,7 @@ class Kernels:
         self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] = {damp}*v[3*a+c]+{size}*d[3*a+c];\n")
         for k, (_, freedom, first) in enumerate(self.sphere_of):
             number = len(freedom) * self.per_sphere
-            own = f"auxiliary[{first}+(ITEM)*{number}+j]"
+            own = f"auxiliary[{first}+item*{number}+j]"
             self._code[k] += (
                 f" if (FIRST) for (int j = 0; j < {number}; j++) {{int a = 0; {draw.format(f'{op.use}+1024*(j+1)')} "
                 f"{own} = {damp}*{own}+{size}*g[0];}}\n }}\n"
@@ -577,7 +571,7 @@ class Kernels:
                     "PUSHED": "d[3*a+c]" if op.verb == "turn" else 0,
                     "SQUARES": ", ".join(f"(mixed) {g + number - 1}" for g in freedom),
                     "COUNT": len(freedom),
-                    "PLACE": f"{start}+(ITEM)*{len(freedom) * number}",
+                    "PLACE": f"{start}+item*{len(freedom) * number}",
                     "AUXILIARY": number,
                 }
                 self._code[k] += _with(_SPHERES, words)
@@ -615,60 +609,38 @@ class Kernels:
                 ends = f"{_summed(list(places))} if (LOCAL_ID == 0) {{{stores}}}\n"
                 accumulators = f" mixed {' = 0, '.join(places)} = 0;\n"
                 self._bank = 3 - self._bank if self._sums else self._bank
+            clusters = "".join(self._cluster(*each) for each in zip(self.places, self._code, strict=True) if each[1])
             self.source.append(
                 f"KERNEL void {name}(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];SCRATCH\n"
                 " if (failure[0] != 0 && failure[0] != launch+1) return;\n"
-                f"{self._before}{accumulators}{self._clusters()}{ends}}}\n"
+                f"{self._before}{accumulators}{clusters}{ends}}}\n"
             )
         if action is not None:
             self._actions.append(action)
         self._reset()
 
-    def _clusters(self) -> str:
-        """Loops over the clusters that a group has and those that an item has."""
-        text = ""
-        for together, loop in (
-            (True, ""),
-            (False, f"for (int item = GLOBAL_ID; item < {self.items}; item += GLOBAL_SIZE)"),
-        ):
-            kinds = [each for each in zip(self.places, self._code, strict=True) if each[0][0].together is together]
-            if found := "".join(self._cluster(place, code) for place, code in kinds if code):
-                text += f" {loop} {{\n{found} }}\n"
-        return text
-
     def _cluster(self, place: tuple[Shape, int, int, int], code: str) -> str:
+        """A loop over the clusters of a shape that a group has, or an item."""
         shape, begin, atoms, work = place
         clusters, n = shape.atoms.shape
-        cluster = f"item-{begin}"
-        if shape.together:
-            room = f" GLOBAL mixed *x = work+{work}+({cluster})*{10 * n}, "
-            room += f"*v = x+{3 * n}, *d = v+{3 * n}, *w = d+{3 * n};\n"
-            words = {"EACH": f"for (int a = LOCAL_ID; a < {n}; a += LOCAL_SIZE)", "ROOM": "", "SYNC": "SYNC_THREADS;"}
-            atom = f"atoms[{atoms}+({cluster})*{n}+a]"
-            words["AT"] = f"RESTS({atom})" if self.resting else atom
-            load = " SYNC\n"
-        else:
-            room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n"
-            words = {"EACH": f"for (int a = 0; a < {n}; a++)", "ROOM": f"mixed d[{3 * n}];", "SYNC": "", "AT": "at[a]"}
-            atom = f"atoms[{atoms}+a*{clusters}+{cluster}]"
-            load = f" EACH at[a] = {f'RESTS({atom})' if self.resting else atom};\n"
-        away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
-        load += (
-            f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')}"
-            + f" if ({atom} < 0) w[a] = 0;" * self.resting
-            + "}\n"
-        )
-        store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
-        text = load + code + store
-        words |= {"NAME": shape.name, "CLUSTER": f"{cluster}+{shape.first}", "ITEM": cluster}
-        words |= {"EVERY": f"for (int a = 0; a < {n}; a++)", "FIRST": "LOCAL_ID == 0" if shape.together else "1"}
-        text = _with(text, words)
-        end = begin + clusters
+        every = f"for (int a = 0; a < {n}; a++)"
+        words = {"NAME": shape.name, "CLUSTER": f"item+{shape.first}", "EVERY": every}
         if shape.together:  # barriers are inside, which no condition may be about
-            loop = f"for (int item = {begin}+GROUP_ID; item < {end}; item += NUM_GROUPS)"
+            loop = f"for (int item = GROUP_ID; item < {clusters}; item += NUM_GROUPS)"
+            room = f" GLOBAL mixed *x = work+{work}+item*{10 * n}, *v = x+{3 * n}, *d = v+{3 * n}, *w = d+{3 * n};\n"
+            room += " SYNC\n"
+            atom = f"atoms[{atoms}+item*{n}+a]"
+            words |= {"EACH": f"for (int a = LOCAL_ID; a < {n}; a += LOCAL_SIZE)", "SYNC": "SYNC_THREADS;", "ROOM": ""}
+            words |= {"AT": f"RESTS({atom})", "FIRST": "LOCAL_ID == 0"}
         else:
-            loop = f"if (item >= {begin} && item < {end})"
-        return f" {loop} {{\n{room}{text} }}\n"
+            loop = f"for (int item = GLOBAL_ID-{begin}; item < {clusters}; item += GLOBAL_SIZE) if (item >= 0)"
+            atom = f"atoms[{atoms}+a*{clusters}+item]"
+            room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n EACH at[a] = RESTS({atom});\n"
+            words |= {"EACH": every, "SYNC": "", "ROOM": f"mixed d[{3 * n}];", "AT": "at[a]", "FIRST": "1"}
+        away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
+        load = f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')} IF_RESTS({atom}) w[a] = 0;}}\n"
+        store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
+        return f" {loop} {{\n{_with(room + load + code + store, words)} }}\n"
 
 
 def plan(
@@ -676,22 +648,9 @@ def plan(
 ) -> tuple[str, list[Array], list[list[Action]], tuple[int, int, int]]:
     """What the plugin needs for a Context, see `Plan` in `plugin/program_integrator.h`.
 
-    Parameters
-    ----------
-    described : mapping
-        What `DeviceIntegrator.describe` says of a step.
-    groups : int
-        Bit mask of the force groups that act.
-    held : DeviceRows
-
-    Returns
-    -------
-    source : str
-    arrays : list of Array
-    parts : list of list of Action
-        Head, middle and tail of a step.
-    sizes : (int, int, int)
-        Work-items that there is work for, their number in a group, and how many groups of forces are kept.
+    Given are what `DeviceIntegrator.describe` says of a step, the bit mask of force groups that act, and the rows.
+    Returns source, arrays, head, middle and tail of a step, and sizes: work-items that there is work for, their number
+    in a group, and how many groups of forces are kept.
     """
     operations = [Op._make(tuple(v) if isinstance(v, list) else v for v in op) for op in described["operations"]]
     names_of_groups = dict.fromkeys(op.group for op in operations if op.verb == "evaluate")
@@ -722,7 +681,8 @@ def plan(
         forces = "+".join(f"FORCE(force{k}, p, c)" for k in range(len(masks)))
         text = _with(_RECORD, {"COUNT": len(recorded), "FIRST": kernels.particles, "FORCES": forces})
         look += f"KERNEL void record(ARGUMENTS) {{\n UNPACK\n{text}}}\n"
-    source = preamble(platform, arrays, held.scratch, held.work_group, len(masks))
+    source = "#define RESTING\n" * (len(held.fixed) > 0)
+    source += preamble(platform, arrays, held.scratch, held.work_group, len(masks))
     source += "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
     items = kernels.items + kernels.crowds * work_group

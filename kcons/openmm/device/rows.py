@@ -1,4 +1,4 @@
-"""Rows on the device, from the declarations of families and the plan of the engine: C text and arrays for the kernels.
+"""Rows on the device: C text and arrays for the kernels, and the part of an integrator that measures and tells of them.
 
 Positions end where x + M^-1 A(x)^T y fulfils the rows, by Newton's method, to the tolerance asked for; velocities where
 A v = c. Residuals are compared so that NaN fails. Impulses of the rows are summed on the device and read when asked.
@@ -6,33 +6,38 @@ A v = c. Residuals are compared so that NaN fails. Impulses of the rows are summ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import weakref
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import openmm
 
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.functions.straight_line import Function
+from kcons.constraints.functions.straight_line import Function, function_of
 from kcons.constraints.target import FloatArray, MovingTarget
-from kcons.errors import ConvergenceError, KconsError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.openmm.callback_rows import with_massless_atoms
-from kcons.openmm.device.c_writer import c_functions
-from kcons.openmm.device.held_rows import (
+from kcons.openmm.callback_rows import CarriedConstraints, Engine, refuse_virtual_sites, with_massless_atoms
+from kcons.openmm.device.clusters import (
     IN_CELLS,
     NEAREST,
     RELATIVE,
     STORED,
+    Array,
+    ItemWriter,
     Row,
     Shape,
-    constraints_of,
-    function_on_device,
+    c_functions,
+    large_clusters,
 )
-from kcons.openmm.device.kernels import Array
-from kcons.openmm.device.large_clusters import large_clusters
-from kcons.openmm.device.small_clusters import ItemWriter
+from kcons.openmm.integrator.guard import SystemRows, settled_rows
+from kcons.openmm.integrator.part import Precision, Solver
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.quantities import accepted, masses_of, positions_of
 from kcons.plan.clusters_alike import alike
 
 #: Newton iterations at most; those after which a large cluster is factored again.
@@ -74,43 +79,54 @@ DEVICE mixed rows_moving(GLOBAL const mixed* knots, int j, mixed time, int rate)
 """
 
 
-class DeviceRows:
-    """What kernels hold: the System's constraints and what was given beside them.
+def constraints_of(parts: Any) -> list[Constraint]:
+    """The constraint objects of parts as they were given, targets that were found included; refuses other rows."""
+    found: list[Constraint] = []
+    for part in parts if isinstance(parts, Iterable) else (parts,):
+        if isinstance(part, Constraint):
+            found.append(part)
+        elif hasattr(part, "given"):
+            found += part.given
+        else:
+            raise UnsupportedError(
+                f"{part!r} is not held on the device; give constraint objects of kcons, or leave it to the host "
+                "(device=False)"
+            )
+    return found
 
-    Parameters
-    ----------
-    masses : ndarray, shape (n_particles,)
-        0 for particles that do not move.
-    system_rows : (ndarray of int, shape (n, 2), ndarray, shape (n,))
-        Pairs and lengths in nm of the System's constraints.
-    parts : sequence of CarriedConstraints or Constraint
-        What else is held.
-    positions : ndarray, shape (n_particles, 3)
-        On or near the constraints, nm.
-    cell : ndarray, shape (3, 3), optional
-        Box vectors, nm, where rows take periodic images.
-    time : float
+
+def function_on_device(item: Constraint) -> Function:
+    """The function of an object's rows; refuses what only Python can compute, and what cannot be written in C."""
+    found = function_of(item)
+    if found is None:
+        raise UnsupportedError(
+            f"{item!r} is a function of Python, which no device can call; write it as a Formula, or leave it to the "
+            "host (device=False)"
+        )
+    c_functions("looked_at", found)
+    return found
+
+
+class DeviceRows:
+    """What kernels hold: the System's constraints, pairs (n, 2) and lengths in nm (n,), and what was given beside them.
+
+    Masses are 0 for particles that do not move; `positions` are on or near the constraints, nm, in a `cell` where rows
+    take periodic images.
 
     Attributes
     ----------
-    motion : Motion
-        The engine of all rows.
-    set : ConstraintSet
-        All rows, those of the System's constraints first.
-    functions : list of Function
+    motion, set : Motion, ConstraintSet
+        The engine of all rows, and these, the System's first.
+    functions, parameters : list
+        Functions of rows, and of each row its parameters.
     target, scale : ndarray, shape (n_rows,)
         The scale is what tolerances are relative to: the length held, 1 for all that is no length.
-    parameters : list of ndarray
-        Of each row.
     doubtful : ndarray of bool, shape (n_rows,)
         Rows of clusters in which rows depend on others.
     mover, cell : ndarray of int, shape (n_rows,)
         Number of a row's moving target, and where its cells begin; of other rows the number of the next.
-    n_movers, n_cells : int
-    shapes : list of Shape
-    arrays : list of Array
-    source : str
-        C text: functions of rows, and ``positions_NAME`` and ``velocities_NAME`` of each shape.
+    shapes, arrays, source
+        Of the functions ``positions_NAME`` and ``velocities_NAME`` of each shape, as C.
     scratch, work_group : int
         Numbers of LOCAL memory that a work-group needs, and its size.
     fixed, placed : ndarray of int
@@ -119,12 +135,7 @@ class DeviceRows:
     block : int
         Steps after which `renew` is due.
 
-    Raises
-    ------
-    UnsupportedError
-        Rows that only Python can compute; fixed atoms that move.
-    KconsError
-        What `ConstraintSet` and `Motion` raise.
+    Raises UnsupportedError for rows that only Python can compute and fixed atoms that move.
     """
 
     def __init__(
@@ -198,7 +209,7 @@ class DeviceRows:
         order, tables = [np.zeros(0, np.int64)], [np.zeros(1)]
         for shape in self.shapes:
             writer = ItemWriter(shape, self, sum(map(len, tables)), sum(map(len, order)))
-            texts.append(writer.text())
+            texts += [writer.positions(), writer.velocities()]
             tables.append(writer.table.ravel())
             order.append(shape.clusters.ravel())
         self.arrays = [Array("rows_numbers", "mixed", np.concatenate(tables))]
@@ -224,22 +235,9 @@ class DeviceRows:
     def renew(
         self, time: float, dt: float, steps: int, positions: FloatArray | None = None, cell: FloatArray | None = None
     ) -> dict[str, FloatArray]:
-        """What functions of Python and positions say for the next steps, by the name of the array.
+        """What functions of Python say for so many steps, at most `block`, and positions, by the name of the array.
 
-        Parameters
-        ----------
-        time, dt : float
-            Where the steps begin, and the time step, ps.
-        steps : int
-            At most `block`.
-        positions : ndarray, shape (n_particles, 3), optional
-            Needed where there are `n_cells`.
-        cell : ndarray, shape (3, 3), optional
-
-        Raises
-        ------
-        InputError
-            A target that is no length; a cell that a row does not fit into.
+        Positions and the cell are needed where there are `n_cells`.
         """
         found: dict[str, FloatArray] = {}
         if self.n_movers:
@@ -300,3 +298,161 @@ class DeviceRows:
             atoms=self.set.row_atoms(number).tolist(),
             step=step,
         )
+
+
+class KernelRows(CarriedConstraints):
+    """All rows of a Context that its kernels hold: those of parts and the System's constraints.
+
+    Parameters
+    ----------
+    parts : sequence of Constraint or CarriedConstraints
+        What ``ProjectedIntegrator(..., parts=[...], device=True)`` was given; numbers of nm, ps, dalton, radian.
+        Targets left at None are taken from the positions at the first step.
+
+    Notes
+    -----
+    A target that is a function is asked before each call of `step`, and at every half step that the call will make: it
+    may read a context parameter.
+    """
+
+    def __init__(self, parts: Sequence[Any]) -> None:
+        self._parts = parts
+        carried = [part for part in parts if isinstance(part, CarriedConstraints)]
+        self.given = list(accepted(constraints_of(parts)))
+        self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
+        self._carried = carried
+        #: Whether rows take periodic images: as `hold` was told, else as the System.
+        self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
+        self._bound: tuple[DeviceRows, Engine] | None = None
+        self._of: tuple[Any, ...] = ()
+        self._context: Callable[[], openmm.Context | None] = lambda: None
+        self.code = 0
+        #: Time at which sums of multipliers began, and where the last call of `step` left it, ps.
+        self._since = self.left = math.nan
+
+    # -- a Context ------------------------------------------------------------------------------
+
+    def serve(self, integrator: Any) -> None:
+        """PythonForces of the rows know that kernels hold them, and ask for the time step where no program does."""
+        for part in self._carried:
+            part._engine.served = True
+            other = part._engine._integrator()
+            if other is None or other.program.on_device:
+                part._engine._integrator = weakref.ref(integrator)
+
+    def rows_at(
+        self,
+        masses: FloatArray,
+        pairs: IntArray,
+        lengths: FloatArray,
+        positions: FloatArray,
+        cell: FloatArray | None,
+        time: float,
+    ) -> DeviceRows:
+        """The rows for a System; made where they are asked for first."""
+        # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
+        moving = (masses[pairs] > 0).any(axis=1)  # between others OpenMM holds nothing
+        pairs, lengths = pairs[moving], lengths[moving]
+        lengths = np.where(settled_rows(pairs, lengths, len(masses)), lengths.astype(np.float32), lengths)
+        made_of = tuple(array.tobytes() for array in (masses, pairs, lengths))
+        if self._bound is None or self._of != made_of:
+            cell = None if self._wraps is False else cell
+            rows = DeviceRows(masses, (pairs, lengths), self.given, positions, cell, time)
+            self._bound, self._of = (rows, Engine(rows.motion, masses, cell)), made_of
+            self._slopes = None
+        return self._bound[0]
+
+    def bind(self, context: openmm.Context) -> DeviceRows:
+        """The rows for a Context, at its positions."""
+        program = self.program
+        assert program is not None
+        if self._context() is not context or not program.integrator.planned:
+            system = context.getSystem()
+            refuse_virtual_sites(system, self.atoms, masses_of(system))
+            program.integrator.read("seed")  # makes the plan, which asks `rows_at`
+            self._context = weakref.ref(context)
+        assert self._bound is not None
+        return self._bound[0]
+
+    @property
+    def atoms(self) -> IntArray:
+        """Particles that a row of the parts touches, and of the System's constraints once they are known."""
+        if self._bound is not None:
+            return self._bound[1].atoms
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *(item.atoms.ravel() for item in self.given)]))
+
+    @property
+    def _engine(self) -> Any:  # type: ignore[override]
+        if self._bound is None:
+            raise InputError(
+                "these rows are known at the first step of a Context; call integrator.attach(context) after its "
+                "positions were set",
+                item="context",
+            )
+        return self._bound[1]
+
+    @property
+    def driven(self) -> bool:
+        return any(item.moving or not item.holonomic for item in self.given)
+
+    def attach(self, program: Program, context: openmm.Context) -> None:
+        self.bind(context)
+
+    def solver_at(self, context: openmm.Context) -> Solver:
+        self.bind(context)
+        return super().solver_at(context)
+
+    def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
+        self.bind(context)
+        self._engine.precision = Precision.of(context)
+        return super()._state(context)
+
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """Whatever the precision is: residuals are what it can hold."""
+
+    def _check_system(self, system: openmm.System) -> None:
+        """Kernels are made for the System of a Context."""
+
+    def check_masses(self, system: openmm.System) -> None:
+        """Kernels are made for the masses of a Context."""
+
+    def rank(self, context: openmm.Context | None = None) -> int:
+        """Degrees of freedom that the rows take, beyond the constraints of the System."""
+        assert context is not None
+        rows = self.bind(context)
+        fixed = int(np.count_nonzero(rows.motion.masses[self.atoms] == 0))
+        return rows.motion.rank - 3 * fixed - SystemRows.of(context.getSystem()).rank(positions_of(context))
+
+    # -- results --------------------------------------------------------------------------------
+
+    def mean_multipliers(self, integrator: Any) -> FloatArray:
+        """Multipliers averaged over all steps since they were reset, by row of ``motion.constraint_set``.
+
+        Where the time was set, or a State or checkpoint of another time loaded, they begin anew.
+
+        Impulses that the kernels have summed over the time: kJ/mol over the unit of the row; NaN for constraints of the
+        System, and before the first step. The weights of `Series.weights`, which blue-moon averages over
+        configurations need, are not in them: take samples by `HeldCoordinatesReporter` where masses enter det Z.
+
+        Parameters
+        ----------
+        integrator : ProjectedIntegrator
+            The one that has made the steps.
+        """
+        rows, time = self.bind(integrator.context), float(integrator.context.getTime()._value) - self._since
+        sums = integrator.read("rows_sums")
+        return rows.multipliers(sums, time) if time > 0 else np.full(rows.set.n_rows, np.nan)
+
+    def reset_multipliers(self, integrator: Any) -> None:
+        """Begin the sums of `mean_multipliers` anew, as the first step does, and one after the time was set."""
+        integrator.write("rows_sums", np.zeros(len(integrator.read("rows_sums"))))
+        self._since = self.left = float(integrator.context.getTime()._value)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> KernelRows:
+        return KernelRows(self._parts)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return KernelRows, (self._parts,)
+
+    def __repr__(self) -> str:
+        return f"<KernelRows: {sum(item.n_rows for item in self.given)} rows and the constraints of the System>"

@@ -183,7 +183,7 @@ class LangevinRespa(Langevin):
         return nested(self.levels, (1.0,), middle=self.slow_kicks == "middle")
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        """Refuse forces of other groups, and virtual sites, which are placed at the end of a step only."""
+        """Refuse groups that do not act, and virtual sites, which are placed at the end of a step only."""
         steps = dict(self.steps)
         idle = set(steps) - groups_in(integrator)
         if idle:
@@ -192,8 +192,15 @@ class LangevinRespa(Langevin):
                 f"{steps[min(idle)]}: all groups in steps act; take those forces out of the System",
                 item="steps",
             )
+        self.verify(integrator)
         system = context.getSystem()
-        for force in system.getForces():
+        if any(system.isVirtualSite(k) for k in range(system.getNumParticles())):
+            raise UnsupportedError(f"{self!r} has no virtual sites: they are placed at the end of a step; use Langevin")
+
+    def verify(self, integrator: Integrator) -> None:
+        """Refuse forces of other groups, which nobody would compute: a Context takes a new group at once."""
+        steps = dict(self.steps)
+        for force in integrator.context.getSystem().getForces():
             left = groups_of(force) - set(steps)
             if left:
                 raise InputError(
@@ -201,8 +208,6 @@ class LangevinRespa(Langevin):
                     f"there are {', '.join(map(str, steps))}",
                     item="steps",
                 )
-        if any(system.isVirtualSite(k) for k in range(system.getNumParticles())):
-            raise UnsupportedError(f"{self!r} has no virtual sites: they are placed at the end of a step; use Langevin")
 
     # -- program --------------------------------------------------------------------------------
 

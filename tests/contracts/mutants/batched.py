@@ -6,15 +6,10 @@ MUTANTS = {
         ("_each(operator.«neg→pos», self.spread(slope, a)", "batched/gradients::derivatives_are_those_of_the_solution"),
         ("start=of.start «+→-» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
         ("d, rest), «rest.T→0 * rest.T»])", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
-    ],
-    "batched/levels.py": [
         ("[which] * s[beside], alpha=«-1→1»)", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
     ],
     "batched/groups.py": [
         ("sums = «-→+»torch.round(", "batched/against_the_engine::rows_take_the_images_that_the_engine_takes"),
-    ],
-    "batched/projections.py": [
-        ("«group.worst→size», size / group.scale", "batched/batch::a_failure_names_copy_and_row_when_it_is_looked_for"),
     ],
     "batched/row_functions.py": [
         (
@@ -23,6 +18,7 @@ MUTANTS = {
         ),
     ],
     "batched/batch.py": [
+        ("«group.worst→size», size / group.scale", "batched/batch::a_failure_names_copy_and_row_when_it_is_looked_for"),
         ("if «getattr(self, item)._version→False»:", "batched/batch::what_is_refused"),
         (
             "torch.where(self._is_position, held, «flight→1.0» * middle)",

@@ -7,7 +7,7 @@ MUTANTS = {
         ("link[k] = (link[k]*damp+h*push«/2→»)*damp;", "device_integrator::settings_change_what_is_done"),
         ("scale = 1+(1«-→+»cosine)*twice/2;", "molecule_spheres::trajectories_are_those_on_arrays"),
     ],
-    "openmm/device/kernel_rows.py": [
+    "openmm/device/rows.py": [
         (
             "part._engine._integrator = «weakref.ref(integrator)→other»",
             "kernel_rows::states_with_energies_of_rows_of_hold_that_move",
@@ -20,10 +20,13 @@ MUTANTS = {
         ("if not (accelerated() «or→and» is_built()):", "device_integrator::which_steps_are_made_on_the_device"),
     ],
     "plan/clusters_alike.py": [
-        ("key=lambda k: («k in last, →»k)", "rows::levels_have_rows_that_share_no_entry"),
-        ("= «max(level[min(mine)], level[place] + 1)→level[place] + 1»", "rows::levels_have_rows_that_share_no_entry"),
+        (
+            "if k not in beside and not «(k in last and coupled[k] - last)→False»",
+            "rows::levels_have_rows_that_share_no_entry",
+        ),
+        ("if «k not in beside→True» and not", "rows::levels_have_rows_that_share_no_entry"),
     ],
-    "openmm/device/small_clusters.py": [
+    "openmm/device/clusters.py": [
         ('"there« && last→»"', "surfaces_on_the_device::the_device_holds_the_same_surfaces"),
     ],
     "openmm/device/device_integrator.py": [

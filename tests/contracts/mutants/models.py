@@ -16,7 +16,7 @@ MUTANTS = {
     ],
     "models/growth/rows.py": [
         ('return «-→»float(called(f"time der', "constrained::values_stay_along_the_velocity_of_the_rows"),
-        ("lambda t, x: «-→»self._moved(t)[1]", "constrained::values_stay_along_the_velocity_of_the_rows"),
+        ("lambda t, x: «-→»moved(t)[1]", "constrained::values_stay_along_the_velocity_of_the_rows"),
     ],
     "models/flows/known_flows.py": [
         ("complex(-0.5 * (self.eta «+→-» a))", "known_flows::damped_oscillator_reference"),

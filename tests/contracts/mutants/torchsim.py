@@ -1,7 +1,7 @@
 """TorchSim: slices, drifts, noise, degrees of freedom; they need torch."""
 
 MUTANTS = {
-    "torchsim/constraints_object.py": [
+    "torchsim/holding.py": [
         ("or any(a is not b «or n != m→»", "torchsim/torchsim_refusals::masses_that_are_edited_in_a_run_are_refused"),
         ("(torch.cumsum(system_mask, 0) - «1→0»)", "torchsim/torchsim_states::slices_take_the_right_rows_along"),
         (
@@ -11,8 +11,6 @@ MUTANTS = {
         ("(0, atoms, «positions→new[atoms]»)", "torchsim/torchsim_states::systems_with_nothing_held_stay_free"),
         ("«self.check(state)→pass»", "torchsim/torchsim_optimizers::steps_that_cannot_be_held_are_told"),
         ("self.system_idx + «system_offset→0»", "torchsim/torchsim_states::splitting_joining_popping_and_copies"),
-    ],
-    "torchsim/holding.py": [
         ("if excess[row] > «1→1e9»", "torchsim/torchsim_refusals::bad_input_is_named_and_leaves_the_state"),
         ("[FixedAtoms(fixed)] if «len(fixed)→False»", "torchsim/torchsim_states::fixed_atoms_are_taken_over"),
     ],

@@ -155,19 +155,6 @@ def test_free_particle_on_a_sphere():
     assert abs(found - np.array(given["reference"]["positions"])[:, 0]).max() < 1e-10
 
 
-@pytest.mark.parametrize("name", ["generic", "near_conical"])
-def test_spherical_pendulum(name):
-    given = case(f"A02_spherical_pendulum_{name}")
-    x0, v0 = (np.array(given["initial"][key])[0] for key in ("positions", "velocities"))
-    m = given["masses"][0]
-    (force,) = given["forces"]
-    g = np.array(force["g"])
-    flow = ParticleOnSphere(given["constraints"][0]["target"], m, lambda x: m * g)
-    times = [t for t in given["times"] if t <= 10.0]
-    found = flow.solve((0.0, times[-1]), np.concatenate([x0, v0]), t_eval=times, rtol=1e-13, atol=1e-13)
-    assert abs(found.y[:3].T - np.array(given["reference"]["positions"])[: len(times), 0]).max() < 1e-10
-
-
 def test_acceleration_on_the_sphere_is_the_projected_one():
     rng = np.random.default_rng(4)
     x = rng.normal(size=3)

@@ -48,12 +48,6 @@ def test_holonomic_row():
         HolonomicRow(product).value(P)
 
 
-def test_moving_target():
-    row = LinearRow([1.0, 2.0, 0.0], lambda t: (3.0 + t, 1.0))
-    assert row.value(P) == pytest.approx(3.5 - 3.3)
-    assert row.rate(P) == 1.0
-
-
 def test_velocity_row():
     row = VelocityRow(lambda t, x: [t, x[0], 1.0], lambda t, x: x[1])
     assert row.gradient(P).tolist() == [0.3, 0.5, 1.0]
@@ -125,7 +119,7 @@ MODEL = GrowthModel(lambda t, x: x, n=2)
         (lambda: HolonomicRow(product, target="x"), "target is 'x'"),
         (lambda: HolonomicRow(3.0), "function is 3.0; give a function of t, x"),
         (lambda: TotalPopulation(2).gradient(P), "2 coefficients, there are 3 species"),
-        (lambda: VelocityRow([1.0]).gradient(P), "coefficients for 3 species"),
+        (lambda: VelocityRow([1.0]).gradient(P), r"returned shape \(1,\), not \(3,\)"),
         (lambda: VelocityRow(lambda x: x), "is called with"),
         (lambda: VelocityRow([1.0, 0.0], lambda: 0.0), "is called with"),
         (lambda: TotalPopulation(2, lambda: (1.0, 0.0)), "is called with"),
@@ -147,7 +141,7 @@ def test_bad_rows_and_models_are_refused(make, words):
 
 
 def exact(x, rows, right, drift):
-    """Multipliers and z of (A G A^T) lambda = b - A drift, for two rows, without any rounding but the last."""
+    """z = A^T lambda, (A G A^T) lambda = b - A drift, for two rows, without any rounding but the last."""
     G, D = ([Fraction(float(v)) for v in a] for a in (x, drift))
     A = [[Fraction(float(v)) for v in row] for row in rows]
     M = [[sum(xi * a * c for xi, a, c in zip(G, one, two, strict=True)) for two in A] for one in A]
@@ -155,18 +149,16 @@ def exact(x, rows, right, drift):
     det = M[0][0] * M[1][1] - M[0][1] * M[1][0]
     multipliers = [(r[0] * M[1][1] - r[1] * M[0][1]) / det, (r[1] * M[0][0] - r[0] * M[1][0]) / det]
     z = [sum(k * row[i] for k, row in zip(multipliers, A, strict=True)) for i in range(len(G))]
-    return np.array([float(k) for k in multipliers]), np.array([float(v) for v in z])
+    return np.array([float(v) for v in z])
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4])
 def test_agrees_with_the_dense_formula(m):
     rng = np.random.default_rng(m)
     x, A, b, drift = rng.random(6) + 0.1, rng.normal(size=(m, 6)), rng.normal(size=m), rng.normal(size=6)
-    found = constraint_rates(x, list(A), list(b), drift)
-    multipliers = np.linalg.solve(A * x @ A.T, b - A @ drift)
-    assert found.multipliers == pytest.approx(multipliers, rel=1e-11)
-    assert found.z == pytest.approx(A.T @ multipliers, rel=1e-11)
-    assert pytest.approx(b, rel=1e-11) == A @ (drift + x * found.z)
+    z, _ = constraint_rates(x, list(A), list(b), drift)
+    assert z == pytest.approx(A.T @ np.linalg.solve(A * x @ A.T, b - A @ drift), rel=1e-11)
+    assert pytest.approx(b, rel=1e-11) == A @ (drift + x * z)
 
 
 @pytest.mark.parametrize("apart", [1e-3, 1e-6, 1e-9])
@@ -176,23 +168,22 @@ def test_nearly_parallel_rows_stay_orthogonal(apart):
     rng = np.random.default_rng(3)
     x, drift = rng.random(6) + 0.1, rng.normal(size=6)
     rows, right = [np.ones(6), np.ones(6) + apart * rng.normal(size=6)], [0.3, 0.3 + apart * 0.7]
-    found = constraint_rates(x, rows, right, drift)
-    multipliers, z = exact(x, rows, right, drift)
-    velocity = drift + x * found.z
+    found, _ = constraint_rates(x, rows, right, drift)
+    z = exact(x, rows, right, drift)
+    velocity = drift + x * found
     # Sums of six terms, each rounded: six half units in the last place of what is summed, and one for the terms.
-    rounding = 4 * np.finfo(float).eps * (np.abs(drift) + np.abs(x * found.z)).sum()
+    rounding = 4 * np.finfo(float).eps * (np.abs(drift) + np.abs(x * found)).sum()
     assert abs(velocity.sum() - right[0]) < rounding
     assert abs(rows[1] @ velocity - right[1]) < rounding
-    assert found.z == pytest.approx(z, abs=1e-15 / apart * abs(z).max())
-    assert found.multipliers == pytest.approx(multipliers, rel=2e-15 / apart)
+    assert found == pytest.approx(z, abs=1e-15 / apart * abs(z).max())
 
 
 @pytest.mark.parametrize(("apart", "dependent"), [(4e-12, False), (2.5e-13, True)])
 def test_rows_count_as_dependent_below_a_part_in_a_million_million(apart, dependent):
     # The length of the second row across the first is `apart` of its own.
     rows = [np.ones(4), np.ones(4) + apart * np.array([1.0, -1.0, 1.0, -1.0])]
-    found = constraint_rates(np.full(4, 0.25), rows, [0.4, 0.4], np.array([0.1, 0.2, -0.3, 0.4]))
-    assert found.dependent.tolist() == [False, dependent]
+    _, missing = constraint_rates(np.full(4, 0.25), rows, [0.4, 0.4], np.array([0.1, 0.2, -0.3, 0.4]))
+    assert np.isfinite(missing).tolist() == [False, dependent]
 
 
 @pytest.mark.parametrize(("off", "refused"), [(4e-10, False), (2.5e-9, True)])

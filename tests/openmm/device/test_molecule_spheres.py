@@ -11,7 +11,7 @@ from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import IsokineticSpheres, ProjectedIntegrator
 from kcons.openmm.device import build
-from kcons.openmm.device.held_rows import Shape
+from kcons.openmm.device.clusters import Shape
 from kcons.openmm.quantities import GAS_CONSTANT
 from kcons.steppers import State
 from kcons.thermostats import IsokineticSpheres as OnArrays

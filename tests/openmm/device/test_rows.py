@@ -7,7 +7,7 @@ from kcons.constraints import Angle, CenterDistance, Custom, Distance, Formula, 
 from kcons.constraints.functions.straight_line import Function
 from kcons.constraints.target import MovingTarget
 from kcons.errors import UnsupportedError
-from kcons.openmm.device.c_writer import c_functions
+from kcons.openmm.device.clusters import c_functions
 from kcons.openmm.device.device_integrator import refusal
 from kcons.openmm.device.rows import DeviceRows
 from kcons.openmm.integrator.program import ConstantEnergy, to_scheme

@@ -184,3 +184,16 @@ def test_groups_that_are_left_out_are_refused():
     with pytest.raises(InputError, match="group 0 is left out by setIntegrationForceGroups"):
         integrator.step(1)
     np.testing.assert_array_equal(state_of(context), (x, v))
+
+
+def test_a_force_that_gets_another_group_in_a_run_is_noticed_at_the_next_check():
+    """It would act no more."""
+    system, x, v = trapped()
+    integrator = ProjectedIntegrator(1e-3, check_every=5, ensemble=LangevinRespa(300, 1.0, TWO))
+    context = started(system, integrator, x, v)
+    integrator.step(5)
+    kept = state_of(context)
+    context.getSystem().getForces()[0].setForceGroup(7)
+    with pytest.raises(InputError, match=r"CustomExternalForce is in force group 7.*back at step 5"):
+        integrator.step(5)
+    np.testing.assert_array_equal(state_of(context), kept)
