@@ -41,7 +41,10 @@ MUTANTS = {
             "change = change[«periodic→:»]",
             "images::directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
         ),
-        ("self.gather(item, x, «together→y»)", "images::lengths_found_far_away_can_be_held_near_the_origin"),
+        (
+            "r if together is y else self.gather(item, x, «together→y»)",
+            "images::lengths_found_far_away_can_be_held_near_the_origin",
+        ),
         ("«x→whole»[item.atoms] if self.moved is None", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
     ],
     "constraints/contradictions.py": [
