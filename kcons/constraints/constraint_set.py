@@ -27,6 +27,8 @@ from kcons.errors import ImageError, InputError, KconsError
 _HALF = 0.5 - 1e-9
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
 MOST_STRAIN = 0.1
+#: What is taken for rounding of a sum of gradients, relative to their sizes, and of values, to gradients times lengths.
+CANCELS = 1e-7
 
 
 class Residuals(NamedTuple):
@@ -135,6 +137,7 @@ class ConstraintSet:
         for start, item in zip(self.starts, marked, strict=False):
             r = self.gather(item, x, y)
             item.check(r, time, int(start))
+            self._refuse_cut(item, r, time, int(start))
             if isinstance(item.target, MovingTarget):
                 item.target.check(repr(item), time, item.n_rows, item.period)
             if item.target is None:
@@ -568,6 +571,33 @@ class ConstraintSet:
         if item.cell_offsets is not None:
             r[item.whole] += item.cell_offsets[item.whole] @ self.lattice[0]
         return r
+
+    def _refuse_cut(self, item: Constraint, r: FloatArray, time: float, start: int) -> None:
+        """Refuse rows whose atoms lie in other images than the nearest, and nobody has said that images do not count.
+
+        Such rows depend on differences of positions only, as their gradients tell here and in the nearest images, and
+        have another value there.
+        """
+        if self.lattice is None or item.relative or item.width == 1 or not item.holonomic:
+            return
+        cut = np.round(np.diff(r, axis=1) @ self.lattice[1]).any(axis=(1, 2))
+        if not cut.any():
+            return
+        near = lined_up(r.copy(), self.lattice)
+        for place in (r, near):
+            slope = item.gradient(place, time)
+            cut &= norm(slope.sum(axis=1)) <= CANCELS * norm(slope).sum(axis=1)
+        apart = nearest_image(item.measure(near, time) - item.measure(r, time), item.period)
+        reach = norm(slope).sum(axis=1) * norm(near - near[:, :1]).max(axis=1)
+        item.refuse(
+            cut & (np.abs(apart) > CANCELS * reach),
+            start,
+            lambda k: (
+                f"its atoms are cut by a face of the cell, and where they lie the value differs by {apart[k]:.3g} from "
+                "that of the nearest images; pass translation_invariant=True, or put the atoms next to each other"
+            ),
+            "translation_invariant",
+        )
 
     def __len__(self) -> int:
         return self.n_rows

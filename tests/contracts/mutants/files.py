@@ -42,6 +42,10 @@ MUTANTS = {
             "images::directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
         ),
         (
+            "«self._refuse_cut(item, r, time, int(start))→pass»",
+            "custom::atoms_cut_by_a_face_of_the_cell_are_refused_unless_it_is_said_what_is_meant",
+        ),
+        (
             "r if together is y else self.gather(item, x, «together→y»)",
             "images::lengths_found_far_away_can_be_held_near_the_origin",
         ),

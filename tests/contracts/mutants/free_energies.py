@@ -20,7 +20,7 @@ MUTANTS = {
             "free_energy/windows/input_file::a_difference_of_distances",
         ),
     ],
-    "cli/scan.py": [
+    "cli/free_energy.py": [
         ('if «family in ("angle", "dihedral")→family != "distance"» else axis)', "cli/scan::a_difference_of_distances"),
     ],
     "free_energy/windows/driver.py": [
