@@ -264,7 +264,7 @@ def test_positive_numbers(value):
 
 #: Methods that take a time, and how many arrays before it.
 OF_A_SET = {"target": 0, "measure": 1, "value": 1, "jacobian": 1, "velocity_target": 1, "acceleration_target": 2}
-OF_A_SET |= {"curvature": 2, "tolerance": 1, "residuals": 1}
+OF_A_SET |= {"tolerance": 1, "residuals": 1}
 OF_A_MOTION = {"project_positions": 2, "project_velocities": 2, "restore_positions": 1, "acceleration": 3}
 OF_A_MOTION |= {"multipliers": 3, "constraint_force": 3, "project_forces": 2, "certify": 1, "report": 1}
 #: Calls that take a time, or other numbers of everyday use, and what these are called.
