@@ -119,13 +119,10 @@ class AcceptedPositions:
 
     def _scaled(self, motion: Motion, x: FloatArray, cell: FloatArray) -> bool:
         """Whether positions are those accepted last but for a change of the cell that took them along."""
-        self.refuse_taken_along(motion, x, cell)
-        moved = self._positions @ deformation(np.frombuffer(self._cell or b"").reshape(3, 3), cell)
+        before = np.frombuffer(self._cell or b"").reshape(3, 3)
+        refuse_taken_along(motion, self._positions, before, x, cell)
+        moved = self._positions @ deformation(before, cell)
         return float(np.abs(moved - x).max(initial=0.0)) <= START_TOLERANCE
-
-    def refuse_taken_along(self, motion: Motion, x: FloatArray, cell: FloatArray) -> None:
-        """As the function of this name, from the positions and the cell that were accepted last."""
-        refuse_taken_along(motion, self._positions, np.frombuffer(self._cell or b"").reshape(3, 3), x, cell)
 
     def ask(self, held: ConstraintSet, old: FloatArray, new: FloatArray) -> int:
         """Remember positions before they are corrected; what `compared` finds of them.
