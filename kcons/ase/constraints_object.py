@@ -161,7 +161,7 @@ class Constraints(FixConstraint):
         x = bound.kernel_array(new, "position")
         motion, old, cell = bound.motion, atoms.arrays["positions"], atoms.cell.array
         found = accepted.ask(motion.constraint_set, old, x)
-        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched):
+        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x):
             motion.project_positions(x, accepted.asked, out=x)
         else:
             try:

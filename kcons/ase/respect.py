@@ -9,7 +9,6 @@ from ase.cell import Cell
 from kcons.ase.topology import velocities_of
 from kcons.constraints.arguments import finite_array
 from kcons.constraints.compilation import njit
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
@@ -259,12 +258,12 @@ def refuse_taken_along(
             )
 
 
-def fulfilled(held: ConstraintSet, x: FloatArray, touched: IntArray) -> bool:
-    """Whether positions fulfill the rows, of the atoms `touched`: to rounding, or to the digits that they come with."""
+def fulfilled(held: ConstraintSet, x: FloatArray) -> bool:
+    """Whether positions fulfill the rows: to rounding, or to the digits that they come with."""
     if _worst_row(held, x) is None:
         return True
     for digits in DIGITS:
-        written = x[touched] * 10.0**digits
+        written = x[held.touched] * 10.0**digits
         if np.abs(written - np.round(written)).max(initial=0.0) <= 1e-3:  # also those that were float32 in between
             reach = np.asarray(abs(held.jacobian(x)).sum(axis=1)).ravel()
             return bool(np.all(np.abs(held.value(x)) <= 0.5 * 10.0**-digits * reach + START_TOLERANCE * held.scale))
