@@ -36,7 +36,6 @@ from kcons.thermostats import (
 )
 from kcons.thermostats.barostats import Barostat, ConstantPressure, require_barostat
 from kcons.thermostats.freedom import Momentum
-from kcons.thermostats.isokinetic import Convention
 from kcons.thermostats.monte_carlo import POTENTIAL
 
 
@@ -151,8 +150,6 @@ class IsokineticDynamics(ThermostattedDynamics):
         None keeps the kinetic energy that the atoms have.
     order : {2, 4, 6}
         1, 6 and 10 force evaluations a step.
-    convention : {'exact', 'notes'}
-        2K = (g - 1) kT, or 3 N kT.
     momentum : {'auto', 'conserved', 'free'}
         Whether total momentum is conserved, and takes degrees of freedom. 'auto' asks the calculator for forces at
         one to three shifted places at the start; with forces that add up to nothing only roughly (plane waves, particle
@@ -171,11 +168,10 @@ class IsokineticDynamics(ThermostattedDynamics):
         temperature_K: float | None = None,
         *,
         order: Literal[2, 4, 6] = 2,
-        convention: Convention = "exact",
         momentum: Momentum = "auto",
         **kwargs: Any,
     ) -> None:
-        make = partial(Isokinetic, order=order, convention=convention, momentum=momentum)
+        make = partial(Isokinetic, order=order, momentum=momentum)
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
     def set_temperature(self, temperature_K: float) -> None:

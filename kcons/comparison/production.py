@@ -25,6 +25,8 @@ from kcons.thermostats.correlated_series import slope
 CHEAP = 1e-3
 #: Records of the energy, and standard errors beyond which its slope is a climb.
 RECORDS, CLIMBS = 40, 3.0
+#: Standard errors beyond which a temperature is wrong: several are looked at, and errors of short runs are rough.
+WRONG = 4.0
 #: Friction, in inverse steps of 1 fs.
 FRICTION = 0.005
 
@@ -79,7 +81,7 @@ def known(row: Mapping[str, Any]) -> bool:
     if row["status"] != "ok" or row["climb"] > CLIMBS:
         return True
     _, off, error = _worst(row)
-    return 2 * error <= RIGHT or abs(off) - 2 * error > RIGHT
+    return 2 * error <= RIGHT or abs(off) - WRONG * error > RIGHT
 
 
 def _worst(row: Mapping[str, Any]) -> tuple[str, float, float]:
@@ -97,7 +99,7 @@ def sentence(rows: Sequence[Mapping[str, Any]], unit: str, kelvin: float = 300.0
         before = f"A step of {good[-1]:g} {unit} is right for averages at {kelvin:g} K; at" if good else "At"
         return (
             f"{before} {doubt['setting']:g} {unit} the temperature of configurations is known to "
-            f"{200 * _worst(doubt)[2]:.1g} % only (two standard errors): give a larger --budget to know it to "
+            f"{200 * _worst(doubt)[2]:.2g} % only (two standard errors): give a larger --budget to know it to "
             f"{100 * RIGHT:g} %."
         )
     last = rows[-1]
@@ -106,8 +108,8 @@ def sentence(rows: Sequence[Mapping[str, Any]], unit: str, kelvin: float = 300.0
     elif last["error"] <= RIGHT:
         why = "the energy climbs"
     else:
-        kind, off, _ = _worst(last)
-        why = f"{kind} motions are off by {100 * off:+.1f} %"
+        kind, off, error = _worst(last)
+        why = f"{kind} motions are off by {100 * off:+.1f} % (± {200 * error:.1g}, two standard errors)"
     if not good:
         return f"No step that was tried, from {rows[0]['setting']:g} {unit} on, is right for averages: {why}."
     words = (

@@ -98,10 +98,10 @@ def pareto(rows: pd.DataFrame, cost: str, least: float = 0.0) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The cheapest setting of each method that is good enough, cheapest first."""
+    """The cheapest setting of each method that is good enough, by place."""
 
     #: Rows of the comparison with 'place', 'cost' and 'times' (of the first). Methods whose costs differ by less than
-    #: the scatter share a place.
+    #: the scatter share a place, the one with the shortest step, which is the simplest, first.
     table: pd.DataFrame
     #: The best row of each method that is not good enough.
     beyond: pd.DataFrame
@@ -148,8 +148,9 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | Non
     best = good.sort_values("cost").drop_duplicates("method")
     beyond = done[~done.method.isin(good.method)].sort_values("error").drop_duplicates("method")
     same = scatter(table, cost)
+    best = best.assign(place=_places(list(best.cost), same), times=best.cost / best.cost.min())
     return Ranking(
-        table=best.assign(place=_places(list(best.cost), same), times=best.cost / best.cost.min()),
+        table=best.sort_values(["place", "adaptive", "setting"], kind="stable"),
         beyond=beyond,
         limit=limit,
         limit_is=limit_is,

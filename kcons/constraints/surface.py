@@ -44,9 +44,6 @@ class Surface(Constraint, base=True):
     def __init__(self, atoms: ArrayLike, target: Target, **data: ArrayLike) -> None:
         Constraint.__init__(self, atom_column(atoms, self.family), target, **data)
 
-    def parameters(self) -> FloatArray:
-        return np.hstack([getattr(self, name).reshape(self.n_rows, -1) for name in self.per_row])
-
 
 class Sphere(Surface):
     """Distance from a point, q = |r - c|.

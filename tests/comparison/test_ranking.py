@@ -71,6 +71,12 @@ def test_costs_within_the_scatter_share_a_place():
     assert list(rank(made(*rows, margin=None)).table.place) == [1, 2, 3]  # 5 % at least
 
 
+def test_of_equal_ones_the_simplest_comes_first():
+    rows = [row("blanes", 24.0, 1e-3, 2.0), row("rattle", 2.0, 1e-3, 2.1), row("peer", 1.0, 1e-3, 2.5)]
+    found = rank(made(*rows)).table
+    assert list(found.method) == ["rattle", "blanes", "peer"] and list(found.place) == [1, 1, 3]
+
+
 def test_costs_are_times_or_force_evaluations():
     """Forces that take no time stand for those that do; where there are none, the time of the step itself decides."""
     rows = [row("rattle", 2.0, 1e-3, 2.0, evaluations=500), row("peer", 2.0, 1e-3, 9.0, evaluations=501)]

@@ -99,8 +99,6 @@ def test_steps_and_systems_that_cannot_be(name):
     stepper = BATHS[name](3)
     with pytest.raises(UnsupportedError):
         stepper.step(System(held.motion, lambda x, v, t: -v, velocity_dependent=True), state, 0.1)
-    with pytest.raises(UnsupportedError, match="System with friction"):
-        stepper.step(System(held.motion, held.force, potential=held.potential, friction=0.1), state, 0.1)
     broken = {key: lambda x, t: np.nan * x for key in ("fast", "slow")}
     if name != "HamiltonianMonteCarlo":
         with pytest.raises(NonFiniteError, match=r"non-finite force at step [01]"):

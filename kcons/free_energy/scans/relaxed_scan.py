@@ -122,10 +122,7 @@ def scan(
     if folder is None:
         return wavefront.run()
     plan = {
-        "symbols": str(atoms.symbols),
-        "positions": atoms.positions.tolist(),
-        "cell": atoms.cell.array.tolist(),
-        "pbc": atoms.pbc.tolist(),
+        "structure": [value.tolist() for value in (atoms.numbers, atoms.positions, atoms.cell.array, atoms.pbc)],
         "calculator": described(atoms.calc, atoms),
         "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
         "values": [axis.tolist() for axis in grid.values],

@@ -38,7 +38,7 @@ MUTANTS = {
             "ase/edits::an_edit_is_named_before_a_class",
         ),
         (
-            "= «found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched)→False»",
+            "if «found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched)→False»:",
             "ase/edits::frames_on_the_constraints_are_taken",
         ),
     ],
