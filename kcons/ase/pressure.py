@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from ase import units
 from ase.calculators.calculator import PropertyNotImplementedError
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.constraints.arguments import positive, refuse_other
@@ -17,7 +17,6 @@ from kcons.motion.motion import Motion
 from kcons.thermostats.cells import (
     BarostatBodies,
     CellSystem,
-    Held,
     Virial,
     find_pieces,
     instantaneous_pressure,
@@ -76,8 +75,6 @@ class PressureReporter:
         Or any of the thermostats. It needs no barostat.
     virial : {'molecular', 'atomic', 'difference'}
         See `kcons.thermostats.instantaneous_pressure`; 'difference' is for calculators without stress.
-    molecules : array_like of int, shape (n, 2), optional
-        Bonds, for pieces; by default those of the barostat.
     temperature_K : float, optional
         For N kT/V instead of the present kinetic energy of pieces.
 
@@ -93,12 +90,11 @@ class PressureReporter:
         dynamics: ConstrainedDynamics,
         *,
         virial: Virial = "molecular",
-        molecules: ArrayLike | None = None,
         temperature_K: float | None = None,
     ) -> None:
         refuse_virial(virial, temperature_K)
         refuse_other(dynamics, ConstrainedDynamics, "dynamics", "a dynamics object of kcons.ase")
-        self.dynamics, self.virial, self.molecules = dynamics, virial, molecules
+        self.dynamics, self.virial = dynamics, virial
         self.thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")
         self._known: tuple[Any, AtomsSystem, BarostatBodies | None] | None = None
         self.values: list[FloatArray] = []
@@ -130,10 +126,9 @@ class PressureReporter:
             barostat, pieces = getattr(dynamics, "barostat", None), None
             if self.virial != "atomic":
                 x = dynamics.atoms.arrays["positions"]
-                if barostat is not None and self.molecules is None:
-                    pieces = barostat.pieces(dynamics._systems(), x, dynamics.time)
+                if barostat is None:
+                    pieces = find_pieces(system, x, self._axes, None, "refuse", dynamics.time)
                 else:
-                    held: Held = "refuse" if barostat is None else barostat.held
-                    pieces = find_pieces(system, x, self._axes, self.molecules, held, dynamics.time)
+                    pieces = barostat.pieces(dynamics._systems(), x, dynamics.time)
             self._known = motion, system, pieces
         return self._known[1:]

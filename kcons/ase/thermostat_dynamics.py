@@ -36,7 +36,6 @@ from kcons.thermostats import (
 )
 from kcons.thermostats.barostats import Barostat, ConstantPressure, require_barostat
 from kcons.thermostats.freedom import Momentum
-from kcons.thermostats.isokinetic import Convention
 from kcons.thermostats.monte_carlo import POTENTIAL
 
 
@@ -151,8 +150,6 @@ class IsokineticDynamics(ThermostattedDynamics):
         None keeps the kinetic energy that the atoms have.
     order : {2, 4, 6}
         1, 6 and 10 force evaluations a step.
-    convention : {'exact', 'notes'}
-        2K = (g - 1) kT, or 3 N kT.
     momentum : {'auto', 'conserved', 'free'}
         Whether total momentum is conserved, and takes degrees of freedom. 'auto' asks the calculator for forces at
         one to three shifted places at the start; with forces that add up to nothing only roughly (plane waves, particle
@@ -171,11 +168,10 @@ class IsokineticDynamics(ThermostattedDynamics):
         temperature_K: float | None = None,
         *,
         order: Literal[2, 4, 6] = 2,
-        convention: Convention = "exact",
         momentum: Momentum = "auto",
         **kwargs: Any,
     ) -> None:
-        make = partial(Isokinetic, order=order, convention=convention, momentum=momentum)
+        make = partial(Isokinetic, order=order, momentum=momentum)
         super().__init__(atoms, timestep, temperature_K, make, **kwargs)
 
     def set_temperature(self, temperature_K: float) -> None:
@@ -356,8 +352,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     Raises
     ------
     InputError
-        One calculator given twice; calculators of other atoms; options of the other bath. While it runs: the atoms got
-        another calculator.
+        One calculator given twice; options of the other bath. While it runs: calculators of other atoms, or the atoms
+        got another calculator.
     """
 
     @checked
@@ -385,7 +381,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         self.seed = seed_from(rng)
         steps = {"slow": 1, "fast": fast_steps}
         make = partial(kind, friction=friction, rng=self.seed, steps=steps, **options)
-        make(_thermal(temperature_K))  # what it refuses comes before calculators are called
+        make(_thermal(temperature_K))  # what it refuses comes first
         self._parts = fast_steps
         if fast is slow:
             raise InputError(
@@ -396,13 +392,6 @@ class MultipleTimeSteps(ThermostattedDynamics):
         for name, calculator in (("fast", fast), ("slow", slow)):
             if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
                 raise InputError(f"{name} is {calculator!r:.80}; give an ASE calculator", item=name)
-            forces = as_float_array(calculator.get_forces(atoms), f"forces of {name}")
-            if forces.shape != (len(atoms), 3):
-                raise InputError(
-                    f"{name} computes forces of shape {forces.shape}, not of these {len(atoms)} atoms "
-                    f"({atoms.get_chemical_formula()}); fast and slow must be of the same atoms",
-                    item=name,
-                )
         self._calculators = fast, slow
         cheap, expensive = self._forces_of(fast, True), self._forces_of(slow, difference)
         if difference:

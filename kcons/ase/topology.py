@@ -22,7 +22,6 @@ from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rigid_groups import water_rows
 from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import (
-    MASSES,
     Snapshot,
     Topology,
     elements_of,
@@ -138,9 +137,6 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     elements = np.where(atoms.numbers == 0, "", symbols)
     names = np.asarray(arrays["atomtypes"]).astype(str) if "atomtypes" in arrays else symbols
     names = np.char.strip(names)
-    masses = atoms.get_masses()
-    if "masses" not in arrays:
-        masses[atoms.numbers == 0] = 0.0
     known = "residuenames" in arrays
     if known:
         called = np.char.strip(np.asarray(arrays["residuenames"]).astype(str))
@@ -152,7 +148,10 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
         residues = np.zeros(n, np.int64)
         residue_names, ids, chains = np.array([""] * min(n, 1)), np.array(["1"] * min(n, 1)), np.array([""] * min(n, 1))
     if known and "atomtypes" in arrays:
-        elements, masses = _repaired(elements, masses, names, residues, residue_names, "masses" in arrays)
+        elements = _repaired(elements, names, residues, residue_names)
+    masses = atoms.get_masses()
+    if "masses" not in arrays:
+        masses = np.array([atomic_masses[atomic_numbers[e]] if e else 0.0 for e in elements.tolist()])
     bonds = check_pairs(atoms.info.get(BONDS, np.zeros((0, 2), np.int64)), n, _ITEM)
     charges = atoms.get_initial_charges() if "initial_charges" in arrays else None
     topology = Topology(
@@ -201,12 +200,12 @@ def repair_elements(atoms: Atoms) -> int:
     return changed
 
 
-def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0, *, water: bool = False) -> int:
+def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0) -> int:
     """Give hydrogens more mass, in place, and take it from the heavy atoms that they are bonded to; how many have it.
 
     This slows the angles of hydrogens, so that with their bonds held steps may be 4 fs; averages of configurations stay
-    as they are. The same as OpenMM's ``hydrogenMass``. A second call with the same mass changes nothing. Momenta stay:
-    draw velocities afterwards.
+    as they are. The same as OpenMM's ``hydrogenMass``: water stays as it is. A second call with the same mass changes
+    nothing. Momenta stay: draw velocities afterwards.
 
     Parameters
     ----------
@@ -214,8 +213,6 @@ def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0, *, water: bool = 
         Bonds are the pairs in ``atoms.info['bonds']``; without them they are guessed.
     mass : float
         Of each hydrogen that is bonded to a heavy atom, in dalton.
-    water : bool
-        Whether to change water as well, which rigid water does not need.
 
     Raises
     ------
@@ -228,8 +225,7 @@ def repartition_hydrogen_mass(atoms: Atoms, mass: float = 3.0, *, water: bool = 
     pairs = bonds[light[bonds].sum(axis=1) == 1]
     pairs = np.where(light[pairs[:, :1]], pairs, pairs[:, ::-1])  # hydrogen, heavy
     count, among = (np.bincount(end, minlength=len(atoms)) for end in (bonds.ravel(), pairs[:, 1]))
-    if not water:
-        pairs = pairs[~((atoms.numbers == 8) & (count == 2) & (among == 2))[pairs[:, 1]]]
+    pairs = pairs[~((atoms.numbers == 8) & (count == 2) & (among == 2))[pairs[:, 1]]]
     # Of a bridge, from the first of its heavy atoms.
     pairs = pairs[np.unique(pairs[:, 0], return_index=True)[1]]
     masses = atoms.get_masses()
@@ -275,14 +271,9 @@ def _had_elements(elements: NDArray[np.str_], by_name: NDArray[np.str_], names: 
 
 
 def _repaired(
-    elements: NDArray[np.str_],
-    masses: NDArray[np.float64],
-    names: NDArray[np.str_],
-    residues: IntArray,
-    residue_names: NDArray[np.str_],
-    keep_masses: bool,
-) -> tuple[NDArray[np.str_], NDArray[np.float64]]:
-    """Elements by name where a name contradicts the symbol, and their masses."""
+    elements: NDArray[np.str_], names: NDArray[np.str_], residues: IntArray, residue_names: NDArray[np.str_]
+) -> NDArray[np.str_]:
+    """Elements by name where a name contradicts the symbol."""
     by_name = elements_of(names, residues, residue_names, None)
     wrong = (by_name != elements) & (by_name != "") & (np.char.upper(elements) != np.char.upper(by_name))
     # A name that begins otherwise says nothing about the element (C1 of a chlorine, X1): the symbol stays.
@@ -301,7 +292,7 @@ def _repaired(
         )
         wrong &= ~left
     if not wrong.any():
-        return elements, masses
+        return elements
     atom = int(np.argmax(wrong))
     warnings.warn(
         f"{int(wrong.sum())} atoms have elements that their names contradict, such as {names[atom]} of "
@@ -310,9 +301,4 @@ def _repaired(
         UserWarning,
         stacklevel=4,
     )
-    elements = np.where(wrong, by_name, elements)
-    if not keep_masses:
-        standard = {s: float(atomic_masses[atomic_numbers[s]]) for s in set(by_name[wrong].tolist()) & set(MASSES)}
-        masses = masses.copy()
-        masses[wrong] = [standard[s] for s in by_name[wrong].tolist()]
-    return elements, masses
+    return np.where(wrong, by_name, elements)

@@ -38,8 +38,8 @@ class ProjectedEquation:
         return f"ProjectedEquation({self.order}{', project=True' if self.project else ''})"
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for friction and forces that depend on the velocities."""
-        if system.friction or system.velocity_dependent:
+        """Raise `UnsupportedError` for forces that depend on the velocities."""
+        if system.velocity_dependent:
             raise UnsupportedError(f"{self!r} is made for forces of positions alone; use Rattle")
 
     def step(self, system: System, state: State, dt: float) -> State:

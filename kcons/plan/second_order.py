@@ -240,40 +240,27 @@ def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -
         if len(rows) == 0:
             return
     for k in np.flatnonzero(large).tolist():
-        _check_large(constraint_set, members[starts[k] : starts[k + 1]], positions, time)
+        _check_large(LocalRows(constraint_set, members[starts[k] : starts[k + 1]], positions, time))
 
 
-def _check_large(constraint_set: ConstraintSet, rows: IntArray, positions: FloatArray, time: float) -> None:
+def _check_large(block: LocalRows) -> None:
     """Refuse a block too large for dense algebra whose rank is lower here than at positions nearby."""
-    part, atoms = constraint_set.subset(rows)
-    x = positions[atoms]
-    free = ~np.isin(atoms, fixed_atoms(constraint_set))
-    shortest = float(part.measure(x, time).min())
-    rng = np.random.default_rng(20090131)
-    away = x + DISPLACEMENT * shortest * rng.standard_normal(x.shape) * free[:, None]
-    here, nearby = (_lost_rows(part, y, free, time) for y in (x, away))
-    if here > nearby:
-        names = ", ".join(constraint_set.row_name(int(r)) for r in rows[:4])
-        raise SingularGeometryError(
-            f"constraint set singular at this geometry: the {len(rows)} rows {names}, ... have rank "
-            f"{len(rows) - here} here but {len(rows) - nearby} at positions nearby. Hold collinear and coplanar "
-            "groups by x_a = sum c_i x_i (LinearRelation) instead of all their distances",
-            rows=rows,
-            atoms=atoms,
-        )
+    here, nearby = (_sparse_rank(block, x) for x in (block.x, block.nearby(np.random.default_rng(20090131))))
+    if here < nearby:
+        raise _unresolved(block, here, nearby)
 
 
-def _lost_rows(part: ConstraintSet, x: FloatArray, free: BoolArray, time: float) -> int:
-    """Rows less rank: eigenvalues of A A^T below LOST^2, counted by Sylvester's law of inertia."""
-    a = part.jacobian(x, time)
-    a.data *= np.repeat(free, 3)[a.indices]
+def _sparse_rank(block: LocalRows, x: FloatArray) -> int:
+    """Eigenvalues of A A^T above LOST^2, counted by Sylvester's law of inertia."""
+    a = block.part.jacobian(x, block.time)
+    a.data *= ~np.repeat(block.pinned, 3)[a.indices]
     norms = row_norms(a)
     a.data *= np.repeat(1.0 / np.where(norms > 0, norms, 1.0), np.diff(a.indptr))
-    shifted = (a @ a.T - LOST**2 * sp.eye_array(part.n_rows)).tocsc()
+    shifted = (a @ a.T - LOST**2 * sp.eye_array(block.part.n_rows)).tocsc()
     from scipy.sparse.linalg import splu  # slow to import, seldom needed
 
     factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return int(np.sum(factor.U.diagonal() < 0))
+    return int(np.sum(factor.U.diagonal() > 0))
 
 
 # -- one block ----------------------------------------------------------------------------------------------
@@ -364,17 +351,20 @@ class LocalRows:
         other.x = x
         return other
 
+    def nearby(self, rng: np.random.Generator) -> FloatArray:
+        """Positions of the movable atoms displaced at random, by less than rows are long."""
+        wide = [c for c in self.part.constraints if c.width > 1 and c.n_rows]
+        sides = [np.linalg.norm(np.diff(self.part.gather(c, self.x), axis=1), axis=2).min() for c in wide]
+        step = DISPLACEMENT * min(sides, default=extent_of(self.x))
+        return self.x + step * rng.standard_normal(self.x.shape) * ~self.pinned[:, None]
+
     def rigid_pairs(self) -> tuple[BoolArray, int]:
         """Pairs of atoms that keep their distance at positions nearby, and the rank there."""
         rng = np.random.default_rng(20090131)
         n = len(self.atoms)
-        wide = [c for c in self.part.constraints if c.width > 1 and c.n_rows]
-        sides = [np.linalg.norm(np.diff(self.part.gather(c, self.x), axis=1), axis=2).min() for c in wide]
-        step = DISPLACEMENT * min(sides, default=extent_of(self.x))
         best, rigid = -1, np.eye(n, dtype=bool)
         for _ in range(3):
-            x = self.x + step * rng.standard_normal(self.x.shape)
-            x[self.pinned] = self.x[self.pinned]
+            x = self.nearby(rng)
             _, _, vt, rank = self.decomposed(x)
             if rank <= best:
                 continue
@@ -461,7 +451,7 @@ def find_flat_bodies(block: LocalRows) -> list[FlatBody]:
     x = block.unwrapped(block.x)
     groups = [atoms for atoms in _cliques(rigid) if block.singular(block.x, block.inside(atoms))]
     if not groups:
-        raise _unresolved(block, generic)
+        raise _unresolved(block, block.decomposed(block.x)[3], generic)
     bodies = _without_repeats(block, [_body(block, atoms, x) for atoms in groups])
     _check_result(block, bodies, generic)
     return [body.renumbered(block.atoms, block.rows) for body in bodies]
@@ -579,21 +569,12 @@ def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> Non
     distances between them resist the fold at second order.
     """
     new = _rebuilt(block, bodies)
-    u, s, vt, rank = new.decomposed(block.x)
-    old, _, bend = block.linear(block.x)
-    curvature = new.linear(block.x)[2]
-    if np.abs(old @ vt[rank:].T).max(initial=0.0) > 1e-4 or new.singular(block.x):
-        raise _unresolved(block, generic)
-    rng = np.random.default_rng(20060921)
-    for _ in range(3):
-        v = rng.standard_normal(len(vt) - rank) @ vt[rank:]
-        a = -((u[:, :rank].T @ curvature(v)) / s[:rank]) @ vt[:rank]
-        bent = bend(v)
-        miss = old @ a + bent
-        # Rigid motion has no curvature but rounding.
-        size = np.linalg.norm(bent) + 1e-5 * (v @ v) / extent_of(block.x)
-        if np.linalg.norm(miss) > UNSOLVABLE * size:
-            raise _unresolved(block, generic)
+    _, _, vt, rank = new.decomposed(block.x)
+    apart = np.abs(block.linear(block.x)[0] @ vt[rank:].T).max(initial=0.0)
+    both = new.part.replaced([*new.part.constraints, *block.part.constraints], block.x, block.time)
+    together = LocalRows(both, np.arange(both.n_rows), block.x, block.time, pinned=block.pinned)
+    if apart > 1e-4 or new.singular(block.x) or together.singular(block.x):
+        raise _unresolved(block, block.decomposed(block.x)[3], generic)
 
 
 def with_flat_bodies(
@@ -647,9 +628,8 @@ def _refused(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray,
     )
 
 
-def _unresolved(block: LocalRows, generic: int) -> SingularGeometryError:
+def _unresolved(block: LocalRows, here: int, generic: int) -> SingularGeometryError:
     names = ", ".join(block.set.row_name(int(r)) for r in block.rows[:4]) + (", ..." if len(block.rows) > 4 else "")
-    here = block.decomposed(block.x)[3]
     free = 3 * int(np.sum(~block.pinned))
     return SingularGeometryError(
         f"constraint set singular at this geometry: {free - here} linearized degrees of freedom here but "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
 
 import ase.io
 import numpy as np
@@ -190,14 +189,12 @@ def test_hydrogens_take_mass_from_the_atoms_that_they_are_bonded_to():
     assert np.count_nonzero(given.get_masses() != before) == 2
 
 
-def test_water_stays_unless_it_is_asked_for():
+def test_water_keeps_its_masses():
     atoms = molecule("H2O") + molecule("CH3OH")
     atoms.positions[3:] += 8.0
     light = atoms.get_masses()
     assert repartition_hydrogen_mass(atoms) == 4
     assert np.array_equal(atoms.get_masses()[:3], light[:3])
-    assert repartition_hydrogen_mass(atoms, water=True) == 6
-    assert atoms.get_masses()[:3] == pytest.approx([light[0] - 2 * (3 - light[1]), 3, 3])
     hydrogen = molecule("H2")
     assert repartition_hydrogen_mass(hydrogen) == 0
     assert repartition_hydrogen_mass(Atoms("Ar")) == 0
@@ -214,22 +211,3 @@ def test_masses_that_cannot_be_are_refused():
     with pytest.raises(InputError, match="atoms must be"):
         repartition_hydrogen_mass([atoms])
     assert np.array_equal(atoms.get_masses(), before)
-
-
-def test_the_same_masses_as_those_of_openmm():
-    """Of villin in water, atom by atom."""
-    pytest.importorskip("openmm")
-    from openmm import app, unit
-
-    pdb = app.PDBFile(str(Path(app.__file__).parent / "data" / "test.pdb"))
-    field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
-    light, heavy = (
-        np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
-        for system in (field.createSystem(pdb.topology, hydrogenMass=m) for m in (None, 3 * unit.dalton))
-    )
-    numbers = [0 if a.element is None else a.element.atomic_number for a in pdb.topology.atoms()]
-    atoms = Atoms(numbers, pdb.getPositions(asNumpy=True)._value * 10, masses=light)
-    atoms.info["bonds"] = [[bond.atom1.index, bond.atom2.index] for bond in pdb.topology.bonds()]
-    count = repartition_hydrogen_mass(atoms, 3)
-    assert count == np.count_nonzero(heavy == 3) > 200
-    assert atoms.get_masses() == pytest.approx(heavy, abs=1e-12)

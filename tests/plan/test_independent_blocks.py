@@ -19,15 +19,6 @@ def blocks(rows, n_atoms, only=None):
     return held, x, sorted(members[a:b].tolist() for a, b in itertools.pairwise(starts))
 
 
-def test_triangles_that_share_an_atom_are_two_blocks():
-    pairs = [[0, 1], [1, 2], [0, 2], [2, 3], [3, 4], [2, 4], [4, 5]]
-    assert blocks([Distance(pairs)], 6)[2] == [[0, 1, 2], [3, 4, 5]]
-
-
-def test_a_forest_has_none():
-    assert blocks([Distance([[0, 1], [1, 2], [1, 3], [4, 5]])], 6)[2] == []
-
-
 def test_a_row_of_several_atoms_is_a_cycle_through_them():
     assert blocks([Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2]])], 4)[2] == [[0, 1, 2]]
     assert blocks([Distance([[0, 1]]), Angle([[1, 2, 3]])], 4)[2] == []

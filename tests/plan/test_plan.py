@@ -101,12 +101,6 @@ def test_anchored_clusters(fixed, pairs, expected) -> None:
     assert (plan.inverse_masses[fixed] == 0).all()
 
 
-def test_dependent_rows_are_listed_cluster_by_cluster() -> None:
-    rows, x = many(METHANE, all_pairs(5), 3)
-    plan = planned(rows, x)
-    assert sorted(part.tolist() for part in plan.dependent) == [list(range(10 * k, 10 * k + 10)) for k in range(3)]
-
-
 # -- rows between fixed atoms -----------------------------------------------------------------------
 
 

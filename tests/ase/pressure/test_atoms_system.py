@@ -114,8 +114,7 @@ def crystal(calculator=None):
     return atoms
 
 
-@pytest.mark.parametrize("kind", ["isotropic", "semi-isotropic", "anisotropic", "flexible"])
-@pytest.mark.parametrize("which", ["monte carlo", "rescaling"])
+@pytest.mark.parametrize(("which", "kind"), [("monte carlo", "semi-isotropic"), ("rescaling", "flexible")])
 def test_the_energy_that_trials_bring_is_accounted_for(which, kind):
     atoms = crystal()
     made = {
@@ -130,10 +129,10 @@ def test_the_energy_that_trials_bring_is_accounted_for(which, kind):
     tried = dyn.state.barostat[11:].reshape(3, -1)[0]
     assert tried.sum() == 20
     assert 0.1 < np.nanmean(made.acceptance(dyn.state)) <= 1
-    assert which == "monte carlo" or np.ptp(made.acceptance(dyn.state)) == 0
-    if kind == "flexible":
+    if which == "rescaling":
+        assert np.ptp(made.acceptance(dyn.state)) == 0
         assert atoms.cell.array[0, 1] == atoms.cell.array[0, 2] == atoms.cell.array[1, 2] == 0
-        assert which == "monte carlo" or abs(atoms.cell.array[2, 0]) > 1e-4
+        assert abs(atoms.cell.array[2, 0]) > 1e-4
 
 
 class WarmElectrons(Free):
@@ -240,9 +239,6 @@ def test_forces_of_ase_constraints_count_in_the_energy():
     before = dyn.get_conserved_energy()
     dyn.run(20)
     assert dyn.get_conserved_energy() == pytest.approx(before, abs=2e-3)
-    dyn = ConstrainedLangevin(atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=CellRescaling(0.0, 100 * FS, 1.0))
-    with pytest.raises(UnsupportedError, match="no stress"):
-        dyn.run(1)
 
 
 def test_a_step_that_fails_after_a_trial_leaves_the_cell(monkeypatch):

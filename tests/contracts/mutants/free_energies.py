@@ -73,7 +73,7 @@ MUTANTS = {
     ],
     "constraints/constraint_set.py": [
         (
-            "if any(«getattr(item, name) != getattr(wanted, name)→name is None» for name in wanted.shared):",
+            "or any(«getattr(item, name) != getattr(wanted, name)→name is None» for name in wanted.shared)",
             "held_coordinates::formulas_on_the_same_atoms_are_told_apart",
         ),
     ],
