@@ -17,7 +17,7 @@ from kcons.steppers.stepper import explained
 
 
 class ProjectedEquation:
-    """Velocity Verlet (order 2) or Runge-Kutta (4) on the projected equation; with `project`, each step is projected."""
+    """Velocity Verlet (order 2) or Runge-Kutta (4) on the projected equation; with `project`, each is projected."""
 
     reversible = False
     symplectic = False
