@@ -4,7 +4,7 @@
 
 A page has a table between `<!-- table: FILE NAME -->` and `<!-- end -->`. FILE.csv is the result of a study in
 examples/studies, and NAME one of the tables that the study makes of it; tables of FILE.json are made by
-result_tables.py. Figures go to docs/figures.
+result_tables.py, and `steppers all` of the steppers themselves. Figures go to docs/figures.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ sys.path[:0] = [str(DOCS.parent / "tests"), str(STUDIES), str(DOCS)]
 import harness  # noqa: E402
 import result_pictures  # noqa: E402
 import result_tables  # noqa: E402
+
+from kcons.steppers import RungeKuttaNystrom  # noqa: E402
+from kcons.steppers.splitting import SCHEMES  # noqa: E402
 
 #: Which study has made a result file.
 MADE_BY = {
@@ -75,9 +78,25 @@ def machine_of(data: Any) -> dict[str, Any]:
     return next(filter(None, found), {})
 
 
+def steppers() -> pd.DataFrame:
+    """What the steppers say of themselves."""
+    rows = []
+    for scheme, make in SCHEMES.items():
+        stepper = make()
+        flights = [abs(drift * part) for drift in stepper.drifts for part in stepper.flight]
+        words = ("yes" if each else "no" for each in (stepper.reversible, stepper.symplectic))
+        row = f"`{type(stepper).__name__}`", f"`{scheme}`", stepper.order, *words, stepper.force_evaluations
+        refuses = isinstance(stepper, RungeKuttaNystrom)
+        rows.append((*row, len(flights), f"{max(flights):.3g}", "no" if refuses else "yes"))
+    head = "stepper|scheme|order|reversible|symplectic|forces a step|flights a step|longest flight"
+    return pd.DataFrame(rows, columns=[*head.split("|"), "velocity-dependent forces"])
+
+
 @cache
 def results(name: str) -> tuple[str, dict[str, pd.DataFrame]]:
     """Of which run a result is, and its tables."""
+    if name == "steppers":
+        return "", {"all": steppers()}
     if name in MADE_BY:
         head, table = harness.read(harness.RESULTS / f"{name}.csv")
         made = (
@@ -98,8 +117,8 @@ def renewed(text: str, folder: Path = DOCS) -> str:
     def block(match: re.Match[str]) -> str:
         result, name = match.groups()
         made, tables = results(result)
-        made = made.replace("RESULTS", os.path.relpath(harness.RESULTS, folder))
-        return f"<!-- table: {result} {name} -->\n{markdown(tables[name])}\n\n{made}\n<!-- end -->"
+        made = made and f"\n{made}\n".replace("RESULTS", os.path.relpath(harness.RESULTS, folder))
+        return f"<!-- table: {result} {name} -->\n{markdown(tables[name])}\n{made}<!-- end -->"
 
     return BLOCK.sub(block, text)
 

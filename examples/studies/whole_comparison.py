@@ -162,7 +162,7 @@ def rows(key: str, quick: bool) -> Iterator[dict[str, Any]]:
         if method.holds
         and (method.usual or (method.engine == "arrays" and not quick))
         and not method.name.startswith(part.without or ("-",))
-        and (method.engine != "OpenMM" or method.refuses(system) is None)
+        and (method.engine != "OpenMM" or method.refusal(system) is None)
     ]
     table = compare(system, names, budget=2.0 if quick else part.budget, rounds=1 if quick else 3)
     about = {"part": key, "heading": part.heading, **{name: table.attrs[name] for name in ABOUT}}

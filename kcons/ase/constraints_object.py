@@ -11,6 +11,7 @@ import ase.constraints
 import numpy as np
 from ase import Atoms
 from ase.constraints import FixAtoms, FixConstraint
+from numpy.typing import ArrayLike
 
 import kcons.constraints as families
 from kcons.ase.binding import (
@@ -339,13 +340,19 @@ class Constraints(FixConstraint):
 
     # -- for people -----------------------------------------------------------------------------
 
-    def restore(self, atoms: Atoms) -> None:
+    def restore(self, atoms: Atoms, bonds: ArrayLike | None = None) -> None:
         """Move atoms that are off the constraints onto them, and project their momenta if they have any.
 
         Near starts go to the nearest point in the mass metric. Where that would change other bonds or angles, and for
-        far targets, groups move as rigid pieces: see `Motion.restore_positions`. Bonds are those in
-        ``atoms.info['bonds']``, otherwise they are guessed from covalent radii. For starts and edited structures, not
+        far targets, groups move as rigid pieces: see `Motion.restore_positions`. For starts and edited structures, not
         for time steps.
+
+        Parameters
+        ----------
+        atoms : ase.Atoms
+        bonds : array_like of int, shape (n, 2), optional
+            Those that stay as they are; by default ``atoms.info['bonds']``, otherwise they are guessed from covalent
+            radii. Empty: the nearest point, whatever becomes of what no row holds.
 
         Raises
         ------
@@ -354,7 +361,8 @@ class Constraints(FixConstraint):
             changed.
         """
         bound, accepted = self._bound(atoms), self._accepted
-        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=lambda: bonds_of(atoms))
+        kept = (lambda: bonds_of(atoms)) if bonds is None else bonds
+        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept)
         self._move(atoms, bound.motion, x)
         accepted.between_steps = True
 

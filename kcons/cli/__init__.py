@@ -1,9 +1,9 @@
 """The command `kcons`.
 
-- `terminal`: what is written to the terminal
-- `parser`: the table of options of a command
-- `systems`: the test system or file that a command is asked for, and `kcons plan`
-- `check`, `compare`, `doctor`, `freeenergy`, `scan`, `warmup`: the commands of these names
-- `compiled_systems`: what `kcons warmup` runs
+- `terminal`: the table of options of a command, and what is written to the terminal
+- `compare`: `kcons compare` and `kcons plan`, of test systems and files
+- `check`: `kcons check`, of trajectories
+- `free_energy`: `kcons scan` and `kcons freeenergy`
+- `machine`: `kcons doctor` and `kcons warmup`
 - `main`: the command itself
 """

@@ -5,17 +5,12 @@ from __future__ import annotations
 import argparse
 import io
 import sys
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from kcons.cli.parser import Command, Option
-from kcons.cli.terminal import rendered, say_written, show
+from kcons.cli.terminal import Command, Option, rendered, say_written, show
 from kcons.constraints.arguments import positive
-from kcons.errors import InputError, KconsError, OccupiedError, UnreadableError
-
-if TYPE_CHECKING:
-    from kcons.mdanalysis.check.result import CheckResult
+from kcons.errors import InputError, KconsError, UnreadableError
 
 #: The exit status of each result; 2 is wrong use.
 EXIT = {"kept": 0, "tolerated": 0, "violated": 1, "incomplete": 3}
@@ -29,23 +24,24 @@ def _check(chosen: argparse.Namespace) -> int:
     from kcons.mdanalysis.check import report
     from kcons.mdanalysis.check.constraint_check import check_trajectory
 
-    if chosen.out is not None:
-        report.results(chosen.out, chosen.trajectory).refuse_others()  # complain before any work
+    path: Path = chosen.trajectory
+    folder: Path = chosen.out or Path(f"check-{path.stem}")
+    report.results(folder, path).refuse_others()  # complain before any work
     for name in ("no_rigid_water", "format", "topology_format"):
         if chosen.forces is not None and getattr(chosen, name):
-            option = name.replace("_", "-")
-            raise InputError(f"--forces does not go with --{option}; leave one of them out", item="forces")
+            raise InputError(f"--forces does not go with --{name.replace('_', '-')}; leave one out", item="forces")
     if chosen.temperature is not None:
         if chosen.forces is None:
             raise InputError("--temperature needs --forces, from which temperatures are found", item="temperature")
         positive(chosen.temperature, "temperature")
     given = {name: getattr(chosen, name) for name in AS_GIVEN}
     try:
-        result = check_trajectory(chosen.trajectory, chosen.topology, rigid_water=not chosen.no_rigid_water, **given)
+        result = check_trajectory(path, chosen.topology, rigid_water=not chosen.no_rigid_water, **given)
     except UnreadableError as error:
         said = str(error)
         print(f"kcons: {said}", file=sys.stderr)
-        say_written(_put(chosen, {"trajectory": str(chosen.trajectory), "status": "incomplete", "verdict": said}))
+        found = {"trajectory": str(path), "status": "incomplete", "verdict": said}
+        say_written(report.write(folder, path, found))
         return EXIT["incomplete"]
     failed = ""
     if chosen.forces is not None:
@@ -59,13 +55,13 @@ def _check(chosen: argparse.Namespace) -> int:
     picture = io.BytesIO()
     report.plot(result, picture)
     text = "\n".join([summary, rendered(units), rendered(rows), result.verdict])
-    written = _put(chosen, result.to_dict(), picture.getvalue(), text)
+    written = report.write(folder, path, result.to_dict(), picture.getvalue(), text)
     show(summary, units, rows, verdict)
     say_written(written)
     return 2 if failed else EXIT[result.status]
 
 
-def _temperatures(chosen: argparse.Namespace, result: CheckResult) -> list[str]:
+def _temperatures(chosen: argparse.Namespace, result: Any) -> list[str]:
     from kcons.comparison import trajectory_temperatures
 
     if result.violated:
@@ -75,43 +71,37 @@ def _temperatures(chosen: argparse.Namespace, result: CheckResult) -> list[str]:
     return trajectory_temperatures.sentences(found, chosen.temperature)
 
 
-def _put(chosen: argparse.Namespace, *contents: Any) -> list[Path]:
-    """Write into the folder asked for, or into the first of the usual names that no other trajectory has."""
-    from kcons.mdanalysis.check.report import write
-
-    if chosen.out is not None:
-        return write(chosen.out, chosen.trajectory, *contents)
-    number, folder = 1, Path(f"check-{chosen.trajectory.stem}")
-    while True:
-        if not folder.is_symlink():
-            with suppress(OccupiedError):
-                return write(folder, chosen.trajectory, *contents)
-        number += 1
-        folder = Path(f"check-{chosen.trajectory.stem}-{number}")
-
-
-COMMAND = Command(
-    "check",
-    "how well a trajectory of any engine kept its constraints",
-    "Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift, judged "
-    "by the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a file "
-    "that ends too early, or has a NaN.",
-    (
-        Option("trajectory", "any trajectory that MDAnalysis reads", type=Path),
-        Option("--topology", "any topology that MDAnalysis reads", type=Path, required=True),
-        Option("--format", "of the trajectory, where its name does not tell: LAMMPSDUMP, ...", metavar="NAME"),
-        Option("--topology-format", "of the topology, where its name does not tell", metavar="NAME"),
-        Option("--constrain", "hbonds (default), allbonds, hangles, allangles, none", default="hbonds", metavar="NAME"),
-        Option("--select", "rows within this selection only (MDAnalysis' language)", default="all"),
-        Option("--no-rigid-water", "do not expect water to be rigid", action="store_true"),
-        Option("--targets", "first (frame, default), mean, topology (coordinates), or a TOML file", default="first"),
-        Option("--tolerance", "relative, of the engine (default 1e-4)", type=float, default=1e-4),
-        Option("--precision", "step of the coordinates in the file, Å, where not known", type=float),
-        Option("--frames", "frames to look at (default all)", metavar="A:B:STEP"),
-        Option("--workers", "processes (default 1)", type=int, default=1),
-        Option("--forces", "also temperatures of the configurations: forces as for compare (amber14-all, gfn2, ...)"),
-        Option("--temperature", "with --forces: say whether the temperatures are this one", type=float, metavar="K"),
-        Option("--out", "folder for check.json, .png and .txt (default ./check-TRAJECTORY)", type=Path),
+COMMANDS = (
+    Command(
+        "check",
+        "how well a trajectory of any engine kept its constraints",
+        "Judged by the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a "
+        "file that ends too early, or has a NaN.",
+        (
+            Option("trajectory", "any trajectory that MDAnalysis reads", type=Path),
+            Option("--topology", "any topology that MDAnalysis reads", type=Path, required=True),
+            Option("--format", "of the trajectory, where its name does not tell: LAMMPSDUMP, ...", metavar="NAME"),
+            Option("--topology-format", "of the topology, where its name does not tell", metavar="NAME"),
+            Option(
+                "--constrain", "hbonds (default), allbonds, hangles, allangles, none", default="hbonds", metavar="NAME"
+            ),
+            Option("--select", "rows within this selection only (MDAnalysis' language)", default="all"),
+            Option("--no-rigid-water", "do not expect water to be rigid", action="store_true"),
+            Option(
+                "--targets", "first (frame, default), mean, topology (coordinates), or a TOML file", default="first"
+            ),
+            Option("--tolerance", "relative, of the engine (default 1e-4)", type=float, default=1e-4),
+            Option("--precision", "step of the coordinates in the file, Å, where not known", type=float),
+            Option("--frames", "frames to look at (default all)", metavar="A:B:STEP"),
+            Option("--workers", "processes (default 1)", type=int, default=1),
+            Option(
+                "--forces", "also temperatures of the configurations: forces as for compare (amber14-all, gfn2, ...)"
+            ),
+            Option(
+                "--temperature", "with --forces: say whether the temperatures are this one", type=float, metavar="K"
+            ),
+            Option("--out", "folder for check.json, .png and .txt (default ./check-TRAJECTORY)", type=Path),
+        ),
+        _check,
     ),
-    _check,
 )

@@ -8,19 +8,11 @@ import sys
 from collections.abc import Sequence
 
 from kcons import __version__
-from kcons.cli import check, compare, doctor, freeenergy, scan, systems, warmup
-from kcons.cli.terminal import Terminated, drop_what_follows, ended_in_order, warnings_in_a_line
+from kcons.cli import check, compare, free_energy, machine
+from kcons.cli.terminal import Terminated, drop_what_follows, in_order
 from kcons.errors import KconsError, with_extra
 
-COMMANDS = (
-    compare.COMMAND,
-    systems.PLAN,
-    check.COMMAND,
-    doctor.COMMAND,
-    freeenergy.COMMAND,
-    scan.COMMAND,
-    warmup.COMMAND,
-)
+COMMANDS = (*compare.COMMANDS, *check.COMMANDS, *free_energy.COMMANDS, *machine.COMMANDS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,15 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> int:
     parser, _ = parsers()
     chosen = parser.parse_args(arguments)
-    if chosen.version:
-        print(f"kcons {__version__}")
-        return 0
     if chosen.command is None:
         parser.print_help()
         return 0
     status = 2
     try:
-        with ended_in_order(), warnings_in_a_line():
+        with in_order():
             return int(chosen.run(chosen))
     except ModuleNotFoundError as error:
         explained = with_extra(error, f"kcons {chosen.command}")
@@ -87,8 +76,11 @@ def _main(arguments: Sequence[str] | None) -> int:
 def parsers() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
     """The parser of the command line, and that of each command by name."""
     parser = argparse.ArgumentParser(prog="kcons", description="Constraints in molecular dynamics.")
-    parser.add_argument("--version", action="store_true", help="print the version and leave")
+    parser.add_argument("--version", action="version", version=f"kcons {__version__}")
     commands = parser.add_subparsers(title="commands", dest="command")
     for command in COMMANDS:
-        command.add(commands)
+        mine = commands.add_parser(command.name, help=command.help, description=command.description)
+        for option in command.options:
+            mine.add_argument(option.name, **option.how)
+        mine.set_defaults(run=command.run, kept=command.kept)
     return parser, commands.choices

@@ -1,4 +1,4 @@
-"""What the commands write to the terminal, and how they read lists."""
+"""The options of a command as a table, what is written to the terminal, and how lists are read."""
 
 from __future__ import annotations
 
@@ -9,41 +9,60 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import RenderableType
 
 #: Columns of a page that is no terminal.
 WIDE = 150
+#: What `--constrain` takes.
+HELD = ("hbonds", "allbonds", "hangles", "allangles")
+
+
+class Option:
+    """A row of the table of a command: its name ('--out'; without dashes what is given by its place), and help.
+
+    `more` are further arguments of `argparse.ArgumentParser.add_argument`: type, default, nargs, choices, ...
+    """
+
+    def __init__(self, name: str, help: str, **more: Any) -> None:
+        self.name, self.how = name, {"help": help, **more}
+
+
+class Command(NamedTuple):
+    """A command: its table of options, and what runs it.
+
+    `run` is given the options as attributes and returns the exit status; `kept` is what of its work stays when it is
+    stopped, and is gone on from.
+    """
+
+    name: str
+    help: str
+    description: str
+    options: Sequence[Option]
+    run: Callable[[argparse.Namespace], int]
+    kept: str = ""
 
 
 def numbers(text: str) -> list[float]:
-    try:
-        return [float(word) for word in text.split(",") if word.strip()]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 4,2,1") from None
+    return [float(word) for word in names(text)]
 
 
 def names(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def console() -> Console:
+def show(*parts: RenderableType) -> None:
+    """Tables, and sentences as they are; into a pipe that nobody reads nothing."""
     from rich.console import Console
 
     # A file or a pipe has no width to fit into.
-    found = Console(width=None if sys.stdout.isatty() else WIDE)
-    found.on_broken_pipe = drop_what_follows  # type: ignore[method-assign]
-    return found
-
-
-def show(*parts: RenderableType) -> None:
-    """Tables, and sentences as they are; into a pipe that nobody reads nothing."""
-    terminal = console()
+    terminal = Console(width=None if sys.stdout.isatty() else WIDE)
+    terminal.on_broken_pipe = drop_what_follows  # type: ignore[method-assign]
     for part in parts:
         terminal.print(part, highlight=False, markup=False, soft_wrap=not hasattr(part, "columns"))
 
@@ -71,33 +90,25 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def ended_in_order() -> Iterator[None]:
-    """Let SIGTERM end a command as Ctrl-C does, so that it finishes its files and ends its workers."""
-    if threading.current_thread() is not threading.main_thread():  # no other one can set what a signal does
-        yield
-        return
+def in_order() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does, and say warnings for users as errors are said, in one line."""
 
     def end(*_: object) -> None:
         raise Terminated
 
-    before = signal.signal(signal.SIGTERM, end)
+    def show_one(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if category is UserWarning:
+            print(f"kcons: {' '.join(str(message).split())}", file=sys.stderr)
+        else:
+            shown(message, category, *where, **more)
+
+    main = threading.current_thread() is threading.main_thread()  # no other one can set what a signal does
+    before = signal.signal(signal.SIGTERM, end) if main else None
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("default", UserWarning)
+            shown, warnings.showwarning = warnings.showwarning, show_one
+            yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
-
-
-@contextmanager
-def warnings_in_a_line() -> Iterator[None]:
-    """Say warnings for users as errors are said, without the line of code that they come from."""
-    with warnings.catch_warnings():
-        shown = warnings.showwarning
-
-        def show_one(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-            if category is UserWarning:
-                print(f"kcons: {' '.join(str(message).split())}", file=sys.stderr)
-            else:
-                shown(message, category, *where, **more)
-
-        warnings.showwarning = show_one
-        yield
+        if main:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)

@@ -88,18 +88,16 @@ class Sampler:
     """A way to sample; see `add_sampler`."""
 
     name: str
-    title: str
     make: Callable[[Setting], Stepper]
-    several: bool
-    frictions: bool
+    title: str
+    several: bool = False
+    frictions: bool = True
 
 
 SAMPLERS: dict[str, Sampler] = {}
 
 
-def add_sampler(
-    name: str, make: Callable[[Setting], Stepper], title: str, *, several: bool = False, frictions: bool = True
-) -> None:
+def add_sampler(name: str, make: Callable[[Setting], Stepper], title: str, **options: bool) -> None:
     """Register a thermostat for `compare_averages` and ``kcons compare --criterion temperature``.
 
     Parameters
@@ -110,12 +108,10 @@ def add_sampler(
         A `Setting` to a stepper.
     title : str
         What tables call it.
-    several : bool
-        Whether it uses cheap forces, as the force groups 'slow' and 'fast'.
-    frictions : bool
-        Whether it has a friction.
+    **options
+        several: whether it uses cheap forces, as the force groups 'slow' and 'fast'; frictions: whether it has one.
     """
-    SAMPLERS[name] = Sampler(name, title, make, several, frictions)
+    SAMPLERS[name] = Sampler(name, make, title, **options)
 
 
 def _langevin(s: Setting) -> Stepper:

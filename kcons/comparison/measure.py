@@ -217,7 +217,7 @@ def warm_up(system: TestSystem, methods: Iterable[Method], budget: float) -> Non
     """Compile or load every kernel that these methods need, outside of any timing."""
     dt = min(system.time_steps)
     for method in methods:
-        if method.engine != "OpenMM" and not method.adaptive and method.refuses(system) is None:
+        if method.engine != "OpenMM" and not method.adaptive and method.refusal(system) is None:
             # What goes wrong is shown where it is measured.
             with suppress(Exception), InterruptedAfter(PATIENCE * budget):
                 run = method.start(system, dt)
@@ -232,7 +232,7 @@ def all_settings(
     system: TestSystem, method: Method, reference: Reference, budget: float, watcher: Watcher
 ) -> list[dict[str, Any]]:
     """Rows of one method at all its settings, as far as the budget goes."""
-    reason = method.refuses(system)
+    reason = method.refusal(system)
     if reason is not None:
         return [{**about_row(system, method, np.nan), "status": "not run", "note": reason}]
     found: list[dict[str, Any]] = []

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 Start = Callable[[TestSystem, float], Run]
 #: A test system to the reason why a method cannot run it; None if it can.
 Refuses = Callable[[TestSystem], str | None]
-#: Lines of Python with $made_by (the test system), $step, $steps, and $ps (the step in ps); or a test system to them.
 Code = str | Callable[[TestSystem], str]
 
 Engine = Literal["arrays", "ASE", "OpenMM"]
@@ -45,27 +44,52 @@ ENGINES = get_args(Engine)
 
 @dataclass(frozen=True)
 class Method:
-    """A way to run a test system; see `add_method`."""
+    """A way to run a test system, which `add_method` registers for `compare` and `kcons compare`.
+
+    Parameters
+    ----------
+    name : str
+        By which it is chosen.
+    start : callable
+        Test system and time step (or tolerance) to a `kcons.comparison.runs.Run` at the start.
+    title : str
+        What tables call it; its name by default.
+    engine : {'arrays', 'ASE', 'OpenMM'}
+        Whose loop and forces it runs on: methods of one engine are compared by time.
+    force_evaluations : int
+        Of a step. Steps are as many times longer than RATTLE's, so that all cost about the same.
+    adaptive : bool
+        Whether its setting is a relative tolerance.
+    holds : bool
+        Whether it holds what the test system holds; of one that does not, a baseline, only the cost is stated.
+    usual : bool
+        Whether it runs unless methods are named.
+    refuses : callable
+        Test system to the reason why the method cannot run it, or None.
+    code : str or callable, optional
+        Lines of Python that run it, with $made_by (an expression that makes the test system), $step (or the tolerance),
+        $steps and $ps (the step in ps); or a test system to them.
+    """
 
     name: str
-    title: str
     start: Start
-    engine: str
-    force_evaluations: int
-    adaptive: bool
-    holds: bool
-    usual: bool
-    refuses_too: Refuses
-    code: Code | None
+    title: str
+    engine: str = "arrays"
+    force_evaluations: int = 1
+    adaptive: bool = False
+    holds: bool = True
+    usual: bool = True
+    refuses: Refuses = lambda system: None
+    code: Code | None = None
 
-    def refuses(self, system: TestSystem) -> str | None:
+    def refusal(self, system: TestSystem) -> str | None:
         """Why it cannot run a test system, or None."""
         if self.engine == "OpenMM":
             if find_spec("openmm") is None:
                 return "OpenMM is not installed; python -m pip install openmm"
             if system.openmm is None:
                 return "the test system has no OpenMM System"
-        return system.refusals.get(self.name) or self.refuses_too(system)
+        return system.refusals.get(self.name) or self.refuses(system)
 
     def settings(self, system: TestSystem) -> list[float]:
         """Time steps, which cost as many force evaluations as those of the test system cost RATTLE; or tolerances."""
@@ -82,47 +106,11 @@ METHODS: dict[str, Method] = {}
 
 @checked
 def add_method(
-    name: str,
-    start: Start,
-    *,
-    title: str = "",
-    engine: Engine = "arrays",
-    force_evaluations: Count = 1,
-    adaptive: bool = False,
-    holds: bool = True,
-    usual: bool = True,
-    refuses: Refuses = lambda system: None,
-    code: Code | None = None,
+    name: str, start: Start, *, engine: Engine = "arrays", force_evaluations: Count = 1, **options: Any
 ) -> Method:
-    """Register a method for `compare` and `kcons compare`.
-
-    Parameters
-    ----------
-    name : str
-        By which it is chosen. A method of that name is replaced.
-    start : callable
-        Test system and time step (or tolerance) to a `kcons.comparison.runs.Run` at the start.
-    title : str, optional
-        What tables call it.
-    engine : {'arrays', 'ASE', 'OpenMM'}
-        Whose loop and forces it runs on: methods of one engine are compared by time.
-    force_evaluations : int
-        Of a step. Steps are as many times longer than RATTLE's, so that all cost about the same.
-    adaptive : bool
-        Whether its setting is a relative tolerance.
-    holds : bool
-        Whether it holds what the test system holds; of one that does not, a baseline, only the cost is stated.
-    usual : bool
-        Whether it runs unless methods are named.
-    refuses : callable, optional
-        Test system to the reason why the method cannot run it, or None.
-    code : str or callable, optional
-        Lines of Python that run it, with $made_by (an expression that makes the test system), $step (or the tolerance),
-        $steps and $ps (the step in ps); or a test system to them.
-    """
-    METHODS[name] = made = Method(
-        name, title or name, start, engine, force_evaluations, adaptive, holds, usual, refuses, code
-    )
+    """Register a `Method`, which takes these arguments, in place of one of that name."""
+    options = {"title": name, "engine": engine, "force_evaluations": force_evaluations, **options}
+    METHODS[name] = made = Method(name, start, **options)
     return made
 
 
@@ -135,9 +123,9 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
     usual = [method for method in METHODS.values() if method.usual]
     if names is None:
         if system is not None and system.openmm is not None and system.openmm.home:
-            usual = [m for m in usual if m.engine == "OpenMM" and m.refuses(system) is None]
+            usual = [m for m in usual if m.engine == "OpenMM" and m.refusal(system) is None]
         elif system is not None:
-            able = [m for m in usual if m.name in guests(system) and m.refuses(system) is None]
+            able = [m for m in usual if m.name in guests(system) and m.refusal(system) is None]
             usual = [m for m in usual if m.engine != "OpenMM" or m in able]
         return usual
     groups = {"all": list(METHODS.values())} | {e.lower(): [m for m in usual if m.engine == e] for e in ENGINES}
@@ -146,7 +134,7 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
         if name in METHODS:
             picked[name] = METHODS[name]
         elif name.lower() in groups:
-            able = [m for m in groups[name.lower()] if system is None or m.refuses(system) is None]
+            able = [m for m in groups[name.lower()] if system is None or m.refusal(system) is None]
             picked |= {m.name: m for m in able}
         else:
             known = ", ".join((*METHODS, *groups))

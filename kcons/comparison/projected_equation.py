@@ -38,20 +38,12 @@ class ProjectedEquation:
         return f"ProjectedEquation({self.order}{', project=True' if self.project else ''})"
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for friction and forces that depend on the velocities."""
-        if system.friction or system.velocity_dependent:
+        """Raise `UnsupportedError` for forces that depend on the velocities."""
+        if system.velocity_dependent:
             raise UnsupportedError(f"{self!r} is made for forces of positions alone; use Rattle")
 
     def step(self, system: System, state: State, dt: float) -> State:
-        """Advance by `dt`; the constraints drift.
-
-        Raises
-        ------
-        ConvergenceError
-            With `project`, if no positions on the constraints are near enough; carries `step`.
-        NonFiniteError
-            The motion diverged; carries `step`.
-        """
+        """Advance by `dt`; the constraints drift. Errors carry `step`."""
         number, (time, left_over), motion = state.step + 1, state.later(dt), system.motion
         state = system.with_forces(state)
         x0, v0, f0 = system.kernel_arrays(state)

@@ -36,28 +36,14 @@ def along(
     """Temperatures of these frames of a trajectory that MDAnalysis reads, each brought onto the constraints; kT in eV.
 
     `forces` and options (constrain, select, force_field, platform) are those of `test_systems.from_file`.
-
-    Raises
-    ------
-    InputError
-        Fewer than 32 frames; what `test_systems.from_file` raises.
-    UnsupportedError
-        The box changes.
     """
     if len(frames) < MIN_FRAMES:
         raise InputError(f"{len(frames)} frames are too few for temperatures; give {MIN_FRAMES} or more", item="frames")
-    with warnings.catch_warnings():
-        # The check says so itself.
-        warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)
-        return _along(trajectory, topology, forces, frames, options)
-
-
-def _along(
-    trajectory: Path | str, topology: Path | str, forces: str, frames: Sequence[int], options: dict[str, Any]
-) -> SplitTemperatures:
     from kcons.mdanalysis import open_universe
 
-    test_system = test_systems.from_file(topology, coordinates=trajectory, forces=forces, **options)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)  # the check says so
+        test_system = test_systems.from_file(topology, coordinates=trajectory, forces=forces, **options)
     motion, potential, lattice = test_system.motion, test_system.potential, test_system.constraint_set.lattice
     given = {name: value for name, value in options.items() if name not in ("force_field", "platform")}
     described = test_systems.plan(topology, coordinates=trajectory, angles="distances", **given).rows.snapshot.topology

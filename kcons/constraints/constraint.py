@@ -149,6 +149,7 @@ class Constraint:
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
         self.atoms: IntArray = read_only(atom_table(atoms, type(self).__name__, self.row_width))
+        target = 0.0 if target is None and not self.holonomic else target
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
         self._keep(**data)
         self._settle()
@@ -216,13 +217,7 @@ class Constraint:
         return out.T
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        """q, shape (n_rows,), and dq/dr, shape (n_rows, width, 3); of velocity rows 0 and the coefficients of v.
-
-        Parameters
-        ----------
-        r : ndarray, shape (n_rows, width, 3)
-        time : float
-        """
+        """q, shape (n_rows,), and dq/dr, of the shape of `r`, (n_rows, width, 3); of velocity rows 0 and a."""
         with np.errstate(all="ignore"):  # either may be undefined where the other is not
             out = self._evaluated(r, time)
         return out[0], np.ascontiguousarray(out[1:].T).reshape(r.shape)
@@ -283,8 +278,9 @@ class Constraint:
         return target
 
     def parameters(self) -> FloatArray:
-        """Numbers for the compiled kernels, shape (n_rows, p); see `RowKind`."""
-        return np.zeros((self.n_rows, 0))
+        """Numbers for `row` and the compiled kernels, shape (n_rows, p): the width, where `alike`, and the data."""
+        data = [getattr(self, name).reshape(self.n_rows, -1) for name in self.per_row]
+        return np.hstack([np.full((self.n_rows, min(self.alike, 1)), float(self.width)), *data])
 
     @property
     def linked(self) -> IntArray:
@@ -335,6 +331,11 @@ class Constraint:
             if item:
                 raise InputError(message, item=item, atoms=atoms)
             raise SingularGeometryError(message, rows=[first_row + k], atoms=atoms)
+
+    def refuse_zero(self, coefficients: FloatArray) -> None:
+        """Refuse rows whose coefficients, shape (n_rows, width, 3), are all zero."""
+        zero = ~np.any(coefficients, axis=(1, 2))
+        self.refuse(zero, 0, lambda k: f"all coefficients of row {k} are zero; remove the row", "coefficients")
 
     def changed(self, **own: Any) -> Self:
         """Copy with other attributes, of which nothing is checked."""

@@ -23,8 +23,12 @@ from kcons.constraints.target import FloatArray, MovingTarget, nearest_image
 from kcons.constraints.vectors import extent, norm
 from kcons.errors import ImageError, InputError, KconsError
 
+#: Parts of the cell at which a link that nothing holds is taken to have reached half of it.
+_HALF = 0.5 - 1e-9
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
 MOST_STRAIN = 0.1
+#: What is taken for rounding of a sum of gradients, relative to their sizes, and of values, to gradients times lengths.
+CANCELS = 1e-7
 
 
 class Residuals(NamedTuple):
@@ -78,11 +82,6 @@ class ConstraintSet:
         They cannot be changed: make a new set for others.
     lattice : ndarray, shape (2, 3, 3), or None
         Cell vectors as rows, and the inverse with zeros for directions without periodicity.
-    images : Images or None
-        The tree along which atoms of whole rows are made whole; see `kcons.constraints.periodic.images`.
-    moved : ndarray, shape (n_atoms, 3), or None
-        Whole cells by which the positions that the set is given were moved from where they are stored, in solvers:
-        rows with a place in space take them off.
 
     References
     ----------
@@ -90,7 +89,10 @@ class ConstraintSet:
     """
 
     lattice: FloatArray | None
+    #: The tree along which atoms of whole rows are made whole; see `kcons.constraints.periodic.images`.
     images: Images | None
+    #: Whole cells by which the positions that the set is given were moved from where they are stored, in solvers,
+    #: shape (n_atoms, 3): rows with a place in space take them off.
     moved: FloatArray | None = None
     #: What an engine converted to make this set from another one; see `Motion.conversions`.
     conversions: tuple[Any, ...] = ()
@@ -123,27 +125,28 @@ class ConstraintSet:
         self.n_atoms = len(x)
         self.masses = read_only(m)  # engines know their inverse
         self._set_cell(cell, pbc)
-        _check_atoms(given, x, m)
-
-        self.constraints: tuple[Constraint, ...] = ()
         self.starts = _starts(given)
+        _check_atoms(given, self.starts, x, m)
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)
         together = whole_bodies(marked, y, self.lattice)
+        if self.images is not None:
+            together[self.images.atoms] = y[self.images.atoms]
         bound: list[Constraint] = []
         for start, item in zip(self.starts, marked, strict=False):
             r = self.gather(item, x, y)
             item.check(r, time, int(start))
+            self._refuse_cut(item, r, time, int(start))
             if isinstance(item.target, MovingTarget):
                 item.target.check(repr(item), time, item.n_rows, item.period)
             if item.target is None:
-                item = item.with_target(
-                    item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)
-                )
+                r = r if together is y else self.gather(item, x, together)
+                found = item.measure(r, time) if item.holonomic else np.zeros(item.n_rows)
+                item = item.with_target(found)
             bound.append(item)
-        found = [item.target is None for item in marked]
-        self.constraints = tuple(agreed_targets(bound, found, self.starts, time))
+        open_ = [item.target is None for item in marked]
+        self.constraints: tuple[Constraint, ...] = tuple(agreed_targets(bound, open_, self.starts, time))
         self._set_scale(x, time)
 
     def _set_scale(self, x: FloatArray, time: float) -> None:
@@ -262,11 +265,6 @@ class ConstraintSet:
             return _rate_of(c, t, 2) - (bent + c.time_terms(r, v, t)[1] if c.moving else bent)
 
         return self._of_rows(x, time, wanted)
-
-    def curvature(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
-        """v^T (d2q/dx2) v of position rows at fixed time, shape (n_rows,)."""
-        u = self._positions(v, "velocities")
-        return self._of_rows(x, time, lambda c, r, t: c.curvature(r, u[c.atoms], t))
 
     def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
@@ -412,36 +410,34 @@ class ConstraintSet:
     def _check_cell(self, before: FloatArray | None) -> None:
         if self.lattice is None:
             return
-        periodic = self.lattice[1].any(axis=0)
         if any(c.relative and (c.moving or not c.holds_length) for c in self.constraints):
+            periodic = self.lattice[1].any(axis=0)
             if before is None or np.any(periodic & ~before[1].any(axis=0)):
                 raise InputError(
                     "this set was made without this periodic direction, and which images its rows mean has to be found "
                     "anew; make a new ConstraintSet with the cell",
                     item="cell",
                 )
-            change = norm(self.lattice[0] - before[0]) / norm(before[0])
-            change = change[periodic]  # the vector of a direction without periodicity is arbitrary
-            if self.images is not None and np.any(self.images.unheld >= 0) and np.any(change > MOST_STRAIN):
-                raise InputError(
-                    f"the cell changes by {change.max():.0%} at once, more than a tenth: which images rows mean among "
-                    "atoms that nothing ties together cannot be followed; make a new ConstraintSet with the cell",
-                    item="cell",
-                )
+            if self.images is not None and np.any(self.images.unheld >= 0):
+                change = norm(self.lattice[0] - before[0]) / norm(before[0])
+                change = change[periodic]  # the vector of a direction without periodicity is arbitrary
+                if np.any(change > MOST_STRAIN):
+                    raise InputError(
+                        f"the cell changes by {change.max():.0%} at once, more than a tenth: which images rows mean "
+                        "among atoms that nothing ties together cannot be followed; make a new ConstraintSet with the "
+                        "cell",
+                        item="cell",
+                    )
         (longest, row), half = self._longest_plain, self.half_width
         tied = 0.0 if self.images is None else self.images.longest
         if max(longest, tied) >= half:
-            found = longest >= half
+            what, item = f"a distance of {tied:g} that ties atoms", "cell"
+            if longest >= half:
+                what, item = f"row {self.row_name(row)}: target {longest:g}", "target"
             raise InputError(
-                (
-                    f"row {self.row_name(row)}: target {longest:g}"
-                    if found
-                    else f"a distance of {tied:g} that ties atoms"
-                )
-                + f" is not shorter than half the box ({half:g}), and its minimum image is ambiguous; use a larger "
+                f"{what} is not shorter than half the box ({half:g}), and its minimum image is ambiguous; use a larger "
                 "cell, or make a new ConstraintSet in this one",
-                item="target" if found else "cell",
-                atoms=self.row_atoms(row) if found else (),
+                item=item,
             )
 
     @property
@@ -459,11 +455,14 @@ class ConstraintSet:
         """
         if self.images is None or self.lattice is None:
             return
-        link = self.images.reached_half(whole, self.lattice)
-        if link >= 0:
-            pair = np.array([self.images.parents[link], self.images.atoms[link]])
-            row = int(self.images.unheld[link])
-            raise self._image_error(row, pair, numbers)
+        links = np.flatnonzero(self.images.unheld >= 0)
+        if not len(links):
+            return
+        pairs = np.stack([self.images.parents[links], self.images.atoms[links]])
+        reached = np.abs((whole[pairs[1]] - whole[pairs[0]]) @ self.lattice[1]).max(axis=1)
+        worst = int(np.argmax(reached))
+        if reached[worst] >= _HALF:
+            raise self._image_error(int(self.images.unheld[links[worst]]), pairs[:, worst], numbers)
 
     def _image_error(self, row: int, pair: IntArray, numbers: IntArray | None) -> ImageError:
         """The error for two atoms of a row that have drifted half the cell apart."""
@@ -568,15 +567,32 @@ class ConstraintSet:
             r[item.whole] += item.cell_offsets[item.whole] @ self.lattice[0]
         return r
 
-    def _one_piece(self, item: Constraint, r: FloatArray, together: FloatArray) -> FloatArray:
-        """`r` of open rows from positions in one piece, where these mean the same images."""
-        if self.lattice is None or not item.relative:
-            return r
-        near = together[item.atoms]
-        same = ~np.round(np.diff(near, axis=1) @ self.lattice[1]).any(axis=(1, 2))
-        if item.whole is not None:
-            same &= ~item.whole
-        return np.where(same[:, None, None], near, r)
+    def _refuse_cut(self, item: Constraint, r: FloatArray, time: float, start: int) -> None:
+        """Refuse rows whose atoms lie in other images than the nearest, and nobody has said that images do not count.
+
+        Such rows depend on differences of positions only, as their gradients tell here and in the nearest images, and
+        have another value there.
+        """
+        if self.lattice is None or item.relative or item.width == 1 or not item.holonomic:
+            return
+        cut = np.round(np.diff(r, axis=1) @ self.lattice[1]).any(axis=(1, 2))
+        if not cut.any():
+            return
+        near = lined_up(r.copy(), self.lattice)
+        for place in (r, near):
+            slope = item.gradient(place, time)
+            cut &= norm(slope.sum(axis=1)) <= CANCELS * norm(slope).sum(axis=1)
+        apart = nearest_image(item.measure(near, time) - item.measure(r, time), item.period)
+        reach = norm(slope).sum(axis=1) * norm(near - near[:, :1]).max(axis=1)
+        item.refuse(
+            cut & (np.abs(apart) > CANCELS * reach),
+            start,
+            lambda k: (
+                f"its atoms are cut by a face of the cell, and where they lie the value differs by {apart[k]:.3g} from "
+                "that of the nearest images; pass translation_invariant=True, or put the atoms next to each other"
+            ),
+            "translation_invariant",
+        )
 
     def __len__(self) -> int:
         return self.n_rows
@@ -602,10 +618,8 @@ def contiguous(values: ArrayLike, item: str) -> FloatArray:
 def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
     """Positions in which what open plain rows tie together is not cut by the boundary; `x` itself where nothing is.
 
-    `x` has the atoms of whole rows in the images that these mean.
-
-    Each atom is rounded once, so that lengths and angles of one body fit each other to rounding wherever its atoms are
-    stored. Rows that close through the boundary still do.
+    `x` has the atoms of whole rows in the images that these mean. Each atom is rounded once, so that lengths and angles
+    of one body fit each other to rounding wherever its atoms are stored.
     """
     pairs = [
         np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
@@ -621,39 +635,35 @@ def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: Floa
     return make_whole(x, *spanning_tree(links, len(x)), lattice)
 
 
-def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:
+def _check_atoms(given: Sequence[Constraint], starts: IntArray, x: FloatArray, m: FloatArray) -> None:
     """Raise `InputError` where rows name atoms that do not exist, have no place, or no mass."""
-    start = 0
     held = np.zeros(len(x), dtype=bool)
-    for item in given:
-        if item.fixes_atoms:
-            held[item.atoms[item.atoms < len(x)]] = True
-    for item in given:
-        atoms = item.atoms
-        if atoms.size and atoms.max() >= len(x):
-            row, slot = np.argwhere(atoms >= len(x))[0]
+    for item, start in zip(given, starts, strict=False):
+        if item.atoms.max(initial=-1) >= len(x):
+            row = int(np.argmax(item.atoms.max(axis=1) >= len(x)))
             raise InputError(
-                f"row {start + row}, {item.row_name(int(row))}: there is no atom {atoms[row, slot]}; "
+                f"row {start + row}, {item.row_name(row)}: there is no atom {item.atoms[row].max()}; "
                 f"the system has atoms 0 to {len(x) - 1}",
                 item="atoms",
-                atoms=atoms[row],
+                atoms=item.atoms[row],
             )
-        used = atoms.ravel()
-        bad = ~np.isfinite(x[used]).all(axis=1)
-        if bad.any():
-            atom = int(used[np.argmax(bad)])
-            raise InputError(f"position of atom {atom} is not finite: {x[atom]}", item="positions", atoms=[atom])
-        # Fixed atoms move with infinite mass, whatever theirs is.
-        bad = ~(np.isfinite(m[used]) & ((m[used] > 0) | (held[used] & (m[used] == 0))))
-        if bad.any():
-            atom = int(used[np.argmax(bad)])
-            raise InputError(
-                f"atom {atom} has mass {m[atom]:g}; constrained atoms need positive mass "
-                "(fix it with FixedAtoms, or make it a virtual site)",
-                item="masses",
-                atoms=[atom],
-            )
-        start += item.n_rows
+        if item.fixes_atoms:
+            held[item.atoms] = True
+    used = np.concatenate([np.zeros(0, np.int64), *(item.atoms.ravel() for item in given)])
+    bad = ~np.isfinite(x[used]).all(axis=1)
+    if bad.any():
+        atom = int(used[np.argmax(bad)])
+        raise InputError(f"position of atom {atom} is not finite: {x[atom]}", item="positions", atoms=[atom])
+    # Fixed atoms move with infinite mass, whatever theirs is.
+    bad = ~(np.isfinite(m[used]) & ((m[used] > 0) | (held[used] & (m[used] == 0))))
+    if bad.any():
+        atom = int(used[np.argmax(bad)])
+        raise InputError(
+            f"atom {atom} has mass {m[atom]:g}; constrained atoms need positive mass "
+            "(fix it with FixedAtoms, or make it a virtual site)",
+            item="masses",
+            atoms=[atom],
+        )
 
 
 def _rate_of(c: Constraint, time: float, order: int = 1) -> FloatArray:
@@ -681,12 +691,10 @@ def rows_like(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
         )
     found = []
     for k in range(wanted.n_rows):
-        for start, item in zip(held.starts, held.constraints, strict=False):
-            rows = start + np.flatnonzero(same_rows(item, wanted, k))
-            if len(rows):
-                found.append(int(rows[0]))
-                break
-        else:
+        same = [same_rows(item, wanted, k) for item in held.constraints]
+        rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *same]))
+        found.extend(rows[:1].tolist())
+        if not len(rows):
             raise InputError(
                 f"{name}, {wanted.row_name(k)}, is not among the {held.n_rows} rows that are held; hold it, or name a "
                 "constraint that is",
@@ -698,13 +706,12 @@ def rows_like(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
 
 def same_rows(item: Constraint, wanted: Constraint, k: int) -> NDArray[np.bool_]:
     """Which rows of `item` are row k of `wanted`, whatever they are held at, shape (n_rows,)."""
-    same = np.zeros(item.n_rows, dtype=bool)
-    if item.family != wanted.family or item.width != wanted.width:
-        return same
-    if any(getattr(item, f, None) is not getattr(wanted, f, None) for f in wanted.functions):
-        return same
-    if any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared):
-        return same
+    if (
+        (item.family, item.width) != (wanted.family, wanted.width)
+        or any(getattr(item, f, None) is not getattr(wanted, f, None) for f in wanted.functions)
+        or any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared)
+    ):
+        return np.zeros(item.n_rows, dtype=bool)
     same = np.all(item.atoms == wanted.atoms[k], axis=1)
     if wanted.reversible:
         same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)

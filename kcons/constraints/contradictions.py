@@ -23,14 +23,8 @@ def agreed_targets(
     """The items, which have targets, where one found from positions is the one given of the same row.
 
     They differ by the rounding of positions, by which both could not be held. `found` says it of each item, `starts`
-    are their first rows.
-
-    Raises
-    ------
-    ContradictionError
-        The same distance, angle or dihedral held at two values.
-    InfeasibleError
-        Distances that violate the triangle inequality; looked for in about 0.1 s for 10^5 of them.
+    are their first rows. Refused are the same distance, angle or dihedral held at two values, and distances that
+    violate the triangle inequality (0.1 s for 10^5 of them).
     """
     result = list(items)
     for family in {type(item): None for item in items if item.reversible and item.n_rows}:
@@ -48,8 +42,8 @@ def agreed_targets(
         first = np.flatnonzero(np.concatenate([[True], (atoms[1:] != atoms[:-1]).any(axis=1)]))
         if chosen[0].holds_length:
             _refuse_impossible_triangles(atoms[first], rows[first], target[first])
-        agreed = np.where(open_, np.repeat(target[first], np.diff([*first, len(atoms)])), target)
-        if np.any(agreed != target):
+        if open_.any() and not open_.all():
+            agreed = np.where(open_, np.repeat(target[first], np.diff(np.append(first, len(atoms)))), target)
             back = np.empty_like(agreed)
             back[order] = agreed
             for n, part in zip(numbers, np.split(back, np.cumsum([item.n_rows for item in chosen])), strict=False):

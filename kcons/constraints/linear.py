@@ -32,12 +32,7 @@ class LinearRows(Constraint, base=True):
         self.translation_invariant = bool(
             self.width > 1 and np.all(np.abs(c.sum(axis=1)) <= 1e-12 * np.abs(c).sum(axis=1).max(initial=0.0))
         )
-        self.refuse(
-            ~np.any(c, axis=(1, 2)),
-            0,
-            lambda k: f"all coefficients of row {k} are zero; remove the row",
-            "coefficients",
-        )
+        self.refuse_zero(c)
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         slope = self.parameters().reshape(r.shape)
@@ -103,23 +98,19 @@ class LinearRelation(LinearRows):
 
     def __init__(self, atoms: ArrayLike, bases: ArrayLike, weights: ArrayLike, target: Target = 0.0) -> None:
         dependent = atom_column(atoms, self.family)
-        base = np.atleast_2d(atom_array(bases, self.family))
+        base, w = np.atleast_2d(atom_array(bases, self.family)), as_float_array(weights, "weights")
         try:
             base = np.broadcast_to(base, (len(dependent), base.shape[-1]))
-            w = np.broadcast_to(as_float_array(weights, "weights"), base.shape)
-        except InputError:
-            raise
+            w = np.broadcast_to(w, base.shape)
         except ValueError:
             raise InputError(
                 f"LinearRelation: {len(dependent)} atoms, bases of shape {np.shape(bases)} and weights of shape "
                 f"{np.shape(weights)} do not fit; give n_bases bases and as many weights, for all atoms or for each",
                 item="weights",
             ) from None
-        if not np.issubdtype(np.result_type(dependent, base), np.integer) and dependent.size:
-            raise InputError("LinearRelation: atom indices must be integers", item="atoms")
         factors = np.hstack([np.ones((len(w), 1)), -w])
         super().__init__(
-            np.repeat(np.hstack([dependent, base]).astype(np.int64), 3, axis=0),
+            np.repeat(np.hstack([dependent, base]), 3, axis=0),
             target,
             coefficients=np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, factors.shape[1], 3),
         )
@@ -136,7 +127,6 @@ class FixedAtoms(LinearRows):
         The atoms.
     target : array_like of shape (n, 3), callable of time returning (n, 3), MovingTarget, or None
         Where they are held; None takes the initial positions.
-
     """
 
     row_width = 1

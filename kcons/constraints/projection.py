@@ -57,41 +57,29 @@ class BottDuffinSolution(NamedTuple):
 # -- generalized inverses (appendix A.1) ------------------------------------------------------------
 
 
-def pseudo_inverse(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> PseudoInverse:
+def pseudo_inverse(matrix: ArrayLike) -> PseudoInverse:
     """A+, through the singular values of the row-normalized matrix (notes eqs. 154-158).
 
-    The rank is found on rows of unit length, so that it does not depend on the units of the rows. With V
-    an orthonormal basis of the row space, A = (A V) V^H is a full-rank factorisation and A+ = V (A V)+.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (s, n)
-        Real or complex.
-    rtol : float
-        Singular values below this part of the largest count as zero.
-
-    Raises
-    ------
-    InputError
-        No matrix, or a NaN or infinity in it.
+    The rank is found on rows of unit length, so that it does not depend on the units of the rows. With V an orthonormal
+    basis of the row space, A = (A V) V^H is a full-rank factorisation and A+ = V (A V)+.
     """
     A = _matrix(matrix)
-    V = row_space(A, rtol)
+    V = row_space(A)
     return PseudoInverse(V @ _left_inverse(A @ V), V.shape[1])
 
 
-def rank(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> int:
+def rank(matrix: ArrayLike) -> int:
     """Number of independent rows, by the singular values of the row-normalized matrix."""
-    return int(row_space(matrix, rtol).shape[1])
+    return int(row_space(matrix).shape[1])
 
 
-def row_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+def row_space(matrix: ArrayLike) -> NumberArray:
     """Orthonormal basis V of the space that the (conjugate) rows span, shape (n, rank); A+A = V V^H."""
     A = _matrix(matrix)
-    return _row_space(A / _row_sizes(A)[:, None], rtol)
+    return _row_space(A / _row_sizes(A)[:, None])
 
 
-def full_rank_factors(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> tuple[NumberArray, NumberArray]:
+def full_rank_factors(matrix: ArrayLike) -> tuple[NumberArray, NumberArray]:
     """A = F G with F (s, r) and G (r, n), both of rank r (notes eq. 159).
 
     By QR with row exchanges, without any singular values: a second way to the rank and to A+.
@@ -102,7 +90,7 @@ def full_rank_factors(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> tuple[
     sizes = _row_sizes(A)
     Q, R, order = scipy.linalg.qr((A / sizes[:, None]).conj().T, mode="economic", pivoting=True)
     pivots = np.abs(np.diag(R))
-    r = int(np.sum(pivots > rtol * pivots[0])) if pivots[0] > 0 else 0
+    r = int(np.sum(pivots > RANK_TOLERANCE * pivots[0])) if pivots[0] > 0 else 0
     F = np.empty((len(A), r), dtype=A.dtype)
     F[order] = R[:r].conj().T
     return F * sizes[:, None], np.ascontiguousarray(Q[:, :r].conj().T)
@@ -141,48 +129,38 @@ def penrose_residuals(matrix: ArrayLike, inverse: ArrayLike) -> FloatArray:
     return np.where(scale > 0, off / np.where(scale > 0, scale, 1.0), np.where(off, np.inf, 0.0))
 
 
-def general_solution(matrix: ArrayLike, b: ArrayLike, y: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+def general_solution(matrix: ArrayLike, b: ArrayLike, y: ArrayLike) -> NumberArray:
     """x = A+ b + (1 - A+ A) y, every solution of A x = b as y runs over all vectors (notes eq. 163).
 
     Where A x = b has none, every x that makes the residual b - A x least; A+ b is the shortest (notes eqs. 167, 168).
     """
     A = _matrix(matrix)
     y = _numbers(y, "y")
-    x = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b") + parallel_projector(A, rtol) @ y.ravel()
+    x = pseudo_inverse(A).matrix @ _vector(b, len(A), "b") + parallel_projector(A) @ y.ravel()
     return np.asarray(x).reshape(y.shape)
 
 
 # -- solvability (eq. 95) ---------------------------------------------------------------------------
 
 
-def _unsolved(matrix: ArrayLike, b: ArrayLike, tolerance: float, rtol: float) -> FloatArray:
+def _unsolved(matrix: ArrayLike, b: ArrayLike) -> FloatArray:
     """|A A+ b - b| row by row, rows of A scaled to unit length, shape (s,); 0 where it is within the tolerance."""
     A = _matrix(matrix)
     sizes = _row_sizes(A)
     b = _vector(b, len(A), "b") / sizes
-    W = _row_space((A / sizes[:, None]).conj().T, rtol)
+    W = _row_space((A / sizes[:, None]).conj().T)
     miss = np.abs(W @ (W.conj().T @ b) - b)
-    return miss * (miss > tolerance * np.max(np.abs(b), initial=0.0))
+    return miss * (miss > SOLVABILITY_TOLERANCE * np.max(np.abs(b), initial=0.0))
 
 
-def is_solvable(
-    matrix: ArrayLike, b: ArrayLike, tolerance: float = SOLVABILITY_TOLERANCE, rtol: float = RANK_TOLERANCE
-) -> bool:
+def is_solvable(matrix: ArrayLike, b: ArrayLike) -> bool:
     """Whether A A+ b = b: the rows do not contradict each other (notes eqs. 95, 162)."""
-    return not _unsolved(matrix, b, tolerance, rtol).any()
+    return not _unsolved(matrix, b).any()
 
 
-def require_solvable(
-    matrix: ArrayLike, b: ArrayLike, tolerance: float = SOLVABILITY_TOLERANCE, rtol: float = RANK_TOLERANCE
-) -> None:
-    """Refuse rows that contradict each other.
-
-    Raises
-    ------
-    ContradictionError
-        If A A+ b differs from b (notes eq. 95); it names the rows that are off.
-    """
-    miss = _unsolved(matrix, b, tolerance, rtol)
+def require_solvable(matrix: ArrayLike, b: ArrayLike) -> None:
+    """Raise `ContradictionError`, which names the rows that are off, where A A+ b differs from b (notes eq. 95)."""
+    miss = _unsolved(matrix, b)
     if not miss.any():
         return
     worst = int(np.argmax(miss))
@@ -198,77 +176,67 @@ def require_solvable(
 # -- projectors (eqs. 96, 97) -----------------------------------------------------------------------
 
 
-def perpendicular_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+def perpendicular_projector(matrix: ArrayLike) -> NumberArray:
     """P_perp = A+ A onto the space of constraint forces (notes eq. 97)."""
-    V = row_space(matrix, rtol)
+    V = row_space(matrix)
     return np.asarray(V @ V.conj().T)
 
 
-def parallel_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+def parallel_projector(matrix: ArrayLike) -> NumberArray:
     """P_par = 1 - A+ A onto the space of admissible displacements (notes eq. 96)."""
-    P = perpendicular_projector(matrix, rtol)
+    P = perpendicular_projector(matrix)
     return np.eye(len(P)) - P
 
 
-def project_velocities(
-    matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0, rtol: float = RANK_TOLERANCE
-) -> FloatArray:
+def project_velocities(matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0) -> FloatArray:
     """The nearest velocities, in the mass metric, with A v = c: v - M^-1/2 B+ (A v - c)."""
     A, L, B = _weighted(matrix, masses)
     flat = _vector(v, A.shape[1], "v", real=True)
     off = A @ flat - np.broadcast_to(_numbers(c, "c", real=True), (len(A),))
-    return np.asarray(flat - _back(L, pseudo_inverse(B, rtol).matrix @ off)).reshape(np.shape(v))
+    return np.asarray(flat - _back(L, pseudo_inverse(B).matrix @ off)).reshape(np.shape(v))
 
 
 # -- dynamics (eqs. 99-107) -------------------------------------------------------------------------
 
 
-def constrained_inverse(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+def constrained_inverse(matrix: ArrayLike, masses: ArrayLike) -> FloatArray:
     """M_par+ = (P_par M P_par)+ = M^-1/2 (1 - B+ B) M^-1/2, shape (3N, 3N) (notes eqs. 106, 107).
 
     With independent rows it is M^-1 - M^-1 A^T (A M^-1 A^T)^-1 A M^-1.
     """
     _, L, B = _weighted(matrix, masses)
-    return _back(L, _back(L, parallel_projector(B, rtol)).T)
+    return _back(L, _back(L, parallel_projector(B)).T)
 
 
-def multipliers(
-    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
-) -> FloatArray:
+def multipliers(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """The multipliers of z = A^T lambda, shape (s,); of least norm, in the rows as they are (notes eqs. 101-103).
 
     (A M^-1 A^T) lambda = b - A M^-1 f, solved by (B B^T)+ = (B+)^T B+.
     """
     A, L, B = _weighted(matrix, masses)
-    B_plus = pseudo_inverse(B, rtol).matrix
+    B_plus = pseudo_inverse(B).matrix
     return np.asarray(B_plus.T @ (B_plus @ _lacking(A, L, f, b)))
 
 
-def constraint_force(
-    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
-) -> FloatArray:
+def constraint_force(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """The force z = A^T (A M^-1 A^T)^-1 (b - A M^-1 f) = M^1/2 B+ (b - A M^-1 f), as f (notes eq. 104)."""
     A, L, B = _weighted(matrix, masses)
-    z = L @ (pseudo_inverse(B, rtol).matrix @ _lacking(A, L, f, b))
+    z = L @ (pseudo_inverse(B).matrix @ _lacking(A, L, f, b))
     return np.asarray(z).reshape(np.shape(f))
 
 
-def acceleration(
-    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
-) -> FloatArray:
+def acceleration(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """M_par+ f + M^-1 A^T (A M^-1 A^T)^-1 b, in the shape of f (notes eq. 105, corrected).
 
     The notes lost the M^-1 in front of A^T. In mass-weighted form the second term is M^-1/2 B+ b.
     """
     A, L, B = _weighted(matrix, masses)
-    free = constrained_inverse(A, masses, rtol) @ _vector(f, A.shape[1], "f", real=True)
-    driven = _back(L, pseudo_inverse(B, rtol).matrix @ _vector(b, len(A), "b", real=True))
+    free = constrained_inverse(A, masses) @ _vector(f, A.shape[1], "f", real=True)
+    driven = _back(L, pseudo_inverse(B).matrix @ _vector(b, len(A), "b", real=True))
     return np.asarray(free + driven).reshape(np.shape(f))
 
 
-def bott_duffin(
-    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
-) -> BottDuffinSolution:
+def bott_duffin(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> BottDuffinSolution:
     """Acceleration and constraint force as one linear problem (notes eqs. 98-100).
 
     M (a_par + A+ b) = f + z with a_par in V_par and z in V_perp. Both parts sit in one vector u, with
@@ -279,9 +247,9 @@ def bott_duffin(
     A = _matrix(matrix, real=True)
     n = A.shape[1]
     M = _mass_matrix(masses, n)
-    P_perp = perpendicular_projector(A, rtol)
+    P_perp = perpendicular_projector(A)
     P_par = np.eye(n) - P_perp
-    a_perp = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b", real=True)
+    a_perp = pseudo_inverse(A).matrix @ _vector(b, len(A), "b", real=True)
     # P_perp u may be given any unit: one of mass keeps both parts of the matrix of one size.
     diagonal = np.diagonal(M)[np.diagonal(M) > 0]
     unit = float(np.exp(np.mean(np.log(diagonal)))) if len(diagonal) else 1.0
@@ -394,10 +362,10 @@ def _row_sizes(A: NumberArray) -> FloatArray:
     return np.where(sizes > 0, sizes, 1.0)
 
 
-def _row_space(A: NumberArray, rtol: float) -> NumberArray:
+def _row_space(A: NumberArray) -> NumberArray:
     """Orthonormal basis of what the conjugate rows span, by singular values."""
     _, singular, vt = np.linalg.svd(A, full_matrices=False)
-    kept = (singular > rtol * singular.max(initial=0.0)) & (singular > 0)
+    kept = (singular > RANK_TOLERANCE * singular.max(initial=0.0)) & (singular > 0)
     return np.ascontiguousarray(vt[kept].conj().T)
 
 

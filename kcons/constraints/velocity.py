@@ -35,9 +35,6 @@ class VelocityRows(Constraint, base=True):
     kind = RowKind.VELOCITY
     held = SPEED
 
-    def __init__(self, atoms: ArrayLike, target: Target = 0.0, **data: ArrayLike) -> None:
-        super().__init__(atoms, 0.0 if target is None else target, **data)
-
 
 class LinearVelocity(VelocityRows):
     """A combination of velocity components, sum_a c_a . v_a = target.
@@ -67,24 +64,16 @@ class LinearVelocity(VelocityRows):
         super().__init__(atoms, target, coefficients=coefficients)
 
     def _settle(self) -> None:
-        self.refuse(
-            ~np.any(self.coefficients, axis=(1, 2)),
-            0,
-            lambda k: f"all coefficients of row {k} are zero; remove the row",
-            "coefficients",
-        )
+        self.refuse_zero(self.coefficients)
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        # p holds how many coefficients there are, and them.
-        n, speed = int(p[0]), 0.0
+        # p holds the number of atoms, and the coefficients.
+        n, speed = 3 * int(p[0]), 0.0
         for i in range(n):
             speed += p[1 + i] * r[n + i]
             out[1 + i] = p[1 + i]
         out[0] = speed
-
-    def parameters(self) -> FloatArray:
-        return np.hstack([np.full((self.n_rows, 1), 3.0 * self.width), self.coefficients.reshape(self.n_rows, -1)])
 
 
 class KnifeEdge(VelocityRows):
@@ -115,7 +104,6 @@ class KnifeEdge(VelocityRows):
     translation_invariant = True
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"normal": _VECTOR, "contact": ()}
     normal: FloatArray
-    contact: FloatArray
 
     def __init__(
         self,
@@ -144,9 +132,6 @@ class KnifeEdge(VelocityRows):
         f, g = 1.0 - s + half, s - half
         out[1], out[2], out[3] = f * lx, f * ly, f * lz
         out[4], out[5], out[6] = g * lx, g * ly, g * lz
-
-    def parameters(self) -> FloatArray:
-        return np.hstack([self.normal, self.contact[:, None]])
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         d = r[:, 1] - r[:, 0]
@@ -186,7 +171,6 @@ class Rolling(VelocityRows):
     row_width = 2
     translation_invariant = True
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"radius": (), "heading": _VECTOR, "normal": _VECTOR}
-    radius: FloatArray
     heading: FloatArray
     normal: FloatArray
 
@@ -222,9 +206,6 @@ class Rolling(VelocityRows):
         x, y, z = a * p[1] + b * p[4], a * p[2] + b * p[5], a * p[3] + b * p[6]
         out[1], out[2], out[3] = p[1] + x, p[2] + y, p[3] + z
         out[4], out[5], out[6] = -x, -y, -z
-
-    def parameters(self) -> FloatArray:
-        return np.hstack([self.radius[:, None], self.heading, self.normal])
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         s = r[:, 1] - r[:, 0]

@@ -18,7 +18,7 @@ from kcons.errors import with_extra
 _NAMES = {
     "held_coordinates": ("HeldCoordinates", "Sample"),
     "series": ("Recorder", "Series"),
-    "mean_forces": ("MeanForce", "local_mean_force", "mean_force", "thermal_multipliers"),
+    "mean_forces": ("MeanForce", "mean_force"),
     "windows.window": ("Settings", "Window"),
     "windows.ase_windows": ("AseRecorder", "AseWindows"),
     "windows.openmm_windows": ("HeldCoordinatesReporter", "OpenMMWindows"),

@@ -117,12 +117,10 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
 
 
 def agreement(one: FloatArray, other: FloatArray, covariance: FloatArray) -> float:
-    """Probability of a difference of two means (d,) as large as theirs, by chi square, if both are of the same.
+    """Probability, by chi square, of a difference of two means (d,) as large as theirs, if both are of the same.
 
-    Held windows share no configurations, and so have no overlap that could be looked at: where a window has forgotten
-    how it was made, its mean force is the same from both sides. `covariance` (d, d) is that of both means together.
-    Where it is singular, only what has an error counts; a difference in what has none has the probability 0.
-    Differences of rounding, 1e-9 of the largest mean, are none.
+    `covariance` (d, d) is that of both together; where it is singular, only what has an error counts, and a difference
+    in what has none has the probability 0. Differences of rounding, 1e-9 of the largest mean, are none.
     """
     sizes, directions = np.linalg.eigh(covariance)
     known = sizes > 1e-12 * max(float(sizes[-1]), 0.0)

@@ -169,14 +169,8 @@ class HeldCoordinates:
         widest = max(item.width for item in self._rows.constraints)
         self._averages = len(everything) <= _MOST_ROWS and widest <= _MOST_ATOMS and not self._rows.moving
         self._copies: dict[tuple[int, int], Constraint] = {}
-        #: Objects with coordinates among their rows, and all rows of these.
-        own = np.searchsorted(self._rows.starts, self._order[-len(self) :], side="right") - 1
-        self._own = {k: slice(*self._rows.starts[k : k + 2]) for k in set(own.tolist())}
-        # Where each number of the gradients stands in the dense ones, whose rows are in the order of results.
-        line, width = np.argsort(self._order), 3 * len(self.atoms)
-        every = zip(self._rows.starts, self._rows.constraints, strict=False)
-        first = [line[start + np.arange(c.n_rows), None, None] * width + 3 * c.atoms[:, :, None] for start, c in every]
-        self._places = np.concatenate([(place + np.arange(3)).ravel() for place in first])
+        # The lines of each object's rows in results.
+        self._lines = np.split(np.argsort(self._order), self._rows.starts[1:-1])
         here = x[self.atoms]
         near = 1e-3 * np.random.default_rng(1).normal(size=here.shape) * np.ptp(here, axis=0).max()
         # Beside a structure so symmetric that a gradient vanishes, too.
@@ -185,7 +179,8 @@ class HeldCoordinates:
         if bonds is not None:
             pairs = np.array(bonds, dtype=np.int64).reshape(-1, 2)
             for k, row in enumerate(self.rows.tolist()):
-                turn = rigid_turn(_row(held, row), pairs, x, held.lattice)
+                item, own = held.locate(row)
+                turn = rigid_turn(item.select([own]), pairs, x, held.lattice)
                 if turn is not None and leaves_the_rest(turn, row, held, others, x, time):
                     self._turns[k] = turn
 
@@ -193,16 +188,13 @@ class HeldCoordinates:
         return len(self.names)
 
     def __repr__(self) -> str:
-        return (
-            f"<HeldCoordinates: {', '.join(self.names)}, beside {len(self._order) - len(self)} rows of their clusters>"
-        )
+        beside = len(self._order) - len(self)
+        return f"<HeldCoordinates: {', '.join(self.names)}, beside {beside} rows of their clusters>"
 
     @property
     def seen(self) -> IntArray:
         """All atoms that samples depend on: `atoms`, and those of the groups that torsions turn."""
-        groups = [
-            np.concatenate([turn.axis, turn.group, turn.bonds.ravel()]) for turn in self._turns if turn is not None
-        ]
+        groups = [part for turn in self._turns if turn for part in (turn.axis, turn.group, turn.bonds.ravel())]
         return np.unique(np.concatenate([self.atoms, *groups])).astype(np.int64)
 
     def sample(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> Sample:
@@ -258,11 +250,10 @@ class HeldCoordinates:
         mean = np.full((n, d), np.nan)
         if self._averages:
             mean = (respond @ (bent[:, 1 + d * d :].sum(axis=1) - traces)[:, :, None])[:, :, 0]
-        values = np.zeros((n, rows.n_rows))
-        for k, mine in self._own.items():
-            r = gathered[k]
-            values[:, mine] = self._copied(k, n).measure(r.reshape(-1, *r.shape[2:]), time).reshape(n, -1)
-        value = values[:, order[-d:]]
+        values = [
+            self._copied(k, n).measure(r.reshape(-1, *r.shape[2:]), time).reshape(n, -1) for k, r in enumerate(gathered)
+        ]
+        value = np.concatenate(values, axis=1)[:, order[-d:]]
         off = np.abs(nearest_image(value - rows.target(time)[order[-d:]], self.periods)).max(axis=1)
         turned = np.full((n, d), np.nan)
         for k, turn in enumerate(self._turns):
@@ -288,14 +279,13 @@ class HeldCoordinates:
 
     def _at(self, gathered: Sequence[FloatArray], time: float) -> _Metric:
         """Z and all that follows from the gradients; raises where a coordinate depends on other constraints."""
-        d, n, shape = len(self), len(gathered[0]), (len(self._order), 3 * len(self.atoms))
-        slopes = [
-            self._copied(k, n).gradient(r.reshape(-1, *r.shape[2:]), time).reshape(n, -1)
-            for k, r in enumerate(gathered)
-        ]
-        size = shape[0] * shape[1]
-        places = self._places + size * np.arange(n)[:, None]
-        gradients = np.bincount(places.ravel(), np.concatenate(slopes, axis=1).ravel(), n * size).reshape(n, *shape)
+        d, n = len(self), len(gathered[0])
+        table = np.zeros((n, len(self._order), len(self.atoms), 3))
+        for k, (item, r) in enumerate(zip(self._rows.constraints, gathered, strict=True)):
+            slopes = self._copied(k, n).gradient(r.reshape(-1, *r.shape[2:]), time).reshape(r.shape)
+            for w in range(item.width):  # an atom may be twice in a row
+                table[:, self._lines[k], item.atoms[:, w]] += slopes[:, :, w]
+        gradients = table.reshape(n, len(self._order), -1)
         weighed = gradients * self._inverse_masses
         product = weighed @ gradients.swapaxes(1, 2)
         if not np.isfinite(product).all():
@@ -380,9 +370,3 @@ def _root(product: FloatArray) -> tuple[FloatArray, FloatArray]:
     known = sizes > _NONE * sizes[:, -1:]
     inverse = np.where(known, 1 / np.sqrt(np.where(known, sizes, 1.0)), 0.0)
     return (axes * inverse[:, None]).swapaxes(1, 2), (axes**2 * ~known[:, None]).sum(axis=2)
-
-
-def _row(held: ConstraintSet, row: int) -> Constraint:
-    """One row of the set."""
-    item, k = held.locate(row)
-    return item.select([k])

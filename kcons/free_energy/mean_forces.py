@@ -55,17 +55,11 @@ class MeanForce:
 
 
 def thermal_multipliers(series: Series, kT: float) -> FloatArray:
-    """Multipliers as canonical velocities would give them, shape (n, d).
+    """Multipliers as canonical velocities would give them, shape (n, d); kT in the energy of the series.
 
     The part of lambda that is quadratic in the velocities is replaced by its mean over canonical velocities where that
     is known: those of a run have a wrong temperature in fast modes, to second order in the step. Where it is not known,
     this part is taken g/(g - 1) times of an isokinetic run.
-
-    Parameters
-    ----------
-    series : Series
-    kT : float
-        Temperature times Boltzmann's constant, in the energy of the series.
     """
     positive(kT, "kT")
     known, g = np.isfinite(series.mean_kinetic), series.isokinetic_degrees_of_freedom
@@ -79,10 +73,7 @@ def thermal_multipliers(series: Series, kT: float) -> FloatArray:
 
 
 def local_mean_force(series: Series, kT: float) -> FloatArray:
-    """What is averaged with the weights of the series to give dF/dq, shape (n, d): lambda + kT G.
-
-    Lambda is that of `thermal_multipliers`, whose parameters and errors these are.
-    """
+    """What is averaged with the weights of the series to give dF/dq, shape (n, d): lambda + kT G."""
     return thermal_multipliers(series, kT) + kT * series.gradient
 
 

@@ -165,11 +165,7 @@ def _constraints_on(atoms: ase.Atoms) -> list[Constraint]:
 
 
 def to_openmm(
-    universe: Any,
-    constraints: Iterable[Constraint] = (),
-    *,
-    force_field: Sequence[str] = (),
-    **options: Any,
+    universe: Any, constraints: Iterable[Constraint] = (), *, force_field: Sequence[str] = (), **options: Any
 ) -> ToOpenMM:
     """Topology, positions and System of the present frame, with `constraints` held in the System.
 

@@ -27,18 +27,6 @@ _OPEN_ERRORS = (*READ_ERRORS, ImportError, SyntaxError, AttributeError, NotImple
 #: Formats of files whose endings, or names without one, MDAnalysis does not know.
 _FORMATS = {"LAMMPSTRJ": "LAMMPSDUMP", "DUMP": "LAMMPSDUMP", "REVCON": "CONFIG", "NCRST": "NCDF", "RST": "RST7"}
 _HDF5 = b"\x89HDF\r\n"
-#: How files begin, by the ending of their name.
-_BEGINS = {
-    ".dcd": (b"\x54\x00\x00\x00CORD", b"\x00\x00\x00\x54CORD"),
-    ".xtc": (b"\x00\x00\x07\xcb", b"\x00\x00\x07\xe7"),
-    ".trr": (b"\x00\x00\x07\xc9",),
-    ".nc": (b"CDF", _HDF5),
-    ".ncdf": (b"CDF", _HDF5),
-    ".h5md": (_HDF5,),
-    ".h5": (_HDF5,),
-    ".gz": (b"\x1f\x8b",),
-    ".bz2": (b"BZh",),
-}
 
 
 @contextmanager
@@ -85,9 +73,10 @@ def open_universe(
     Raises
     ------
     InputError
-        A file that is missing or unreadable; a format that MDAnalysis does not have; atom counts that differ.
+        A file that is missing, a topology that is unreadable; a format that MDAnalysis does not have, or needs a
+        package for; atom counts that differ.
     UnreadableError
-        A trajectory that is empty, or begins as it should and cannot be read.
+        A trajectory that is empty, or cannot be read.
     """
     for path, what in ((topology, "topology"), (trajectory, "trajectory")):
         if path is not None:
@@ -132,9 +121,9 @@ def load_trajectory(
     Raises
     ------
     InputError
-        A file that is missing or unreadable; a format that MDAnalysis does not have; atom counts that differ.
+        A file that is missing; a format that MDAnalysis does not have, or needs a package for; atom counts that differ.
     UnreadableError
-        A trajectory that is empty, or begins as it should and cannot be read.
+        A trajectory that is empty, or cannot be read.
     """
     _look_at(Path(trajectory), "trajectory")
     named = _format(trajectory, format, "format")
@@ -159,26 +148,15 @@ def load_trajectory(
         )
     if not failure:
         return
-    # A file that begins as it should was cut off, or damaged later.
-    kind = UnreadableError if _begins_well(Path(trajectory)) else InputError
-    advice = "is it complete, and does its ending tell its format?"
+    packages, advice = _advice_on_packages(failure), "is it complete, and does its ending tell its format?"
     if named in ("NC", "NCDF", "H5MD"):
-        advice = (
-            "files of this format cannot be read at all when they were cut off; write DCD, XTC or TRR if that happens"
-        )
-    if packages := _advice_on_packages(failure):
-        kind, advice = InputError, packages
-    raise kind(f"{trajectory}: MDAnalysis cannot read this trajectory ({failure}); {advice}", item="trajectory")
+        advice = "files of this format that were cut off cannot be read at all: write DCD, XTC or TRR if that happens"
+    said = f"{trajectory}: MDAnalysis cannot read this trajectory ({failure}); {packages or advice}"
+    raise (InputError if packages else UnreadableError)(said, item="trajectory")
 
 
 def _format(path: str | Path, given: str | None, item: str) -> str:
-    """What MDAnalysis calls the format of a file: the one given, or what its name tells.
-
-    Raises
-    ------
-    InputError
-        MDAnalysis has no such format; `item` is the argument that says another one.
-    """
+    """What MDAnalysis calls the format of a file: the one given, or what its name tells; `item` says another one."""
     readers = set(MDAnalysis._READERS) | (set(MDAnalysis._PARSERS) if item == "topology_format" else set())
     name = format_named(path) if given is None else given.upper()
     if name in readers:
@@ -223,14 +201,6 @@ def _advice_on_packages(failure: str) -> str:
     """How to get the package that MDAnalysis says is missing; '' where it does not."""
     found = re.findall(r"install (\w+)", failure)
     return f"python -m pip install {found[-1].lower()}, or give another format" if found else ""
-
-
-def _begins_well(path: Path) -> bool:
-    """Whether the first bytes are those of the format that the name tells."""
-    with path.open("rb") as file:
-        head = file.read(8)
-    begins = _BEGINS.get(path.suffix.lower(), ())
-    return head.startswith(begins) if begins else False
 
 
 def format_of(reader: Any) -> str:

@@ -82,9 +82,8 @@ def selected(universe: Any, words: Any) -> IntArray:
     try:
         found = universe.atoms.select_atoms(words)
     except Exception as error:  # MDAnalysis raises SelectionError, and others for odd words
-        raise InputError(
-            f"selection {words!r} cannot be read: {' '.join(str(error).split()) or type(error).__name__}", item="select"
-        ) from error
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"selection {words!r} cannot be read: {why}", item="select") from error
     if not len(found):
         raise InputError(f"selection {words!r} matches nothing{_hint(universe.atoms, words)}", item="select")
     return found.indices.astype(np.int64)
@@ -94,14 +93,9 @@ def _hint(group: Any, words: str) -> str:
     """What there is instead of what a selection asks for."""
     tokens = words.replace("(", " ").replace(")", " ").split()
     asked = dict(zip(tokens, [*tokens[1:], ""], strict=True))
-    for keyword, attribute in (
-        ("resname", "resnames"),
-        ("name", "names"),
-        ("segid", "segids"),
-        ("element", "elements"),
-    ):
-        if keyword in asked and hasattr(group, attribute):
-            present = np.unique(getattr(group, attribute).astype(str)).tolist()
+    for keyword in ("resname", "name", "segid", "element"):
+        if keyword in asked and hasattr(group, f"{keyword}s"):
+            present = np.unique(getattr(group, f"{keyword}s").astype(str)).tolist()
             if (given := asked[keyword]) not in present:
                 return f": no {keyword} {given}{did_you_mean(given, present)}; there are {listed(present)}"
     if "resid" in asked and hasattr(group, "resids"):
@@ -127,19 +121,14 @@ def snapshot_of(universe: Any) -> Snapshot:
     if group.n_atoms != group.unique.n_atoms:
         _, first = np.unique(group.indices, return_index=True)
         twice = int(np.setdiff1d(np.arange(len(group)), first)[0])
-        raise InputError(
-            f"the group has atom {group.indices[twice]} of its Universe twice, the second time in place {twice}; take "
-            "group.unique",
-            item="atoms",
-            atoms=[twice],
-        )
+        said = f"the group has atom {group.indices[twice]} of its Universe twice, the second time in place {twice}"
+        raise InputError(f"{said}; take group.unique", item="atoms", atoms=[twice])
     try:
         step = whole.trajectory.ts
         x = as_written(group.positions)
     except (AttributeError, MDAnalysis.exceptions.NoDataError):
-        raise InputError(
-            f"{_file(whole)} has no coordinates; load a coordinates file beside it", item="positions"
-        ) from None
+        said = f"{_file(whole)} has no coordinates; load a coordinates file beside it"
+        raise InputError(said, item="positions") from None
     require_angstrom(whole.trajectory)
     # Of a part, only the atoms of the part; but whole residues keep their numbers.
     described = topology_of(universe)
@@ -169,12 +158,7 @@ def _refuse_alternates(group: Any, topology: Topology) -> None:
 
 
 def require_angstrom(reader: Any) -> None:
-    """Refuse coordinates that MDAnalysis was told to leave in nanometers.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse coordinates that MDAnalysis was told to leave in nanometers."""
     length = (getattr(reader, "units", None) or {}).get("length")
     if getattr(reader, "convert_units", True) is False and length not in (None, "Angstrom", "A"):
         raise InputError(
@@ -264,12 +248,7 @@ def _texts(group: Any, name: str) -> NDArray[np.str_]:
 
 
 def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> None:
-    """Refuse a cell that no box of MDAnalysis can be, and warn of one that is periodic in some directions only.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a cell that no box of MDAnalysis can be, and warn of one that is periodic in some directions only."""
     if cell.shape != (3, 3):
         raise InputError(f"the cell is {cell.tolist()}; give three vectors as rows", item="cell")
     if not np.isfinite(cell).all():
@@ -287,23 +266,13 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
 
 
 def dimensions_of(cell: FloatArray) -> NDArray[np.float32]:
-    """Lengths and angles of a cell that `check_box` does not refuse.
-
-    They are those of vectors with a positive diagonal: a vector and its opposite span the same lattice, but lengths
-    and angles of those given would be of its mirror image.
-    """
+    """Lengths and angles of a cell, with a positive diagonal: those of others would be of its mirror image."""
     box: NDArray[np.float32] = triclinic_box(*(cell * np.where(np.diag(cell) < 0, -1.0, 1.0)[:, None]))
     return box
 
 
 def cell_of(state: State, motion: Motion | None) -> FloatArray | None:
-    """The cell that a state is written with, and its residuals are found in; None without one.
-
-    Raises
-    ------
-    InputError
-        A barostat has changed the cell of `motion` since.
-    """
+    """The cell that a state is written with; refuses one that is not that of `motion` any more."""
     cell, lattice = state.cell, None if motion is None else motion.lattice
     if lattice is None:
         return cell

@@ -33,12 +33,7 @@ _SINGLE = float(np.finfo(np.float32).max)
 _MOST, _SAFE, _FLOATS = 2**31 - 3, 2**23, 9
 #: Writers of which some may still be open.
 _ALIVE: WeakSet[TrajectoryWriter] = WeakSet()
-_H5MD_UNITS = {
-    "timeunit": "ps",
-    "lengthunit": "Angstrom",
-    "velocityunit": "Angstrom/ps",
-    "forceunit": "kJ/(mol*Angstrom)",
-}
+_H5MD = {"timeunit": "ps", "lengthunit": "Angstrom", "velocityunit": "Angstrom/ps", "forceunit": "kJ/(mol*Angstrom)"}
 
 
 @dataclass(frozen=True)
@@ -136,7 +131,7 @@ class TrajectoryWriter:
             raise UnsupportedError(f"{self._format} has no {self._kept[0]}; write TRR or H5MD")
         self._universe = MDAnalysis.Universe.empty(n_atoms, trajectory=True, **kept)
         if self._format in ("H5MD", "NC", "NCDF"):
-            options = {**(_H5MD_UNITS if self._format == "H5MD" else {}), **options, **kept}
+            options = {**(_H5MD if self._format == "H5MD" else {}), **options, **kept}
         if interval is not None:
             dt = self._universe.trajectory.ts.dt = abs(finite_number(interval, "interval")) * self.units.time
             if self._format == "DCD":

@@ -22,10 +22,7 @@ from kcons.steppers.compiled_operations import (
     ENGINE,
     FAR,
     ITERATIONS,
-    LENGTH,
     PYTHON,
-    ROOM,
-    WIDTH,
     check_finite,
     kernel,
     tangents,
@@ -36,8 +33,6 @@ from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Listed, explained, stays
 
 _MAX_ITERATIONS = 50
-#: Largest rate of friction times length of a drift; exponentials of it are still numbers.
-_MOST_DAMPED = 600.0
 _EPS = float(np.finfo(float).eps)
 _FLOAT = np.dtype(np.float64)
 _EMPTY = np.empty(0)
@@ -194,10 +189,6 @@ class Interpreter:
             room[first:] = numbers
         if program.pairs:
             self.low, self.push, self.spare = room[begin:first].reshape(3, *shape)
-        if system.friction:  # flights take another time than their length
-            for k, row in enumerate(program.rows):
-                if row.name == "fly":
-                    room[ROOM + WIDTH * k + LENGTH] = self.length(row) / dt
         sets, lists = system.motion.sources, (program.rows, program.shown, program.ends, program.flies)
         simple, end = self.simple and not system.velocity_dependent, len(program.rows) - 1
         self.unchanging = _compiled(), system, dt, room, shape, *sets, *lists, simple, end
@@ -341,19 +332,6 @@ class Interpreter:
         """Positions as the force function sees them."""
         return x if self.shift is None else x + self.shift
 
-    def length(self, row: Row) -> float:
-        """How long a flight is: between two halves of `damp`, (2/gamma) sinh(gamma h/2) for a time h."""
-        friction, h = self.system.friction, row.length * self.dt
-        if not friction:
-            return h
-        if not abs(friction * h) < _MOST_DAMPED:
-            raise InputError(
-                f"friction leaves nothing of the velocities in a step of {friction * h:g} divided by its rate; use a "
-                "shorter step",
-                item="dt",
-            )
-        return 2.0 * math.sinh(0.5 * friction * h) / friction
-
     def force_of(self, row: Row) -> FloatArray:
         """The forces of its group."""
         n = len(self.x)
@@ -382,14 +360,13 @@ class Interpreter:
 
         x1 = x0 + h u with sigma(x1, t1) = 0, u = v + M^-1 A(x0)^T l: RATTLE without forces, order 2. The impulse takes
         what v has across the constraints, so that kicks need no projection before it. Rows of velocities hold at the
-        middle, a((x0 + x1)/2) . u = c((t0 + t1)/2), which is the symmetric choice. Where there is friction, the time
-        that passes is not the length of the flight.
+        middle, a((x0 + x1)/2) . u = c((t0 + t1)/2), which is the symmetric choice.
 
         References
         ----------
         McLachlan and Perlmutter, J. Nonlinear Sci. 16, 283 (2006).
         """
-        h, here, there = self.length(row), self.place(row.here), self.place(row.there)
+        h, here, there = row.length * self.dt, self.place(row.here), self.place(row.there)
         self.room[ITERATIONS] = -1.0
         self.system.motion.project_positions(
             there, here, time=self.at(row.end), reference_time=self.at(row.begin), velocities=self.push, dt=h, flight=h,
@@ -440,10 +417,6 @@ class Interpreter:
             iterations=_MAX_ITERATIONS,
         )
 
-    def damp(self, row: Row, begun: bool) -> None:
-        """Friction of the system at fixed positions."""
-        self.v *= math.exp(-self.system.friction * (row.length * self.dt))
-
     # -- the end --------------------------------------------------------------------------------
 
     def end(self, here: int) -> State:
@@ -452,13 +425,13 @@ class Interpreter:
         if self.shift is not None:
             x = self.x + self.shift
             remainder = self.x - (x - self.shift)
-        else:
-            if not x.flags.writeable:
-                x = x.copy()
-            if self.room[FAR]:
-                remainder = np.zeros_like(x) if self.low is None else self.low.copy()
-        time, v = self.then, self.v
-        last = time, self.applied(here), self.number, remainder, self.left_over_then, self.variables(), start.barostat
+        elif self.room[FAR]:
+            remainder = np.zeros_like(x) if self.low is None else self.low.copy()
+        time, v, forces, variables = self.then, self.v, self.applied(here), self.variables()
+        for array in (x, v, remainder, variables, None if system.force is None else forces):
+            if array is not None:
+                array.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
+        last = time, forces, self.number, remainder, self.left_over_then, variables, start.barostat
         after = system.last = State(x, v, *last, (ref(system), x, v, time))
         return after
 

@@ -9,7 +9,7 @@ end, also where a drift goes back.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -67,12 +67,6 @@ class Turn(Timed):
 
     verb, meaning = "turn", "change velocities by forces at constant kinetic energy"
     group: str = ""  # type: ignore[misc]
-
-
-class Damp(Timed):
-    """Friction of the system at fixed positions: v dies away along the constraints."""
-
-    verb, meaning = "damp", "let friction act on velocities"
 
 
 class Exchange(Timed):
@@ -154,7 +148,6 @@ def splitting(
     *,
     exact: bool = False,
     settled: bool = False,
-    damped: bool = False,
 ) -> tuple[Operation, ...]:
     """Kicks and drifts in turn, with the longer of both first and last.
 
@@ -166,8 +159,6 @@ def splitting(
         Fly along great circles.
     settled : bool
         For forces that depend on velocities: about each drift half a kick, and one that is solved for.
-    damped : bool
-        Friction acts about each flight.
     """
     done: list[Operation] = []
     stages = drifts_of(drifts, flight, exact=exact)
@@ -179,15 +170,4 @@ def splitting(
         for fraction, stage in zip(kicks[len(first) :], stages, strict=False):
             done += [stage, Evaluate(), Kick(fraction)]
         done = [*first, *done, *stages[len(kicks) - len(first) :], Project()]
-    return tuple(_damped(done) if damped else done)
-
-
-def _damped(operations: Sequence[Operation]) -> Iterator[Operation]:
-    for operation in operations:
-        if not isinstance(operation, Fly):
-            yield operation
-            continue
-        for length, end in zip(operation.flights, operation.ends, strict=True):
-            yield Damp(0.5 * length)
-            yield Fly(length, (length,), (end,), operation.exact)
-            yield Damp(0.5 * length)
+    return tuple(done)

@@ -146,7 +146,6 @@ def run(
     if dt == 0 or not holds:
         check_every = 0
     schedule = system.schedule
-    state = system.behind(state)
     if hasattr(stepper, "barostat"):
         state = stepper.start(system, state)  # type: ignore[attr-defined]  # the first state shown has a cell
     if steps and holds and state is not system.last:
@@ -177,5 +176,5 @@ def run(
         if record is not None:
             error.trajectory = Trajectory(kept, kept[-1] if kept else state)  # type: ignore[attr-defined]
         raise
-    state = system.show(state, bool(steps))
+    state = state.read_only() if steps else state
     return state if record is None else Trajectory(kept, state)

@@ -99,7 +99,7 @@ class Splitting(Interpreted):
                 item="kicks",
             )
         self.kick_first = len(self.kicks) > len(self.drifts)
-        self._by_form: dict[tuple[bool, bool, bool], Program] = {}
+        self._by_form: dict[tuple[bool, bool], Program] = {}
 
     @property
     def force_evaluations(self) -> int:
@@ -109,14 +109,14 @@ class Splitting(Interpreted):
         return f"{type(self).__name__}()"
 
     def program(self, system: System | None) -> Program:
-        exact = settled = damped = False
+        exact = settled = False
         if system is not None:
             exact = self.exact_flight and system.great_circles is not None
-            settled, damped = system.velocity_dependent, system.friction > 0
-        form = exact, settled, damped
+            settled = system.velocity_dependent
+        form = exact, settled
         if form not in self._by_form:
             flight = (1.0,) if exact else self.flight
-            listed = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled, damped=damped)
+            listed = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled)
             self._by_form[form] = Program(listed)
         return self._by_form[form]
 
@@ -208,8 +208,7 @@ class Composition(Splitting):
 
     One force evaluation a fraction, more for forces that depend on velocities.
 
-    Works with all that `Rattle` works with: velocity rows, rows and targets that move, friction (of which the
-    stages that go back see the reverse).
+    Works with all that `Rattle` works with: velocity rows, rows and targets that move.
 
     Not for targets or forces with fewer derivatives in time than the order, which is then lost. Where the sums of
     the fractions leave [0, 1], as those of `Yoshida4` do, not for targets or forces that begin with the run either.
@@ -269,8 +268,7 @@ class Suzuki4(Composition):
 class Yoshida4(Composition):
     """Order 4, three force evaluations: the triple jump, the fewest and with the largest error.
 
-    Stages lie between -0.35 and 1.35 of the step. Not for targets or forces that begin with the run, nor for strong
-    friction.
+    Stages lie between -0.35 and 1.35 of the step. Not for targets or forces that begin with the run.
     """
 
     def __init__(self) -> None:

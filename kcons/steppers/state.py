@@ -21,7 +21,6 @@ from kcons.constraints.arguments import (
     check_call,
     finite_array,
     finite_number,
-    not_negative,
     read_only_view,
     refuse_other,
 )
@@ -55,7 +54,8 @@ class State:
     Attributes
     ----------
     positions, velocities : ndarray, shape (n_atoms, 3)
-        In the caller's units. Read-only: states share arrays where nothing changed. Observers cannot change them.
+        In the caller's units. Arrays of states that kcons makes cannot be written to: states share them where nothing
+        changed, and forces belong to them. `dataclasses.replace` makes another state.
     time : float
     forces : ndarray, shape (n_atoms, 3), or None
         Applied forces at this state, None before they are known. With them in hand a step evaluates the
@@ -168,7 +168,9 @@ class State:
 
     def read_only(self) -> State:
         """The same state for a function of the user, who can read its arrays and not change them."""
-        return self._with_arrays(read_only_view)
+        if any(isinstance(a, np.ndarray) and a.flags.writeable for a in vars(self).values()):
+            return self._with_arrays(read_only_view)
+        return self
 
     def copied(self) -> State:
         """The same state with arrays of its own."""
@@ -192,11 +194,6 @@ class System:
         Potential energy ``potential(x, t)``, for `total_energy`.
     velocity_dependent : bool
         Whether `force` takes the velocities too (magnetic fields, drag that is not linear).
-    friction : float
-        Rate at which velocities die away besides, m dv/dt = ... - gamma m v, in inverse units of time. At fixed
-        positions velocities fall off as exp(-gamma t), and in free flight x = x0 + u (1 - exp(-gamma t))/gamma, also
-        along constraints: it takes no shorter step and no further evaluation of the force. Relative to space at rest,
-        also where targets move.
     far : float
         From this many times the size of what is held away from the origin, states carry the remainder of their
         positions. Infinite: never, so that positions and velocities alone are the whole state.
@@ -204,7 +201,7 @@ class System:
     Raises
     ------
     InputError
-        A mass that is not positive, of an atom not held by FixedAtoms; bad friction; functions of other arguments.
+        A mass that is not positive, of an atom not held by FixedAtoms; functions of other arguments.
     """
 
     #: What messages call the unit in which they show time steps, and its size; no name for the unit of the system.
@@ -217,7 +214,6 @@ class System:
         *,
         potential: Callable[[FloatArray, float], float] | None = None,
         velocity_dependent: bool = False,
-        friction: float = 0.0,
         far: float = FAR,
     ) -> None:
         refuse_other(motion, Motion, "motion", "a kcons.Motion")
@@ -246,14 +242,12 @@ class System:
             #: 1/m, shape (n_atoms, 1); 0 for fixed atoms.
             self.inverse_masses: FloatArray = (1.0 / self.masses)[:, None]
         self.inverse_masses[motion.fixed_atoms] = 0.0
-        #: The same for each coordinate, shape (n_atoms, 3).
+        #: The same for each coordinate, shape (n_atoms, 3). Neither can be written to: kernels have them already.
         self.weights: FloatArray = np.repeat(self.inverse_masses, 3, axis=1)
-        #: 0 where nothing is slowed down.
-        self.friction = not_negative(friction, "friction")
+        self.weights.setflags(write=False)
+        self.inverse_masses.setflags(write=False)
         #: The state that the last step ended in, whose arrays need not be looked at.
         self.last: State | None = None
-        #: The state that the last run returned, which cannot be written to, and the same as steps go on from it.
-        self.shown: tuple[State, State] | None = None
         #: Steps on their way that have ended in a state, whose they are, what they depend on, and they themselves.
         self.going: tuple[State, Any, Any, Any] | None = None
 
@@ -263,18 +257,8 @@ class System:
         if going is not None and going[0] is after and going[3].simple and not len(going[3].numbers):
             self.going = (state, *going[1:])
 
-    def behind(self, state: State) -> State:
-        """What steps go on from: the state itself where `state` shows the one that the last run ended in."""
-        return self.shown[1] if self.shown is not None and state is self.shown[0] else state
-
-    def show(self, state: State, new: bool) -> State:
-        """The same state, which cannot be written to, where steps go on from it."""
-        if new:
-            self.shown = state.read_only(), state
-        return self.shown[0] if self.shown is not None and state is self.shown[1] else state
-
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "going": None, "shown": None}  # those steps are of this System
+        return {**vars(self), "going": None}  # those steps are of this System
 
     @cached_property
     def schedule(self) -> Schedule:
@@ -348,7 +332,7 @@ class System:
         v = finite_array(velocities, self.n_atoms, "velocities") if given else np.zeros_like(x)
         motion, held = self.motion, self.motion.constraint_set
         if held.n_rows == 0:
-            return State(x, v, time)
+            return State(x, v, time).read_only()
         try:
             self.require_on_rows(x, time)
         except InputError:
@@ -384,7 +368,7 @@ class System:
                     atoms=[atom],
                 )
             given = False
-        return State(x, v if given else tangent, time, remainder=remainder)
+        return State(x, v if given else tangent, time, remainder=remainder).read_only()
 
     def rest(self, x: FloatArray, v: FloatArray, time: float, dt: float = 0.0) -> float:
         """Speed below which velocities are rounding: of a kick by which atoms cross the system, or of one for `dt`."""

@@ -84,7 +84,7 @@ class Listed(DropsSystemCaches):
         Parameters
         ----------
         system : System, optional
-            What it makes of the step: great circles, friction, forces that depend on velocities. Without it, what
+            What it makes of the step: great circles, forces that depend on velocities. Without it, what
             the step consists of where forces depend on positions and time only.
         """
         raise NotImplementedError

@@ -203,10 +203,7 @@ class Level(NamedTuple):
 def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
     """Groups from the slowest to the fastest; None for all forces at once.
 
-    Raises
-    ------
-    InputError
-        Numbers of steps of which one does not divide the next, or of which the least is not 1.
+    Refused are numbers of steps of which one does not divide the next, or of which the least is not 1.
     """
     if steps is None:
         return (Level("", 1),)
@@ -246,20 +243,11 @@ def nested(
     exact: bool = False,
     middle: bool = False,
 ) -> tuple[Operation, ...]:
-    """The operations of a step.
+    """The operations of a step of these groups.
 
-    Parameters
-    ----------
-    levels
-        The groups.
-    flight : tuple of float
-        What each drift is made of, as fractions that add up to 1.
-    turns : bool
-        Kicks on spheres, before which velocities are put onto the constraints.
-    exact : bool
-        Fly along great circles.
-    middle : bool
-        The slowest group kicks once, in the middle.
+    `flight` is what each drift is made of, as fractions that add up to 1. With `turns`, kicks are on spheres, before
+    which velocities are put onto the constraints; `exact` drifts fly along great circles; in the `middle`, the slowest
+    group kicks once.
     """
     inner = levels[-1].steps
     flights = iter(drifts_of([0.5 / inner] * (2 * inner), flight, exact=exact))

@@ -441,16 +441,9 @@ def _apart(system: System, state: State) -> bool:
 
 
 def refuse_dissipation(system: System, why: str) -> None:
-    """Raise `UnsupportedError` for friction of the system, which takes out heat that no noise brings, and
-    velocity-dependent forces; `why` says what a thermostat lacks for these, and what to do.
-    """
+    """Raise `UnsupportedError` for velocity-dependent forces; `why` says what a thermostat lacks for these."""
     if system.velocity_dependent:
         raise UnsupportedError(f"forces that depend on the velocities have no {why}")
-    if system.friction:
-        raise UnsupportedError(
-            "a System with friction has no temperature: what it takes out, a thermostat would put back elsewhere; "
-            "leave it out of the System, and give the rate to Langevin, which brings noise with it"
-        )
 
 
 def refuse_driven(system: System, why: str) -> None:

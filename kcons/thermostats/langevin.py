@@ -84,7 +84,7 @@ class SeededBath(Interpreted):
         raise NotImplementedError
 
     def check(self, system: System) -> None:
-        """Raise for forces of velocities, friction besides that of the bath, other groups of forces than have steps."""
+        """Raise for forces of velocities, and other groups of forces than have steps."""
         refuse_dissipation(system, "place in this scheme; use friction")
         group_names(system.force, self.names)
 

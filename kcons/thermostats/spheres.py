@@ -59,12 +59,8 @@ class SphereLayout:
     def of(cls, system: System, positions: FloatArray, kind: Spheres) -> SphereLayout:
         """The spheres of one kind; ranks of clusters with dependent rows are found at the positions.
 
-        Raises
-        ------
-        UnsupportedError
-            Targets move, or rows hold velocities; the ranks of the clusters do not add up.
-        OverdeterminedError
-            Nothing can move.
+        Refused are targets that move, rows that hold velocities, ranks of clusters that do not add up, and systems in
+        which nothing can move.
         """
         refuse_driven(system, _NO_BATH)
         moving = system.inverse_masses[:, 0] > 0

@@ -47,22 +47,12 @@ _AS_GOOD = 1 - 1e-6
 
 
 def angle_rows(snapshot: Snapshot, bonds: IntArray, rigid: Sequence[IntArray]) -> tuple[IntArray, IntArray]:
-    """Angles and dihedrals that hold all angles between bonds that are held.
+    """Angles, shape (n, 3), and dihedrals, shape (m, 4), that hold all angles between bonds that are held.
 
-    Parameters
-    ----------
-    snapshot : Snapshot
-    bonds : ndarray of int, shape (n_bonds, 2)
-        Sorted, each once; those within rigid groups too.
-    rigid : sequence of ndarray, shape (n_bodies, n_atoms)
-        Groups that are held rigid. Rows within one are not needed, and may be among those returned.
-
-    Returns
-    -------
-    triples : ndarray of int, shape (n_angles, 3)
-        With the vertex in the middle, sorted by vertex and ends. Beyond `STRAIGHT`, it is the only row of an end.
-    quads : ndarray of int, shape (n_dihedrals, 4)
-        Impropers a-j-b-c of an atom j with its neighbors, and dihedrals of flat rings.
+    `bonds` are sorted, each once, those within rigid groups too. Rows within one of the groups `rigid`, arrays of shape
+    (n_bodies, n_atoms), are not needed, and may be among those returned. Angles have the vertex in the middle and are
+    sorted by vertex and ends; one beyond `STRAIGHT` is the only row of an end. Dihedrals are impropers a-j-b-c of an
+    atom j with its neighbors, and those of flat rings.
     """
     n = snapshot.topology.n_atoms
     of_bond, systems = ring_systems(bonds, n)
@@ -114,14 +104,27 @@ def _centers(snapshot: Snapshot, bonds: IntArray, label: IntArray) -> tuple[IntA
         e = np.take_along_axis(e, swap[..., None], axis=1)
         apart = (group[:, 0] < 0) | (group[:, 0] != group[:, 1])
         triples.append(np.stack([others[:, 0], vertex, others[:, 1]], axis=1)[apart])
+        row, plane = np.arange(len(vertex)), cross(e[:, 0], e[:, 1])
         for k in range(2, d):
             earlier = (group[:, :k] == group[:, k, None]) & (group[:, k, None] >= 0)
-            _third(vertex, others, e, k, ~earlier.any(axis=1), triples, quads)
+            wanted = ~earlier.any(axis=1)
+            opposite = np.stack([dot(e[:, b], e[:, k]) for b in (0, 1)], axis=1) < np.cos(np.radians(STRAIGHT))
+            sine = np.stack([norm(cross(e[:, b], e[:, k])) for b in (0, 1)], axis=1)
+            # The base atom that is nearer to 90 degrees is the axis.
+            axis = (sine[:, 1] * _WIDE > sine[:, 0]).astype(int)
+            volume = np.abs(dot(plane, e[:, k]))
+            flat = volume < np.sin(np.radians(FLAT_CENTER)) * sine[row, axis] * norm(plane)
+            flat &= (norm(plane) > _NARROW) & (sine[row, axis] > _NARROW)
+            alone = opposite.any(axis=1)
+            for b in (0, 1):
+                own = wanted & np.where(alone, np.argmax(opposite, axis=1) == b, ~flat | (axis == b))
+                triples.append(np.stack([others[:, b], vertex, others[:, k]], axis=1)[own])
+            improper = np.stack([others[row, 1 - axis], vertex, others[row, axis], others[:, k]], axis=1)
+            quads.append(improper[wanted & flat & ~alone])
             # The second of another group: what is left is to turn about the first of it.
             turning = (earlier.sum(axis=1) == 1) & ~earlier[:, 0]
-            axis = np.argmax(earlier, axis=1)
-            row = np.arange(len(vertex))
-            quads.append(np.stack([others[:, 0], vertex, others[row, axis], others[:, k]], axis=1)[turning])
+            first = others[row, np.argmax(earlier, axis=1)]
+            quads.append(np.stack([others[:, 0], vertex, first, others[:, k]], axis=1)[turning])
     return np.concatenate(triples), np.concatenate(quads)
 
 
@@ -137,69 +140,35 @@ def _second(e: FloatArray, group: IntArray) -> IntArray:
     return order
 
 
-def _third(
-    vertex: IntArray,
-    others: IntArray,
-    e: FloatArray,
-    k: int,
-    wanted: BoolArray,
-    triples: list[IntArray],
-    quads: list[IntArray],
-) -> None:
-    """Rows of neighbor k beside the base, appended to the lists."""
-    straight = -np.cos(np.radians(180 - STRAIGHT))
-    c = np.stack([dot(e[:, 0], e[:, k]), dot(e[:, 1], e[:, k])], axis=1)
-    s = np.stack([norm(cross(e[:, 0], e[:, k])), norm(cross(e[:, 1], e[:, k]))], axis=1)
-    opposite = c < straight
-    # The base atom that is nearer to 90 degrees is the axis.
-    axis = (s[:, 1] * _WIDE > s[:, 0]).astype(int)
-    row = np.arange(len(vertex))
-    volume = np.abs(dot(cross(e[:, 0], e[:, 1]), e[:, k]))
-    plane = norm(cross(e[:, 0], e[:, 1]))
-    flat = volume < np.sin(np.radians(FLAT_CENTER)) * s[row, axis] * plane
-    flat &= (plane > _NARROW) & (s[row, axis] > _NARROW)
-    alone = opposite.any(axis=1)
-    for b in (0, 1):
-        own = wanted & np.where(alone, np.argmax(opposite, axis=1) == b, ~flat | (axis == b))
-        triples.append(np.stack([others[:, b], vertex, others[:, k]], axis=1)[own])
-    improper = np.stack([others[row, 1 - axis], vertex, others[row, axis], others[:, k]], axis=1)
-    quads.append(improper[wanted & flat & ~alone])
-
-
 # -- rings ---------------------------------------------------------------------------------------
 
 
 def ring_systems(bonds: IntArray, n_atoms: int) -> tuple[IntArray, list[list[IntArray]]]:
-    """Rings that share bonds: the shortest ring through each bond, up to `LARGEST` atoms; `bonds` sorted, each once.
+    """The system of rings of each bond, -1 for none, shape (n_bonds,), and the rings of each system.
 
-    Returns
-    -------
-    of_bond : ndarray of int, shape (n_bonds,)
-        The system each bond belongs to, -1 for bonds in no small ring.
-    rings : list of list of ndarray of int
-        The rings of each system: their atoms, one after the other.
+    Rings that share bonds are one system. There is the shortest ring through each bond, up to `LARGEST` atoms, given by
+    its atoms, one after the other; `bonds` are sorted, each once.
     """
-    of_bond = np.full(len(bonds), -1)
     keep = _without_ends(bonds, n_atoms)
     starts, ends = neighbor_lists(bonds[keep], n_atoms)
-    number = {pair: k for k, pair in enumerate(map(tuple, bonds.tolist()))}
     found: dict[tuple[int, ...], IntArray] = {}
     for i, j in bonds[keep].tolist():
         ring = _shortest_ring(i, j, starts, ends)
         if ring:
             found.setdefault(tuple(sorted(ring)), np.array(ring))
-    cycles = list(found.values())
-    members = [
-        [number[tuple(sorted(p))] for p in zip(c.tolist(), np.roll(c, -1).tolist(), strict=True)] for c in cycles
-    ]
-    links = [(len(bonds) + k, b) for k, ring in enumerate(members) for b in ring]
-    label, _ = connected(np.array(links, dtype=np.int64).reshape(-1, 2), len(bonds) + len(cycles))
-    rings: dict[int, list[IntArray]] = {}
-    for cycle, ring in zip(cycles, members, strict=True):
-        rings.setdefault(int(label[ring[0]]), []).append(cycle)
-    for k, system in enumerate(rings):
-        of_bond[label[: len(bonds)] == system] = k
-    return of_bond, list(rings.values())
+    cycles, code, links = list(found.values()), bonds @ [n_atoms, 1], [np.zeros((0, 2), np.int64)]
+    for k, cycle in enumerate(cycles):
+        sides = np.sort(np.stack([cycle, np.roll(cycle, -1)], axis=1), axis=1)
+        own = np.searchsorted(code, sides @ [n_atoms, 1])
+        links.append(np.stack([np.full(len(cycle), len(bonds) + k), own], axis=1))
+    label, count = connected(np.concatenate(links), len(bonds) + len(cycles))
+    kinds, which = np.unique(label[len(bonds) :], return_inverse=True)
+    systems: list[list[IntArray]] = [[] for _ in kinds]
+    for cycle, system in zip(cycles, which.tolist(), strict=True):
+        systems[system].append(cycle)
+    number = np.full(count, -1)
+    number[kinds] = np.arange(len(kinds))
+    return number[label[: len(bonds)]], systems
 
 
 def ring_rows(
@@ -210,26 +179,20 @@ def ring_rows(
     rings: Sequence[IntArray],
     rigid: Sequence[IntArray],
 ) -> tuple[IntArray, IntArray]:
-    """Which angles and dihedrals hold one ring system whose bonds are held.
+    """Which angles, shape (n, 3), and dihedrals, shape (m, 4), hold one ring system whose bonds are held.
 
-    Parameters
-    ----------
-    bonds, triples, impropers : ndarray of int
-        Those within the system: its bonds, its angles, impropers at its flat centers.
-    rings : sequence of ndarray of int
-        Its rings, whose dihedrals are candidates where they are flat.
-    rigid : sequence of ndarray, shape (n_bodies, n_atoms)
-        Groups that are held rigid: rows within one are not returned.
-
-    Returns
-    -------
-    triples, quads : ndarray of int, shapes (n, 3) and (n, 4)
+    Bonds, angles and impropers at flat centers are those within the system; dihedrals of flat rings are candidates,
+    too. Rows within one of the groups `rigid` are left out.
     """
     if len(np.unique(bonds)) > LARGE_SYSTEM:
         return triples, impropers
-    turns = [np.stack([np.roll(ring, -k) for k in range(4)], axis=1) for ring in rings if len(ring) > 3]
-    flat = [quads for quads in turns if _is_flat(snapshot, quads)]
-    quads = np.concatenate([impropers, *flat])
+    candidates = [impropers]
+    for ring in (ring for ring in rings if len(ring) > 3):
+        turns = np.stack([np.roll(ring, -k) for k in range(4)], axis=1)
+        r = lined_up(snapshot.positions[turns], snapshot.lattice)
+        if np.abs(Dihedral(turns).measure(r, 0.0)).max() < np.radians(FLAT_RING):
+            candidates.append(turns)
+    quads = np.concatenate(candidates)
     items: list[Constraint] = [Distance(bonds), Angle(triples), Dihedral(quads)]
     rows = _gradients(snapshot, items)
     n = snapshot.topology.n_atoms
@@ -272,11 +235,6 @@ def _shortest_ring(i: int, j: int, starts: IntArray, ends: IntArray) -> list[int
             return ring
         shell = reached
     return []
-
-
-def _is_flat(snapshot: Snapshot, quads: IntArray) -> bool:
-    r = lined_up(snapshot.positions[quads], snapshot.lattice)
-    return bool(np.abs(Dihedral(quads).measure(r, 0.0)).max() < np.radians(FLAT_RING))
 
 
 def _gradients(snapshot: Snapshot, items: Sequence[Constraint]) -> FloatArray:

@@ -41,21 +41,9 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
     """Bonds that the distances suggest, shape (n, 2).
 
     Two atoms are bonded if they are closer than 1.25 times the sum of their covalent radii, under minimum images. A
-    hydrogen keeps its nearest neighbor only. Metals and noble gases get no bonds.
-
-    Parameters
-    ----------
-    snapshot : Snapshot
-    atoms : ndarray of bool, shape (n_atoms,), optional
-        Bonds are returned where at least one of the two atoms is marked.
-
-    among : ndarray of bool, shape (n_atoms,), optional
-        Only these atoms form bonds.
-
-    Raises
-    ------
-    InputError
-        No elements; positions that are not finite; two atoms on top of each other.
+    hydrogen keeps its nearest neighbor only. Metals and noble gases get no bonds. Bonds are returned where at least one
+    of their atoms is marked in `atoms`; only those marked in `among` form any. Refused are systems without elements,
+    positions that are not finite, and two atoms on top of each other.
     """
     topology = snapshot.topology
     radius = _radii(topology.elements)
@@ -110,10 +98,8 @@ def reaches(snapshot: Snapshot, bonds: IntArray) -> tuple[FloatArray, FloatArray
 
 def _radii(elements: NDArray[np.str_]) -> FloatArray:
     """Covalent radii in angstrom, 0 where an element forms no bonds."""
-    radius = np.zeros(len(elements))
-    for symbol, value in RADII.items():
-        radius[elements == symbol] = value
-    return radius
+    kinds, kind = np.unique(elements, return_inverse=True)
+    return np.array([RADII.get(symbol, 0.0) for symbol in kinds.tolist()])[kind]
 
 
 def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: IntArray, able: BoolArray) -> IntArray:

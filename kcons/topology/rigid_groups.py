@@ -123,16 +123,9 @@ class VirtualSites:
 
 @dataclass(frozen=True, eq=False)
 class Waters:
-    """Rigid waters of a system.
+    """Rigid waters of a system: oxygen and hydrogens, and massless sites."""
 
-    Attributes
-    ----------
-    triples : ndarray of int, shape (n, 3)
-        Oxygen and hydrogens.
-    sites : VirtualSites
-    """
-
-    triples: IntArray
+    triples: IntArray  # shape (n, 3)
     sites: VirtualSites
 
     def among(self, atoms: BoolArray) -> Waters:
@@ -158,24 +151,12 @@ def find_waters(
     model_site: float = 0.0,
     geometry: tuple[float, float] | None = None,
 ) -> Waters:
-    """Waters by residue name and composition: one oxygen, two hydrogens, massless sites.
+    """Waters by residue name (in capitals) and composition: one oxygen, two hydrogens, massless sites.
 
-    Waters of one oxygen alone, as in crystal structures, are left out.
-
-    Parameters
-    ----------
-    names : frozenset of str
-        Residue names, in capitals.
-    model_site : float
-        Length O-M in angstrom where the geometry was given by name; 0 takes the sites where they are.
-    geometry : tuple of float, optional
-        O-H length in angstrom and H-O-H angle in degrees at which the waters are held; None as they are.
-
-    Raises
-    ------
-    InputError
-        A residue that is called water and is composed otherwise; it is named. Sites that are not at their water, or
-        whose water has no plane.
+    Waters of one oxygen alone, as in crystal structures, are left out. `model_site` is the length O-M in angstrom of a
+    geometry that was given by name, 0 takes the sites where they are; `geometry` is the O-H length and the H-O-H angle
+    in degrees at which the waters are held, None as they are. Refused, with its name, is a residue that is called water
+    and is composed otherwise; so are sites that are not at their water, or whose water has no plane.
     """
     topology = snapshot.topology
     kinds, kind = np.unique(topology.residue_names, return_inverse=True)
@@ -284,12 +265,9 @@ def residue_bodies(snapshot: Snapshot, names: Sequence[str]) -> list[IntArray]:
 
 
 def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]) -> list[IntArray]:
-    """Checked lists of atoms, grouped by their size.
+    """Lists of atoms, grouped by their size.
 
-    Raises
-    ------
-    InputError
-        Atoms that do not exist or come twice; bodies of one atom.
+    Refused are atoms that do not exist or come twice, and bodies of one atom.
     """
     by_size: dict[int, list[IntArray]] = {}
     for k, body in enumerate(bodies):
@@ -305,17 +283,8 @@ def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]
 def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint]:
     """Rows that hold every group rigid: distances between bases, and relations for all other atoms.
 
-    Bodies that are linear or planar up to `FLAT` are held exactly so; positions may be off by that much.
-
-    Parameters
-    ----------
-    groups : sequence of ndarray, shape (n_bodies, n_atoms)
-        Bodies of one size each.
-
-    Raises
-    ------
-    SingularGeometryError
-        Two atoms of a body at one point.
+    Groups are arrays of shape (n_bodies, n_atoms), bodies of one size each. Those that are linear or planar up to
+    `FLAT` are held exactly so; positions may be off by that much. Two atoms of a body at one point are refused.
     """
     pairs: list[IntArray] = []
     lengths: list[FloatArray] = []
@@ -330,7 +299,12 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint
         center = r.mean(axis=1, keepdims=True)
         _, s, axes = np.linalg.svd(r - center, full_matrices=False)
         dimension = 1 + (s[:, 1:3] > FLAT * s[:, :1]).sum(axis=1) if n > 2 else np.ones(len(atoms), np.int64)
-        _refuse_coincident(snapshot, atoms, s)
+        points = np.flatnonzero(s[:, 0] < 1e-6 * snapshot.angstrom)
+        if len(points):
+            body, name = atoms[points[0]].tolist(), snapshot.topology.atom_name
+            raise SingularGeometryError(
+                f"the atoms of a rigid body coincide: {name(body[0])} and {name(body[1])}; give positions", atoms=body
+            )
         for d in np.unique(dimension).tolist():
             these = np.flatnonzero(dimension == d)
             if d == 3 and n > LARGE:
@@ -366,8 +340,10 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint
             tied[d + 1].append((named.ravel(), bases_of, np.swapaxes(w, 1, 2).reshape(-1, d + 1)))
     rows: list[Constraint] = []
     if pairs:
-        joined, first = _each_once(np.concatenate(pairs))
-        rows.append(Distance(joined, np.concatenate(lengths)[first]))
+        joined = np.sort(np.concatenate(pairs), axis=1)
+        # Each once, in the order in which they came.
+        first = np.sort(np.unique(joined @ [int(joined.max()) + 1, 1], return_index=True)[1])
+        rows.append(Distance(joined[first], np.concatenate(lengths)[first]))
     for parts in tied.values():
         if parts:
             rows.append(LinearRelation(*(np.concatenate([part[k] for part in parts]) for k in range(3))))
@@ -451,26 +427,6 @@ def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:
 def _farthest(distance: FloatArray) -> IntArray:
     """The first atom as far as the farthest, up to rounding: the same choice whatever the unit of length."""
     return np.argmax(distance >= _AS_GOOD * distance.max(axis=1, keepdims=True), axis=1).astype(np.int64)
-
-
-def _each_once(pairs: IntArray) -> tuple[IntArray, IntArray]:
-    """Pairs sorted within and listed once, in their order, and where they came first."""
-    ordered = np.sort(pairs, axis=1)
-    code = ordered[:, 0] * (int(ordered.max()) + 1) + ordered[:, 1]
-    _, first = np.unique(code, return_index=True)
-    first = np.sort(first)
-    return ordered[first], first
-
-
-def _refuse_coincident(snapshot: Snapshot, atoms: IntArray, s: FloatArray) -> None:
-    points = np.flatnonzero(s[:, 0] < 1e-6 * snapshot.angstrom)
-    if len(points):
-        body = atoms[points[0]]
-        raise SingularGeometryError(
-            f"the atoms of a rigid body coincide: {snapshot.topology.atom_name(int(body[0]))} and "
-            f"{snapshot.topology.atom_name(int(body[1]))}; give positions",
-            atoms=body.tolist(),
-        )
 
 
 def body_numbers(n_atoms: int, groups: Sequence[IntArray]) -> Iterator[IntArray]:

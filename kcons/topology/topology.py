@@ -229,12 +229,9 @@ def _in_molecules(snapshot: Snapshot) -> tuple[FloatArray, IntArray]:
 
 
 def whole_molecules(snapshot: Snapshot, links: IntArray | None = None) -> Snapshot:
-    """Every molecule in one piece: bonded atoms moved to their nearest images, from the first atom on.
+    """Every molecule in one piece: atoms moved to nearest images along bonds, from the first atom on.
 
-    Parameters
-    ----------
-    links : ndarray of int, shape (n, 2), optional
-        What counts as bonded; by default the bonds of the topology.
+    `links`, shape (n, 2), are what counts as bonded; by default the bonds of the topology.
     """
     if snapshot.lattice is None:
         return snapshot
@@ -329,13 +326,7 @@ def as_written(positions: ArrayLike) -> FloatArray:
 
 
 def elements_of(names: StrArray, residues: IntArray, residue_names: StrArray, masses: FloatArray | None) -> StrArray:
-    """Symbols by the names of atoms, corrected by masses where these are known, shape (n_atoms,).
-
-    Parameters
-    ----------
-    masses : ndarray or None
-        As read from a file; None if they were guessed from the names themselves.
-    """
+    """Symbols by the names of atoms, corrected by masses where a file has them, shape (n_atoms,)."""
     size = np.bincount(residues, minlength=len(residue_names))[residues]
     alone = size == 1
     # One decision for each distinct name of an atom (or of a residue of one atom), not for each atom.
@@ -363,13 +354,9 @@ def elements_of(names: StrArray, residues: IntArray, residue_names: StrArray, ma
 
 
 def guessed_masses(guess: FloatArray, names: StrArray, elements: StrArray) -> FloatArray:
-    """Masses that a host guessed from names, with those of the elements where it took the atoms for others.
+    """Masses, shape (n_atoms,), guessed by a host from names, or of elements where it took atoms for others.
 
-    Parameters
-    ----------
-    guess : ndarray, shape (n_atoms,)
-    elements : ndarray of str, shape (n_atoms,)
-        With 'D' for deuterium.
+    Elements have 'D' for deuterium.
     """
     kinds, kind = np.unique(np.char.add(np.char.add(elements, "/"), names), return_inverse=True)
     known = np.array([_mass(*k.split("/", 1)) for k in kinds.tolist()] or [0.0])[kind.ravel()]
@@ -462,10 +449,7 @@ def listed(names: Iterable[str], most: int = 12) -> str:
 def selected_numbers(select: Any, n: int, item: str = "select", name: str = "the selection") -> IntArray:
     """Numbers of the atoms that a mask or a list of numbers names.
 
-    Raises
-    ------
-    InputError
-        Words, which only MDAnalysis understands; nothing selected; atoms that do not exist.
+    Refused are words, which only MDAnalysis understands, nothing selected, and atoms that do not exist.
     """
     given = np.asarray(select)
     if given.dtype == bool and given.shape == (n,):

@@ -70,9 +70,11 @@ def test_it_goes_on_from_the_rows_that_are_there(tmp_path, monkeypatch, capsys):
     assert run(*words) == 130
     assert "--resume goes on from what is in" in capsys.readouterr().err
     assert list(read_csv(tmp_path / "compare.csv").method) == ["rattle", "rattle"]
+    first = read_csv(tmp_path / "compare.csv").error.tolist()
     assert run(*words, "--resume") == 0
     assert asked == ["rattle", "suzuki4", "suzuki4"]
-    assert set(read_csv(tmp_path / "compare.csv").method) == {"rattle", "suzuki4"}
+    table = read_csv(tmp_path / "compare.csv")
+    assert set(table.method) == {"rattle", "suzuki4"} and table.error.tolist()[:2] == first
     capsys.readouterr()
     assert run(*words, "--resume", "--budget", 2) == 2
     assert "give another --out" in capsys.readouterr().err

@@ -45,10 +45,6 @@ def test_an_input_runs_and_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
     (tmp_path / "input.toml").write_text(INPUT)
-    assert main(["freeenergy", "input.toml", "--list"]) == 0
-    assert capsys.readouterr().out == (
-        "4 windows of turn, a run each\n84 steps a run: pull 10, equilibration 10, production 64; a sample every 2\n"
-    )
     assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
     shown = capsys.readouterr()
     assert "turn (degrees)" in shown.out and "wrote input/profile.png" in shown.out
@@ -72,8 +68,6 @@ def test_pulls_beside_windows(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
     (tmp_path / "input.toml").write_text(INPUT + PULLS)
-    assert main(["freeenergy", "input.toml", "--list"]) == 0
-    assert "5 pulls both ways of 40 steps each" in capsys.readouterr().out
     assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
     shown = capsys.readouterr().out
     assert "pulls give " in shown and "(BAR)" in shown and " standard errors" in shown and "input/pulls.json" in shown
@@ -85,21 +79,15 @@ def test_pulls_beside_windows(tmp_path, capsys, monkeypatch):
     assert f"{difference:+.1f} standard errors" in shown
 
 
-@pytest.mark.filterwarnings("always")
-def test_list_looks_at_torsions_and_imports_no_calculator(tmp_path, capsys, monkeypatch):
+def test_modules_of_an_input_are_allowed_by_name(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "input.toml").write_text(INPUT.replace("[2, 0, 1, 3]", "[0, 2, 1, 3]"))
-    assert main(["freeenergy", "input.toml", "--list"]) == 0
-    shown = capsys.readouterr()
-    assert "4 windows of turn" in shown.out and "2-1 is no bond" in shown.err and shown.err.startswith("kcons: turn is")
     mine = 'calculator = "lj"\nsettings = {sigma = 1.0, epsilon = 0.02, rc = 6.0}'
     other = 'calculator = "os:system"\nsettings = {command = "touch ran"}'
     assert mine in INPUT
     (tmp_path / "input.toml").write_text(INPUT.replace(mine, other))
-    assert main(["freeenergy", "input.toml", "--list"]) == 2
+    assert main(["freeenergy", "input.toml"]) == 2
     assert "--allow-module os on the command line" in capsys.readouterr().err
-    assert main(["freeenergy", "input.toml", "--list", "--allow-module", "os"]) == 0
     assert main(["freeenergy", "input.toml", "--allow-module", "os"]) == 2
     assert "os:system is no calculator of ASE" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["input.toml", "methanol.xyz"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kcons.cli import main, systems
+from kcons.cli import compare, main
 
 ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
 needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
@@ -29,7 +29,6 @@ def run(*arguments):
     [
         (("plan", "chain", "--size", 6), ("chain of 6 rigid bonds", "rank 6", "solver")),
         ((), ("compare", "freeenergy", "warmup")),
-        (("--version",), ("kcons ",)),
         pytest.param(("plan", ALANINE, "--constrain", "hangles"), ("21 Distance, 9 Angle",), marks=needs_openmm),
     ],
     ids=str,
@@ -60,7 +59,7 @@ MISTAKES = [
     ("plan wat", "there is no test system 'wat'"),
     ("compare watr", "did you mean 'water'?"),
     ("compare water --methods ratle", "did you mean 'rattle'?"),
-    ("warmup protein", "did you mean 'proteins'?"),
+    ("warmup watr", "did you mean 'water'?"),
     ("compare chain --methods shake", "there is no method 'shake'"),
     ("compare chain --methods ,", "no method"),
     ("compare chain --size 0", "size is 0; give a whole number, 1 or more"),
@@ -97,7 +96,7 @@ def test_mistakes_give_one_line_and_status_2(words, text, capsys, tmp_path):
         ("comapre water", "invalid choice: 'comapre'"),
         ("compare water --metods rattle", "unrecognized arguments: --metods rattle"),
         ("compare water --constrain hbond", "invalid choice: 'hbond'"),
-        ("compare chain --dt a,b", "'a,b' is no list of numbers"),
+        ("compare chain --dt a,b", "invalid numbers value: 'a,b'"),
         ("compare --size x", "invalid int value"),
     ],
 )
@@ -118,7 +117,7 @@ def test_interrupt(monkeypatch, capsys):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(systems, "test_system", stop)
+    monkeypatch.setattr(compare, "test_system", stop)
     assert run("plan", "chain") == 130
     assert capsys.readouterr().err == "kcons: interrupted\n"
 

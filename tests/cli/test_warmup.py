@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import kcons
-from kcons.cli import compiled_systems, main, warmup
+from kcons.cli import machine, main
 from kcons.constraints import compilation
 from kcons.constraints.compilation import announcer
 from kcons.openmm.device import build
@@ -50,9 +50,9 @@ def process(*arguments, **environment):
 
 def test_what_was_compiled_beforehand_is_there():
     """Nothing that the molecule calls is anything but what the command has called, whatever others have compiled."""
-    warmed = process("-c", f"from kcons.cli import main; main.main(['warmup', 'molecules']){KERNELS}")
+    warmed = process("-c", f"from kcons.cli import main; main.main(['warmup', 'butane']){KERNELS}")
     told, called = warmed.stdout.splitlines()
-    assert re.match("molecules: (compiled in|is there)", told)
+    assert re.match("butane: (compiled in|is there)", told)
     assert "This happens once" not in warmed.stderr  # the command says it itself
     used = process("-c", MOLECULE + KERNELS)
     seconds, needed = used.stdout.splitlines()
@@ -64,7 +64,7 @@ def test_what_was_compiled_beforehand_is_there():
 def test_kernels_that_nobody_keeps_are_announced(keeps, monkeypatch, capsys):
     monkeypatch.setattr(announcer, "announced", False)
     monkeypatch.setattr(announcer, "keeps", keeps)
-    monkeypatch.setattr(compiled_systems, "KINDS", {})
+    monkeypatch.setattr(machine, "USUAL", ())
     assert main.main(["warmup"]) == 0
     assert announcer.announced == keeps
 
@@ -73,36 +73,33 @@ def test_it_says_what_was_compiled(monkeypatch, capsys):
     """Only what is not there: a kind that takes a second, which it does once."""
     left = [1.0, 0.0]
 
-    def slow():
-        """A kind."""
+    def slow(name):
         announcer.seconds += left.pop(0)
+        return ""
 
-    monkeypatch.setattr(compiled_systems, "KINDS", {"slow": slow})
+    monkeypatch.setattr(machine, "_system", slow)
     monkeypatch.setattr(announcer, "seconds", 0.0)
     monkeypatch.setattr(announcer, "announced", True)
-    assert [main.main(["warmup"]) for _ in range(2)] == [0, 0]
+    assert [main.main(["warmup", "chain"]) for _ in range(2)] == [0, 0]
     first, second = capsys.readouterr().out.splitlines()
-    assert first == "slow: compiled in 1.0 s" and second.startswith("slow: is there")
+    assert first == "chain: compiled in 1.0 s" and second.startswith("chain: is there")
 
 
-def test_all_kinds_can_be_had(capsys, monkeypatch):
-    """Of small systems, and with kernels that other tests have too: what is large differs in its size alone."""
+def test_a_file_of_ones_own(tmp_path, monkeypatch, capsys):
+    """Needs no forces; a name that is none is refused before anything is compiled."""
     monkeypatch.setattr(announcer, "announced", True)
-    monkeypatch.setattr(compiled_systems, "LARGE", 2)
     monkeypatch.setattr(compilation, "all_compiled", nullcontext)
-    assert main.main(["warmup"]) == 0
-    printed = capsys.readouterr().out
-    assert [line.split(":")[0] for line in printed.splitlines()] == list(compiled_systems.KINDS)
+    (tmp_path / "water.xyz").write_text("3\n\nO 0 0 0\nH 0.9572 0 0\nH -0.2400 0.9266 0\n")
+    assert main.main(["warmup", str(tmp_path / "water.xyz")]) == 0
+    assert "water.xyz: " in capsys.readouterr().out
+    assert main.main(["warmup", "chain", "nowhere"]) == 2
+    assert capsys.readouterr().out == ""
 
 
-def test_list_and_what_cannot_be_compiled(monkeypatch, capsys):
-    assert main.main(["warmup", "--list"]) == 0
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in compiled_systems.KINDS)
-    monkeypatch.setattr(warmup, "find_spec", lambda name: None)
-    monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
-    assert main.main(["warmup", "check"]) == 0
-    assert capsys.readouterr().out == "check: MDAnalysis is not installed\n"
+def test_what_cannot_be_compiled(monkeypatch, capsys):
+    monkeypatch.setattr(machine, "find_spec", lambda name: None)
+    assert main.main(["warmup", "alanine"]) == 0
+    assert capsys.readouterr().out == "alanine: OpenMM is not installed\n"
     monkeypatch.undo()
     monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
     assert main.main(["warmup", "device"]) == 0

@@ -248,27 +248,3 @@ def test_steps_that_cost_unevenly_are_timed_again_and_told():
 def test_margin_is_what_nine_tenths_of_the_medians_keep_to():
     assert measure.margin([[1.0, 1.1], [1.0, 1.0], [2.0]]) == pytest.approx(0.09, abs=0.01)
     assert measure.margin([[1.0]]) is None and measure.margin([]) is None
-
-
-# -- going on ---------------------------------------------------------------------------------------
-
-
-def test_methods_that_are_there_are_not_run_again(monkeypatch):
-    kept = []
-    names = ["rattle", "ase-kcons", "suzuki4"]
-
-    def stop(found):
-        kept.append(found)
-        if len(kept) == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        compare(chain(), names, rounds=1, keep=stop)
-    assert list(dict.fromkeys(kept[-1].method)) == names[:2]
-    ran = []
-    original = measure.all_settings
-    monkeypatch.setattr(measure, "all_settings", lambda *args: ran.append(args[1].name) or original(*args))
-    found = compare(chain(), names, rounds=1, done=kept[-1])
-    assert ran == ["suzuki4"] and list(dict.fromkeys(found.method)) == names
-    whole = compare(chain(), names, rounds=1)
-    np.testing.assert_array_equal(found.error, whole.error)

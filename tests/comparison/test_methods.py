@@ -310,14 +310,14 @@ def test_which_methods_run():
 )
 def test_refusals(method, system, reason):
     made = built(system, 2 if system == "sphere" else None)
-    assert reason in METHODS[method].refuses(made)
+    assert reason in METHODS[method].refusal(made)
     (row,) = compare(made, [method], rounds=0).to_dict("records")
     assert row["status"] == "not run"
 
 
 def test_openmm_that_is_not_installed(monkeypatch):
     monkeypatch.setattr("kcons.comparison.methods.find_spec", lambda name: None)
-    assert "python -m pip install openmm" in METHODS["openmm-verlet"].refuses(built("rotor"))
+    assert "python -m pip install openmm" in METHODS["openmm-verlet"].refusal(built("rotor"))
 
 
 # -- lines of Python --------------------------------------------------------------------------------

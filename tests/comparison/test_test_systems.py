@@ -41,7 +41,7 @@ def test_a_test_system_of_ones_own():
         return replace(small("rotor"), name="mine", title=f"{size} {stretch}")
 
     add_system("mine", two, "mine", size=3, quick_size=2, takes=("stretch",))
-    add_system("only", two, "one", unit="pair of atoms", only=True, stretch=2.0)
+    add_system("only", two, "one", unit="pair of atoms", only=True, options={"stretch": 2.0})
     try:
         assert test_systems.build("mine", stretch=4.0).title == "3 4.0"
         assert test_systems.build("mine", quick=True).horizon == small("rotor").horizon / 2

@@ -425,26 +425,6 @@ def test_bad_mass_matrices_are_refused(mass: list[list[float]]) -> None:
 # -- closed forms -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("row", ["square", "length"])
-def test_sphere_closed_form(row: str) -> None:
-    """Notes example 4, eq. 110: a = (1 - x x^T/R^2) f/m - (v.v/R^2) x, whichever coordinate the row holds."""
-    rng = np.random.default_rng(110)
-    for _ in range(20):
-        radius, mass = rng.uniform(0.5, 5), rng.uniform(0.1, 20)
-        x = rng.normal(size=3)
-        x *= radius / np.linalg.norm(x)
-        f, v = rng.normal(size=3), rng.normal(size=3)
-        v -= (v @ x) / radius**2 * x
-        if row == "square":  # sigma = x.x - R^2
-            A, b = 2 * x[None], [-2 * v @ v]
-        else:  # sigma = |x| - R
-            A, b = x[None] / radius, [-v @ v / radius]
-        expected = f / mass - (x @ f) / radius**2 * x / mass - (v @ v) / radius**2 * x
-        near(projection.acceleration(A, [mass], f, b), expected, 1e-14 * np.abs(expected).max())
-        solution = projection.bott_duffin(A, [mass], f, b)
-        near(solution.acceleration, expected, 1e-13 * np.abs(expected).max())
-
-
 def test_distance_closed_form() -> None:
     """Two atoms: z_1 = -z_2 = -n mu (|v_12|^2/d + n.(f_1/m_1 - f_2/m_2)), mu the reduced mass."""
     rng = np.random.default_rng(83)
@@ -465,17 +445,6 @@ def test_distance_closed_form() -> None:
         near(z, expected, 1e-13 * np.abs(expected).max())
         (lam,) = projection.multipliers(A, [m1, m2], f, b)
         assert lam == pytest.approx(-tension / (2 * length), rel=1e-12)
-
-
-def test_isokinetic_closed_form() -> None:
-    """Notes example 5, eq. 113: A = v^T M, b = 0 gives M a = f - alpha M v, alpha = v.f/2K."""
-    rng = np.random.default_rng(113)
-    masses = np.array([1.0, 2.5, 0.6])
-    v, f = rng.normal(size=(2, 3, 3))
-    row = (masses[:, None] * v).reshape(1, -1)
-    alpha = np.sum(v * f) / np.sum(masses[:, None] * v**2)
-    expected = f / masses[:, None] - alpha * v
-    near(projection.acceleration(row, masses, f, [0.0]), expected, 1e-14)
 
 
 # -- solvability ------------------------------------------------------------------------------------

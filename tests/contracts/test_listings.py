@@ -51,7 +51,7 @@ ALL = [
 ]
 STEPPERS = pytest.mark.parametrize("stepper", ALL, ids=repr)
 #: Kicks of all kinds share the step among themselves, and so do drifts, and each kind of bath.
-SHARING = [("kick", "settle", "turn"), ("fly",), ("exchange",), ("chain",), ("damp",)]
+SHARING = [("kick", "settle", "turn"), ("fly",), ("exchange",), ("chain",)]
 
 
 def systems() -> dict[str, System | None]:
@@ -63,10 +63,7 @@ def systems() -> dict[str, System | None]:
         "nothing known": None,
         "bonds": System(bond),
         "great circles": System(spheres),
-        "friction": System(bond, friction=0.1),
-        "friction on great circles": System(spheres, friction=0.1),
         "forces of velocities": System(bond, lambda x, v, t: -v, velocity_dependent=True),
-        "both": System(bond, lambda x, v, t: -v, velocity_dependent=True, friction=0.1),
     }
 
 
@@ -148,10 +145,7 @@ def test_what_a_system_makes_of_a_step() -> None:
 
     plain = ["kick", "fly", "evaluate", "kick", "project"]
     assert verbs("nothing known") == verbs("bonds") == verbs("great circles") == plain
-    assert verbs("friction") == ["kick", *["damp", "fly", "damp"] * 2, "evaluate", "kick", "project"]
-    assert verbs("friction on great circles") == ["kick", "damp", "fly", "damp", "evaluate", "kick", "project"]
     assert verbs("forces of velocities") == ["kick", "fly", "settle"]
-    assert verbs("both") == ["kick", *["damp", "fly", "damp"] * 2, "settle"]
     for stepper in (Geodesic(2), BlanesMoan4(), Langevin(1.0, 1.0, 1)):
         assert all(drift.exact and len(drift.flights) == 1 for drift in drifts("great circles", stepper))
         assert not any(drift.exact or len(drift.flights) == 1 for drift in drifts("bonds", stepper))

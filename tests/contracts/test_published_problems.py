@@ -1,9 +1,8 @@
 """Problems with published solutions, stated as they are published.
 
 The car axis: two wheels on a road that moves one of them, an index-3 problem; parameters and the solution at t = 3 from
-Mazzia and Magherini, Test Set for Initial Value Problem Solvers, release 2.4 (2008), II-1. Thomson's problem:
-particles that repel each other on a sphere and are slowed down come to rest at the least energy known (Wales and
-Ulker, Phys. Rev. B 74, 212101 (2006)).
+Mazzia and Magherini, Test Set for Initial Value Problem Solvers, release 2.4 (2008), II-1. Thomson's problem is that of
+`motion/test_minimization.py`.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ import numpy as np
 import pytest
 
 from kcons import ConstraintSet, Motion, System, run
-from kcons.constraints import Distance, Formula, Sphere
-from kcons.steppers import BlanesMoan6, KahanLi6, Rattle
+from kcons.constraints import Distance, Formula
+from kcons.steppers import BlanesMoan6
 
 ROOT = Path(__file__).parents[2]
 LENGTH, SPRING, EPSILON, MASS, HEIGHT, FREQUENCY = 1.0, 0.5, 1e-2, 10.0, 0.1, 10.0
@@ -66,28 +65,3 @@ def test_car_axis_by_no_more_evaluations_than_dop853():
     errors = {name: script["car_error"](each) for name, each in found.items()}
     assert max(errors.values()) < 1e-7 and errors["BlanesMoan6"] < errors["SciPy alone, DOP853"]
     assert found["BlanesMoan6"][2] < found["SciPy alone, DOP853"][2]
-
-
-#: Least energies of unit charges on the unit sphere.
-THOMSON = {4: 3.674234614, 6: 9.985281374, 12: 49.165253058, 20: 150.881568334}
-
-
-@pytest.mark.parametrize(
-    ("stepper", "size"),
-    [*((Rattle(), size) for size in THOMSON), (KahanLi6(), 6), (BlanesMoan6(), 6)],
-    ids=str,
-)
-def test_friction_ends_at_the_optimum_of_thomson(stepper, size):
-    def repulsion(x, t=0.0):
-        d = x[:, None] - x
-        r = np.linalg.norm(d, axis=2) + np.diag(np.full(len(x), np.inf))
-        return np.einsum("ij,ijk->ik", r**-3, d)
-
-    k = np.arange(size) + 0.5  # on a spiral, no two close to each other
-    z, turn = 1 - 2 * k / size, np.pi * (1 + 5**0.5) * k
-    x = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
-    motion = Motion(ConstraintSet(Sphere(np.arange(size), np.zeros(3), 1.0), x, np.ones(size)), x)
-    system = System(motion, repulsion, friction=0.8)
-    end = run(system, system.initial_state(x), 0.16, 400, stepper=stepper)
-    r = np.linalg.norm(end.positions[:, None] - end.positions, axis=2)
-    assert (1 / r[np.triu_indices(size, 1)]).sum() == pytest.approx(THOMSON[size], abs=1e-8)

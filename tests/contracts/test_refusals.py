@@ -149,7 +149,6 @@ REFUSED: list[tuple[str, ...]] = [
     ("System(3)", "motion"),
     ('System(MOTION, "force")', "force"),
     ("System(MOTION, force, potential=3)", "potential"),
-    ("System(MOTION, force, friction=?)", "friction", "-1.0", "[1.0]"),
     ("System(MOTION, force, far=-1.0)", "far"),
     ("SYSTEM.initial_state(?, V)", "positions", "X[:2]", "X * nan", "X * 1.5"),
     ("SYSTEM.initial_state(X, V[:2])", "velocities"),

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Angle, Distance, FixedAtoms, Formula, Plane
-from kcons.free_energy import HeldCoordinates, Recorder, Sample, Series, local_mean_force, mean_force, weighted_mean
-from kcons.free_energy.mean_forces import _quietest
-from kcons.thermostats import Langevin
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Distance, FixedAtoms, Formula, Plane
+from kcons.free_energy import HeldCoordinates, Sample, Series, mean_force, weighted_mean
+from kcons.free_energy.mean_forces import _quietest, local_mean_force
 
 KT = 0.8
 SAMPLES = 1000
@@ -175,43 +174,6 @@ def test_two_coordinates_with_z_off_the_diagonal():
     ]
     # Nothing is left to move: every sample has it exactly.
     np.testing.assert_allclose(local_mean_force(series, KT), np.tile(exact, (64, 1)), rtol=0, atol=1e-8)
-
-
-@pytest.mark.validation
-@pytest.mark.filterwarnings("ignore:.*independent ones")
-def test_errors_of_repeated_runs_are_as_large_as_they_say():
-    """An angle held between two springs, its energy coupled to a slow particle: runs of 25 of its memories of 2.
-
-    U = 25 ((r - 1)^2 + (s - 1)^2)/2 + 5 y cos q + 5 |(y, z, w)|^2/2. P(q) is sin q exp(5 cos^2 q/(2 kT)).
-    """
-    kT, q, stiff, bond = 1.0, 1.9, 5.0, 25.0
-    start = np.array([[1.0, 0, 0], [0, 0, 0], [np.cos(q), np.sin(q), 0], [5.0, 5.0, 5.0]])
-    angle = Angle([[0, 1, 2]])
-    motion = Motion(ConstraintSet([angle], start, np.ones(4)), start)
-    held = HeldCoordinates(motion, {"angle": angle}, start)
-
-    def forces(x, _):
-        arms = x[[0, 2]] - x[1]
-        lengths = np.sqrt(np.einsum("in,in->i", arms, arms))[:, None]
-        u, y = arms / lengths, x[3] - start[3]
-        c = float(u[0] @ u[1])
-        pull = -bond * (lengths - 1) * u - stiff * y[0] * (u[::-1] - c * u) / lengths
-        return np.array([pull[0], -pull.sum(axis=0), pull[1], -stiff * y - [stiff * c, 0.0, 0.0]])
-
-    system, found = System(motion, forces), []
-    for seed in range(300):
-        rng = np.random.default_rng(seed)
-        x = start.copy()
-        x[3] += rng.normal(size=3) * np.sqrt(kT / stiff) - [np.cos(q), 0.0, 0.0]
-        state = State(x, motion.project_velocities(x, rng.normal(size=x.shape)))
-        state = run(system, state, 0.15, 25, stepper=Langevin(kT, 12.0, 2 * seed))
-        recorder = Recorder(system, held)
-        run(system, state, 0.15, 340, stepper=Langevin(kT, 12.0, 2 * seed + 1), observers=[recorder], every=5)
-        result = mean_force(recorder.series, kT)
-        found.append((result.force[0] + kT / np.tan(q) - stiff * np.cos(q) * np.sin(q), result.error[0]))
-    away, said = np.array(found).T
-    assert abs(away.mean()) < 3 * away.std() / np.sqrt(len(away))
-    assert 0.9 <= np.sqrt((away**2).mean() / (said**2).mean()) <= 1.15
 
 
 def test_of_two_estimates_the_mixture_that_fluctuates_least():

@@ -57,8 +57,8 @@ def test_start_off_the_constraints():
 
 
 @pytest.mark.parametrize("stepper", [Rattle(), Langevin(0.5, 1.0, rng=1)])
-def test_a_state_that_a_run_returns_is_changed_by_replace_only(stepper):
-    """In place, forces of the places that were would go with new ones; runs go on from it as before, at no cost."""
+def test_states_are_changed_by_replace_only(stepper):
+    """In place, forces of the places that were would go with new ones; runs go on from them as before, at no cost."""
     system, state = rotor()
     calls = []
 
@@ -67,10 +67,16 @@ def test_a_state_that_a_run_returns_is_changed_by_replace_only(stepper):
         return -0.3 * x
 
     system = System(system.motion, force)
-    end = run(system, system.initial_state(state.positions, state.velocities), 0.01, 4, stepper=stepper)
-    for name in ("positions", "velocities", "forces"):
+    free = System(Motion(ConstraintSet([], state.positions, system.masses), state.positions))
+    begin = system.initial_state(state.positions, state.velocities)
+    end = run(system, begin, 0.01, 4, stepper=stepper)
+    arrays = [system.weights, system.inverse_masses]
+    for each in (begin, end, stepper.step(system, end, 0.01), free.initial_state(state.positions, state.velocities)):
+        arrays += [a for a in vars(each).values() if isinstance(a, np.ndarray)]
+    assert len(arrays) >= 2 + 2 + 3 + 3 + 2
+    for array in arrays:
         with pytest.raises(ValueError, match="read-only"):
-            getattr(end, name)[0] = 1.0
+            array[0] = 1.0
     assert run(system, end, 0.01, 0, stepper=stepper) is end
     before = len(calls)
     after = run(system, end, 0.01, 3, stepper=stepper)

@@ -117,4 +117,4 @@ for _shape, _text in (
     ("free", "freely jointed chain"),
 ):
     _name = "chain" if _shape == "zigzag" else f"chain-{_shape}"
-    add_system(_name, build, _text, size=100, quick_size=20, unit="bonds", shape=_shape)
+    add_system(_name, build, _text, size=100, quick_size=20, unit="bonds", options={"shape": _shape})

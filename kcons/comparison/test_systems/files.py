@@ -418,4 +418,4 @@ for _name, _text, _unit in (
     ("villin", "protein in water, 8867 atoms; OpenMM", "system"),
 ):
     _takes = ("constrain", "force_field", "platform")
-    add_system(_name, build, _text, unit=_unit, only=True, takes=_takes, structure=_name)
+    add_system(_name, build, _text, unit=_unit, only=True, takes=_takes, options={"structure": _name})

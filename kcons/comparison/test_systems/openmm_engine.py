@@ -58,15 +58,7 @@ class OpenMMEngine:
         return system
 
     def context(self, system: openmm.System, integrator: openmm.Integrator) -> openmm.Context:
-        """A Context on the platform of the test system, on one thread.
-
-        Raises
-        ------
-        InputError
-            There is no such platform.
-        UnsupportedError
-            The System has constraints, and an earlier set-up of them took longer than `patience`.
-        """
+        """A Context on the platform of the test system, on one thread; refused where an earlier one took too long."""
         import openmm
 
         rows = system.getNumConstraints()

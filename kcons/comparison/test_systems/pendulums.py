@@ -134,4 +134,4 @@ for _name, _text in (
     ("double-pendulum", "planar double pendulum"),
     ("triple-pendulum", "planar triple pendulum"),
 ):
-    add_system(_name, build, _text, unit="pendulum", only=True, kind=_name)
+    add_system(_name, build, _text, unit="pendulum", only=True, options={"kind": _name})

@@ -17,35 +17,24 @@ class Entry:
 
     make: Callable[..., TestSystem]
     text: str
-    size: int
-    quick_size: int
-    unit: str
-    only: bool
-    takes: Collection[str]
+    size: int = 1
+    quick_size: int | None = None
+    unit: str = "system"
+    only: bool = False
+    takes: Collection[str] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
 SYSTEMS: dict[str, Entry] = {}
 
 
-def add_system(
-    name: str,
-    make: Callable[..., TestSystem],
-    text: str,
-    *,
-    size: int = 1,
-    quick_size: int | None = None,
-    unit: str = "system",
-    only: bool = False,
-    takes: Collection[str] = (),
-    **options: Any,
-) -> None:
-    """Register a test system for `build` and `kcons compare`.
+def add_system(name: str, make: Callable[..., TestSystem], text: str, **about: Any) -> None:
+    """Register a test system for `build` and `kcons compare`, in place of one of that name.
 
     Parameters
     ----------
     name : str
-        By which it is chosen. A test system of that name is replaced.
+        By which it is chosen.
     make : callable
         Size, rng and options to a `TestSystem`.
     text : str
@@ -58,10 +47,10 @@ def add_system(
         Whether it has this size and no other.
     takes : collection of str
         Options of `make` that may be chosen.
-    **options
+    options : mapping
         Options of `make` that belong to the name.
     """
-    SYSTEMS[name] = Entry(make, text, size, size if quick_size is None else quick_size, unit, only, takes, options)
+    SYSTEMS[name] = Entry(make, text, **about)
 
 
 @checked
@@ -92,7 +81,7 @@ def build(name: str, size: Count | None = None, rng: Rng = 1, *, quick: bool = F
         )
     entry = SYSTEMS[name]
     if size is None:
-        size = entry.quick_size if quick else entry.size
+        size = entry.quick_size if quick and entry.quick_size else entry.size
     if entry.only and size != entry.size:
         raise InputError(f"{name} is one {entry.unit}; it cannot be built at size {size}", item="size")
     for option in sorted(set(options) - set(entry.takes)):

@@ -97,15 +97,9 @@ def _system(masses: FloatArray, gravity: float) -> Any:
     return system_of(masses, *([field] if gravity else []))
 
 
-add_system("sphere", build, "free particles on spheres; closed form", size=10, quick_size=2, unit="particles")
-add_system("sphere-pendulum", build, "spherical pendulums", size=10, quick_size=2, unit="particles", gravity=1.0)
-add_system(
-    "sphere-pendulum-top",
-    build,
-    "spherical pendulums from near the top",
-    size=10,
-    quick_size=2,
-    unit="particles",
-    gravity=1.0,
-    near_top=True,
-)
+for _name, _text, _options in (
+    ("sphere", "free particles on spheres; closed form", {}),
+    ("sphere-pendulum", "spherical pendulums", {"gravity": 1.0}),
+    ("sphere-pendulum-top", "spherical pendulums from near the top", {"gravity": 1.0, "near_top": True}),
+):
+    add_system(_name, build, _text, size=10, quick_size=2, unit="particles", options=_options)

@@ -51,6 +51,7 @@ class PythonRows(Constraint, base=True):
 
     held = ANY
     time_dependent: bool
+    time_step: float
     length: Any
 
     @property
@@ -72,6 +73,13 @@ class PythonRows(Constraint, base=True):
 
     def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         return self.measure(r, time), self.gradient(r, time)
+
+    def _take(self, time_dependent: bool, length: Any, time_step: float, **functions: Any) -> None:
+        """Store what functions are called with, and how far apart; and look at the functions."""
+        self.time_dependent, self.length, self.time_step = bool(time_dependent), length, time_step
+        arguments = ("r", "t") if time_dependent else ("r",)
+        for name, function in functions.items():
+            check_call(f"{self.family}: {name}", function, arguments, TAKES_TIME, needed=name != "gradient")
 
     def _time(self, time: float) -> tuple[float, ...]:
         return (time,) if self.time_dependent else ()
@@ -142,13 +150,9 @@ class Custom(PythonRows):
         time_step: Duration = 0.02,
     ) -> None:
         super().__init__(atoms, target)
-        self.time_dependent = bool(time_dependent)
-        last = ("t",) if self.time_dependent else ()
-        check_call(f"{self.family}: function", function, ("r", *last), TAKES_TIME, needed=True)
-        check_call(f"{self.family}: gradient", gradient, ("r", *last), TAKES_TIME)
+        self._take(time_dependent, length, time_step, function=function, gradient=gradient)
         self.function, self.gradient_function = function, gradient
         self.translation_invariant, self.period = bool(translation_invariant), period
-        self.length, self.time_step = length, time_step
 
     @property
     def called(self) -> tuple[Any, ...]:
@@ -363,13 +367,8 @@ class CustomVelocity(PythonRows, VelocityRows):
         time_step: Duration = 1e-3,
     ) -> None:
         super().__init__(atoms, target)
-        last = ("t",) if time_dependent else ()
-        check_call("CustomVelocity: coefficients", coefficients, ("r", *last), TAKES_TIME, needed=True)
-        self.coefficients = coefficients
-        self.time_dependent = bool(time_dependent)
-        self.translation_invariant = bool(translation_invariant)
-        self.length = length
-        self.time_step = time_step
+        self._take(time_dependent, length, time_step, coefficients=coefficients)
+        self.coefficients, self.translation_invariant = coefficients, bool(translation_invariant)
 
     @property
     def called(self) -> tuple[Any, ...]:

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -47,13 +48,7 @@ _PI = {"pi": np.float64(np.pi)}
 
 
 def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tuple[ast.expr, set[int]]:
-    """The tree of a formula, which may have velocities or not, and the atoms in it.
-
-    Raises
-    ------
-    InputError
-        What is no formula; unknown names and functions.
-    """
+    """The tree of a formula, which may have velocities or not, and the atoms in it."""
     if len(formula) > MAX_LENGTH:
         raise _too_large(formula, f"has {len(formula)} characters, and at most {MAX_LENGTH} are read")
     try:
@@ -177,22 +172,8 @@ def undefined_part(tree: ast.expr, numbers: Mapping[str, float]) -> str | None:
 class Code:
     """What is computed of a formula with parameters of these names; with `speeds`, of one that is linear in velocities.
 
-    Attributes
-    ----------
-    row, rate : callable
-        As of a `Constraint`; `rate` is None where the time is not in the formula.
-    width : int
-        Atoms a row.
-    invariant : bool
-        Whether a common shift of all atoms changes nothing.
-
-    Raises
-    ------
-    InputError
-        As `parsed`; a formula without atoms, or one that leaves some out; one that does not change with the positions,
-        or is not linear in the velocities.
-    UnsupportedError
-        There is no folder that it can be written to.
+    `row` and `rate` are those of a `Constraint`, `rate` None where the time is not in the formula; `width` are the
+    atoms a row, and `invariant` says whether a common shift of all of them changes nothing.
     """
 
     def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool = False) -> None:
@@ -318,18 +299,19 @@ def _vanishes(sums: Any, *parts: Any) -> bool:
 def _module(text: str) -> ModuleType:
     """The module with this text, which is kept in a file: Numba keeps beside files what it compiles of them."""
     own = text.encode()
-    path = _folder() / f"formula_{hashlib.sha256(own).hexdigest()[:24]}.py"
-    if not path.is_file() or path.read_bytes() != own:
-        unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-        try:
-            unfinished.write_bytes(own)
-            os.replace(unfinished, path)
-        except OSError as error:
-            unfinished.unlink(missing_ok=True)
-            raise UnsupportedError(
-                f"the code of a formula cannot be written to {path.parent}: {error}; set NUMBA_CACHE_DIR to a folder "
-                "with space in it"
-            ) from error
+    try:
+        path = _folder() / f"formula_{hashlib.sha256(own).hexdigest()[:24]}.py"
+        if not path.is_file() or path.read_bytes() != own:
+            unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+            try:
+                unfinished.write_bytes(own)
+                os.replace(unfinished, path)
+            finally:
+                unfinished.unlink(missing_ok=True)
+    except OSError as error:
+        raise UnsupportedError(
+            f"the code of a formula cannot be written: {error}; set NUMBA_CACHE_DIR to a folder with space in it"
+        ) from error
     # Numba looks for what it has kept by the names of modules.
     module = sys.modules[f"kcons_{path.stem}"] = ModuleType(f"kcons_{path.stem}")
     exec(compile(own, path, "exec"), module.__dict__)
@@ -338,20 +320,12 @@ def _module(text: str) -> ModuleType:
 
 def _folder() -> Path:
     """Where code is kept: with Numba's own files, or where caches of the user are, or until the process ends."""
-    given = (
-        os.environ.get("NUMBA_CACHE_DIR")
-        or str(getattr(numba.config, "CACHE_DIR", ""))
-        or os.environ.get("XDG_CACHE_HOME")
-    )
-    for folder in (Path(given or os.path.expanduser("~/.cache")) / "kcons-formulas", _passing):
-        path = Path(folder() if callable(folder) else folder)
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(path, os.W_OK):
-            return path
-    raise UnsupportedError("there is no folder to write the code of a formula to; set NUMBA_CACHE_DIR to one")
+    given = os.environ.get("NUMBA_CACHE_DIR") or getattr(numba.config, "CACHE_DIR", "")
+    caches = given or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    path = Path(caches) / "kcons-formulas"
+    with suppress(OSError):
+        path.mkdir(parents=True, exist_ok=True)
+    return path if os.access(path, os.W_OK) else Path(_passing())
 
 
 @cache

@@ -120,9 +120,6 @@ class Formula(Constraint):
     def rate(self) -> Any:  # type: ignore[override]
         return self.code().rate
 
-    def parameters(self) -> FloatArray:
-        return self.values
-
     def undefined(self, k: int, r: FloatArray, time: float) -> str:
         axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
         numbers = dict(zip([*axes, "t", *self.names], [*r.ravel(), time, *self.values[k]], strict=True))
@@ -189,4 +186,4 @@ class VelocityFormula(Formula):
         parameters: Mapping[str, ArrayLike] | None = None,
         target: Target = 0.0,
     ) -> None:
-        super().__init__(formula, atoms, parameters, 0.0 if target is None else target)
+        super().__init__(formula, atoms, parameters, target)

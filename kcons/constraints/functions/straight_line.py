@@ -88,21 +88,10 @@ class _Places:
 
 
 def record(function: Callable[..., Any], known: Sequence[float] = (), remedy: str = "") -> Tape:
-    """The tape of a function as `Constraint.row`.
+    """The tape of a function as `Constraint.row`; `UnsupportedError` where it branches or calls other functions.
 
-    Parameters
-    ----------
-    function : callable
-        Gets places r, parameters p, the time t and `out`.
-    known : sequence of float
-        The first parameters, where they are known: how many there are of something has to be.
-    remedy : str
-        What to do about a function that has none.
-
-    Raises
-    ------
-    UnsupportedError
-        The function branches, or calls what is no elementary function of NumPy.
+    `known` are the first parameters, where they are known: how many there are of something has to be. `remedy` says
+    what to do about a function that has no tape.
     """
     steps: _Steps = {}
     out: dict[int, Any] = {}
@@ -150,10 +139,7 @@ def _times(a: Any, b: Any) -> Any:
 
 
 def differentiated(function: Callable[[Any, Any, Any], Any], places: int) -> Tape:
-    """The tape of a function of places r, parameters p and the time: value, derivatives by places, and by the time.
-
-    They are taken backwards through the steps.
-    """
+    """Value, derivatives by places, and by the time, of a function of places r, parameters p and the time."""
     steps: _Steps = {}
 
     def number(operand: Operand) -> Any:

@@ -42,27 +42,20 @@ ALL_PAIRS_WIDTH = 12
 BOND_LIKE = 1.5
 #: Part of half the cell from which a held distance is followed along the tree: off its row it may be longer than half.
 NEARLY = 0.9
-#: Parts of the cell at which an unheld link is taken to have reached half of it.
-_HALF = 0.5 - 1e-9
 
 
 @dataclass(frozen=True)
 class Images:
     """The tree along which the atoms of whole rows, and all atoms tied to them, are made whole.
 
-    Attributes
-    ----------
-    atoms, parents : ndarray of int, shape (k,)
-        Parents come before their children; a root is its own parent and keeps the image it is stored in.
-    unheld : ndarray of int, shape (k,)
-        For unheld links the row they come from, -1 for others.
-    longest : float
-        The longest of the other links.
+    Parents come before their children; a root is its own parent and keeps the image it is stored in.
     """
 
     atoms: IntArray
     parents: IntArray
+    #: For unheld links the row they come from, -1 for others.
     unheld: IntArray
+    #: The longest of the other links.
     longest: float = 0.0
 
     def make_whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
@@ -79,15 +72,6 @@ class Images:
         step = x[self.atoms] - x_ref[self.atoms]
         cells = np.round((y_ref - x_ref)[self.atoms] @ lattice[1]) - np.round(step @ lattice[1])
         return cells @ lattice[0]
-
-    def reached_half(self, y: FloatArray, lattice: FloatArray) -> int:
-        """An unheld link, as an index into `atoms`, that is as long as half the cell in positions made whole; or -1."""
-        links = np.flatnonzero(self.unheld >= 0)
-        if not len(links):
-            return -1
-        parts = np.abs((y[self.atoms[links]] - y[self.parents[links]]) @ lattice[1]).max(axis=1)
-        worst = int(np.argmax(parts))
-        return int(links[worst]) if parts[worst] >= _HALF else -1
 
     def among(self, atoms: IntArray, rows: IntArray) -> Images | None:
         """The part of the tree between `atoms` and between rows `rows`, both sorted, by their places among these.
@@ -124,16 +108,10 @@ def find_images(
     time: float,
     ties: Sequence[Constraint] = (),
 ) -> tuple[list[Constraint], Images | None]:
-    """Sort rows into plain and whole ones and find the tree.
+    """Copies that know which of their rows are whole, with their cell_offsets; and the tree, None if all are plain.
 
     Targets may still be missing; `starts` are the first rows, `ties` what the constraints replace: rows that are held
-    still and tie atoms together. Gives copies that know which of their rows are whole, with their cell_offsets, and the
-    tree, None if all rows are plain.
-
-    Raises
-    ------
-    InputError
-        A link of the tree as long as half the cell: its image is ambiguous.
+    still and tie atoms together. A link of the tree as long as half the cell is refused: its image is ambiguous.
     """
     given = [item.changed(whole=None, cell_offsets=None) for item in constraints]
     if lattice is None:
@@ -332,13 +310,7 @@ def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: flo
 def _tree(
     tables: Sequence[_Links], given: Sequence[Constraint], x: FloatArray, lattice: FloatArray, half_width: float
 ) -> tuple[Images, FloatArray, IntArray]:
-    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component.
-
-    Raises
-    ------
-    InputError
-        A link that is needed is as long as half the cell.
-    """
+    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component."""
     from scipy.sparse.csgraph import minimum_spanning_tree  # slow to import
 
     n_atoms = len(x)

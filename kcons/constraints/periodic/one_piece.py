@@ -24,11 +24,6 @@ def lattice_of(cell: FloatArray | None, pbc: bool | Sequence[bool] | BoolArray) 
     """Cell vectors as rows, and the inverse with zeros for directions without periodicity, shape (2, 3, 3).
 
     Directions without periodicity get a unit vector normal to the others. None without a periodic direction.
-
-    Raises
-    ------
-    InputError
-        Periodic cell vectors that are zero or not independent.
     """
     # Barostats come here at each trial, with True; the rest takes many times as long.
     periodic = None if pbc is True else np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
@@ -89,10 +84,7 @@ def _links(pairs: IntArray, n: int) -> sp.csr_array:
 def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) -> tuple[IntArray, IntArray]:
     """All atoms breadth first along pairs, and their parents, which come before them.
 
-    Parameters
-    ----------
-    roots : ndarray of int, optional
-        All atoms; the first of a piece is its root, which is its own parent. By default the one of lowest number.
+    The first of `roots`, which are all atoms, in a piece is its root and its own parent; by default the lowest number.
     """
     if not len(pairs):
         return np.arange(n_atoms), np.arange(n_atoms)

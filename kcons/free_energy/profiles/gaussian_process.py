@@ -80,13 +80,7 @@ class Axis:
 
 
 def inside(x: ArrayLike, low: FloatArray, high: FloatArray, periods: Sequence[float | None], item: str) -> FloatArray:
-    """Places (m, d) within the range of the windows; into it by periods where there is one.
-
-    Raises
-    ------
-    InputError
-        A wrong shape; a NaN or infinity; a place beyond the windows.
-    """
+    """Places (m, d) within the range of the windows, into it by periods where there is one; refuses all others."""
     places = np.array(as_float_array(x, item))
     if places.ndim != 2 or places.shape[1] != len(low) or not np.isfinite(places).all():
         raise InputError(f"{item} must be finite numbers of shape (m, {len(low)})", item=item)

@@ -8,8 +8,8 @@ with the distances of the atoms. No bonds need to be known, and weak contacts ha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
@@ -161,26 +161,17 @@ BENDINGS = 4
 
 @cache
 def _libraries() -> Any:
-    """The BLAS libraries that are loaded; None without threadpoolctl."""
-    if find_spec("threadpoolctl") is None:
-        return None
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController().select(user_api="blas")
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
+def one_thread() -> AbstractContextManager[Any]:
     """Keep BLAS to one thread inside: threads that share a small matrix wait for each other longer than they compute.
 
     With few cores, or other work on them, a hundred times as long. A calculator has the threads that its user chose.
     """
-    libraries = _libraries()
-    if libraries is None:
-        yield
-        return
-    with libraries.limit(limits=1):
-        yield
+    return nullcontext() if find_spec("threadpoolctl") is None else _libraries().limit(limits=1)
 
 
 @dataclass(eq=False)
@@ -200,7 +191,6 @@ class Relaxed:
 class _Place:
     """Positions, energy, and what follows from the rows there."""
 
-    @one_thread()
     def __init__(self, descent: Descent, x: FloatArray, energy: float, forces: FloatArray) -> None:
         self.x, self.energy, slope = x, energy, -forces.ravel()
         columns, internals = descent.columns, descent.internals
@@ -246,11 +236,7 @@ class Descent:
     def relaxed(self, x: FloatArray, fmax: float, most: int = 200) -> Relaxed:
         """Follow the forces on the constraints to a minimum of the energy, by at most so many evaluations.
 
-        Raises
-        ------
-        ConvergenceError
-            Too many evaluations, or forces that are not the gradient of the energy; `error.positions` is the last
-            place.
+        `ConvergenceError` of too many, or of forces that are not the gradient; `error.positions` is the last place.
         """
         try:
             with np.errstate(all="ignore"):
@@ -262,7 +248,9 @@ class Descent:
 
     def _place(self, x: FloatArray) -> _Place:
         self.evaluations += 1
-        return _Place(self, x, *self.evaluate(x))
+        found = self.evaluate(x)
+        with one_thread():
+            return _Place(self, x, *found)
 
     def _relaxed(self, x: FloatArray, fmax: float, most: int) -> Relaxed:
         here, radius = self._place(x), FIRST
@@ -276,9 +264,10 @@ class Descent:
                     "no step lowers the energy any further: forces are not its gradient, or not so exact; take a "
                     "larger fmax, or a calculator whose energies are smoother",
                 )
-            step, expected = self._step(here, radius)
             try:
-                x = self._moved(here, step)
+                with one_thread():
+                    step, expected = self._step(here, radius)
+                    x = self._moved(here, step)
             except KconsError:  # too far for the rows
                 radius /= 4
                 continue
@@ -309,7 +298,6 @@ class Descent:
         error.positions = here.x
         return error
 
-    @one_thread()
     def _step(self, here: _Place, radius: float) -> tuple[FloatArray, float]:
         """Along the rows, the longest move of an atom at most `radius`, shape (columns,); what it is to gain."""
         table = here.table[:, self.columns] @ here.along
@@ -330,7 +318,6 @@ class Descent:
         step = -slopes / (size + shift)
         return here.along @ (modes @ step), float(slopes @ step + 0.5 * step @ (curvature * step))
 
-    @one_thread()
     def _moved(self, here: _Place, step: FloatArray) -> FloatArray:
         """Positions after a step, on the rows: internal coordinates change as they do at its beginning."""
         internals, columns = self.internals, self.columns
@@ -345,7 +332,6 @@ class Descent:
             x.flat[columns] += here.along @ np.linalg.solve(normal, weighed @ missing)
         return self.motion.project_positions(x, here.x)
 
-    @one_thread()
     def _learn(self, pair: FloatArray) -> None:
         """The nearest symmetric matrix that maps a move to the change of the slopes, of any signature (TS-BFGS)."""
         move, change = pair

@@ -122,10 +122,7 @@ def scan(
     if folder is None:
         return wavefront.run()
     plan = {
-        "symbols": str(atoms.symbols),
-        "positions": atoms.positions.tolist(),
-        "cell": atoms.cell.array.tolist(),
-        "pbc": atoms.pbc.tolist(),
+        "structure": [value.tolist() for value in (atoms.numbers, atoms.positions, atoms.cell.array, atoms.pbc)],
         "calculator": described(atoms.calc, atoms),
         "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
         "values": [axis.tolist() for axis in grid.values],
@@ -144,12 +141,7 @@ class _Wavefront:
     """What is held at each point, its energies and forces; which point is relaxed next, and from where."""
 
     def __init__(
-        self,
-        atoms: Atoms,
-        grid: Grid,
-        held: list[Constraint],
-        settings: dict[str, Any],
-        progress: Progress | None,
+        self, atoms: Atoms, grid: Grid, held: list[Constraint], settings: dict[str, Any], progress: Progress | None
     ) -> None:
         if atoms.calc is None:
             raise InputError("the atoms have no calculator; give them one: atoms.calc = ...", item="calculator")

@@ -17,7 +17,7 @@ from ase import Atoms, units
 from numpy.typing import ArrayLike
 from rich import box
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from kcons import __version__
 from kcons.ase.constraints_object import Constraints
@@ -44,21 +44,6 @@ class Grid:
     """All combinations of the values of one or two coordinates, in angstrom or radian, up or down.
 
     Of dihedrals over a whole turn the last value, which is the first one again, is left out.
-
-    Attributes
-    ----------
-    coordinates : list of Constraint
-    values : list of ndarray
-    rings : list of bool
-        Whether the first value of a coordinate follows on its last.
-    names, keys : list of str
-        'Dihedral(0, 1, 2, 3)'; without blanks, for files, 'dihedral_0_1_2_3'.
-    in_degrees : list of bool
-        Which coordinates are angles, shown in degrees.
-    units : list of str
-        Of the values as they are shown; formulas and functions have their own.
-    shape : tuple of int
-    points : list of tuple of int
     """
 
     def __init__(self, coordinates: Sequence[Constraint], values: Sequence[ArrayLike]) -> None:
@@ -76,8 +61,10 @@ class Grid:
             if item.moving or not item.holonomic:
                 raise UnsupportedError(f"{item!r} moves with time or holds velocities; scan a coordinate of positions")
         made = [_axis(item, given) for item, given in zip(self.coordinates, values, strict=True)]
+        #: Arrays; and whether the first value of a coordinate follows on its last.
         self.values, self.rings = [axis for axis, _ in made], [ring for _, ring in made]
         self.names = [item.row_name(0) for item in self.coordinates]
+        # Without blanks, for files: 'dihedral_0_1_2_3'.
         keys = ["_".join([item.family.lower(), *map(str, item.atoms[0].tolist()[:6])]) for item in self.coordinates]
         self.keys = [key + (f"_{n}" if key in keys[:n] else "") for n, key in enumerate(keys)]
         self.in_degrees = [item.held == ANGLE for item in self.coordinates]
@@ -301,19 +288,17 @@ class Scan:
 
     def table(self) -> Table:
         """A row a point; energies above the lowest one. Print it."""
-        shown = _Shown(box=box.SIMPLE_HEAD, padding=(0, 1))
-        for name, unit in zip(self.grid.names, self.grid.units, strict=True):
-            shown.add_column(f"{name}\n{unit}", justify="right")
-        for heading in ("energy\nkJ/mol", "hysteresis\nkJ/mol", "calls\n", "force left\neV/angstrom"):
-            shown.add_column(heading, justify="right")
-        for point, row in zip(self.grid.points, self.rows(), strict=True):
-            turns = zip(self.grid.shown(point), self.grid.in_degrees, strict=True)
-            cells = [f"{v:.2f}" if turn else f"{v:.4f}" for v, turn in turns]
-            cells += [f"{row['energy_kJ_mol']:.3f}", f"{row['hysteresis_kJ_mol']:.3f}", str(row["calls"])]
-            cells.append(f"{row['force_left_eV_A']:.4f}")
-            if row["error"]:
-                cells[-4:] = "failed", "", str(row["calls"]), ""
-            shown.add_row(*cells)
+        titles = [f"{name}\n{unit}" for name, unit in zip(self.grid.names, self.grid.units, strict=True)]
+        titles += ["energy\nkJ/mol", "hysteresis\nkJ/mol", "calls\n", "force left\neV/angstrom"]
+        shown = _Shown(*(Column(title, justify="right") for title in titles), box=box.SIMPLE_HEAD, padding=(0, 1))
+        for row in self.rows():
+            *values, _, energy, spread, calls, left, error = row.values()
+            numbers = (
+                ("failed", "", f"{calls}", "")
+                if error
+                else (f"{energy:.3f}", f"{spread:.3f}", f"{calls}", f"{left:.4f}")
+            )
+            shown.add_row(*(f"{value:.6g}" for value in values), *numbers)
         return shown
 
     def plot(self) -> Figure:

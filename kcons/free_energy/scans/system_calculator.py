@@ -21,13 +21,7 @@ _KJ = units.kJ / units.mol
 
 
 def read_system(path: Path, item: str) -> openmm.System:
-    """The System of an XML file.
-
-    Raises
-    ------
-    InputError
-        No System; or one with a `PythonForce`, whose Python code would run while it is read.
-    """
+    """The System of an XML file; refuses one with a `PythonForce`, whose code would run while it is read."""
     if not path.is_file():
         raise InputError(f"there is no file {path}", item=item)
     text = path.read_text(encoding="utf-8", errors="replace")

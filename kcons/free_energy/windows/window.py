@@ -94,18 +94,8 @@ class Sampler(ABC):
 
     Warns of torsions over no bonds, and refuses what is undefined at the initial structure or depends on other rows.
 
-    Parameters
-    ----------
-    coordinates : mapping of str to Constraint
-        Each of one row that holds positions.
-    held : sequence of Constraint
-        What is held beside them.
-    positions, masses, cell, pbc
-        The structure that all windows start from, in the units of the engine.
-    bonds, turning : ndarray of int, shape (n, 2)
-        Of the molecules, and those by which groups may be turned; None where something is held otherwise.
-    angstrom : float
-        In the engine's unit of length: how many angstrom it has.
+    Structure and rows are in the units of the engine, in which a length of 1 has `angstrom` angstrom. Groups are turned
+    by the bonds `turning`; None where something is held otherwise.
 
     Attributes
     ----------
@@ -219,12 +209,8 @@ class Sampler(ABC):
     def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
         """The engine of a window, and the initial structure with groups turned and moved so that it is there.
 
-        Within a ring nothing turns without bending angles. There it goes to the nearest point by small steps.
-
-        Raises
-        ------
-        InfeasibleError
-            Neither way keeps the bonds.
+        Within a ring nothing turns without bending angles. There it goes to the nearest point by small steps;
+        `InfeasibleError` where neither way keeps the bonds.
         """
         motion = Motion(self._set([*self.held, *self.at(values)]), self.positions)
         try:

@@ -14,6 +14,7 @@ import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
 from MDAnalysis.coordinates.DCD import DCDReader
+from MDAnalysis.coordinates.timestep import Timestep
 from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
@@ -36,13 +37,7 @@ from kcons.mdanalysis.check.precision import (
 from kcons.mdanalysis.check.result import Asked, CheckResult, result_of
 from kcons.mdanalysis.check.targets import label, read_targets, with_targets
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, open_universe, quiet
-from kcons.mdanalysis.topology import (
-    constraints_of,
-    host_of,
-    require_angstrom,
-    topology_of,
-    velocities_known,
-)
+from kcons.mdanalysis.topology import constraints_of, host_of, require_angstrom, topology_of, velocities_known
 from kcons.motion.motion import Motion
 from kcons.topology.holding import Options
 from kcons.topology.rows_by_name import HeldRows
@@ -117,10 +112,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         held = constraints.constraints if isinstance(constraints, ConstraintSet) else constraints
         given = tuple(constraints_in(held, "constraints"))
         if not sum(item.n_rows for item in given):
-            raise InputError(
-                "there are no constraints to check; select others, or look at the bonds of the topology",
-                item="constraints",
-            )
+            remedy = "select others, or look at the bonds of the topology"
+            raise InputError(f"there are no constraints to check; {remedy}", item="constraints")
         topology = topology_of(universe)
         self._used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
         self._masses, reason = _masses(universe, topology, given, self._used)
@@ -186,7 +179,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             super().run(**chosen, **options)
         found: Found = self.results.found
         if not len(found.frames):
-            assert found.broken is not None
             raise self._nothing(found.broken)
         # Whether frames that were cut off would have been looked at.
         first, end = (stop, start) if step is not None and step < 0 else (start, stop)
@@ -204,10 +196,9 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         try:
             numbers: list[int] = np.arange(count)[part].tolist()
         except (IndexError, ValueError, TypeError) as error:
+            remedy = f"give start, stop and step, or frames: whole numbers, or {count} times True or False"
             raise InputError(
-                f"{name}: its {count} frames have no {part!r:.60} ({error}); give start, stop and step, or as frames "
-                f"whole numbers, or True and False for each of the {count} frames",
-                item="frames",
+                f"{name}: its {count} frames have no {part!r:.60} ({error}); {remedy}", item="frames"
             ) from None
         if not numbers:
             raise InputError(f"{name}: no frames are left by start, stop and step; it has {count}", item="frames")
@@ -223,12 +214,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
                 seen.append(np.array(self._trajectory[numbers[k]].positions[used]))
         step = grid_of(seen) if seen and np.isfinite(seen).all() else 0.0
         self._precision = [replace(self._precision[0], step=step)] * len(self._precision)
-        if not step:
-            return []
-        return [
-            f"coordinates lie on a grid of {step:g} Å, as after a conversion from XTC or text: that is taken for "
-            "their precision, unless one is given"
-        ]
+        said = f"coordinates lie on a grid of {step:g} Å, as after a conversion from XTC or text: that is taken for"
+        return [f"{said} their precision, unless one is given"] if step else []
 
     def _bind(self, frame: int) -> list[str]:
         """Rows and their targets at one frame, which must be finite; what to say of their rank."""
@@ -253,38 +240,37 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             return [f"no rank: {error}"]
         return []
 
-    def _nothing(self, broken: Break) -> UnreadableError:
+    def _nothing(self, broken: Any) -> UnreadableError:
         """Of a trajectory of which nothing can be told."""
-        return UnreadableError(
-            f"{self.asked.names[0]}: frame {broken.frame}, the first to be checked, cannot be read ({broken.reason}); "
-            "start at another frame, or write the file again",
-            item="trajectory",
-        )
+        said = f"{self.asked.names[0]}: frame {broken.frame}, the first to be checked, cannot be read ({broken.reason})"
+        return UnreadableError(f"{said}; start at another frame, or write the file again", item="trajectory")
 
     def _get_aggregator(self) -> ResultsGroup:
         return ResultsGroup(lookup={"found": Found.joined})
 
     @property
     def check(self) -> CheckResult:
-        """What was found.
-
-        Raises
-        ------
-        InputError
-            Nothing was looked at yet.
-        """
+        """What was found, after `run`."""
         if "check" not in self.results:
             raise InputError("nothing was looked at yet; call run() first", item="check")
         return self.results.check  # type: ignore[no-any-return]
 
 
+class _Uncopied(Timestep):  # type: ignore[misc]
+    """Has coordinates where the reader of DCD put them, all x before all y: to copy them takes longer than to read."""
+
+    @property
+    def positions(self) -> Any:
+        return self.given
+
+    @positions.setter
+    def positions(self, given: Any) -> None:
+        self.given = given
+
+
 @dataclass
 class _Frames:
-    """The work of one worker, which is all that goes to other processes.
-
-    MDAnalysis' own loop ends in an error at the first frame that cannot be used, and takes the whole analysis there
-    and back.
-    """
+    """The work of one worker, all that goes to others: MDAnalysis' own loop takes the analysis, and ends in errors."""
 
     trajectory: Any
     rows: RowTable
@@ -300,8 +286,8 @@ class _Frames:
     ) -> Any:
         """Look at frames, in order, up to the first that cannot be used."""
         numbers, trajectory, previous = indexed_frames[:, 1], self.trajectory, -1
-        # The reader of DCD copies a frame before it reads the next one into the copy, which takes as long again.
         in_place = isinstance(trajectory, DCDReader) and not trajectory.transformations
+        own = _Uncopied.from_timestep(trajectory.ts) if in_place else None
         found = Found.nothing(self.rows.n_rows, numbers)
         with quiet(), ProgressBar(total=len(numbers), verbose=bool(verbose), **(progressbar_kwargs or {})) as bar:
             for k, number in enumerate(numbers.tolist()):
@@ -313,7 +299,7 @@ class _Frames:
                         if not 0 <= previous == number - 1:
                             ts = trajectory[number]
                         else:
-                            ts = trajectory._read_next_timestep(trajectory.ts) if in_place else trajectory.next()
+                            ts = trajectory._read_next_timestep(own) if in_place else trajectory.next()
                         previous = number
                         v = ts.velocities if ts.has_velocities and self.velocities else None
                         self.rows.look(found, k, ts, self.precision[number], self.masses, v)
@@ -323,26 +309,19 @@ class _Frames:
                     found.units, found.frames = found.units[:k], found.frames[:k]
                     break
                 bar.update()
+        if in_place:
+            trajectory.ts = Timestep.from_timestep(trajectory.ts)
         return SimpleNamespace(frames=found.frames["frame"], times=found.frames["time"], results=Results(found=found))
 
 
 def _masses(
     universe: Any, topology: Topology, given: Sequence[Constraint], used: NDArray[np.int64]
 ) -> tuple[FloatArray | None, str]:
-    """Masses; or None where they cannot be used, and why.
-
-    Raises
-    ------
-    InputError
-        Constraints on atoms that do not exist, or that need masses.
-    """
+    """Masses; or None where they cannot be used, and why."""
     masses = topology.masses
     if used[-1] >= len(masses):
-        raise InputError(
-            f"there is no atom {used[-1]}; the topology has atoms 0 to {len(masses) - 1}",
-            item="constraints",
-            atoms=[int(used[-1])],
-        )
+        said = f"there is no atom {used[-1]}; the topology has atoms 0 to {len(masses) - 1}"
+        raise InputError(said, item="constraints", atoms=[int(used[-1])])
     bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
     if not len(bad):
         return masses, ""
@@ -421,10 +400,8 @@ def check_trajectory(
     universe = open_universe(topology, topology_format=topology_format)
     if of_topology:
         if not hasattr(universe, "trajectory"):
-            raise InputError(
-                f"{topology} has no coordinates to take lengths from; give --targets first, mean, or a TOML file",
-                item="targets",
-            )
+            said = f"{topology} has no coordinates to take lengths from; give --targets first, mean, or a TOML file"
+            raise InputError(said, item="targets")
         with quiet():
             errors = precision_of(topology, format_of(universe.trajectory)).half_step(universe.atoms.positions)
     else:

@@ -36,11 +36,12 @@ UNITS = ("Å", "rad")
 #: What second order adds to the error of rows other than distances, at most.
 SECOND_ORDER = 1.1
 _ROOT_THREE = np.sqrt(3.0)
-#: All bits of a single but its sign; those of its exponent alone, which are the power of two below it.
-_UNSIGNED, _EXPONENT = np.int32(0x7FFFFFFF), np.int32(0x7F800000)
+#: Bits of the exponent of a single, which are the power of two below it; all of them are set where it is no number.
+_EXPONENT = np.int32(0x7F800000)
 
-#: What is held: atoms of a length (-1 of other rows), target, what the row may be off by besides rounding, its size.
-_HELD = np.dtype([("i", "i4"), ("j", "i4"), ("target", "f8"), ("slack", "f8"), ("size", "f8")])
+#: What is held: atoms of a length (-1 of other rows), target, what the row may be off by besides rounding, and the
+#: rounding up to which a frame counts: that or its size.
+_HELD = np.dtype([("i", "i4"), ("j", "u4"), ("target", "f8"), ("slack", "f8"), ("most", "f8")])
 #: Over all frames, by row: the largest excess over what was allowed (negative where there was none), the absolute
 #: deviation in that frame and its number; sums of deviations, of what rounding makes of them, and of frames that count.
 _BY_ROW = np.dtype(
@@ -137,7 +138,7 @@ class RowTable:
         ]
         self._lengths: NDArray[np.bool_] = np.concatenate(plain)
         self._table = table = np.zeros(held.n_rows, _HELD)
-        table["i"], table["size"] = -1, self.sizes
+        table["i"] = -1
         for item, first, mine in zip(held.constraints, held.starts, plain, strict=False):
             if mine.any():
                 rows = first + np.flatnonzero(mine)
@@ -147,8 +148,8 @@ class RowTable:
         self.others: ConstraintSet | None = None
         if len(self._rows):
             self.others, self._atoms = held.subset(self._rows)
-        self._is_held = np.zeros(held.n_atoms, dtype=bool)
-        self._is_held[held.touched] = True
+        self._is_held = np.zeros(held.n_atoms, dtype=np.int32)  # 0 where no row has the atom
+        self._is_held[held.touched] = _EXPONENT
         # Runs of rows of one unit.
         starts = np.append(0, np.flatnonzero(np.diff(self.units)) + 1)
         self._runs = np.stack([starts, np.append(starts[1:], held.n_rows), self.units[starts]], axis=1)
@@ -176,20 +177,17 @@ class RowTable:
         return {name: value for name, value in vars(self).items() if name in kept}
 
     def _made_of(self, errors: FloatArray, slopes: Any) -> FloatArray:
-        """What errors of coordinates make of each row, at most: of lengths exactly, of others to first order and more.
-
-        Rows that hold velocities only have no position to be off.
-        """
+        """What errors of coordinates make of each row, at most; rows of velocities have no position to be off."""
         result: FloatArray = SECOND_ORDER * (slopes @ np.repeat(errors, 3))
         lengths = self._table[self._lengths]
         result[self._lengths] = _ROOT_THREE * (errors[lengths["i"]] + errors[lengths["j"]])
         return np.where(self.set.holonomic, result, 0.0)
 
     def _allow(self, of_targets: FloatArray) -> None:
-        """Say what rounding makes of the targets, at most; the tolerance and the rounding of frames come besides."""
-        #: What rounding makes of the targets, at most.
+        #: What rounding makes of the targets, at most; the tolerance and the rounding of frames come besides.
         self.of_targets = of_targets
         self._table["slack"] = of_targets + self.tolerance * self.sizes
+        self._table["most"] = np.maximum(self._table["slack"], self.sizes)
 
     def take_means(self, found: Found) -> None:
         """Take the means that a first pass found as targets."""
@@ -215,18 +213,12 @@ class RowTable:
         return self._cell
 
     def look(self, found: Found, k: int, ts: Any, precision: FilePrecision, masses: FloatArray | None, v: Any) -> None:
-        """Put what is found in one frame into the k-th place; with velocities `v` (angstrom/ps) rates, too.
-
-        Raises
-        ------
-        NonFiniteError
-            A coordinate of a held atom, a velocity or the cell is NaN or infinite.
-        """
+        """Put what is found in one frame, which must be finite, into the k-th place; with velocities rates, too."""
         frame = found.frames[k]
         frame["time"] = time = float(ts.time)
         lattice, limit = self._cell_of(ts.dimensions)
         frame["bare"] = limit == np.inf
-        x = np.ascontiguousarray(ts.positions, dtype=np.float32)
+        planes = np.ascontiguousarray(ts.positions.T, dtype=np.float32)
         speeds = np.zeros((0, 3)) if v is None else np.asarray(v, dtype=np.float64)
         if not np.isfinite(speeds).all():
             atom = int(np.argmin(np.isfinite(speeds).all(axis=1)))
@@ -234,9 +226,9 @@ class RowTable:
         if v is not None and masses is not None:
             frame["kinetic"], frame["momentum"] = masses @ (speeds * speeds).sum(axis=1), masses @ speeds
         if self.others is not None:
-            self._look_at_others(x, speeds, lattice if limit < np.inf else None, precision, time)
+            self._look_at_others(planes.T, speeds, lattice if limit < np.inf else None, precision, time)
         bad = _look(
-            (x, x.view(np.int32), self._is_held, speeds),
+            (planes, planes.view(np.int32), self._is_held, speeds),
             (lattice, limit, precision.grid, *precision.coefficients),
             (self._table, self._given, self._runs),
             found.rows,
@@ -244,7 +236,7 @@ class RowTable:
             found.frames["frame"][k],
         )
         if bad >= 0:
-            raise NonFiniteError(f"position of atom {bad} is {x[bad]}", item="position", atom=bad)
+            raise NonFiniteError(f"position of atom {bad} is {planes[:, bad]}", item="position", atom=bad)
 
     def _look_at_others(
         self, x: NDArray[np.float32], v: FloatArray, lattice: FloatArray | None, precision: FilePrecision, time: float
@@ -272,39 +264,31 @@ def _by_row(constraints: Sequence[Constraint], values: Sequence[Any]) -> Any:
 
 @njit(cache=True, nogil=True)
 def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untyped-def]
-    """Put deviations of all rows in one frame, the `frame`-th, into `by_row` and `by_unit`.
+    """Put deviations of all rows in one frame into `by_row` and `by_unit`; the first held atom of no number, or -1.
 
-    The first atom of a row that is not finite is returned, and nothing changed then; -1 if there is none.
-
-    Parameters
-    ----------
-    atoms : (ndarray, ndarray, ndarray, ndarray)
-        Positions in single precision, shape (n_atoms, 3), and their bits; atoms that rows have; velocities or nothing.
-    space : (ndarray, float, float, float, float, float)
-        Cell and its inverse, and the square of half its smallest width: shorter vectors are their own shortest images;
-        grid of the coordinates in the file, 0 if there is none; what their rounding is, see `FilePrecision`.
-    held : (ndarray, ndarray, ndarray)
-        See `_HELD`; deviation, rounding and rate of rows that are no lengths; first row, end and unit of runs.
+    `atoms`: positions, shape (3, n_atoms), and their bits; which are held; velocities, shape (n_atoms, 3) or (0, 3).
+    `space`: the cell and its inverse, and the square of half its smallest width, below which vectors are their own
+    nearest images; the grid of coordinates in the file, or 0; the coefficients of `FilePrecision`. `held`: `_HELD`;
+    deviation, rounding and rate of rows that are no lengths; first row, end and unit of runs.
     """
     x, bits, is_held, v = atoms
     lattice, limit, step, base, factor, reach = space
     cell = lattice_numbers(lattice)
     table, given, runs = held
-    powers, points = np.empty(len(x), dtype=np.float32), np.empty((len(x), 3))
+    powers = np.empty(len(is_held), dtype=np.float32)
+    exponents, least, worst = powers.view(np.int32), np.float32(reach).view(np.int32), np.int32(0)
+    for a in range(len(powers)):
+        exponent = max(max(bits[0, a] & _EXPONENT, bits[1, a] & _EXPONENT), bits[2, a] & _EXPONENT)
+        worst = max(worst, exponent & is_held[a])
+        exponents[a] = exponent if exponent >= least else 0
+    if worst == _EXPONENT:
+        return np.argmax((is_held != 0) & (exponents == _EXPONENT))
     # As the file holds them.
+    points = np.empty(x.shape)
     numbers, stored, inverse = x.reshape(-1), points.reshape(-1), 1.0 / step if step > 0.0 else 0.0
     for k in range(len(numbers)):
         exact = np.float64(numbers[k])
         stored[k] = np.rint(exact * inverse) * step if step > 0.0 else exact
-    exponents = powers.view(np.int32)
-    least, bad = np.float32(reach).view(np.int32), False
-    for a in range(len(x)):
-        one, two, three = bits[a, 0] & _UNSIGNED, bits[a, 1] & _UNSIGNED, bits[a, 2] & _UNSIGNED
-        exponent = max(max(one, two), three) & _EXPONENT
-        bad |= is_held[a] & (exponent == _EXPONENT)
-        exponents[a] = exponent if exponent >= least else 0
-    if bad:
-        return np.argmax(is_held & (exponents == _EXPONENT))
     for run in range(len(runs)):
         first, end, unit = runs[run]
         total, squares, largest, excess, coarsest, seen, rates, fastest = 0.0, 0.0, 0.0, -np.inf, 0.0, 0, 0.0, 0.0
@@ -312,7 +296,7 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
             row, rate = table[r], 0.0
             i, j = row.i, row.j
             if i >= 0:
-                dx, dy, dz = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+                dx, dy, dz = points[0, i] - points[0, j], points[1, i] - points[1, j], points[2, i] - points[2, j]
                 square = dx * dx + dy * dy + dz * dz
                 if not square < limit:
                     dx, dy, dz = minimum_image(dx, dy, dz, cell, TRICLINIC)
@@ -324,7 +308,7 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
                     rate = abs(along) / np.sqrt(square)
             else:
                 off, rounding, rate = given[r, 0], given[r, 1], given[r, 2]
-            if rounding > row.size and rounding > row.slack:
+            if rounding > row.most:
                 continue
             size = abs(off)
             margin = size - rounding - row.slack

@@ -58,12 +58,7 @@ def ending_of(reader: Any) -> Break | None:
 
 
 def damage_of(reader: Any) -> Break | None:
-    """The first frame of a DCD file whose records are not where they must be; of a text file the first whose lines are
-    not all there, to their ends, or that has another number of atoms. None where there is no such frame, and for other
-    formats.
-
-    The reader does not look: it takes what it finds for coordinates.
-    """
+    """The first damaged frame of DCD and text files, of which the reader takes what it finds for coordinates."""
     return _first(reader, _damage)
 
 
@@ -163,12 +158,9 @@ def _behind_the_only_frame(path: str, file_format: str, n_atoms: int) -> str:
 
 
 def _text_break(path: str, file_format: str, n_atoms: int) -> Break | None:
-    """Where the whole frames of a text format end whose frames have equal numbers of lines; None for other formats.
-
-    Of PDB, whose frames may differ, only a last line without an end is seen.
-    """
+    """Where the whole frames of a text format end whose frames have equal numbers of lines; None for other formats."""
     lines, blank, models, line, wrong = 0, 0, 0, b"", None
-    if file_format == "PDB":
+    if file_format == "PDB":  # whose frames may differ
         with anyopen(path, "rb") as file:
             for line in file:
                 models += line.startswith(b"MODEL")

@@ -17,8 +17,8 @@ import numpy as np
 from MDAnalysis.lib.util import anyopen
 from numpy.typing import ArrayLike
 
+from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 from kcons.mdanalysis.loading import format_named, format_of
 
 #: Formats whose numbers are floats in nanometers, which MDAnalysis turns into angstrom, in single precision again.
@@ -59,10 +59,7 @@ class FilePrecision:
 
     @property
     def coefficients(self) -> tuple[float, float, float]:
-        """How far rounding moves coordinates: by base at most, and by base + factor 2^e of atoms from reach on.
-
-        2^e <= |x| < 2^(e+1) for an atom's largest coordinate; reach is a power of two, or 0.
-        """
+        """Rounding moves coordinates of an atom, 2^e <= largest < 2^(e+1), by base; + factor 2^e from `reach` on."""
         if self.exact:
             # Integers of XTC are turned into nanometers, and these into angstrom, with four roundings; they can be had
             # back where these make less than half a step. Elsewhere the one taken for it is off by twice the four.
@@ -92,20 +89,10 @@ class FilePrecision:
 
 
 def precision_of(path: str | Path, file_format: str, step: float | None = None) -> FilePrecision:
-    """Precision of a file, whose format is as MDAnalysis names it; read from the file itself where it says.
-
-    `step` is what a person knows better, in angstrom.
-
-    Raises
-    ------
-    InputError
-        `step` is not positive.
-    """
+    """Precision of a file, read from it where it says; `step`, in angstrom, is what a person knows better."""
     name = file_format.upper()
     if step is not None:
-        if not step > 0:
-            raise InputError(f"the precision is {step}; give a positive step in angstrom, such as 0.001", item="step")
-        return FilePrecision(name, float(step))
+        return FilePrecision(name, positive(step, "precision"))
     if name == "XTC":
         with open(path, "rb") as file:
             steps = _xtc_precision(file)
@@ -168,10 +155,9 @@ def _xtc_precision(file: BinaryIO, offset: int = 0) -> float:
 
 
 def grid_of(coordinates: ArrayLike) -> float:
-    """Step of the decimal grid that single precision numbers lie on, as after a conversion from XTC or text.
+    """Step of the decimal grid that single precision numbers lie on, as after a conversion from XTC or text; or 0.
 
-    All must lie on it, as far as their precision tells, and most not on one that is ten times as coarse: coordinates
-    that were rounded end in any digit, those that a person wrote do not. 0 where there is no such grid.
+    Most must not lie on one ten times as coarse: rounded numbers end in any digit, those that a person wrote do not.
     """
     x = np.abs(np.asarray(coordinates, dtype=np.float64).ravel())
     x = x[x > 0]

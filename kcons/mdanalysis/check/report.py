@@ -87,10 +87,7 @@ def _rows(result: CheckResult) -> Table:
 
 
 def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
-    """Largest and root mean square deviation along the trajectory, and the temperature, as a PNG file.
-
-    Lines show what rounding of the file makes of a row at most, and what the tolerance allows the shortest row besides.
-    """
+    """Deviations along the trajectory beside what rounding and the tolerance allow, and the temperature, as PNG."""
     from matplotlib.figure import Figure
 
     panels = len(result.units) + (result.temperature is not None)
@@ -137,13 +134,7 @@ def results(folder: Path, trajectory: str | Path) -> ResultFolder:
 def write(
     folder: Path, trajectory: str | Path, data: dict[str, Any], picture: bytes = b"", text: str = ""
 ) -> list[Path]:
-    """Write what there is, and take away what an earlier check of the same trajectory left; the paths written.
-
-    Raises
-    ------
-    OccupiedError
-        The folder has the check of another trajectory, or other files of these names; nothing was written.
-    """
+    """Write what there is, and take away what an earlier check of the same trajectory left; the paths written."""
     place = results(folder, trajectory)
     # Names of files need not be text; in JSON the replacement is what stands for such a character.
     whole = f"{as_json({**place.owner, **data})}\n".encode(errors="backslashreplace")

@@ -176,25 +176,17 @@ def result_of(
     frames = numbers[(found.units["excess"] > 0).any(axis=1)]
     status = "tolerated" if (margins + table.tolerance * table.sizes > 0).any() else "kept"
     status = "violated" if violated.any() else "incomplete" if gaps else status
-    columns = {"largest": found.units["largest"], "rms": found.rms, "rounding": found.units["rounding"]}
-    series = {
-        f"{name} {unit.unit}": values[:, UNITS.index(unit.unit)].tolist()
-        for unit in units
-        for name, values in columns.items()
-    }
+    columns = (("largest", found.units["largest"]), ("rms", found.rms), ("rounding", found.units["rounding"]))
+    of_unit = [(unit.unit, UNITS.index(unit.unit)) for unit in units]
+    series = {f"{name} {unit}": values[:, k].tolist() for unit, k in of_unit for name, values in columns}
     freedom, temperature = None, None
     if rank is not None:
         freedom, kelvin = _temperatures(found, rank, held.masses, remarks)
         if kelvin is not None:
             series["temperature K"] = kelvin.tolist()
             line = fitted(times, kelvin) or Estimate(np.nan, np.nan)
-            temperature = {
-                "mean": float(np.nanmean(kelvin)),
-                "deviation": float(np.nanstd(kelvin)),
-                "frames": float(np.isfinite(kelvin).sum()),
-                "slope": line.value,
-                "slope_error": line.error,
-            }
+            temperature = {"mean": float(np.nanmean(kelvin)), "deviation": float(np.nanstd(kelvin))}
+            temperature |= {"frames": float(np.isfinite(kelvin).sum()), "slope": line.value, "slope_error": line.error}
     return CheckResult(
         trajectory=asked.names[0],
         topology=asked.names[1],
@@ -267,11 +259,7 @@ def _row(table: RowTable, topology: Topology, found: Found, row: int) -> RowResu
 
 
 def _first_alone(table: RowTable, found: Found) -> str:
-    """What to say where the first frame alone differs; '' where it does not, or there are fewer than three.
-
-    Where targets come from it, all others are off; they agree if they differ among themselves by no more than rounding
-    and the tolerance, in the root mean square.
-    """
+    """What to say where the first frame alone differs from others that agree; '' elsewhere."""
     off = np.asarray((found.units["excess"] > 0).any(axis=1))
     if len(off) < 3 or off[0] == off[1] or (off[1:] != off[1]).any():
         return ""

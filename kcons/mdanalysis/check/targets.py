@@ -83,18 +83,10 @@ def _all_match(labels: NDArray[np.str_], patterns: Sequence[str]) -> NDArray[np.
 
 
 def read_targets(path: str | Path) -> dict[str, list[Rule]]:
-    """Entries of a parameter file, by the family of rows that they are for.
-
-    Raises
-    ------
-    InputError
-        A file that is missing or malformed, an entry with a wrong number of names, a value out of range.
-    """
+    """Entries of a parameter file, by the family of rows that they are for."""
     if not Path(path).is_file():
-        raise InputError(
-            f"there is no file {path} with targets; give 'topology', 'first', 'mean', or a TOML file of lengths",
-            item="targets",
-        )
+        remedy = "give 'topology', 'first', 'mean', or a TOML file of lengths"
+        raise InputError(f"there is no file {path} with targets; {remedy}", item="targets")
     try:
         data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, OSError, RecursionError) as error:
@@ -122,26 +114,17 @@ def _rule(kind: str, width: int, where: str, entry: Any, scale: float) -> Rule:
     by = [key for key in ("atoms", "elements") if key in entry]
     if len(by) != 1:
         raise InputError(f"{where}: give either atoms or elements", item="targets")
-    patterns, value = entry[by[0]], entry["value"]
+    patterns, value, angle = entry[by[0]], entry["value"], kind == "angle"
     if not isinstance(patterns, list) or len(patterns) != width or not all(isinstance(p, str) for p in patterns):
         raise InputError(f"{where}: {by[0]} must be {width} names, not {patterns!r}", item=by[0])
-    top, what = (
-        (180.0, "an angle between 0 and 180 degrees") if kind == "angle" else (sys.float_info.max, "a positive length")
-    )
-    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < top:
+    if type(value) not in (int, float) or not 0 < value < (180.0 if angle else sys.float_info.max):
+        what = "an angle between 0 and 180 degrees" if angle else "a positive length"
         raise InputError(f"{where}: value is {value!r}; give {what}", item="value")
-    target = math.radians(value) if kind == "angle" else float(value) * scale
-    return Rule(by[0], patterns, str(entry.get("residue", "*")), target)
+    return Rule(by[0], patterns, str(entry.get("residue", "*")), math.radians(value) if angle else float(value) * scale)
 
 
 def with_targets(path: str | Path, constraints: Sequence[Constraint], topology: Topology) -> list[Constraint]:
-    """Constraints with the targets that a file gives; families other than distances and angles keep theirs.
-
-    Raises
-    ------
-    InputError
-        As `read_targets`; a row that no entry fits.
-    """
+    """Constraints with the targets that a file gives; families other than distances and angles keep theirs."""
     rules = read_targets(path)
     held = []
     for item in constraints:

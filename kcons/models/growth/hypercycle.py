@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import FloatArray, positive, whole_number
 from kcons.errors import ConvergenceError, InputError
@@ -93,10 +93,6 @@ class Hypercycle(GrowthModel):
         eta0 = np.sum(reactions)
         eta1 = b2 - np.sum(reactions * mu)
         return np.asarray(((M0 * eta1 + eta0 * M1) * mu - (eta1 * M1 + eta0 * M2)) / (M0 * M2 - M1 * M1))
-
-    def interior_eigenvalues(self, total: float = 1.0) -> NDArray[np.complex128]:
-        """Eigenvalues at x_i = total/n with the sum fixed: (k_h total/n) exp(2 pi i j/n), j = 1..n-1."""
-        return np.asarray(self.k_h * total / self.n * np.exp(2j * np.pi * np.arange(1, self.n) / self.n))
 
 
 class ConstrainedHypercycle(ConstrainedGrowth):

@@ -105,15 +105,9 @@ def accelerated() -> list[str]:
 
 
 def build(target: Path, platforms: Sequence[str], stubs: bool = False) -> None:
-    """Compile the libraries into a folder.
+    """Compile the libraries of some of the platforms `ACCELERATED` into a folder.
 
-    Parameters
-    ----------
-    target : path
-    platforms : sequence of str
-        Of `ACCELERATED`.
-    stubs : bool
-        Link with empty libraries of the names of OpenMM's, so that none of the platforms need be here.
+    With `stubs`, link with empty libraries of the names of OpenMM's, so that none of the platforms need be here.
     """
     target.mkdir(parents=True, exist_ok=True)
     libraries = Path(openmm.version.openmm_library_path)
@@ -143,13 +137,7 @@ def _compile(arguments: Sequence[str]) -> None:
 
 @cache
 def library() -> ctypes.CDLL:
-    """The library of the integrator, with those of all platforms loaded into OpenMM.
-
-    Raises
-    ------
-    UnsupportedError
-        There is none and none can be made.
-    """
+    """The library of the integrator, with those of all platforms loaded into OpenMM; UnsupportedError without one."""
     if why := refusal():
         raise UnsupportedError(f"no steps on the device: {why}")
     wanted = accelerated()
@@ -167,13 +155,7 @@ def library() -> ctypes.CDLL:
 
 
 def kernels_library(source: str) -> Path:
-    """Kernels for Reference and CPU, compiled to a library.
-
-    Raises
-    ------
-    UnsupportedError
-        There is no compiler, or it refuses them.
-    """
+    """Kernels for Reference and CPU, compiled to a library; UnsupportedError where there is no compiler."""
     if not compiler():
         raise UnsupportedError("steps on the platforms Reference and CPU need a C++ compiler, and there is none")
     path = folder() / f"kernels_{hashlib.sha256(f'{_FLAGS} {source}'.encode()).hexdigest()[:24]}.so"

@@ -331,18 +331,16 @@ class ItemWriter:
 
         def turned(k: int, row: Row) -> str:
             along = "+".join(f"o{k}[{1 + c}]*g{k}[{c}]" for c in range(3 * len(self._legs(row))))
-            return f" if (!({along} > 0)) {told(k, row)}\n"
-
-        def told(k: int, row: Row) -> str:
-            return f"{{bad = {k}; miss = off[{k}]{f'/{self.targets[k]}' if self._plain(row) else ''};}}"
+            return f" if (!({along} > 0)) bad = {k};\n"
 
         # A row of one particle is met to rounding, by one more iteration.
         first, stop, then = (", last = 0", "there && last", " last = there;") if self.single else ("", "there", "")
-        missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) {told(k, row)}")
-        fail = f"{{FAIL({self.row_number}+bad, miss); return;}}\n"
+        missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};")
+        units = ", ".join(self.targets[k] if self._plain(row) else "1" for k, row in enumerate(self.rows))
+        fail = f"{{const mixed unit[] = {{{units}}}; FAIL({self.row_number}+bad, off[bad]/unit[bad]); return;}}\n"
         return (
             f"{self._begin('positions', 'h')}{self._reference('time-h')}{self._each(start)}"
-            f" int bad = -1{first};\n mixed miss = 0;\n"
+            f" int bad = -1{first};\n"
             f" for (int turn = 0;; turn++) {{\n int there = 1;\n{self._each(turn)} if ({stop}) break;{then}\n"
             f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored(False)}{self._solved()} }}\n"
             f"{self._each(turned)} if (bad >= 0) {fail}{self._sums('/h')}}}\n"

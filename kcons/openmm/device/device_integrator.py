@@ -113,18 +113,11 @@ def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> lis
 
 
 class DeviceProgram(Program):
-    """Variables of a step on the device: what the CustomIntegrator would have, in arrays of the plugin.
-
-    Attributes
-    ----------
-    kept : list of str
-        Variables that belong to a state, in the order of the array `memory`.
-    made_under : tuple
-        `conditions` when `remembered` was asked last.
-    """
+    """Variables of a step on the device: what the CustomIntegrator would have, in arrays of the plugin."""
 
     on_device = True
     integrator: DeviceIntegrator
+    #: Variables that belong to a state, in the order of the array `memory`; `conditions` when they were asked for last.
     kept: list[str]
     made_under: tuple[Any, ...] = ()
 
@@ -500,13 +493,7 @@ def choose(
     classes: tuple[type[ProjectedIntegrator], type[DeviceIntegrator]] = (ProjectedIntegrator, DeviceIntegrator),
     **others: Any,
 ) -> tuple[type[ProjectedIntegrator], str]:
-    """The class of an integrator that may run on the device, of two, and why it is the first.
-
-    Raises
-    ------
-    UnsupportedError
-        `device` is True, and there is no plugin or it has no kernels for this step.
-    """
+    """The class of an integrator, of two, and why it is the first, which `device` True refuses."""
     given, around = (tuple(some) if isinstance(some, Iterable) else (some,) for some in (parts, surfaces))
     kind = ConstantEnergy() if ensemble is None else ensemble
     why = refusal(to_scheme(scheme), [*around, *given], kind) or build.refusal()

@@ -2,6 +2,7 @@
 
 - `elimination`: order and pattern, found once
 - `row_functions`: rows that are called by their addresses, alone or many at once
+- `newton`: Newton's method and refinement of tangents, whatever the rows are
 - `distances`: held distances
 - `mixed_rows`: rows of mixed kinds
 """

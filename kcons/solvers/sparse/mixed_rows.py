@@ -13,6 +13,7 @@ atom's inverse mass: n0 r0 n1 r1 n2 r2 w -.
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 
 import numpy as np
 from numba import types
@@ -23,12 +24,11 @@ from kcons.constraints.constraint import IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.internal import angle_between
 from kcons.constraints.target import FloatArray
-from kcons.solvers.addressable_solvers import AddressableSolver, Kernels, address_of, caller_of
+from kcons.solvers.addressable_solvers import Kernels, address_of, caller_of
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import INDICES, NUMBERS, at_first, at_piece, halves, integers
 from kcons.solvers.kernels.lattices import OPEN, TRICLINIC, lattice_numbers, minimum_image
 from kcons.solvers.kernels.two_and_four_wide import (
-    add_to_point,
     dot,
     extract,
     first_vector,
@@ -47,19 +47,20 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
     swapped,
 )
-from kcons.solvers.sparse.distances import factor_serves, hopeless, refines, stalled, update
+from kcons.solvers.sparse import newton
 from kcons.solvers.sparse.elimination import FAST, make_pattern, make_triples, number_atoms
-from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, GivenRows, call_row
-from kcons.solvers.tolerances import (
-    EPS,
-    FLAT,
-    MANY_ITERATIONS,
-    NEWTON_TOLERANCE,
-    PIVOT_TOLERANCE,
-    ROUNDING,
-    SPEED_ROUNDINGS,
-    SPEED_TOLERANCE,
+from kcons.solvers.sparse.newton import (
+    SparseSolver,
+    apply,
+    common_pieces,
+    eliminate_columns,
+    solve_positions,
+    solve_tangents,
+    substitute_back,
+    substitute_forward,
 )
+from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, GivenRows, call_row
+from kcons.solvers.tolerances import EPS, FLAT, MANY_ITERATIONS, PIVOT_TOLERANCE, ROUNDING
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
@@ -76,17 +77,16 @@ call_evaluate, _call_function = caller_of(_EVALUATE), caller_of(_FUNCTION)
 NOW, REFERENCE = np.int64(0), np.int64(1)
 #: How much closer than positions rows of velocities are held: what they are off by is a speed times a short time.
 CLOSER = 16.0
-#: Of the pieces of `SparseRows.tables`, those that are named.
-_PIVOTS, _MOVES, _SOLUTION, _FUNCTIONS, _MOVED = 16, 20, 21, 24, 25
-#: Signatures of what `_positions` and `_tangents` call by address, so that it is compiled once and not into both.
-_RANGE = types.int64, types.int64
-_FACTOR = types.none(*_RANGE, *(5 * (INDICES,)), *(5 * (NUMBERS,)))
-_FORWARD = types.none(*_RANGE, *(2 * (INDICES,)), *(2 * (NUMBERS,)))
-_BACKWARD = types.none(*_RANGE, *(3 * (INDICES,)), *(6 * (NUMBERS,)))
-_call_factor, _call_forward, _call_backward = map(caller_of, (_FACTOR, _FORWARD, _BACKWARD))
+#: The pieces behind those that all tables have: atoms of slots, kinds of rows; of each entry the first of its pairs of
+#: slots on one atom, these, and their inverse masses; scales and targets of rows, lines of slots; values, reciprocals
+#: of roundings; where atoms were at the start, speeds of atoms, where they were at the reference; addresses of kernels;
+#: and what `_take_off` says.
+_OWN = range(newton.COMMON, newton.COMMON + 15)
+_SLOT_ATOMS, _KINDS, _TRIPLE, _SIDES, _MASSES, _SCALE, _TARGET, _LINES = _OWN[:8]
+_VALUES, _ROUNDINGS, _BASE, _SPEEDS, _ORIGIN, _FUNCTIONS, _MOVED = _OWN[8:]
 
 
-class SparseRows(AddressableSolver):
+class SparseRows(SparseSolver):
     """Solver for clusters of compiled rows of any kind.
 
     Parameters
@@ -130,32 +130,25 @@ class SparseRows(AddressableSolver):
         self._made_of = constraint_set, rows, inverse_masses, eliminate_last
         self._given = GivenRows(constraint_set, self.rows, 9 * int(widths.max(initial=0)) + 1)
         links[:-1, 3] = self._given.starts
-        self.kernels, self.numbers = Kernels(_positions, _tangents, _apply), self._given.numbers
+        self.kernels, self.numbers = Kernels(_positions, _tangents, apply), self._given.numbers
         self.refuse = self._given.refuse  # type: ignore[method-assign]
         n, numbers = len(rows), 4 * len(atom_numbers)
         lines = np.zeros(8 * int(slots[-1]))
         lines[6::8] = w[slot_atoms]
         self.tables = in_one_array(
             (
-                *(pattern.clusters, atom_numbers, atom_start, slot_atoms, self._given.kinds, links.ravel()),
-                *(pattern.columns, pattern.targets, triple, sides, masses, constraint_set.scale[self.rows]),
+                *(pattern.clusters, atom_numbers, atom_start, room(numbers), room(n), room(n), links.ravel()),
+                *(pattern.columns, pattern.targets, room(2 * n), room(4 * len(pattern.columns))),
+                *(slot_atoms, self._given.kinds, triple, sides, masses, constraint_set.scale[self.rows]),
                 *(np.where(constraint_set.holonomic, constraint_set.target(0.0), 0.0)[self.rows], lines),
-                # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.distances`.
-                *(room(2 * n), room(4 * len(pattern.columns))),
-                *(room(n), room(n), room(n), room(numbers), room(numbers), room(n), room(numbers), room(numbers)),
-                _addresses(self._given.kinds),
-                room(4 * int(slots[-1])),  # by slot, as quads: what `_take_off` says
+                *(room(n), room(n), room(numbers), room(numbers), room(numbers)),
+                *(_addresses(self._given.kinds), room(4 * int(slots[-1]))),
             )
         )
-        self._solution = part_of(self.tables, _SOLUTION)
+        self._solution = part_of(self.tables, newton.SOLUTION)
         placed = [np.full(c.n_rows, not c.relative) for c in constraint_set.constraints] or [np.zeros(0, np.bool_)]
         self._placed = np.flatnonzero(np.repeat(np.concatenate(placed)[self.rows], widths))
         self._placed_atoms = flat[self._placed]
-
-    @property
-    def pivots(self) -> FloatArray:
-        pivots: FloatArray = part_of(self.tables, _PIVOTS)
-        return pivots
 
     def _take_off(self, moved: FloatArray | None) -> None:
         cells = part_of(self.tables, _MOVED).reshape(-1, 4)
@@ -164,11 +157,9 @@ class SparseRows(AddressableSolver):
 
 
 def _addresses(kinds: NDArray[np.uint32]) -> IntArray:
-    """Of the kernels, in the order of `_FUNCTIONS`; 0 for that of functions where no row is one."""
-    kernels = (evaluate, _EVALUATE), (_function, _FUNCTION), (_factor, _FACTOR), (_forward, _FORWARD)
-    needed = [*kernels, (_backward, _BACKWARD)]
-    some = (kinds >= FUNCTION).any()
-    return np.array([address_of(*each) if some or each[0] is not _function else 0 for each in needed], dtype=np.int64)
+    """Of `evaluate` and of `_function`; 0 for that where no row is one."""
+    function = address_of(_function, _FUNCTION) if (kinds >= FUNCTION).any() else 0
+    return np.array([address_of(evaluate, _EVALUATE), function], dtype=np.int64)
 
 
 # -- values and gradients -------------------------------------------------------------------------------------
@@ -342,320 +333,232 @@ def miss(value, target, period):
 
 # -- elimination and substitution ----------------------------------------------------------------------------
 
+_Pieces = namedtuple(  # type: ignore[misc]
+    "_Pieces",
+    newton.COMMON_NAMES + " slot_atoms kinds triple sides masses scale lines values roundings base speeds origin"
+    " functions moved parameters wanted x ref lattice periodic driven",
+)
+
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots):
-    """Assemble and eliminate rows first to last, with forward substitution, in one sweep.
-
-    Entries are stored as in `kcons.solvers.sparse.distances`; accumulated changes are left at zero.
-    """
-    begin, t, slot = (
-        load_index(links, 4 * first),
-        load_index(links, 4 * first + 1),
-        8 * load_index(links, 4 * first + 2),
-    )
+def _factor(p, first, last):
+    """Assemble and eliminate rows first to last, with forward substitution, in one sweep; changes are left at zero."""
+    links, lines, state, entries = p.links, p.lines, p.state, p.entries
+    begin, t, slot = load_index(links, 4 * first), load_index(links, 4 * first + 1), load_index(links, 4 * first + 2)
     for k in range(first, last):
-        stop = 8 * load_index(links, 4 * k + 6)
         whole = 0.0
+        stop = load_index(links, 4 * k + 6)
         while slot < stop:
             keep_loop_rolled()
-            inner = load_double(lines, slot) * load_double(lines, slot + 1)
-            inner += load_double(lines, slot + 2) * load_double(lines, slot + 3)
-            whole += load_double(lines, slot + 6) * (
-                inner + load_double(lines, slot + 4) * load_double(lines, slot + 5)
-            )
-            slot += 8
+            line = 8 * slot
+            inner = load_double(lines, line) * load_double(lines, line + 1)
+            inner += load_double(lines, line + 2) * load_double(lines, line + 3)
+            inner += load_double(lines, line + 4) * load_double(lines, line + 5)
+            whole += load_double(lines, line + 6) * inner
+            slot += 1
         d = whole + load_double(state, 2 * k)
         store_double(state, 2 * k, 0.0)
         right = load_double(state, 2 * k + 1)
         inverse = 1.0 / d if abs(d) > PIVOT_TOLERANCE * abs(whole) else 0.0
-        store_double(pivots, k, inverse)
+        store_double(p.pivots, k, inverse)
         end = load_index(links, 4 * k + 4)
-        u = load_index(triple, begin)
-        for p in range(begin, end):
+        u = load_index(p.triple, begin)
+        for e in range(begin, end):
             keep_loop_rolled()
-            both = load_pair(entries, 4 * p + 2)
-            stop = load_index(triple, p + 1)
-            while u < stop:
+            both = load_pair(entries, 4 * e + 2)
+            stop2 = load_index(p.triple, e + 1)
+            while u < stop2:
                 keep_loop_rolled()
-                a, b = 8 * load_index(sides, 2 * u), 8 * load_index(sides, 2 * u + 1)
+                a, b = 8 * load_index(p.sides, 2 * u), 8 * load_index(p.sides, 2 * u + 1)
                 inner2 = swapped(load_pair(lines, a)) * load_pair(lines, b)
                 inner2 = inner2 + swapped(load_pair(lines, a + 2)) * load_pair(lines, b + 2)
                 inner2 = inner2 + swapped(load_pair(lines, a + 4)) * load_pair(lines, b + 4)
-                both = both + load_double(masses, u) * inner2
+                both = both + load_double(p.masses, u) * inner2
                 u += 1
-            l = 2 * load_index(columns, p)
+            l = 2 * load_index(p.columns, e)
             low, up = inverse * extract(both, 0), extract(both, 1)
-            store_quad(entries, 4 * p, settled(pair(low, up)))
+            store_quad(entries, 4 * e, settled(pair(low, up)))
             store_pair(state, l, load_pair(state, l) - low * pair(up, right))
-        for p in range(begin, end - 1):
-            keep_loop_rolled()
-            mine = load_pair(entries, 4 * p)
-            for q in range(p + 1, end):
-                keep_loop_rolled()
-                update(t, mine, load_pair(entries, 4 * q), targets, entries)
-                t += 1
+        t = eliminate_columns(begin, end, t, p.targets, entries)
         begin = end
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _forward(first, last, links, columns, state, entries):
-    begin = load_index(links, 4 * first)
-    for k in range(first, last):
-        right = load_double(state, 2 * k + 1)
-        end = load_index(links, 4 * k + 4)
-        for p in range(begin, end):
-            keep_loop_rolled()
-            l = 2 * load_index(columns, p) + 1
-            store_double(state, l, load_double(state, l) - load_double(entries, 4 * p) * right)
-        begin = end
+def _forward(p, first, last):
+    substitute_forward(first, last, p.links, p.columns, p.state, p.entries, 2)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution):
+def _backward(p, first, last):
     """Backward substitution; adds to the multipliers and moves the atoms along the reference gradients."""
+    links, lines, moves = p.links, p.lines, p.moves
     end, slot = load_index(links, 4 * last), load_index(links, 4 * last + 2)
     for back in range(last - first):
         k = last - 1 - back
-        step = load_double(state, 2 * k + 1)
         begin = load_index(links, 4 * k)
-        for p in range(begin, end):
-            keep_loop_rolled()
-            step -= load_double(entries, 4 * p + 1) * load_double(state, 2 * load_index(columns, p) + 1)
+        step = substitute_back(k, begin, end, p.columns, p.state, p.entries, p.pivots, p.solution, 2)
         end = begin
-        step *= load_double(pivots, k)
-        store_double(state, 2 * k + 1, step)
-        store_double(solution, k, load_double(solution, k) + step)
         stop = load_index(links, 4 * k + 2)
         while slot > stop:
             keep_loop_rolled()
             slot -= 1
-            a = 4 * load_index(slot_atoms, slot)
+            a = 4 * load_index(p.slot_atoms, slot)
             f = step * load_double(lines, 8 * slot + 6)
             store_quad(moves, a, load_quad(moves, a) + f * second_vector(lines, 8 * slot))
 
 
+# -- what Newton's method asks for ---------------------------------------------------------------------------
+
+
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _begin(
-    first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
-    scale, lines, values, inverse_rounding, base, moves, origin, moved, solution, functions,
-):  # fmt: skip
-    """Gradients at the reference, and the reciprocal of what rounding leaves of each row."""
-    zero = quad(0.0, 0.0, 0.0, 0.0)
-    for a in range(first_atom, last_atom):
-        store_quad(origin, 4 * a, load_point(x_ref, 3 * load_index(atoms, a)))
-        store_quad(moves, 4 * a, zero)
-    call_evaluate(functions[0], (
-        functions[1], first, last, kinds, links, slot_atoms, parameters, origin, moves, origin, moved, lattice,
-        periodic, values, lines, REFERENCE,
+def _evaluated(p, first, last, base, origin, which):
+    call_evaluate(p.functions[0], (
+        p.functions[1], first, last, p.kinds, p.links, p.slot_atoms, p.parameters, base, p.moves, origin, p.moved,
+        p.lattice, p.periodic, p.values, p.lines, which,
     ))  # fmt: skip
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _begin(p, first, last, first_atom, last_atom):
+    """Gradients at the reference, and the reciprocal of what rounding leaves of each row."""
     for a in range(first_atom, last_atom):
-        point = load_point(x_new, 3 * load_index(atoms, a))
-        store_quad(base, 4 * a, point)
-        store_double(base, 4 * a + 3, np.sqrt(dot(point, point)))
+        store_quad(p.origin, 4 * a, load_point(p.ref, 3 * load_index(p.atoms, a)))
+        store_quad(p.moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
+    _evaluated(p, first, last, p.origin, p.origin, REFERENCE)
+    for a in range(first_atom, last_atom):
+        point = load_point(p.x, 3 * load_index(p.atoms, a))
+        store_quad(p.base, 4 * a, point)
+        store_double(p.base, 4 * a + 3, np.sqrt(dot(point, point)))
     for k in range(first, last):
-        store_double(solution, k, 0.0)
+        store_double(p.solution, k, 0.0)
         # Of absolute positions for rows on space, of the row's own size for others.
         reach = 0.0
-        for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
+        for slot in range(load_index(p.links, 4 * k + 2), load_index(p.links, 4 * k + 6)):
             keep_loop_rolled()
-            size = load_double(base, 4 * load_index(slot_atoms, p) + 3)
-            if load_index(kinds, k) != DISTANCE:
-                g = second_vector(lines, 8 * p)
+            size = load_double(p.base, 4 * load_index(p.slot_atoms, slot) + 3)
+            if load_index(p.kinds, k) != DISTANCE:
+                g = second_vector(p.lines, 8 * slot)
                 size *= np.sqrt(dot(g, g))
             reach += size
-        store_double(inverse_rounding, k, 1.0 / max(ROUNDING * load_double(scale, k), 2 * EPS * reach))
+        store_double(p.roundings, k, 1.0 / max(ROUNDING * load_double(p.scale, k), 2 * EPS * reach))
+    return _measure(p, first, last)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state):
-    """Right-hand sides; largest and total error, the row with the largest, and the largest in units of its rounding."""
-    error, total, excess = 0.0, 0.0, 0.0
-    bad = first
+def _measure(p, first, last):
+    """Values, gradients and right-hand sides."""
+    _evaluated(p, first, last, p.base, p.origin, NOW)
+    error, total = 0.0, 0.0
     for k in range(first, last):
         period = 0.0
-        if load_index(kinds, k) >= FUNCTION:
-            period = load_double(parameters, load_index(links, 4 * k + 3) + 1)
-        off = miss(load_double(values, k), load_double(wanted, k), period)
-        store_double(state, 2 * k + 1, off)
-        e = abs(off) / load_double(scale, k)
-        if load_index(kinds, k) >= VELOCITY:
-            e *= CLOSER
+        if load_index(p.kinds, k) >= FUNCTION:
+            period = load_double(p.parameters, load_index(p.links, 4 * k + 3) + 1)
+        store_double(p.state, 2 * k + 1, miss(load_double(p.values, k), load_double(p.wanted, k), period))
+        e = _size(p, k)
         total += e
-        if e > error:
-            error = e
-            bad = k
-        excess = max(excess, abs(off) * load_double(inverse_rounding, k))
-    return error, total, excess, bad
+        error = max(error, e)
+    return error, total
 
 
-@njit(cache=True, inline="always")
-def _first_not_finite(first, last, state):
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _size(p, k):
+    e = abs(load_double(p.state, 2 * k + 1)) / load_double(p.scale, k)
+    return e * CLOSER if load_index(p.kinds, k) >= VELOCITY else e
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _in_roundings(p, k):
+    return abs(load_double(p.state, 2 * k + 1)) * load_double(p.roundings, k)
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _turned(p, first, last, iteration):
+    """The first row whose gradient has flattened out on the way, or turned by 90 degrees or more; -1 if none has."""
+    bad = first_flat(first, last, p.links, p.lines) if iteration > MANY_ITERATIONS else -1
+    if bad >= 0:
+        return bad
     for k in range(first, last):
-        if not (abs(state[2 * k + 1]) < np.inf):
+        along = 0.0
+        for slot in range(load_index(p.links, 4 * k + 2), load_index(p.links, 4 * k + 6)):
+            keep_loop_rolled()
+            along += dot(first_vector(p.lines, 8 * slot), second_vector(p.lines, 8 * slot))
+        if not (along > 0.0) and (load_index(p.kinds, k) < VELOCITY or load_double(p.parameters, COUNT) != 0.0):
             return k
-    return first
+    return -1
 
 
-@njit(cache=True, fastmath=FAST)
-def _apply(x, factor, tables):
-    """As `kcons.solvers.addressable_solvers` says."""
-    h = integers(tables)
-    atoms, moves = at_piece(halves(tables), h, 1), at_piece(tables, h, _MOVES)
-    for a in range(h[3] - h[2]):
-        add_to_point(x, 3 * load_index(atoms, a), factor * load_quad(moves, 4 * a))
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _begin_tangents(p, first, last, first_atom, last_atom):
+    """Gradients, speeds, and what these are off by."""
+    for a in range(first_atom, last_atom):
+        g = 3 * load_index(p.atoms, a)
+        store_quad(p.base, 4 * a, load_point(p.ref, g))
+        store_quad(p.speeds, 4 * a, load_point(p.x, g))
+        store_quad(p.moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
+    _evaluated(p, first, last, p.base, p.base, REFERENCE)
+    largest, total = 0.0, 0.0
+    for k in range(first, last):
+        goal = load_double(p.wanted, k) if p.driven else 0.0
+        off, size = goal, abs(goal)
+        for slot in range(load_index(p.links, 4 * k + 2), load_index(p.links, 4 * k + 6)):
+            keep_loop_rolled()
+            g = second_vector(p.lines, 8 * slot)
+            _put(p.lines, 8 * slot, extract(g, 0), extract(g, 1), extract(g, 2))
+            part = g * load_quad(p.speeds, 4 * load_index(p.slot_atoms, slot))
+            off -= extract(part, 0) + extract(part, 1) + extract(part, 2)
+            size += abs(extract(part, 0)) + abs(extract(part, 1)) + abs(extract(part, 2))
+        store_double(p.state, 2 * k, 0.0)
+        store_double(p.state, 2 * k + 1, off)
+        largest = max(largest, size)
+        total += size
+        store_double(p.solution, k, 0.0)
+    return largest, total
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _measure_tangents(p, first, last):
+    error, total = 0.0, 0.0
+    for k in range(first, last):
+        off = load_double(p.wanted, k) if p.driven else 0.0
+        for slot in range(load_index(p.links, 4 * k + 2), load_index(p.links, 4 * k + 6)):
+            keep_loop_rolled()
+            a = 4 * load_index(p.slot_atoms, slot)
+            off -= dot(second_vector(p.lines, 8 * slot), load_quad(p.speeds, a) + load_quad(p.moves, a))
+        store_double(p.state, 2 * k + 1, off)
+        total += abs(off)
+        error = max(error, abs(off))
+    return error, total
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _speed(p, k):
+    return abs(load_double(p.state, 2 * k + 1))
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _pieces(tables, numbers, wanted, x, x_ref, lattice, kind, driven):
+    t, h, u = tables, integers(tables), halves(tables)
+    atoms, moves, solution, pivots, links, columns, targets, state, entries = common_pieces(tables)
+    return _Pieces(
+        atoms, moves, solution, pivots, links, columns, targets, state, entries, at_piece(u, h, _SLOT_ATOMS),
+        at_piece(u, h, _KINDS), at_piece(u, h, _TRIPLE), at_piece(u, h, _SIDES), at_piece(t, h, _MASSES),
+        at_piece(t, h, _SCALE), at_piece(t, h, _LINES), at_piece(t, h, _VALUES), at_piece(t, h, _ROUNDINGS),
+        at_piece(t, h, _BASE), at_piece(t, h, _SPEEDS), at_piece(t, h, _ORIGIN), at_piece(h, h, _FUNCTIONS),
+        at_piece(t, h, _MOVED), at_first(numbers), wanted, at_first(x), at_first(x_ref), lattice, kind != OPEN, driven,
+    )  # fmt: skip
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, kind, tables, numbers):
-    """As `kcons.solvers.addressable_solvers` says."""
-    t, h, u = tables, integers(tables), halves(tables)
-    clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)
-    kinds, links, columns, targets = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(u, h, 7)
-    triple, sides, masses, scale = at_piece(u, h, 8), at_piece(u, h, 9), at_piece(t, h, 10), at_piece(t, h, 11)
-    lines, state, entries, pivots = at_piece(t, h, 13), at_piece(t, h, 14), at_piece(t, h, 15), at_piece(t, h, _PIVOTS)
-    values, inverse_rounding, base = at_piece(t, h, 17), at_piece(t, h, 18), at_piece(t, h, 19)
-    moves, solution = at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
-    origin, functions = at_piece(t, h, 23), at_piece(h, h, _FUNCTIONS)
-    moved, periodic = at_piece(t, h, _MOVED), kind != OPEN
-    goals, parameters = at_first(wanted) if wanted.size else at_piece(t, h, 12), at_first(numbers)
-    worst, worst_row, most = 0.0, -1, 0
-    for c in range(h[1] - h[0] - 1):
-        first, last = clusters[c], clusters[c + 1]
-        _begin(
-            first, last, atom_start[c], atom_start[c + 1], x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds,
-            parameters, links, scale, lines, values, inverse_rounding, base, moves, origin, moved, solution, functions,
-        )  # fmt: skip
-        matrix = first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
-        error = np.inf
-        factored = False
-        iteration = 0
-        while True:
-            previous = error
-            call_evaluate(functions[0], (
-                functions[1], first, last, kinds, links, slot_atoms, parameters, base, moves, origin, moved,
-                lattice, periodic, values, lines, NOW,
-            ))  # fmt: skip
-            error, total, excess, bad = _measure(
-                first, last, kinds, parameters, links, goals, scale, inverse_rounding, values, state
-            )
-            if not (total < np.inf):
-                return False, np.inf, iteration, _first_not_finite(first, last, state)
-            if hopeless(iteration, error, previous):
-                return False, error, iteration, bad
-            # Go on to the rounding of the relative coordinates as long as Newton still gains.
-            if excess <= 1.0 and (error <= NEWTON_TOLERANCE or error > 0.1 * previous):
-                break
-            if stalled(iteration, error, previous, excess, last - first):
-                break
-            if factor_serves(factored, error, previous):
-                _call_forward(functions[3], (first, last, links, columns, state, entries))
-            else:
-                _call_factor(functions[2], matrix)
-                factored = True
-            _call_backward(
-                functions[4], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
-            )
-            iteration += 1
-        if iteration > MANY_ITERATIONS:
-            bad_row = first_flat(first, last, links, lines)
-            if bad_row >= 0:
-                return False, np.inf, iteration, bad_row
-        for k in range(first, last):
-            along = 0.0
-            for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
-                keep_loop_rolled()
-                along += dot(first_vector(lines, 8 * p), second_vector(lines, 8 * p))
-            # A gradient must not have turned by 90 degrees or more within the step.
-            if not (along > 0.0) and (load_index(kinds, k) < VELOCITY or load_double(parameters, COUNT) != 0.0):
-                return False, np.inf, iteration, k
-        if error >= worst:
-            worst, worst_row = error, bad
-        most = max(most, iteration)
-    if alone:
-        _apply(x_new, 1.0, tables)
-        if inv_dt != 0.0:
-            _apply(velocities, inv_dt, tables)
-    return True, worst, most, worst_row
+    goals = at_first(wanted) if wanted.size else at_piece(tables, integers(tables), _TARGET)
+    p = _pieces(tables, numbers, goals, x_new, x_ref, lattice, kind, False)
+    return solve_positions(
+        alone, x_new, velocities, inv_dt, tables, p, _begin, _measure, _size, _in_roundings, _factor, _forward,
+        _backward, _turned,
+    )  # fmt: skip
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(alone, y, x, velocities, inv_dt, wanted, lattice, kind, tables, numbers):
-    """As `kcons.solvers.addressable_solvers` says."""
-    t, h, u = tables, integers(tables), halves(tables)
-    clusters, atom_start, atoms, slot_atoms = at_piece(h, h, 0), at_piece(h, h, 2), at_piece(u, h, 1), at_piece(u, h, 3)
-    kinds, links, columns, targets = at_piece(u, h, 4), at_piece(u, h, 5), at_piece(u, h, 6), at_piece(u, h, 7)
-    triple, sides, masses, lines = at_piece(u, h, 8), at_piece(u, h, 9), at_piece(t, h, 10), at_piece(t, h, 13)
-    state, entries, pivots, values = at_piece(t, h, 14), at_piece(t, h, 15), at_piece(t, h, _PIVOTS), at_piece(t, h, 17)
-    base, moves, solution = at_piece(t, h, 19), at_piece(t, h, _MOVES), at_piece(t, h, _SOLUTION)
-    speeds, functions, moved = at_piece(t, h, 22), at_piece(h, h, _FUNCTIONS), at_piece(t, h, _MOVED)
-    driven, goals, parameters, periodic = wanted.size > 0, at_first(wanted), at_first(numbers), kind != OPEN
-    worst, worst_row, most = 0.0, -1, 0
-    for c in range(h[1] - h[0] - 1):
-        first, last = clusters[c], clusters[c + 1]
-        for a in range(atom_start[c], atom_start[c + 1]):
-            g = 3 * load_index(atoms, a)
-            store_quad(base, 4 * a, load_point(x, g))
-            store_quad(speeds, 4 * a, load_point(y, g))
-            store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
-        call_evaluate(functions[0], (
-            functions[1], first, last, kinds, links, slot_atoms, parameters, base, moves, base, moved, lattice,
-            periodic, values, lines, REFERENCE,
-        ))  # fmt: skip
-        largest, total = 0.0, 0.0
-        for k in range(first, last):
-            goal = load_double(goals, k) if driven else 0.0
-            off, size = goal, abs(goal)
-            for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
-                keep_loop_rolled()
-                g = second_vector(lines, 8 * p)
-                store_double(lines, 8 * p, extract(g, 0))
-                store_double(lines, 8 * p + 2, extract(g, 1))
-                store_double(lines, 8 * p + 4, extract(g, 2))
-                part = g * load_quad(speeds, 4 * load_index(slot_atoms, p))
-                off -= extract(part, 0) + extract(part, 1) + extract(part, 2)
-                size += abs(extract(part, 0)) + abs(extract(part, 1)) + abs(extract(part, 2))
-            store_double(state, 2 * k, 0.0)
-            store_double(state, 2 * k + 1, off)
-            largest = max(largest, size)
-            total += size
-            store_double(solution, k, 0.0)
-        if not (total < np.inf):
-            return False, np.inf, 0, _first_not_finite(first, last, state)
-        matrix = first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
-        _call_factor(functions[2], matrix)
-        allowed = SPEED_TOLERANCE * largest
-        previous = np.inf
-        iteration = 0
-        while True:
-            _call_backward(
-                functions[4], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
-            )
-            iteration += 1
-            error, total = 0.0, 0.0
-            bad = first
-            for k in range(first, last):
-                off = load_double(goals, k) if driven else 0.0
-                for p in range(load_index(links, 4 * k + 2), load_index(links, 4 * k + 6)):
-                    keep_loop_rolled()
-                    a = 4 * load_index(slot_atoms, p)
-                    off -= dot(second_vector(lines, 8 * p), load_quad(speeds, a) + load_quad(moves, a))
-                store_double(state, 2 * k + 1, off)
-                total += abs(off)
-                if abs(off) > error:
-                    error = abs(off)
-                    bad = k
-            if not (total < np.inf):
-                return False, np.inf, iteration, bad
-            if not refines(iteration, error, previous, allowed):
-                break
-            previous = error
-            _call_forward(functions[3], (first, last, links, columns, state, entries))
-        if error > SPEED_ROUNDINGS * allowed:
-            return False, error, iteration, bad
-        if error >= worst:
-            worst, worst_row = error, bad
-        most = max(most, iteration)
-    if alone:
-        _apply(y, 1.0, tables)
-    return True, worst, most, worst_row
+    p = _pieces(tables, numbers, at_first(wanted), y, x, lattice, kind, wanted.size > 0)
+    return solve_tangents(alone, y, tables, p, _begin_tangents, _measure_tangents, _speed, _factor, _forward, _backward)

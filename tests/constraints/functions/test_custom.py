@@ -126,3 +126,27 @@ def test_a_gradient_that_vanishes_is_refused_when_it_is_differenced(make) -> Non
     row = make([0], lambda r: (np.sum(r * r, axis=-1 if make is ImplicitSurface else None) - 1) ** 2, target=0.0)
     with pytest.raises(SingularGeometryError, match="it vanishes, or the function varies faster"):
         ConstraintSet([row], np.array([[0.6, 0.0, 0.8]]), np.ones(1))
+
+
+CUT = np.array([[0.2, 0.3, 0.4], [4.8, 0.1, 0.6], [0.5, 1.0, 0.2]])
+
+
+@pytest.mark.parametrize("gradient", [None, gap_gradient])
+def test_atoms_cut_by_a_face_of_the_cell_are_refused_unless_it_is_said_what_is_meant(gradient):
+    """Their value was taken where they lie, and another one held than the nearest images have."""
+    cell, masses = np.diag([5.0, 6.0, 6.0]), np.ones(3)
+    with pytest.raises(InputError, match=r"row 0.* cut by a face .* differs by -4\.\d+ .* translation_invariant=True"):
+        ConstraintSet(Custom([0, 1], gap, gradient), CUT, masses, cell=cell)
+    held = ConstraintSet(Custom([0, 1], gap, gradient, translation_invariant=True), CUT, masses, cell=cell)
+    assert held.value(CUT)[0] == 0 and held.constraints[0].target[0] == pytest.approx(np.sqrt(0.4**2 + 0.2**2 + 0.2**2))
+
+
+def test_functions_that_know_their_images_or_a_place_may_be_cut():
+    cell, masses = np.diag([5.0, 6.0, 6.0]), np.ones(3)
+
+    def nearest(r):
+        d = r[0] - r[1]
+        return float(np.linalg.norm(d - np.diag(cell) * np.round(d / np.diag(cell))))
+
+    for function, atoms in ((nearest, [0, 1]), (lambda r: float(r[0] @ r[1]), [0, 1]), (gap, [0, 2])):
+        assert ConstraintSet(Custom(atoms, function), CUT, masses, cell=cell).value(CUT)[0] == 0

@@ -26,7 +26,12 @@ MUTANTS = {
         ),
         ("if «k not in beside→True» and not", "rows::levels_have_rows_that_share_no_entry"),
     ],
+    "openmm/device/clusters.c": [
+        ("if («missed > 0→1») {", "rows::rows_without_a_solution_are_told"),
+    ],
     "openmm/device/clusters.py": [
+        ("off[bad]«/unit[bad]→»); return", "rows::rows_without_a_solution_are_told"),
+        ("'+' if one[a] «==→!=» other[a] else", "rows::clusters_of_all_sizes"),
         ('"there« && last→»"', "surfaces_on_the_device::the_device_holds_the_same_surfaces"),
     ],
     "openmm/device/device_integrator.py": [

@@ -38,14 +38,21 @@ MUTANTS = {
     ],
     "constraints/constraint_set.py": [
         (
-            "change = change[«self.lattice[1].any(axis=0)→:»]",
+            "change = change[«periodic→:»]",
             "images::directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
         ),
-        ("«np.where(same[:, None, None], near, r)→r»", "images::lengths_found_far_away_can_be_held_near_the_origin"),
+        (
+            "«self._refuse_cut(item, r, time, int(start))→pass»",
+            "custom::atoms_cut_by_a_face_of_the_cell_are_refused_unless_it_is_said_what_is_meant",
+        ),
+        (
+            "r if together is y else self.gather(item, x, «together→y»)",
+            "images::lengths_found_far_away_can_be_held_near_the_origin",
+        ),
         ("«x→whole»[item.atoms] if self.moved is None", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
     ],
     "constraints/contradictions.py": [
-        ("same = open_ & (given[place] «== key→!= given[place]»)", "images::a_length_found_and_the_same_one_given"),
+        ("agreed = np.where(«open_→False», np.repeat", "images::a_length_found_and_the_same_one_given"),
     ],
     "constraints/constraint.py": [
         ('powers.get("length", «0→1»)', "constraint::the_same_points_fulfil_it"),

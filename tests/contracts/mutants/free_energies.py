@@ -20,7 +20,7 @@ MUTANTS = {
             "free_energy/windows/input_file::a_difference_of_distances",
         ),
     ],
-    "cli/scan.py": [
+    "cli/free_energy.py": [
         ('if «family in ("angle", "dihedral")→family != "distance"» else axis)', "cli/scan::a_difference_of_distances"),
     ],
     "free_energy/windows/driver.py": [
@@ -73,7 +73,7 @@ MUTANTS = {
     ],
     "constraints/constraint_set.py": [
         (
-            "if any(«getattr(item, name) != getattr(wanted, name)→name is None» for name in wanted.shared):",
+            "or any(«getattr(item, name) != getattr(wanted, name)→name is None» for name in wanted.shared)",
             "held_coordinates::formulas_on_the_same_atoms_are_told_apart",
         ),
     ],

@@ -29,7 +29,10 @@ MUTANTS = {
     "solvers/sparse/distances.py": [
         ("total «-→+»= w[i]", "distance_solvers::matches_dense_newton[sparse-comb]"),
         (") > «0.→-1e30»0):", "distance_solvers::failure_changes_nothing_and_names_the_cluster[turned-sparse-methane]"),
-        ("load_double(rates, k) * «np.sqrt(s2)→s2»", "distance_solvers::tangents_match_dense_solve[True-sparse-comb]"),
+        (
+            "load_double(p.wanted, k) * «np.sqrt(s2)→s2»",
+            "distance_solvers::tangents_match_dense_solve[True-sparse-comb]",
+        ),
     ],
     "solvers/small_clusters.py": [
         ("«TINY→-1e300», inner)", "distance_solvers::failure_changes_nothing_and_names_the_cluster[turned-small-bond]"),

@@ -25,7 +25,7 @@ MUTANTS = {
         ("beyond = done«[~done.method.isin(good.method)]→»", "ranking::an_error_that_is_asked_for"),
     ],
     "comparison/measure.py": [
-        ("if «method.name not in ther→Tru»e:", "measure::methods_that_are_there_are_not_run_again"),
+        ("if «method.name not in ther→Tru»e:", "cli/compare::it_goes_on_from_the_rows_that_are_there"),
         (", max(self.seconds, 1e-3)«, RING_AGAIN→»)", "comparison/measure::what_a_finalizer_swallows_is_raised_again"),
         ('«row["seconds"] *= step / row["step_seconds"]→pass»', "measure::a_row_a_method_and_setting"),
     ],

@@ -46,6 +46,15 @@ def test_a_window_far_from_the_structure(tmp_path):
     assert np.array_equal(series.multiplier, Series.load(tmp_path / "two").multiplier)
 
 
+def test_atoms_that_are_changed_later_change_no_windows():
+    atoms = molecule("CH3OH", cell=[20.0] * 3, pbc=True)
+    windows = AseWindows(atoms, CALCULATOR, {"turn": TURN}, [PIECES])
+    before = windows.placed([1.0])[1]
+    atoms.set_cell([2.0] * 3)
+    atoms.rattle(0.1)
+    assert np.array_equal(windows.placed([1.0])[1], before)
+
+
 def test_a_window_without_a_pull(tmp_path):
     settings = Settings(**{**SHORT.__dict__, "pull": 0})
     found = Windows(sampler(), tmp_path, settings, both_sides=False, executor=ThreadPoolExecutor(1))
@@ -94,23 +103,17 @@ def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
 
 
 def test_what_a_folder_belongs_to():
-    """The same in another process; another calculator or other constraints are something else."""
+    """The same in another process; another or changed calculator, or other constraints, are something else."""
     assert sampler().digest == sampler().digest == pickle.loads(pickle.dumps(sampler())).digest
-    others = [
-        AseWindows(molecule("CH3OH"), calculator, {"turn": TURN}, [PIECES])
-        for calculator in (partial(LennardJones, sigma=1.1), made(0.01), made(0.02))
-    ]
-    assert len({sampler().digest, sampler(held=[]).digest, *(other.digest for other in others)}) == 5
-
-
-def test_a_calculator_that_was_changed_is_another_one():
-    calculator = LennardJones(epsilon=0.01)
-    windows = AseWindows(molecule("CH3OH"), lambda: calculator, {"turn": TURN}, [PIECES])
-    before = windows.digest
-    calculator.set(epsilon=0.02)
-    assert windows.digest != before
-    calculator.set(epsilon=0.01)
-    assert windows.digest == before
+    lj = LennardJones(epsilon=0.01)
+    calculators = (partial(LennardJones, sigma=1.1), made(0.01), made(0.02), lambda: lj)
+    others = [AseWindows(molecule("CH3OH"), each, {"turn": TURN}, [PIECES]) for each in calculators]
+    first = others[-1].digest
+    assert len({sampler().digest, sampler(held=[]).digest, *(other.digest for other in others)}) == 6
+    lj.set(epsilon=0.02)
+    assert others[-1].digest != first
+    lj.set(epsilon=0.01)
+    assert others[-1].digest == first
 
 
 def made(epsilon):

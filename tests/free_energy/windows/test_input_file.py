@@ -66,19 +66,14 @@ def test_an_input_for_ase(folder):
     assert found.settings.temperature == 310
     assert found.settings.production == 20000
     np.testing.assert_allclose(found.targets[:, 0], np.radians(np.arange(-180, 180, 30)))
-    assert found.options == {"both_sides": False, "rng": 4} and found.improve == {
-        "error": 0.5,
-        "most": 20,
-        "below": 40,
-    }
+    assert found.options == {"both_sides": False, "rng": 4}
+    assert found.improve == {"error": 0.5, "most": 20, "below": 40}
     assert found.sampler.start == pytest.approx([np.pi])
     assert found.sampler.held[0].n_rows == 4
 
 
 def test_atoms_from_one_and_two_coordinates(folder):
-    text = INPUT.replace('file = "methanol.xyz"', 'file = "methanol.xyz"\ncount_from = 1').replace(
-        "dihedral = [2, 0, 1, 3]", "dihedral = [3, 1, 2, 4]"
-    )
+    text = INPUT.replace(FILE, f"{FILE}\ncount_from = 1").replace(TURN, "dihedral = [3, 1, 2, 4]")
     text += "\n[[coordinate]]\ndistance = [1, 2]\nvalues = [1.4, 1.5]\n"
     found = read(folder, text.replace(IMPROVE, ""))
     assert found.sampler.coordinates["turn"].atoms.tolist() == [[2, 0, 1, 3]]
@@ -95,21 +90,18 @@ def test_a_difference_of_distances(folder):
     assert found.sampler.names == ("turn", "difference-1-2-4-2")
     assert found.targets[:3, 1].tolist() == [-0.5, 0.0, 0.5]
     assert found.options["approach"] == pytest.approx([np.radians(6), 0.2])
-    assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4])
+    assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4]) and found.pull_steps == 20000
     atoms = molecule("CH3OH")
     assert found.sampler.start[1] == pytest.approx(atoms.get_distance(0, 1) - atoms.get_distance(3, 1))
 
 
 def test_pulls(folder):
+    """By default from the first window to the last; of two coordinates, see `test_a_difference_of_distances`."""
     assert read(folder).pulls is None
     found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8\nsteps = 300\n")
-    assert found.pulls["start"] == pytest.approx([-np.pi / 3]) and found.pulls["end"] == pytest.approx(
-        found.targets[-1]
-    )
+    assert found.pulls["start"] == pytest.approx([-np.pi / 3])
+    assert found.pulls["end"] == pytest.approx(found.targets[-1])
     assert found.pulls["count"] == 8 and found.pull_steps == 300
-    text = INPUT + "\n[[coordinate]]\ndistance = [0, 1]\nvalues = [1.4, 1.5]\n[pulls]\nto = [90.0, 1.6]\n"
-    found = read(folder, text.replace(IMPROVE, ""))
-    assert found.pulls["end"] == pytest.approx([np.pi / 2, 1.6]) and found.pull_steps == 20000
 
 
 def test_an_input_for_openmm(folder):
@@ -144,73 +136,63 @@ def test_an_input_for_openmm(folder):
     assert found.sampler.start == pytest.approx([first, first - second])
 
 
+LJ, FILE, TURN = 'calculator = "lj"', 'file = "methanol.xyz"', "dihedral = [2, 0, 1, 3]"
+#: Another coordinate.
+MORE, ROW = "[[coordinate]]\nangle = [2, 0, 1]\nvalues = ", "[[coordinate]]\ndistance = [0, "
+MANY = "".join(f"{ROW}{k}]\nfrom=1\nto=2\nwindows=90000\n" for k in range(1, 5))
+ZEROS = "0" * 400
+
+
+def before_improve(text):
+    return IMPROVE[:9], f"{text}\n[improve]"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
         ("[sampling]", "[samplings]", r"unknown key 'samplings' \(did you mean 'sampling'\?"),
         ("timestep = 0.5", "time_step = 0.5", r"\[sampling\] has an unknown key 'time_step' .did you mean 'timestep'"),
         ("temperature = 310", "temperature = -310", "temperature is -310"),
-        ('calculator = "lj"', 'calculator = "no such"', "no calculator 'no such'"),
-        ('file = "methanol.xyz"', 'file = "nothing.xyz"', "there is no file .*nothing.xyz"),
-        ('file = "methanol.xyz"', "", r"\[structure\] has no file; write file = "),
-        ('calculator = "lj"', "", r"give calculator or system"),
+        (LJ, 'calculator = "no such"', "no calculator 'no such'"),
+        (FILE, 'file = "nothing.xyz"', "there is no file .*nothing.xyz"),
+        (FILE, "", r"\[structure\] has no file; write file = "),
+        (LJ, "", r"give calculator or system"),
         ("windows = 12", "", "give values, or from, to and windows"),
-        ("dihedral = [2, 0, 1, 3]", "", "coordinate turn is nothing"),
-        ("dihedral = [2, 0, 1, 3]", "dihedral = [2, 0, 1, 3]\nangle = [2, 0, 1]", "turn is angle and dihedral"),
-        ("dihedral = [2, 0, 1, 3]", "difference = [2, 0, 1]", "difference names 3 atoms; give four"),
+        (TURN, "", "coordinate turn is nothing"),
+        (TURN, f"{TURN}\nangle = [2, 0, 1]", "turn is angle and dihedral"),
+        (TURN, "difference = [2, 0, 1]", "difference names 3 atoms; give four"),
         ("[[coordinate]]", "[coordinate]", r"write \[\[coordinate\]\]"),
         ("temperature = 310", "temperature 310", "is no TOML"),
         ('constrain = "hbonds"', 'constrain = "everything"', "everything"),
-        ("[improve]", "[pulls]\nfrom = [1.0, 2.0]\n[improve]", r"from of \[pulls\] has 2 values.*turn"),
-        ("[improve]", "[pulls]\ncount = 4\n[improve]", r"count of \[pulls\] is 4.*5 or more"),
-        ("[improve]", "[pulls]\nsteps = 0.5\n[improve]", r"steps of \[pulls\] is 0.5"),
-        ("[improve]", "[pulls]\nfrom = 3\nto = 3\n[improve]", "begin where they end"),
+        (*before_improve("[pulls]\nfrom = [1.0, 2.0]"), r"from of \[pulls\] has 2 values.*turn"),
+        (*before_improve("[pulls]\ncount = 4"), r"count of \[pulls\] is 4.*5 or more"),
+        (*before_improve("[pulls]\nsteps = 0.5"), r"steps of \[pulls\] is 0.5"),
+        (*before_improve("[pulls]\nfrom = 3\nto = 3"), "begin where they end"),
+        (*before_improve("[pull]\ncount = 5"), r"unknown key 'pull' .did you mean 'pulls'"),
         ("windows = 12", "windows = 12\nvalues = [1, 2, 3]", "turn has values and from"),
         ("windows = 12", "windows = 2", r"\[improve\] adds windows.*has 1, with 2 windows"),
-        ("[improve]", "[[coordinate]]\nangle = [2, 0, 1]\nvalues = [100, 110]\n[improve]", "has 2, with 24 windows"),
-        ("[improve]", "[[coordinate]]\nangle = [2, 0, 1]\nvalues = [100, 180]\n[improve]", "no angle of 180 to hold"),
-        ("[improve]", "[[coordinate]]\ndistance = [0, 1]\nvalues = [1.4, -1]\n[improve]", "no distance of -1 to hold"),
-        (
-            'calculator = "lj"',
-            'calculator = "lj"\nplatform = "CPU"',
-            "platform of .forces. says nothing to a calculator",
-        ),
+        (*before_improve(f"{MORE}[100, 110]"), "has 2, with 24 windows"),
+        (*before_improve(f"{MORE}[100, 180]"), "no angle of 180 to hold"),
+        (*before_improve(f'{MORE}[100.0]\nname = "turn"'), "two coordinates"),
+        (*before_improve(f"{ROW}1]\nvalues = [1.4, -1]"), "no distance of -1 to hold"),
+        (*before_improve(MANY), "the input file has 787,320,000,000,000,000,000 windows"),
+        (*before_improve(f"a = {'[' * 5000}{']' * 5000}"), "lists or tables are too deep in each other"),
+        (LJ, f'{LJ}\nplatform = "CPU"', "platform of .forces. says nothing to a calculator"),
         ("windows = 12", 'windows = "x"', r"windows of \[coordinate\] is 'x'; give a whole number, 1 or more"),
-        ("dihedral = [2, 0, 1, 3]", "dihedral = [2.5, 0, 1, 3]", "give whole numbers"),
+        (TURN, "dihedral = [2.5, 0, 1, 3]", "give whole numbers"),
         ("both_sides = false", 'both_sides = "no"', "give true or false"),
         ("most = 20", "", r"\[improve\] has no most; write most = "),
         ("error = 0.5", 'error = "x"', "give a positive number"),
-        (
-            'file = "methanol.xyz"',
-            'file = "methanol.xyz"\ncount_from = -1',
-            "count_from of .structure. is -1; give 0 or 1",
-        ),
-        (
-            'file = "methanol.xyz"',
-            'file = "methanol.xyz"\ncount_from = 1',
-            "there is no atom 0; atoms are counted from 1",
-        ),
+        (FILE, f"{FILE}\ncount_from = -1", "count_from of .structure. is -1; give 0 or 1"),
+        (FILE, f"{FILE}\ncount_from = 1", "there is no atom 0; atoms are counted from 1"),
         ("sigma = 1.0", "sgima = 1.0", r"lj has no setting 'sgima' .did you mean 'sigma'"),
         ("rng = 4", "approach = [6, 0.2, 1]", "approach has 3 values; give one for each of turn"),
         ("rng = 4", 'approach = "x"', "approach of .sampling. is 'x'; give a number, or numbers"),
-        ("[improve]", "[pull]\ncount = 5\n[improve]", r"unknown key 'pull' .did you mean 'pulls'"),
-        (
-            "[improve]",
-            '[[coordinate]]\nname = "turn"\nangle = [2, 0, 1]\nvalues = [100.0]\n[improve]',
-            "two coordinates",
-        ),
         ("windows = 12", "windows = 2000000000", "the input file has 2,000,000,000 windows; give at most 100,000"),
-        ("windows = 12", f"windows = 1{'0' * 400}", "the input file has 10,000.* windows; give at most 100,000"),
-        (
-            "[improve]",
-            "".join(f"[[coordinate]]\ndistance = [0, {k}]\nfrom=1\nto=2\nwindows=90000\n" for k in range(1, 5))
-            + "[improve]",
-            "the input file has 787,320,000,000,000,000,000 windows",
-        ),
-        ("to = 180", f"to = 1{'0' * 400}", r"to of \[coordinate\] is 10{10,30}\.\.\.0+; give a number"),
-        ("timestep = 0.5", f"timestep = 1{'0' * 400}", "give a positive number"),
+        ("windows = 12", f"windows = 1{ZEROS}", "the input file has 10,000.* windows; give at most 100,000"),
+        ("to = 180", f"to = 1{ZEROS}", r"to of \[coordinate\] is 10{10,30}\.\.\.0+; give a number"),
+        ("timestep = 0.5", f"timestep = 1{ZEROS}", "give a positive number"),
         ("timestep = 0.5", f"timestep.{'.'.join('a' * 3000)} = 0.5", r"timestep of \[sampling\] is .*give one value"),
-        ("[improve]", f"a = {'[' * 5000}{']' * 5000}\n[improve]", "lists or tables are too deep in each other"),
     ],
 )
 def test_wrong_files(folder, old, new, match):

