@@ -130,7 +130,7 @@ class Constraints(FixConstraint):
         """The engine, which knows the cell; an `InputError` leaves it as it was."""
         bound = self._binding
         assert bound is not None
-        if not self._own and cell.tobytes() != bound.cell:
+        if not self._own and cell.tobytes() != bound.cell and bound.periodic:
             bound = bind(self.constraints, atoms)
             bound.given = self.constraints
             self._binding, self._own = bound, True
@@ -161,15 +161,12 @@ class Constraints(FixConstraint):
         bound, accepted = self._bound(atoms), self._accepted
         x = bound.kernel_array(new, "position")
         motion, old, cell = bound.motion, atoms.arrays["positions"], atoms.cell.array
-        changed = accepted.in_another(cell)
-        if changed:
-            accepted.refuse_taken_along(motion, old, cell)
         found = accepted.ask(motion.constraint_set, old, x)
-        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched):
+        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x):
             motion.project_positions(x, accepted.asked, out=x)
         else:
             try:
-                if changed or found & ELSEWHERE:
+                if found & ELSEWHERE or accepted.in_another(cell):
                     accepted.look(motion, old, cell, elsewhere=True)
                 accepted.between_steps = False
                 motion.project_positions(x, old, out=x)

@@ -289,12 +289,10 @@ class ConstrainedDynamics(MolecularDynamics):
         same = last is not None and cell == self._cell
         if last is not None and same:
             if equal_pairs(x, last.positions, p, self._momenta):
-                if last.step == self.nsteps and last.time == self.time:
-                    return last
-                if last.time == self.time:
-                    return replace(last, step=self.nsteps)
-                require_on_surface(system.motion.constraint_set, x, self.time)
-                return replace(last, time=self.time, step=self.nsteps, time_remainder=0.0)
+                if last.time != self.time:
+                    require_on_surface(system.motion.constraint_set, x, self.time)
+                    last = replace(last, time=self.time, time_remainder=0.0)
+                return last if last.step == self.nsteps else replace(last, step=self.nsteps)
             same = bool((last.positions == x).all())
         v = np.divide(p, self._masses, out=np.zeros_like(p), where=self._masses != 0.0)
         require_on_surface(system.motion.constraint_set, x, self.time)

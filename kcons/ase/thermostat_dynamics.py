@@ -352,8 +352,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     Raises
     ------
     InputError
-        One calculator given twice; calculators of other atoms; options of the other bath. While it runs: the atoms got
-        another calculator.
+        One calculator given twice; options of the other bath. While it runs: calculators of other atoms, or the atoms
+        got another calculator.
     """
 
     @checked
@@ -381,7 +381,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         self.seed = seed_from(rng)
         steps = {"slow": 1, "fast": fast_steps}
         make = partial(kind, friction=friction, rng=self.seed, steps=steps, **options)
-        make(_thermal(temperature_K))  # what it refuses comes before calculators are called
+        make(_thermal(temperature_K))  # what it refuses comes first
         self._parts = fast_steps
         if fast is slow:
             raise InputError(
@@ -392,13 +392,6 @@ class MultipleTimeSteps(ThermostattedDynamics):
         for name, calculator in (("fast", fast), ("slow", slow)):
             if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
                 raise InputError(f"{name} is {calculator!r:.80}; give an ASE calculator", item=name)
-            forces = as_float_array(calculator.get_forces(atoms), f"forces of {name}")
-            if forces.shape != (len(atoms), 3):
-                raise InputError(
-                    f"{name} computes forces of shape {forces.shape}, not of these {len(atoms)} atoms "
-                    f"({atoms.get_chemical_formula()}); fast and slow must be of the same atoms",
-                    item=name,
-                )
         self._calculators = fast, slow
         cheap, expensive = self._forces_of(fast, True), self._forces_of(slow, difference)
         if difference:

@@ -266,11 +266,6 @@ class ConstraintSet:
 
         return self._of_rows(x, time, wanted)
 
-    def curvature(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
-        """v^T (d2q/dx2) v of position rows at fixed time, shape (n_rows,)."""
-        u = self._positions(v, "velocities")
-        return self._of_rows(x, time, lambda c, r, t: c.curvature(r, u[c.atoms], t))
-
     def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
         return np.maximum(1e-14 * self.scale, 2 * np.finfo(float).eps * self._reach(self._positions(x), time))

@@ -9,16 +9,7 @@ import pytest
 import sympy
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import (
-    Angle,
-    CenterDistance,
-    Dihedral,
-    Distance,
-    FixedAtoms,
-    Formula,
-    KnifeEdge,
-    MovingTarget,
-)
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, FixedAtoms, Formula, KnifeEdge, MovingTarget
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError
 from kcons.free_energy import HeldCoordinates
 
@@ -71,11 +62,7 @@ CASES = {
         [Distance([[1, 2], [3, 4]])],
         [("length", 1, 5), ("angle", 1, 2, 3), ("length", 1, 2), ("length", 3, 4)],
     ),
-    "a square": (
-        {"s": Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2", [[0, 4]], target=None)},
-        [],
-        [("square", 0, 4)],
-    ),
+    "a square": ({"s": Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2", [[0, 4]], target=None)}, [], [("square", 0, 4)]),
 }
 
 

@@ -236,8 +236,6 @@ def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "ener
     low, high = profile.F - _BAND * profile.error, profile.F + _BAND * profile.error
     above.fill_between(profile.x, low, high, color=_BLUE, alpha=0.25, linewidth=0, label=f"± {_BAND:g} standard errors")
     above.plot(profile.x, profile.F, color=_BLUE, label="F")
-    places = profile.windows[:, None] * np.ones((1, 2))
-    above.plot(places.T, np.tile([[0.0], [0.04]], len(places)), color=_GREY, transform=above.get_xaxis_transform())
     above.set_ylabel(f"F / {energy}")
     above.legend(fontsize=8)
     slope = np.gradient(profile.F, profile.x)

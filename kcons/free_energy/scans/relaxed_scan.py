@@ -141,12 +141,7 @@ class _Wavefront:
     """What is held at each point, its energies and forces; which point is relaxed next, and from where."""
 
     def __init__(
-        self,
-        atoms: Atoms,
-        grid: Grid,
-        held: list[Constraint],
-        settings: dict[str, Any],
-        progress: Progress | None,
+        self, atoms: Atoms, grid: Grid, held: list[Constraint], settings: dict[str, Any], progress: Progress | None
     ) -> None:
         if atoms.calc is None:
             raise InputError("the atoms have no calculator; give them one: atoms.calc = ...", item="calculator")

@@ -17,7 +17,7 @@ from ase import Atoms, units
 from numpy.typing import ArrayLike
 from rich import box
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from kcons import __version__
 from kcons.ase.constraints_object import Constraints
@@ -288,11 +288,9 @@ class Scan:
 
     def table(self) -> Table:
         """A row a point; energies above the lowest one. Print it."""
-        shown = _Shown(box=box.SIMPLE_HEAD, padding=(0, 1))
-        for name, unit in zip(self.grid.names, self.grid.units, strict=True):
-            shown.add_column(f"{name}\n{unit}", justify="right")
-        for heading in ("energy\nkJ/mol", "hysteresis\nkJ/mol", "calls\n", "force left\neV/angstrom"):
-            shown.add_column(heading, justify="right")
+        titles = [f"{name}\n{unit}" for name, unit in zip(self.grid.names, self.grid.units, strict=True)]
+        titles += ["energy\nkJ/mol", "hysteresis\nkJ/mol", "calls\n", "force left\neV/angstrom"]
+        shown = _Shown(*(Column(title, justify="right") for title in titles), box=box.SIMPLE_HEAD, padding=(0, 1))
         for row in self.rows():
             *values, _, energy, spread, calls, left, error = row.values()
             numbers = (

@@ -148,10 +148,10 @@ class AseWindows(Sampler):
                 item="calculator",
             )
         self.atoms, self.calculator = atoms.copy(), calculator
-        rows = [*from_ase_constraints(self.atoms), *held]
-        self.atoms.set_constraint()
+        rows, atoms = [*from_ase_constraints(self.atoms), *held], self.atoms
+        atoms.set_constraint()
         where = (atoms.get_positions(), atoms.get_masses(), atoms.cell.array if atoms.pbc.any() else None, atoms.pbc)
-        super().__init__(coordinates, rows, *where, *2 * (bonds_of(self.atoms),))
+        super().__init__(coordinates, rows, *where, *2 * (bonds_of(atoms),))
 
     @property
     def digest(self) -> str:

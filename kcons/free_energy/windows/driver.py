@@ -45,10 +45,7 @@ BOLTZMANN = 0.00831446261815324
 #: How often a window is begun again whose process was killed.
 RETRIES = 3
 #: Files of a folder of windows, those of `FreeEnergy` and of the command line included.
-FILES = (
-    *("window-*.npz", "pull-*.npz"),
-    *("free_energy.json", "profile.csv", "profile.png", "pulls.json"),
-)
+FILES = ("window-*.npz", "pull-*.npz", "free_energy.json", "profile.csv", "profile.png", "pulls.json")
 #: Differences of the two sides that are less probable than this are marked, and widen errors.
 UNLIKELY = 0.01
 #: Windows of a torsion do not go around a gap that is wider than any other by more than this.
@@ -165,13 +162,13 @@ class FreeEnergy:
 
     def table(self) -> Table:
         """The windows, one in a line; print it by rich."""
-        from rich.table import Table
+        from rich.table import Column, Table
 
-        made = Table(title=f"mean force (kJ/mol by {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})")
         titles = [f"{name} ({_SHOWN[angle]})" for name, angle in zip(self.names, self.angles, strict=True)]
         titles += [f"dF/d {name}" for name in self.names] if len(self.names) > 1 else ["dF/dq"]
-        for title in (*titles, "raw multiplier", "independent samples", "p of both sides"):
-            made.add_column(title, justify="right")
+        titles += ["raw multiplier", "independent samples", "p of both sides"]
+        made = Table(*(Column(title, justify="right") for title in titles))
+        made.title = f"mean force (kJ/mol by {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})"
         for window in self.windows:
             shown = [np.degrees(q) if angle else q for q, angle in zip(window.value, self.angles, strict=True)]
             mark = "!" if window.p_value < UNLIKELY else ""
@@ -217,8 +214,7 @@ class FreeEnergy:
             if windows is None:
                 return numbers, f"{said}; the windows do not reach both ends"
             numbers["windows"] = [*windows]
-            away = (best.value - windows.value) / math.hypot(best.error, windows.error)
-            said += f", windows {windows.value:.2f} ± {windows.error:.2f}: {away:+.1f} standard errors"
+            said += f", windows {windows.value:.2f} ± {windows.error:.2f}: {best.off(*windows):+.1f} standard errors"
         return numbers, said
 
     def numbers(self) -> dict[str, Any]:

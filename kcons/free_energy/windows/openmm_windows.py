@@ -213,7 +213,7 @@ class OpenMMWindows(Sampler):
         _refuse_another(topology, system)
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
-        x, masses = nanometers(positions, system.getNumParticles()), masses_of(system)
+        x, masses = nanometers(positions, system.getNumParticles()).copy(), masses_of(system)
         bonds, others = bonds_of(system, x), _beside(system, list(named(coordinates).values()), masses)
         wraps = system.usesPeriodicBoundaryConditions()
         cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None

@@ -46,6 +46,15 @@ def test_a_window_far_from_the_structure(tmp_path):
     assert np.array_equal(series.multiplier, Series.load(tmp_path / "two").multiplier)
 
 
+def test_atoms_that_are_changed_later_change_no_windows():
+    atoms = molecule("CH3OH", cell=[20.0] * 3, pbc=True)
+    windows = AseWindows(atoms, CALCULATOR, {"turn": TURN}, [PIECES])
+    before = windows.placed([1.0])[1]
+    atoms.set_cell([2.0] * 3)
+    atoms.rattle(0.1)
+    assert np.array_equal(windows.placed([1.0])[1], before)
+
+
 def test_a_window_without_a_pull(tmp_path):
     settings = Settings(**{**SHORT.__dict__, "pull": 0})
     found = Windows(sampler(), tmp_path, settings, both_sides=False, executor=ThreadPoolExecutor(1))
