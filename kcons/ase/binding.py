@@ -38,7 +38,6 @@ class Binding:
 
     motion: Motion
     given: tuple[Constraint, ...]
-    touched: IntArray
     made_for: tuple[Any, ...]
     periodic: bool
     cell: bytes
@@ -107,15 +106,13 @@ def bind(given: Sequence[Constraint], atoms: Atoms, time: float = 0.0) -> Bindin
         given, x, atoms.get_masses(), cell=atoms.cell.array if periodic else None, pbc=atoms.pbc, time=time
     )
     motion = Motion(held, x, time=time)
-    touched = touched_atoms(held.constraints)
     return Binding(
         motion=motion,
         given=held.constraints,
-        touched=touched,
         made_for=_read_by_engine(atoms),
         periodic=periodic,
         cell=atoms.cell.array.tobytes(),
-        weights=_weights(motion) if len(touched) == len(atoms) else None,
+        weights=_weights(motion) if len(held.touched) == len(atoms) else None,
     )
 
 
@@ -143,7 +140,7 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
             continue
         if type(other) is ase.constraints.FixCom and all(c.translation_invariant for c in bound.given):
             continue  # a common shift of all atoms changes no row
-        both = np.intersect1d(_acted_on(other, bound.motion.n_atoms), bound.touched)
+        both = np.intersect1d(_acted_on(other, bound.motion.n_atoms), bound.motion.constraint_set.touched)
         if len(both):
             raise UnsupportedError(
                 f"{type(other).__name__} acts on atom {both[0]}, which kcons holds too; ASE would apply the two "

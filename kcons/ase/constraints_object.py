@@ -11,6 +11,7 @@ import ase.constraints
 import numpy as np
 from ase import Atoms
 from ase.constraints import FixAtoms, FixConstraint
+from numpy.typing import ArrayLike
 
 import kcons.constraints as families
 from kcons.ase.binding import (
@@ -129,7 +130,7 @@ class Constraints(FixConstraint):
         """The engine, which knows the cell; an `InputError` leaves it as it was."""
         bound = self._binding
         assert bound is not None
-        if not self._own and cell.tobytes() != bound.cell:
+        if not self._own and cell.tobytes() != bound.cell and bound.periodic:
             bound = bind(self.constraints, atoms)
             bound.given = self.constraints
             self._binding, self._own = bound, True
@@ -160,15 +161,12 @@ class Constraints(FixConstraint):
         bound, accepted = self._bound(atoms), self._accepted
         x = bound.kernel_array(new, "position")
         motion, old, cell = bound.motion, atoms.arrays["positions"], atoms.cell.array
-        changed = accepted.in_another(cell)
-        if changed:
-            accepted.refuse_taken_along(motion, old, cell)
         found = accepted.ask(motion.constraint_set, old, x)
-        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched):
+        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x):
             motion.project_positions(x, accepted.asked, out=x)
         else:
             try:
-                if changed or found & ELSEWHERE:
+                if found & ELSEWHERE or accepted.in_another(cell):
                     accepted.look(motion, old, cell, elsewhere=True)
                 accepted.between_steps = False
                 motion.project_positions(x, old, out=x)
@@ -342,13 +340,19 @@ class Constraints(FixConstraint):
 
     # -- for people -----------------------------------------------------------------------------
 
-    def restore(self, atoms: Atoms) -> None:
+    def restore(self, atoms: Atoms, bonds: ArrayLike | None = None) -> None:
         """Move atoms that are off the constraints onto them, and project their momenta if they have any.
 
         Near starts go to the nearest point in the mass metric. Where that would change other bonds or angles, and for
-        far targets, groups move as rigid pieces: see `Motion.restore_positions`. Bonds are those in
-        ``atoms.info['bonds']``, otherwise they are guessed from covalent radii. For starts and edited structures, not
+        far targets, groups move as rigid pieces: see `Motion.restore_positions`. For starts and edited structures, not
         for time steps.
+
+        Parameters
+        ----------
+        atoms : ase.Atoms
+        bonds : array_like of int, shape (n, 2), optional
+            Those that stay as they are; by default ``atoms.info['bonds']``, otherwise they are guessed from covalent
+            radii. Empty: the nearest point, whatever becomes of what no row holds.
 
         Raises
         ------
@@ -357,7 +361,8 @@ class Constraints(FixConstraint):
             changed.
         """
         bound, accepted = self._bound(atoms), self._accepted
-        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=lambda: bonds_of(atoms))
+        kept = (lambda: bonds_of(atoms)) if bonds is None else bonds
+        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept)
         self._move(atoms, bound.motion, x)
         accepted.between_steps = True
 

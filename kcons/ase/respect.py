@@ -9,7 +9,6 @@ from ase.cell import Cell
 from kcons.ase.topology import velocities_of
 from kcons.constraints.arguments import finite_array
 from kcons.constraints.compilation import njit
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
@@ -119,13 +118,10 @@ class AcceptedPositions:
 
     def _scaled(self, motion: Motion, x: FloatArray, cell: FloatArray) -> bool:
         """Whether positions are those accepted last but for a change of the cell that took them along."""
-        self.refuse_taken_along(motion, x, cell)
-        moved = self._positions @ deformation(np.frombuffer(self._cell or b"").reshape(3, 3), cell)
+        before = np.frombuffer(self._cell or b"").reshape(3, 3)
+        refuse_taken_along(motion, self._positions, before, x, cell)
+        moved = self._positions @ deformation(before, cell)
         return float(np.abs(moved - x).max(initial=0.0)) <= START_TOLERANCE
-
-    def refuse_taken_along(self, motion: Motion, x: FloatArray, cell: FloatArray) -> None:
-        """As the function of this name, from the positions and the cell that were accepted last."""
-        refuse_taken_along(motion, self._positions, np.frombuffer(self._cell or b"").reshape(3, 3), x, cell)
 
     def ask(self, held: ConstraintSet, old: FloatArray, new: FloatArray) -> int:
         """Remember positions before they are corrected; what `compared` finds of them.
@@ -262,12 +258,12 @@ def refuse_taken_along(
             )
 
 
-def fulfilled(held: ConstraintSet, x: FloatArray, touched: IntArray) -> bool:
-    """Whether positions fulfill the rows, of the atoms `touched`: to rounding, or to the digits that they come with."""
+def fulfilled(held: ConstraintSet, x: FloatArray) -> bool:
+    """Whether positions fulfill the rows: to rounding, or to the digits that they come with."""
     if _worst_row(held, x) is None:
         return True
     for digits in DIGITS:
-        written = x[touched] * 10.0**digits
+        written = x[held.touched] * 10.0**digits
         if np.abs(written - np.round(written)).max(initial=0.0) <= 1e-3:  # also those that were float32 in between
             reach = np.asarray(abs(held.jacobian(x)).sum(axis=1)).ravel()
             return bool(np.all(np.abs(held.value(x)) <= 0.5 * 10.0**-digits * reach + START_TOLERANCE * held.scale))

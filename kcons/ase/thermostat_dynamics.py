@@ -34,7 +34,7 @@ from kcons.thermostats import (
     NoseHooverChain,
     thermal_velocities,
 )
-from kcons.thermostats.barostats import Barostat, ConstantPressure, require_barostat
+from kcons.thermostats.barostats import Barostat, require_barostat
 from kcons.thermostats.freedom import Momentum
 from kcons.thermostats.monte_carlo import POTENTIAL
 
@@ -85,10 +85,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
         else:
             self._momenta = momenta
         self._state = begun
-
-    @property
-    def _mover(self) -> Stepper:
-        return self.stepper if self.barostat is None else ConstantPressure(self.stepper, self.barostat)
 
     def _made(self, motion: Motion) -> System:
         if self.barostat is None:
@@ -352,8 +348,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
     Raises
     ------
     InputError
-        One calculator given twice; calculators of other atoms; options of the other bath. While it runs: the atoms got
-        another calculator.
+        One calculator given twice; options of the other bath. While it runs: calculators of other atoms, or the atoms
+        got another calculator.
     """
 
     @checked
@@ -381,7 +377,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         self.seed = seed_from(rng)
         steps = {"slow": 1, "fast": fast_steps}
         make = partial(kind, friction=friction, rng=self.seed, steps=steps, **options)
-        make(_thermal(temperature_K))  # what it refuses comes before calculators are called
+        make(_thermal(temperature_K))  # what it refuses comes first
         self._parts = fast_steps
         if fast is slow:
             raise InputError(
@@ -392,13 +388,6 @@ class MultipleTimeSteps(ThermostattedDynamics):
         for name, calculator in (("fast", fast), ("slow", slow)):
             if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
                 raise InputError(f"{name} is {calculator!r:.80}; give an ASE calculator", item=name)
-            forces = as_float_array(calculator.get_forces(atoms), f"forces of {name}")
-            if forces.shape != (len(atoms), 3):
-                raise InputError(
-                    f"{name} computes forces of shape {forces.shape}, not of these {len(atoms)} atoms "
-                    f"({atoms.get_chemical_formula()}); fast and slow must be of the same atoms",
-                    item=name,
-                )
         self._calculators = fast, slow
         cheap, expensive = self._forces_of(fast, True), self._forces_of(slow, difference)
         if difference:

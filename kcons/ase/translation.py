@@ -132,14 +132,15 @@ def ase_forms(rows: Sequence[Constraint]) -> tuple[list[dict[str, Any]], list[Co
     Known are fixed atoms; distances and their differences, angles and dihedrals; planes and lines; components of single
     atoms; centers of mass with all their components; all with targets that are found and rest.
     """
-    kinds: dict[str, list[Constraint]] = {}
+    kinds: dict[Callable[..., list[dict[str, Any]]] | None, list[Constraint]] = {}
     for item in rows:
         known = isinstance(item.target, np.ndarray) and item.n_rows and item.cell_offsets is None
-        kinds.setdefault(_KINDS.get(item.family, "") if known else "", []).append(item)
-    left = kinds.pop("", [])
+        kinds.setdefault(_FORMS.get(item.family) if known else None, []).append(item)
+    left = kinds.pop(None, [])
     forms = []
-    for kind, items in kinds.items():
-        found = _FORMS[kind](items)
+    for form, items in kinds.items():
+        assert form is not None
+        found = form(items)
         forms += found
         left += [] if found else items
     return forms, left
@@ -163,20 +164,18 @@ def _internal(items: list[Constraint]) -> list[dict[str, Any]]:
 
 
 def _directed(items: list[Constraint]) -> list[dict[str, Any]]:
-    """Planes by their normals, or lines by their directions; none where one atom has two of them."""
-    atoms: dict[tuple[float, ...], list[int]] = {}
+    """Planes by their normals, lines by their directions; none where one atom has two of them."""
+    atoms: dict[tuple[str, tuple[float, ...]], list[int]] = {}
     for item in items:
-        directions = np.asarray(item.coefficients)[:, 0]  # type: ignore[attr-defined]
-        each = item.atoms[:, 0]
+        name, directions, each = "FixedPlane", np.asarray(item.coefficients)[:, 0], item.atoms[:, 0]  # type: ignore[attr-defined]
         if item.family == "Line":
-            directions, each = np.cross(directions[::2], directions[1::2]), each[::2]
+            name, directions, each = "FixedLine", np.cross(directions[::2], directions[1::2]), each[::2]
         for direction, atom in zip(directions.tolist(), each.tolist(), strict=True):
-            atoms.setdefault(tuple(direction), []).append(atom)
+            atoms.setdefault((name, tuple(direction)), []).append(atom)
     every = [atom for found in atoms.values() for atom in found]
     if len(set(every)) < len(every):
         return []
-    name = "FixedPlane" if items[0].family == "Plane" else "FixedLine"
-    return [_named(name, indices=found, direction=list(direction)) for direction, found in atoms.items()]
+    return [_named(name, indices=found, direction=list(along)) for (name, along), found in atoms.items()]
 
 
 def _components(items: list[Constraint]) -> list[dict[str, Any]]:
@@ -203,16 +202,11 @@ def _centers(items: list[Constraint]) -> list[dict[str, Any]]:
     return [_named("FixSubsetCom", indices=list(atoms)) for atoms in axes]
 
 
-#: Families that one object of ASE holds together, and what makes its data; none where it does not hold these.
-_KINDS = {
-    **dict.fromkeys(("Distance", "DistanceDifference", "Angle", "Dihedral"), "internal"),
-    **{family: family for family in ("FixedAtoms", "Plane", "Line", "LinearCombination", "CenterOfMass")},
-}
+#: What makes the data of objects of ASE for rows of a family, and of those that one object holds together.
 _FORMS: dict[str, Callable[[list[Constraint]], list[dict[str, Any]]]] = {
+    **dict.fromkeys(("Distance", "DistanceDifference", "Angle", "Dihedral"), _internal),
+    **dict.fromkeys(("Plane", "Line"), _directed),
     "FixedAtoms": _fixed,
-    "internal": _internal,
-    "Plane": _directed,
-    "Line": _directed,
     "LinearCombination": _components,
     "CenterOfMass": _centers,
 }

@@ -5,11 +5,18 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from time import monotonic
 from typing import Any, Self
 
 
 class Watcher:
-    """Is told of progress, and shows it if `shown`: a bar for the piece in hand; without a terminal a line for each."""
+    """Is told of progress, and shows it if `shown`: a bar for the piece in hand.
+
+    Without a terminal, a line for each piece, and one a minute.
+    """
+
+    #: Seconds between two lines about one piece.
+    pause = 60.0
 
     def __init__(self, shown: bool = False) -> None:
         self._bars: Any = None
@@ -34,8 +41,7 @@ class Watcher:
     def piece(self, what: str, total: float) -> Iterator[None]:
         """A piece of work of `total` units, which is over at the end of the block."""
         if self._bars is not None:
-            if not self._bars.console.is_terminal:
-                print(what, file=sys.stderr, flush=True)
+            self._say(what)
             self._task = self._bars.add_task(what, total=total)
         try:
             yield
@@ -48,6 +54,14 @@ class Watcher:
         """So much of the piece in hand is done."""
         if self._task is not None:
             self._bars.update(self._task, completed=done)
+            if monotonic() - self._said >= self.pause:
+                (task,) = self._bars.tasks
+                self._say(f"{task.description}: {task.percentage:.0f} %")
+
+    def _say(self, line: str) -> None:
+        self._said = monotonic()
+        if not self._bars.console.is_terminal:
+            print(line, file=sys.stderr, flush=True)
 
 
 def duration(seconds: float) -> str:

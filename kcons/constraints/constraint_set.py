@@ -141,7 +141,8 @@ class ConstraintSet:
             if isinstance(item.target, MovingTarget):
                 item.target.check(repr(item), time, item.n_rows, item.period)
             if item.target is None:
-                found = item.measure(self.gather(item, x, together), time) if item.holonomic else np.zeros(item.n_rows)
+                r = r if together is y else self.gather(item, x, together)
+                found = item.measure(r, time) if item.holonomic else np.zeros(item.n_rows)
                 item = item.with_target(found)
             bound.append(item)
         open_ = [item.target is None for item in marked]
@@ -264,11 +265,6 @@ class ConstraintSet:
             return _rate_of(c, t, 2) - (bent + c.time_terms(r, v, t)[1] if c.moving else bent)
 
         return self._of_rows(x, time, wanted)
-
-    def curvature(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
-        """v^T (d2q/dx2) v of position rows at fixed time, shape (n_rows,)."""
-        u = self._positions(v, "velocities")
-        return self._of_rows(x, time, lambda c, r, t: c.curvature(r, u[c.atoms], t))
 
     def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
@@ -414,22 +410,24 @@ class ConstraintSet:
     def _check_cell(self, before: FloatArray | None) -> None:
         if self.lattice is None:
             return
-        periodic = self.lattice[1].any(axis=0)
         if any(c.relative and (c.moving or not c.holds_length) for c in self.constraints):
+            periodic = self.lattice[1].any(axis=0)
             if before is None or np.any(periodic & ~before[1].any(axis=0)):
                 raise InputError(
                     "this set was made without this periodic direction, and which images its rows mean has to be found "
                     "anew; make a new ConstraintSet with the cell",
                     item="cell",
                 )
-            change = norm(self.lattice[0] - before[0]) / norm(before[0])
-            change = change[periodic]  # the vector of a direction without periodicity is arbitrary
-            if self.images is not None and np.any(self.images.unheld >= 0) and np.any(change > MOST_STRAIN):
-                raise InputError(
-                    f"the cell changes by {change.max():.0%} at once, more than a tenth: which images rows mean among "
-                    "atoms that nothing ties together cannot be followed; make a new ConstraintSet with the cell",
-                    item="cell",
-                )
+            if self.images is not None and np.any(self.images.unheld >= 0):
+                change = norm(self.lattice[0] - before[0]) / norm(before[0])
+                change = change[periodic]  # the vector of a direction without periodicity is arbitrary
+                if np.any(change > MOST_STRAIN):
+                    raise InputError(
+                        f"the cell changes by {change.max():.0%} at once, more than a tenth: which images rows mean "
+                        "among atoms that nothing ties together cannot be followed; make a new ConstraintSet with the "
+                        "cell",
+                        item="cell",
+                    )
         (longest, row), half = self._longest_plain, self.half_width
         tied = 0.0 if self.images is None else self.images.longest
         if max(longest, tied) >= half:

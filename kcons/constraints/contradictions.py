@@ -42,8 +42,8 @@ def agreed_targets(
         first = np.flatnonzero(np.concatenate([[True], (atoms[1:] != atoms[:-1]).any(axis=1)]))
         if chosen[0].holds_length:
             _refuse_impossible_triangles(atoms[first], rows[first], target[first])
-        agreed = np.where(open_, np.repeat(target[first], np.diff([*first, len(atoms)])), target)
-        if np.any(agreed != target):
+        if open_.any() and not open_.all():
+            agreed = np.where(open_, np.repeat(target[first], np.diff(np.append(first, len(atoms)))), target)
             back = np.empty_like(agreed)
             back[order] = agreed
             for n, part in zip(numbers, np.split(back, np.cumsum([item.n_rows for item in chosen])), strict=False):

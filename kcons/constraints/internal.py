@@ -136,14 +136,13 @@ class DistanceDifference(Constraint):
                 "other than 0, one for each pair",
                 item="weights",
             )
-        atoms = self.atoms[0] if self.n_rows else range(self.width)
-        for i, j in self.slots:
-            if i == j:
-                raise InputError(f"DistanceDifference: a pair names atom {atoms[i]} twice", item="pairs")
-        if len({frozenset(pair) for pair in self.slots}) < n:
-            raise InputError("DistanceDifference: a pair comes twice; name it once and add the weights", item="pairs")
         if self.n_rows and {slot for pair in self.slots for slot in pair} != set(range(self.width)):
             raise InputError("DistanceDifference: slots and atoms do not belong together", item="slots")
+        if twice := [i for i, j in self.slots if i == j]:
+            named = self.atoms[0, twice[0]] if self.n_rows else twice[0]
+            raise InputError(f"DistanceDifference: a pair names atom {named} twice", item="pairs")
+        if len({frozenset(pair) for pair in self.slots}) < n:
+            raise InputError("DistanceDifference: a pair comes twice; name it once and add the weights", item="pairs")
         self.links = read_only(np.array(_walk(self.slots)[1], dtype=np.int64))
         self.alike = 2 + 3 * n
         self.positive = "target" if min(self.weights) > 0 else ""

@@ -95,8 +95,6 @@ class Cylinder(Surface):
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"point": _VECTOR, "axis": _VECTOR}
     length_powers = {"point": 1}
     singular = "atom {atom} lies on the axis of the cylinder: gradient undefined; move the atom"
-    point: FloatArray
-    axis: FloatArray
 
     def __init__(self, atoms: ArrayLike, point: Lengths, axis: Directions, radius: Target = None) -> None:
         super().__init__(atoms, radius, point=point, axis=axis)
@@ -130,8 +128,6 @@ class Torus(Surface):
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR, "axis": _VECTOR, "major_radius": ()}
     length_powers = {"center": 1, "major_radius": 1}
     singular = "atom {atom} lies on the axis or on the core circle of the torus: gradient undefined; move the atom"
-    center: FloatArray
-    axis: FloatArray
     major_radius: FloatArray
 
     def __init__(

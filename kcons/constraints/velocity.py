@@ -104,7 +104,6 @@ class KnifeEdge(VelocityRows):
     translation_invariant = True
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"normal": _VECTOR, "contact": ()}
     normal: FloatArray
-    contact: FloatArray
 
     def __init__(
         self,
@@ -172,7 +171,6 @@ class Rolling(VelocityRows):
     row_width = 2
     translation_invariant = True
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"radius": (), "heading": _VECTOR, "normal": _VECTOR}
-    radius: FloatArray
     heading: FloatArray
     normal: FloatArray
 

@@ -29,14 +29,13 @@ from __future__ import annotations
 import uuid
 import weakref
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, Literal, Self, cast
 
 import numpy as np
 import openmm
 from numpy.typing import ArrayLike, NDArray
 from openmm import unit
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray, constraints_in
@@ -48,6 +47,7 @@ from kcons.motion.report import Report
 from kcons.openmm.collective.coordinates import free_groups
 from kcons.openmm.integrator.guard import (
     ROW_NAME,
+    components,
     forces_of,
     groups_in,
     refuse_agents,
@@ -198,12 +198,11 @@ class _Table:
                 f"system is a {type(system).__name__}; give the openmm.System, as createSystem makes it", item="system"
             )
         known = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-        self.system, n = system, system.getNumParticles()
+        self.system = system
         self.pairs = np.array([[i, j] for i, j, _ in known], dtype=np.int64).reshape(-1, 2)
         # In nm; converting a Quantity takes longer than all else here.
         self.lengths = np.array([length._value for _, _, length in known], dtype=np.float64)
-        links = coo_array((np.ones(len(known)), self.pairs.T), shape=(n, n))
-        self.clusters = connected_components(links, directed=False)[1].astype(np.int64)
+        self.clusters = components(system.getNumParticles(), self.pairs)
         self.cluster = self.clusters[self.pairs[:, 0]]
 
     def all(self) -> NDArray[np.bool_]:
@@ -494,7 +493,11 @@ class CallbackEngine(Engine):
         return start + then * dt, start + now * dt, shares[stage] * dt
 
     def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
-        """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
+        """What the PythonForce of this phase returns.
+
+        In steps of an integrator that holds the rows nothing is raised: OpenMM would make a string of it.
+        """
+        self.refuse_strangers(state)
         change = None
         try:
             if phase == "remember":
@@ -506,6 +509,11 @@ class CallbackEngine(Engine):
         except BaseException as error:
             self._error, change = error, None
         return (0.0 if self._error is None else 1.0), self.give(change)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise UnsupportedError(
+            "rows of hold belong to their System: copy the System, or write it to XML, before the call of hold"
+        )
 
     # -- afterwards -----------------------------------------------------------------------------
 
@@ -529,22 +537,6 @@ class CallbackEngine(Engine):
         elif isinstance(error, Exception):
             error.add_note(f"in step {step}, from the function of a constraint; the step was taken back")
         return cast(KconsError, error)
-
-
-class Callback:
-    """The function of one PythonForce."""
-
-    def __init__(self, engine: CallbackEngine, phase: str) -> None:
-        self.engine, self.phase = engine, phase
-
-    def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
-        self.engine.refuse_strangers(state)
-        return self.engine.answer(self.phase, state)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        raise UnsupportedError(
-            "rows of hold belong to their System: copy the System, or write it to XML, before the call of hold"
-        )
 
 
 def great_circles(x: FloatArray, there: FloatArray, spheres: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -614,7 +606,7 @@ class CarriedConstraints(Part):
     def add_to(self, system: openmm.System) -> None:
         """Put the forces that carry the rows into the System; before the Context is made."""
         for phase, group in self._groups.items():
-            force = openmm.PythonForce(Callback(self._engine, phase))
+            force = openmm.PythonForce(partial(self._engine.answer, phase))
             if self._engine.some:
                 force.setParticles(self.atoms.tolist())
             force.setUsesPeriodicBoundaryConditions(self._engine.cell is not None)

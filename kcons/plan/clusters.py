@@ -80,10 +80,11 @@ def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: Fl
     kinds, pairs = _row_tables(constraint_set)
     inside = labels >= 0
     n_rows = np.bincount(labels[inside], minlength=n_clusters)
-    distances_only = np.ones(n_clusters, dtype=bool)
-    np.logical_and.at(distances_only, labels[inside], kinds[inside] == RowKind.DISTANCE)
-    compiled = np.ones(n_clusters, dtype=bool)
-    np.logical_and.at(compiled, labels[inside], kinds[inside] != RowKind.INTERPRETED)
+
+    def only(rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.bincount(labels[inside & ~rows], minlength=n_clusters) == 0
+
+    distances_only, compiled = only(kinds == RowKind.DISTANCE), only(kinds != RowKind.INTERPRETED)
 
     # Atoms that move belong to one cluster each.
     atom_label = np.full(constraint_set.n_atoms, -1, dtype=np.int64)
@@ -113,9 +114,7 @@ def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: Fl
     np.maximum.at(largest, atom_label[atom_label >= 0], degree[atom_label >= 0])
     path = tree & ~anchored & ~small & (largest <= 2)
     sparse = distances_only & ~path & (~small | left_over)
-    single = np.zeros(n_clusters, dtype=bool)
-    single[labels[inside & (kinds == RowKind.FUNCTION)]] = True
-    single &= n_rows == 1
+    single = only(kinds == RowKind.FUNCTION) & (n_rows == 1)
     if constraint_set.images is not None:
         single &= ~anchored  # fixed atoms may be moved to another image, of which single rows know nothing
     kinds_of: tuple[tuple[ShapeKind, NDArray[np.bool_]], ...] = (
@@ -188,11 +187,8 @@ def _small_shapes(
             where = np.flatnonzero(new[one])
             atoms = flat[members][:, where]
             local_pairs = local[one].reshape(-1, 2)
-            triangle = size == 3 and len(where) == 3
-            if triangle and not np.array_equal(local_pairs, [[0, 1], [0, 2], [1, 2]]):
-                triangle = False
             shape = Shape(
-                "RigidTriangles" if triangle else "SmallClusters",
+                "RigidTriangles" if np.array_equal(local_pairs, [[0, 1], [0, 2], [1, 2]]) else "SmallClusters",
                 rows[table[members]],
                 len(members),
                 bool(tree[numbers[chosen[one]]]),
@@ -200,13 +196,10 @@ def _small_shapes(
                 pairs=local_pairs,
             )
             waiting.append((shape, numbers[chosen[members]]))
-    few = [s for s, _ in waiting if s.clusters < LANES_CLUSTERS]
+    few = sum(shape.clusters < LANES_CLUSTERS for shape, _ in waiting)
     for shape, members in waiting:
         # A handful of groups is served in lanes however few their members.
-        if shape.clusters < LANES_CLUSTERS and len(few) > 2:
-            yield None, members
-        else:
-            yield shape, members
+        yield (None if few > 2 and shape.clusters < LANES_CLUSTERS else shape), members
 
 
 def _paths(rows: IntArray, pairs: IntArray, n_atoms: int, clusters: int) -> Shape:

@@ -23,8 +23,17 @@ _GROUND = -1
 
 def fixed_atoms(constraint_set: ConstraintSet) -> IntArray:
     """Atoms that FixedAtoms of the set hold, sorted."""
-    fixed = [c.atoms[:, 0] for c in constraint_set.constraints if c.fixes_atoms]
-    return np.unique(np.concatenate(fixed)) if fixed else np.zeros(0, np.int64)
+    return fixed_rows(constraint_set)[0]
+
+
+def fixed_rows(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
+    """Fixed atoms, sorted, and their rows, three an atom; the first ones of an atom that is named again."""
+    pairs = zip(constraint_set.constraints, constraint_set.starts, strict=False)
+    found = [(item.atoms[::3, 0], start + np.arange(0, item.n_rows, 3)) for item, start in pairs if item.fixes_atoms]
+    none = np.zeros(0, np.int64)
+    atoms, rows = (np.concatenate([none, *parts]) for parts in (zip(*found, strict=True) if found else ([], [])))
+    atoms, first = np.unique(atoms, return_index=True)
+    return atoms, (rows[first][:, None] + np.arange(3)).ravel()
 
 
 def row_blocks(

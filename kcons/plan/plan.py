@@ -13,6 +13,7 @@ from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError
 from kcons.plan.clusters import Shape, classify, cluster_labels
+from kcons.plan.independent_blocks import fixed_rows
 from kcons.solvers.chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -205,7 +206,7 @@ def make_plan(
     `named` has the same rows on the atom numbers of the whole system, for messages.
     """
     named = constraint_set if named is None else named
-    pinned, pinned_rows = _pinned(constraint_set)
+    pinned, pinned_rows = fixed_rows(constraint_set)
     inverse_masses = np.zeros(constraint_set.n_atoms)
     touched = constraint_set.touched
     inverse_masses[touched] = 1.0
@@ -350,18 +351,3 @@ def _by_cluster(rows: IntArray, labels: IntArray) -> list[IntArray]:
     order = np.argsort(labels[rows], kind="stable")
     cuts = np.flatnonzero(np.diff(labels[rows[order]])) + 1
     return [np.sort(part) for part in np.split(rows[order], cuts)]
-
-
-def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
-    """Fixed atoms and their rows, the first three of those that name an atom again."""
-    atoms: list[IntArray] = []
-    rows: list[IntArray] = []
-    for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
-        if item.fixes_atoms:
-            atoms.append(item.atoms[::3, 0])
-            rows.append(start + np.arange(item.n_rows))
-    if not atoms:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    every = np.concatenate(atoms)
-    first = np.sort(np.unique(every, return_index=True)[1])
-    return every[first], np.concatenate(rows).reshape(-1, 3)[first].ravel()

@@ -190,3 +190,16 @@ def test_momenta_go_along() -> None:
     held = constrain(atoms, [Dihedral([[3, 2, 1, 0]], 0.3), Distance([[0, 1]])], project=True)
     rows = held.engine(atoms).constraint_set.jacobian(atoms.positions)
     assert np.abs(rows @ atoms.get_velocities().ravel()).max() < 1e-13
+
+
+def test_a_target_that_bonds_stand_against_is_reached_without_them():
+    """The message says how, and it can be done in ASE."""
+    atoms = molecule("CH3CH2OH")
+    held = Constraints(CenterDistance([2], [6, 7, 8], 2.9))
+    atoms.set_constraint(held)
+    start = atoms.positions.copy()
+    with pytest.raises(InfeasibleError, match=r"restore\(\.\.\., bonds=\[\]\)"):
+        held.restore(atoms)
+    np.testing.assert_array_equal(atoms.positions, start)
+    held.restore(atoms, bonds=[])
+    assert held.report(atoms).residual < 1e-12

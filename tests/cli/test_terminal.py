@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from kcons.cli.main import main
+from kcons.comparison import progress
 from kcons.comparison.progress import Watcher
 
 C_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
@@ -46,15 +47,18 @@ def test_streams_are_left_as_they_were(monkeypatch):
     assert mine.getvalue().startswith("usage: kcons ")
 
 
-def test_a_line_for_each_piece_where_there_is_no_terminal(capsys):
+def test_a_line_for_each_piece_and_one_a_minute_where_there_is_no_terminal(capsys, monkeypatch):
+    clock = iter([0.0, 59.0, 61.0, 61.0, 62.0, 200.0])
+    monkeypatch.setattr(progress, "monotonic", lambda: next(clock))
     with Watcher(shown=True) as bars:
         with bars.piece("reference solution", 10.0):
-            bars.advance(5.0)
+            for done in (1.0, 5.0, 6.0):
+                bars.advance(done)
         with bars.piece("water", 1.0):
             pass
     shown = capsys.readouterr()
     lines = [line for line in shown.err.splitlines() if line.strip()]
-    assert shown.out == "" and lines == ["reference solution", "water"]
+    assert shown.out == "" and lines == ["reference solution", "reference solution: 50 %", "water"]
 
 
 def test_bars_are_gone_however_a_piece_ends():

@@ -174,23 +174,24 @@ def test_arrays_cannot_be_changed(name):
 
 
 class Height(Constraint):
-    """A family of a user's own, in two lines."""
+    """A family of a user's own, in three lines: its data are what `row` finds in p."""
 
     row_width = 1
+    per_row = {"factor": ()}
 
     @staticmethod
     def row(r, p, t, out):
-        out[0], out[1], out[2], out[3] = r[2] * r[2], 0.0 * r[0], 0.0 * r[0], 2.0 * r[2]
+        out[0], out[1], out[2], out[3] = p[0] * r[2] * r[2], 0.0 * r[0], 0.0 * r[0], 2.0 * p[0] * r[2]
 
 
 def test_a_family_of_ones_own_is_compiled_kept_in_files_and_takes_quantities():
     x = np.array([[1.0, 2.0, 3.0], [0.0, 1.0, 2.0]])
-    motion = Motion(ConstraintSet(Height([[0], [1]]), x, np.ones(2)), x)
-    assert motion.constraint_set.target().tolist() == [9.0, 4.0]
+    motion = Motion(ConstraintSet(Height([[0], [1]], factor=[1.0, 0.5]), x, np.ones(2)), x)
+    assert motion.constraint_set.target().tolist() == [9.0, 2.0]
     assert motion.project_positions(x + 0.1, x)[:, 2] == pytest.approx([3.0, 2.0], abs=1e-14)
     assert motion.acceleration(x, np.ones((2, 3)), np.zeros((2, 3)))[:, 2] == pytest.approx([-1 / 3, -1 / 2], abs=1e-14)
-    assert type(from_dict(Height([[0]], 4.0).todict())) is Height
-    assert Height([[0]], 4.0 * unit.angstrom).target == pytest.approx([0.4])
+    assert type(from_dict(Height([[0]], 4.0, factor=1.0).todict())) is Height
+    assert Height([[0]], 4.0 * unit.angstrom, factor=1.0).target == pytest.approx([0.4])
 
 
 # -- in another unit of length ----------------------------------------------------------------------

@@ -4,7 +4,7 @@ import numpy as np
 import openmm
 import pytest
 from openmm import unit
-from openmm_systems import dumbbell, started
+from openmm_systems import dumbbell, started, state_of
 
 from kcons.constraints import (
     Angle,
@@ -19,7 +19,9 @@ from kcons.errors import InputError
 from kcons.openmm import (
     CarriedConstraints,
     CollectiveRows,
+    Isokinetic,
     Langevin,
+    LangevinRespa,
     NoseHoover,
     ProjectedIntegrator,
     Row,
@@ -96,35 +98,80 @@ def test_collective_variables_of_composite_units():
             CollectiveRows(atoms(), [Row(product, wrong)])
 
 
-def test_arguments_of_integrators_and_ensembles():
-    for make, words in (
+# -- arguments that are refused ---------------------------------------------------------------------
+
+TWO = {0: 1, 1: 4}
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
         (lambda: ProjectedIntegrator(1 * kelvin), "timestep is 1 K; give it in ps"),
         (lambda: ProjectedIntegrator(1 * nm), "timestep is 1 nm; give it in ps"),
-        (lambda: Langevin(1 * nm, 1.0), "temperature is 1 nm; give it in K"),
-        (lambda: Langevin(300, 1 * nm), "friction is 1 nm; give it in 1/ps"),
-        (lambda: NoseHoover(300, 1 * nm), "frequency is 1 nm; give it in 1/ps"),
         (lambda: ProjectedIntegrator("soon"), "timestep is 'soon'; give a number of ps, or a Quantity"),
+        *((lambda dt=dt: ProjectedIntegrator(dt), "positive") for dt in (np.nan, np.inf, -1 * ps)),
+        (lambda: ProjectedIntegrator(1e-3, "rattel"), "no scheme 'rattel'; known: rattle, geodesic"),
+        *(
+            (lambda e=e: ProjectedIntegrator(1e-3, ensemble=e), "ensemble is .*; give one of kcons.openmm, such as")
+            for e in ("langevin", 300, Isokinetic)
+        ),
+        *(
+            (lambda p=p: ProjectedIntegrator(1e-3, parts=p), r"no part of an integrator; kcons\.openmm\.hold")
+            for p in (Distance([[0, 1]]), [Distance([[0, 1]])])
+        ),
+        (lambda: Langevin(1 * nm, 1.0), "temperature is 1 nm; give it in K"),
         (lambda: Langevin([300], 1.0), "temperature is"),
-    ):
-        with pytest.raises(InputError, match=words):
-            make()
+        (lambda: Langevin(np.nan, 1), "temperature"),
+        (lambda: Langevin(300, 1 * nm), "friction is 1 nm; give it in 1/ps"),
+        (lambda: LangevinRespa(300, -1.0, TWO), "friction"),
+        (lambda: LangevinRespa(300, 1.0, 4), "steps must name each force group"),
+        (lambda: LangevinRespa(300, 1.0, {0: 1}), "give two or more"),
+        (lambda: LangevinRespa(300, 1.0, {0: 1, 32: 4}), "force group 32 is no number from 0 to 31"),
+        (lambda: LangevinRespa(300, 1.0, {0: 1, "fast": 4}), "force group 'fast' is no number"),
+        (lambda: LangevinRespa(300, 1.0, {0: 1, 1: 0}), "steps is 0"),
+        (lambda: LangevinRespa(300, 1.0, {**TWO, 2: 6}), "does not divide"),
+        (lambda: LangevinRespa(300, 1.0, {0: 1, 1: 3}, "middle"), "no middle"),
+        (lambda: NoseHoover(0.0, 1.0), "temperature"),
+        (lambda: NoseHoover(1 * nm, 1.0), "give it in K"),
+        (lambda: NoseHoover(300, 1 * nm), "frequency is 1 nm; give it in 1/ps"),
+        (lambda: NoseHoover(300, 1.0, length=0), "length is 0"),
+        (lambda: NoseHoover(300, 1.0, momentum="maybe"), "momentum"),
+        (lambda: ProjectedIntegrator(2e-3, ensemble=Isokinetic(300)).setTemperature(0), "temperature"),
+        *(
+            (lambda g=g: ProjectedIntegrator(1e-3).setIntegrationForceGroups(g), "group")
+            for g in ({40}, [0.5], "0", 1.5, None)
+        ),
+    ],
+)
+def test_arguments_of_integrators_and_ensembles(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
 
 
-def test_arguments_of_methods():
+@pytest.mark.parametrize(
+    ("call", "given", "words"),
+    [
+        ("setStepSize", [1 * nm], "timestep is 1 nm"),
+        ("setStepSize", [-0.001], "positive"),
+        ("setTemperature", [1 * nm], "temperature is 1 nm"),
+        ("setFriction", [1 * nm], "friction is 1 nm"),
+        *(("setConstraintTolerance", [t], "tolerance") for t in ("small", None, np.nan, 0.0, 1 * nm)),
+        *(("setVelocitiesToTemperature", [..., t], "temperature is") for t in (1 * nm, -5, np.nan)),
+        *(("setVelocitiesToTemperature", [..., 300, rng], "rng is") for rng in (2.7, 2**31)),
+        *(("minimizeEnergy", [..., tolerance], "tolerance is") for tolerance in (1 * nm, np.nan, -1)),
+        ("minimizeEnergy", [..., 10.0, 2.5], "maxIterations"),
+        ("applyConstraints", [..., -1], "tolerance is"),
+        ("applyVelocityConstraints", [..., "small"], "tolerance is"),
+    ],
+)
+def test_arguments_of_methods(call, given, words):
+    """... stands for the Context, where nothing changes."""
     system, x, v = dumbbell()
     integrator = ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1))
     context = started(system, integrator, x, v)
-    for call, words in (
-        (lambda: integrator.setStepSize(1 * nm), "timestep is 1 nm"),
-        (lambda: integrator.setTemperature(1 * nm), "temperature is 1 nm"),
-        (lambda: integrator.setFriction(1 * nm), "friction is 1 nm"),
-        (lambda: integrator.setVelocitiesToTemperature(context, 1 * nm), "temperature is 1 nm"),
-        (lambda: integrator.minimizeEnergy(context, tolerance=1 * nm), "tolerance is 1 nm"),
-    ):
-        with pytest.raises(InputError, match=words):
-            call()
-    integrator.setVelocitiesToTemperature(context, 300 * kelvin, 1)
-    integrator.minimizeEnergy(context, tolerance=1 * unit.kilocalorie_per_mole / angstrom, maxIterations=2)
+    with pytest.raises(InputError, match=words):
+        getattr(integrator, call)(*(context if each is ... else each for each in given))
+    np.testing.assert_array_equal(state_of(context), (x, v))
 
 
 def test_positions_of_the_wrong_kind():

@@ -7,7 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from thermostat_systems import distance, dumbbells, molecules, quartic, quartic_potential, waves, waves_potential
+from thermostat_systems import (
+    distance,
+    dumbbells,
+    molecules,
+    quartic,
+    quartic_potential,
+    springs,
+    waves,
+    waves_potential,
+)
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State, System, run
@@ -113,6 +122,49 @@ def test_steps_and_systems_that_cannot_be(name):
     after = stepper.step(held, state, 0.1)
     still = stepper.step(held, after, 0.0)
     assert np.array_equal(still.positions, after.positions) and np.array_equal(still.velocities, after.velocities)
+
+
+RESPA = {"": {"steps": TWO}, ", three": {"steps": {"slow": 1, "medium": 2, "fast": 6}}}
+RESPA[", middle"] = {"steps": TWO, "slow_kicks": "middle"}
+SPHERES = [{"spheres": kind} for kind in ("split", "axes", "cluster", "global")]
+#: Without noise, and what they come near to: one step for all forces.
+SILENT = {
+    "NoseHooverChain": (NoseHooverChain(0.5, 1.0),) * 2,
+    **{f"Respa{key}": (LangevinRespa(0.5, 0.0, 3, **more), Langevin(0.5, 0.0, 3)) for key, more in RESPA.items()},
+    **{k["spheres"]: [IsokineticSpheres(0.5, 1e-32, 3, **k, **more) for more in ({"steps": TWO}, {})] for k in SPHERES},
+}
+
+
+@pytest.mark.parametrize("name", SILENT)
+def test_without_noise_it_is_of_order_two(name):
+    stepper, plain = SILENT[name]
+    held, x = dumbbells(2)
+    groups = {"fast": springs, "medium": lambda x, t: 0.1 * quartic(x), "slow": lambda x, t: 0.3 * waves(x)}
+    split = System(held.motion, ForceGroups({name: groups[name] for name in getattr(stepper, "names", groups)}))
+    state = held.initial_state(x, 0.5 * np.random.default_rng(1).normal(size=x.shape), project=True)
+    counts = (16, 32, 64)
+    known = run(split, state, 1 / 1024, 1024, stepper=plain).positions
+    errors = [np.abs(run(split, state, 1 / n, n, stepper=stepper).positions - known).max() for n in counts]
+    assert np.diff(-np.log2(errors)) == pytest.approx([2, 2], abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("plain", "several"),
+    [
+        (Langevin(0.5, 0.0, 3), LangevinRespa(0.5, 0.0, 3, steps=TWO)),
+        (IsokineticSpheres(0.5, 1e-32, 3, auxiliary=2), IsokineticSpheres(0.5, 1e-32, 3, auxiliary=2, steps=TWO)),
+    ],
+    ids=["Langevin", "spheres"],
+)
+def test_slow_forces_of_zero_change_nothing(plain, several):
+    """But for the noise, which no friction leaves out, and the rounding of velocities, projected once more often."""
+    held, state = molecules("bent", 3, ions=1)
+    split = System(held.motion, ForceGroups({"fast": springs, "slow": lambda x, t: 0 * x}))
+    one = run(held, state, 0.02, 40, stepper=plain)
+    two = run(split, state, 0.08, 10, stepper=several)
+    np.testing.assert_allclose(one.positions, two.positions, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(one.velocities, two.velocities, rtol=0, atol=1e-13)
+    assert split.force.evaluations == {"fast": 41, "slow": 11}
 
 
 @pytest.mark.parametrize(

@@ -34,17 +34,6 @@ def test_a_negative_step_undoes_a_step(length, steps):
     assert np.abs(back.thermostat - begun.thermostat).max() <= 1e-10
 
 
-def test_order_two():
-    held, state = started()
-    thermostat = NoseHooverChain(0.5, 1.0)
-    exact = run(held, state, 1 / 3200, 3200, stepper=thermostat)
-    errors = [
-        np.abs(run(held, state, 1 / n, n, stepper=thermostat).positions - exact.positions).max() for n in (40, 80, 160)
-    ]
-    slopes = np.diff(-np.log2(errors))
-    np.testing.assert_allclose(slopes, 2, atol=0.15)
-
-
 def loaded(state):
     file = io.BytesIO()
     state.save(file)

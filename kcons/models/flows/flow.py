@@ -112,7 +112,7 @@ class PhaseVolume(NamedTuple):
 
 
 def phase_volume(
-    flow: Flow, X0: ArrayLike, times: ArrayLike, *, rtol: float = 1e-11, atol: float = 1e-12, pieces: int = 1
+    flow: Flow, X0: ArrayLike, times: ArrayLike, *, rtol: float = 1e-11, atol: float = 1e-12
 ) -> PhaseVolume:
     """The change of phase-space volume along a trajectory (notes eqs. 30-39).
 
@@ -125,8 +125,6 @@ def phase_volume(
     X0 : array_like, shape (n,)
     times : array_like, shape (k,)
         Increasing; the first is that of X0.
-    pieces : int
-        Fresh starts between two times.
 
     Raises
     ------
@@ -135,7 +133,7 @@ def phase_volume(
     ConvergenceError
         If the integration fails, or a volume shrinks beyond the digits of its propagator.
     """
-    wanted, pieces = as_float_array(times, "times"), whole_number(pieces, "pieces")
+    wanted = as_float_array(times, "times")
     if wanted.ndim != 1 or len(wanted) < 1 or not np.all(np.diff(wanted) > 0):
         raise InputError("times are one-dimensional and increase", item="times")
     n = flow.n
@@ -148,7 +146,7 @@ def phase_volume(
         A = flow.jacobian(t, Y[:n])
         return np.concatenate([flow.velocity(t, Y[:n]), (A @ Y[n:-1].reshape(n, n)).ravel(), [np.trace(A)]])
 
-    for a, b in pairwise(in_pieces(wanted, pieces)):
+    for a, b in pairwise(wanted):
         start = np.concatenate([state, np.eye(n).ravel(), [0.0]])
         found = solve_ivp(together, (a, b), start, "DOP853", rtol=rtol, atol=atol)
         if not found.success:
@@ -158,13 +156,8 @@ def phase_volume(
         if not abs(change - integral) <= WRONG * max(1.0, abs(integral)):
             raise ConvergenceError(
                 f"from t = {a:.6g} to {b:.6g} the volume changes by exp({integral:.6g}), which its propagator no "
-                "longer resolves: raise `pieces`"
+                "longer resolves: give more times"
             )
         log_volume, divergence, total = log_volume + change, divergence + integral, J @ total
         rows.append((state, total, log_volume, divergence))
-    return PhaseVolume(wanted, *(np.array(column)[::pieces] for column in zip(*rows, strict=True)))
-
-
-def in_pieces(times: FloatArray, pieces: int) -> FloatArray:
-    """Times with so many equal pieces between each two of them."""
-    return np.interp(np.arange(pieces * (len(times) - 1) + 1) / pieces, np.arange(len(times)), times)
+    return PhaseVolume(wanted, *(np.array(column) for column in zip(*rows, strict=True)))

@@ -19,10 +19,9 @@ from kcons.constraints.arguments import (
     check_call,
     checked,
     positive,
-    whole_number,
 )
 from kcons.errors import InputError
-from kcons.models.flows.flow import Flow, in_pieces, phase_volume
+from kcons.models.flows.flow import Flow, phase_volume
 from kcons.models.flows.linear import JordanBlocks, JordanForm, LinearFlow, jordan_block
 from kcons.models.flows.mechanics import HamiltonianFlow
 from kcons.models.integration import called
@@ -266,13 +265,13 @@ class Thermostat(Flow):
         w = X[self.masses.size :]
         return np.concatenate([w, self._force(self.positions(X)) / self.root - self.friction(X) * w])
 
-    def compression(self, X0: ArrayLike, times: ArrayLike, pieces: int = 1) -> Compression:
+    def compression(self, X0: ArrayLike, times: ArrayLike) -> Compression:
         """Measure the compression of phase space along a trajectory, and predict it from alpha."""
         X0, n, g = self._state(X0), self.masses.size, self.degrees_of_freedom
         extended = Flow(lambda t, Y: np.append(self.velocity(t, Y[:-1]), self.friction(Y[:-1])), self.n + 1)
-        wanted, pieces = np.atleast_1d(as_float_array(times, "times")), whole_number(pieces, "pieces")
+        wanted = np.atleast_1d(as_float_array(times, "times"))
         Y, volume, rows = np.append(X0, 0.0), 0.0, [(0.0, 0.0)]
-        for a, b in pairwise(in_pieces(wanted, pieces)):
+        for a, b in pairwise(wanted):
             # Vectors along the surface start anew as orthonormal ones: carried far, they would all turn into one.
             T = scipy.linalg.block_diag(np.eye(n), scipy.linalg.null_space(Y[None, n:-1]))
             found = phase_volume(extended, Y, [a, b])
@@ -280,5 +279,5 @@ class Thermostat(Flow):
             volume += 0.5 * float(np.linalg.slogdet(carried.T @ carried)[1])
             Y = found.states[-1]
             rows.append((volume, float(Y[-1])))
-        volumes, frictions = np.array(rows)[::pieces].T
+        volumes, frictions = np.array(rows).T
         return Compression(wanted, volumes, -(g - 1) * frictions, g)

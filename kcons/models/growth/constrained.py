@@ -426,7 +426,7 @@ class EntropyBalance(NamedTuple):
 
 
 def entropy_balance(solution: GrowthSolution) -> EntropyBalance:
-    """Whether the entropy produced is the integral of its prescribed rate.
+    """Whether the entropy produced from the start to the end of a run is the integral of its prescribed rate.
 
     Parameters
     ----------
@@ -448,8 +448,8 @@ def entropy_balance(solution: GrowthSolution) -> EntropyBalance:
         changes = np.array([p.x * system.logarithmic_velocity(p), system.model.drift(p)])
         return np.asarray(-changes @ row.mixture.potentials(p))
 
-    t0, *between, t1 = solution.t.tolist()
+    t0, *between, t1 = solution.log_sol.ts.tolist()
     integrated, reactions = quad_vec(production, t0, t1, epsabs=1e-10, epsrel=1e-9, points=between)[0].tolist()
-    ends = [Populations.from_logarithms(t, solution.log_y[:, k]) for k, t in ((0, t0), (-1, t1))]
+    ends = [Populations.from_logarithms(t, solution.log_sol(t)) for t in (t0, t1)]
     lost = row.mixture.excess(ends[0], row.total) - row.mixture.excess(ends[1], row.total)
     return EntropyBalance(lost, integrated, row.produced(t1), reactions, integrated - reactions)

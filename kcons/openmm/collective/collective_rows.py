@@ -20,10 +20,8 @@ import numpy as np
 import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from kcons.constraints import Constraint, Custom, Distance, Formula, MovingTarget
+from kcons.constraints import Constraint, Custom, Distance, MovingTarget
 from kcons.constraints.arguments import positive
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -42,7 +40,6 @@ from kcons.motion.motion import Motion
 from kcons.openmm.collective.coordinates import (
     Row,
     as_constraint,
-    as_rows,
     finite_number,
     found_values,
     moved_atoms,
@@ -52,6 +49,7 @@ from kcons.openmm.collective.coordinates import (
 )
 from kcons.openmm.integrator.guard import (
     SystemRows,
+    components,
     forces_alone,
     forces_of,
     groups_in,
@@ -104,9 +102,8 @@ class CollectiveRows(Part):
     ----------
     system : openmm.System
         The Forces that are not part of it are added, each in a free group. Make the Simulation or Context afterwards.
-    rows : Row, openmm.Force or Formula, or a sequence of them
-        What to hold. A Force alone is held at the value found at `positions`; a `kcons.constraints.Formula` is one
-        for each of its rows.
+    rows : Row or openmm.Force, or a sequence of them
+        What to hold. A Force alone is held at the value found at `positions`.
     positions : array_like or Quantity, shape (n_particles, 3), optional
         In nm if without unit. Needed where a target is to be found.
     tolerance : float, optional
@@ -134,15 +131,22 @@ class CollectiveRows(Part):
     def __init__(
         self,
         system: openmm.System,
-        rows: Row | openmm.Force | Formula | Sequence[Row | openmm.Force | Formula],
+        rows: Row | openmm.Force | Sequence[Row | openmm.Force],
         *,
         positions: object | None = None,
         tolerance: float | None = None,
         meets_system: bool = False,
     ) -> None:
-        given = as_rows(rows)
+        listed = rows if isinstance(rows, list | tuple) else [rows]
+        given = [each if isinstance(each, Row) else Row(each) for each in listed]
         if not given:
             raise InputError("no rows to hold", item="rows")
+        for k, row in enumerate(given):
+            if not isinstance(row.force, openmm.Force):
+                raise InputError(
+                    f"row {k}: {row.force!r} is no Force of OpenMM; kcons.openmm.hold holds constraints of kcons",
+                    item="force",
+                )
         self.asked_tolerance = tolerance
         self.tolerance = positive(TOLERANCE if tolerance is None else tolerance, "tolerance")
         self.n_rows = len(given)
@@ -196,10 +200,10 @@ class CollectiveRows(Part):
         pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
         tied = {atom for pair in pairs for atom in pair}
         self.meets_system = asked or any(tied.intersection(touched) for touched in self.atoms)
-        body = _components(system.getNumParticles(), pairs if self.meets_system else [])
+        body = components(system.getNumParticles(), pairs if self.meets_system else [])
         bodies = [{int(body[atom]) for atom in touched} for touched in self.atoms]
         self._meet = [[bool(a & b) for b in bodies] for a in bodies]
-        together = _components(self.n_rows, [(i, j) for i, row in enumerate(self._meet) for j in range(i) if row[j]])
+        together = components(self.n_rows, [(i, j) for i, row in enumerate(self._meet) for j in range(i) if row[j]])
         self._blocks = [np.flatnonzero(together == k).tolist() for k in range(int(together.max()) + 1)]
         self._block_of = {k: block for block in self._blocks for k in block}
 
@@ -582,7 +586,7 @@ class CollectiveRows(Part):
         held = SystemRows.of(context.getSystem(), rounded=Precision.of(context).rounds_lengths)
         if not (self.meets_system and held.n_rows):
             return []
-        body = _components(len(held.masses), held.pairs)
+        body = components(len(held.masses), held.pairs)
         met = np.isin(body[held.pairs[:, 0]], body[[atom for atoms in self.atoms for atom in atoms]])
         return [Distance(held.pairs[met], held.lengths[met])] if met.any() else []
 
@@ -834,13 +838,6 @@ def _value_and_gradient(
         return -forces_at(alone, {group})[atoms]
 
     return value, gradient
-
-
-def _components(n: int, pairs: ArrayLike) -> np.ndarray:
-    """Number of the component of each of n things that pairs join."""
-    i, j = np.array(pairs, dtype=np.int32).reshape(-1, 2).T
-    links = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
-    return np.asarray(connected_components(links, directed=False)[1])
 
 
 def _name(force: openmm.Force) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import math
 import re
 from collections.abc import Sequence
@@ -13,9 +12,9 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance
 from kcons.constraints.constraint import Constraint
-from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import ROW_NAME, forces_alone, groups_of
 from kcons.openmm.quantities import energy_of, nanometers, number
@@ -75,68 +74,6 @@ def _may_be_a_coordinate(of: unit.Unit) -> bool:
     powers = {dimension.name: power for dimension, power in of.iter_base_dimensions() if power}
     mass, time = powers.pop("mass", 0), powers.pop("time", 0)
     return powers.keys() <= {"length", "angle", "amount", "charge"} and time in (0, -2 * mass)
-
-
-# -- formulas of kcons ------------------------------------------------------------------------------
-
-_POWERS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "^"}
-
-
-def as_rows(given: Row | openmm.Force | Formula | Sequence[Row | openmm.Force | Formula]) -> list[Row]:
-    """Whatever stands for rows, or for one, as rows; a formula is one for each of its rows.
-
-    `InputError` for what is no row, `UnsupportedError` for a formula that moves with the time, or is one of velocities.
-    """
-    rows: list[Row] = []
-    for each in [given] if isinstance(given, Row | openmm.Force | Formula) else given:
-        if isinstance(each, Formula):
-            rows += formula_rows(each)
-        else:
-            rows.append(each if isinstance(each, Row) else Row(each))
-    for k, row in enumerate(rows):
-        if not isinstance(row.force, openmm.Force):
-            raise InputError(
-                f"row {k}: {row.force!r} is no Force of OpenMM; kcons.openmm.hold holds constraints of kcons",
-                item="force",
-            )
-    return rows
-
-
-def formula_rows(item: Formula) -> list[Row]:
-    """A `Row` for each row of a formula; positions are taken as OpenMM has them, no images are looked for."""
-    if not item.holonomic:
-        raise UnsupportedError(f"{item!r} holds velocities, not positions; hold it by kcons.openmm.hold")
-    if item.moving or isinstance(item.target, MovingTarget):
-        raise UnsupportedError(
-            f"{item!r} moves with the time, which OpenMM's expressions do not know; hold it by kcons.openmm.hold"
-        )
-    rows = []
-    for k in range(item.n_rows):
-        numbers = dict(zip(item.names, item.values[k].tolist(), strict=True))
-        force = openmm.CustomCompoundBondForce(item.width, expression(item.code().tree, numbers))
-        force.addBond(item.atoms[k].tolist(), [])
-        target = None if item.target is None else float(item.target[k])
-        rows.append(Row(force, target, period=item.period, name=item.row_name(k)))
-    return rows
-
-
-def expression(tree: ast.expr, numbers: dict[str, float]) -> str:
-    """A tree as OpenMM reads it, with every operation in brackets and numbers for parameters."""
-    match tree:
-        case ast.Constant(value=value):
-            return repr(float(value))  # type: ignore[arg-type]
-        case ast.Name(id="pi"):
-            return "3.141592653589793"
-        case ast.Name(id=name):
-            return f"({numbers[name]!r})" if name in numbers else name
-        case ast.UnaryOp(op=operation, operand=operand):
-            inner = expression(operand, numbers)
-            return f"(-{inner})" if isinstance(operation, ast.USub) else inner
-        case ast.Call(func=ast.Name(id=name), args=args):
-            return f"{name}({', '.join(expression(each, numbers) for each in args)})"
-        case ast.BinOp(left=left, op=operation, right=right):
-            return f"({expression(left, numbers)}{_POWERS[type(operation)]}{expression(right, numbers)})"
-    raise AssertionError(ast.dump(tree))
 
 
 # -- terms ------------------------------------------------------------------------------------------

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import openmm
@@ -35,23 +34,13 @@ Momentum = Literal["auto", "conserved", "free"]
 _PLACES = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Momenta:
-    """Conserved momenta.
+class Momenta(NamedTuple):
+    """Conserved momenta."""
 
-    Attributes
-    ----------
-    directions : ndarray, shape (k, 3)
-        Orthonormal directions in which total momentum is conserved.
-    turns : bool
-        Whether neither forces nor rows exert a torque about some axis, about which angular momentum is conserved too.
-    """
-
+    #: Orthonormal directions in which total momentum is conserved, shape (k, 3).
     directions: FloatArray
+    #: Whether neither forces nor rows exert a torque about some axis, about which angular momentum is conserved too.
     turns: bool
-
-
-NONE = Momenta(np.zeros((0, 3)), False)
 
 
 class CountsMomenta(Ensemble):
@@ -114,7 +103,7 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     without mass hold all), or 'free' (in none).
     """
     if momentum == "free":
-        return NONE
+        return Momenta(np.zeros((0, 3)), False)
     system, x = context.getSystem(), positions_of(context)
     masses, removed = masses_of(system), removes_center_of_mass_motion(system)
     turns = RigidMotions(x, turn=not system.usesPeriodicBoundaryConditions())

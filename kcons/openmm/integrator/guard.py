@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 import openmm
-from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
@@ -98,31 +99,19 @@ _INVARIANT = frozenset(
 
 @dataclass(frozen=True)
 class SystemRows:
-    """The constraints of a System that act, as arrays.
-
-    Attributes
-    ----------
-    masses : ndarray, shape (n_particles,)
-    pairs : ndarray of int, shape (n_rows, 2)
-    lengths : ndarray, shape (n_rows,)
-        What OpenMM's solvers hold: SETTLE stores its distances in single precision.
-    numbers : ndarray of int, shape (n_rows,)
-        Which constraint of the System each row is. OpenMM ignores those between massless particles.
-    settled : ndarray of bool, shape (n_rows,)
-        Rows that SETTLE holds.
-    others : ndarray, shape (n_rows,)
-        What a GPU's SHAKE holds instead where it is responsible, which stores squares of lengths in single precision.
-    slack : ndarray, shape (n_rows,)
-        By how much a relative distance may differ from `lengths` although it is held exactly: what a GPU's SETTLE
-        makes of its distances in single precision.
-    """
+    """The constraints of a System that act, as arrays, the first of n_particles and the others of n_rows."""
 
     masses: FloatArray
     pairs: IntArray
+    #: What OpenMM's solvers hold: SETTLE stores its distances in single precision.
     lengths: FloatArray
+    #: Which constraint of the System each row is. OpenMM ignores those between massless particles.
     numbers: IntArray
+    #: Rows that SETTLE holds.
     settled: NDArray[np.bool_]
+    #: What a GPU's SHAKE holds instead where it is responsible, which stores squares of lengths in single precision.
     others: FloatArray
+    #: By how much a relative distance that is held exactly may differ from `lengths`: a GPU's SETTLE rounds.
     slack: FloatArray
 
     @classmethod
@@ -159,12 +148,10 @@ class SystemRows:
     @property
     def rigid(self) -> bool:
         """Whether each molecule that is tied at all is a rigid body: all distances of its particles are held."""
-        from scipy.sparse.csgraph import connected_components  # slow to import
-
-        n = len(self.masses)
-        i, j = np.unique(np.sort(self.pairs, axis=1), axis=0).T
-        count, body = connected_components(csr_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)
-        particles, rows = np.bincount(body, minlength=count), np.bincount(body[i], minlength=count)
+        pairs = np.unique(np.sort(self.pairs, axis=1), axis=0)
+        body = components(len(self.masses), pairs)
+        particles = np.bincount(body)
+        rows = np.bincount(body[pairs[:, 0]], minlength=len(particles))
         return bool((2 * rows == particles * (particles - 1)).all())
 
     def stretches(self, x: FloatArray) -> FloatArray:
@@ -203,6 +190,13 @@ class SystemRows:
         distances = Distance(pairs.reshape(-1, 2), self.lengths[rest])
         rows = ConstraintSet([distances], x[atoms], self.masses[atoms])
         return count + make_plan(rows, np.ascontiguousarray(x[atoms]), 0.0).rank
+
+
+def components(n: int, pairs: ArrayLike) -> IntArray:
+    """Number of the component of each of n things that pairs join, shape (n,)."""
+    i, j = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    links = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
 def worst_length(context: openmm.Context) -> tuple[str, float]:
@@ -420,14 +414,8 @@ def refuse_agents(
 ) -> None:
     """Refuse, by `UnsupportedError`, what moves particles off rows between steps: barostats, and a CMMotionRemover.
 
-    Parameters
-    ----------
-    bound : str, optional
-        A row that holds particles in space.
-    rows : iterable of (ndarray of int of shape (n, width), function)
-        The particles of rows of one kind, and their names by number.
-    molecules : callable
-        The molecules, which barostats move as wholes, each by a vector of its own.
+    `bound` names a row that holds particles in space; `rows` are the particles of rows of one kind, shape (n, width),
+    and their names by number; barostats move each of the molecules by a vector of its own.
     """
     for force in forces_of(system):
         name = type(force).__name__

@@ -102,27 +102,16 @@ class Precision:
 
 @dataclass(frozen=True)
 class Violation:
-    """A row that is off by more than it may be.
-
-    Attributes
-    ----------
-    what : str
-        'positions', or 'velocities'.
-    row : int
-    name : str
-    off, allowed : float
-        sigma in the unit of the row, or A v less its target, per ps.
-    atoms : sequence of int
-    near : bool
-        Whether positions are off by less than a tenth of the length that is held: they are put right in a first step.
-    """
+    """A row whose 'positions' or 'velocities' are off by more than they may be."""
 
     what: str
     row: int
     name: str
+    #: sigma in the unit of the row, or A v less its target, per ps.
     off: float
     allowed: float
     atoms: Sequence[int] = ()
+    #: Whether positions are off by less than a tenth of the length that is held: they are put right in a first step.
     near: bool = False
 
     @classmethod
@@ -173,36 +162,24 @@ class Part(ABC):
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
     `kcons.openmm.integrator.guard.refuse_agents`.
-
-    Attributes
-    ----------
-    code : int
-        Number of the part in its integrator, from 1; set by the integrator before `declare`.
-    meets_system : bool
-        Whether the rows may touch atoms that the System constrains. Such a part calls `program.hold_positions`
-        within its own `land`; at most one part of an integrator may.
-    lands_last : bool
-        Whether it adds to x of its own particles only, so that it comes after the constraints of the System.
-    groups : frozenset of int
-        Force groups that carry rows, not forces.
-    flies_exactly : bool
-        Whether `land_alone` can fly exactly, as it does where the program is `exact`.
-    alone : bool
-        Whether it is known that the System has no constraints. Where there is no other part, `land_alone` is the
-        whole drift then.
-    stays_finite : bool
-        Whether x is still a place where forces can be computed after a failure; set-up is faster then.
-    sited : bool
-        Whether the System is known to have virtual sites: they are placed before the applied forces are computed.
     """
 
+    #: Number of the part in its integrator, from 1; set by the integrator before `declare`.
     code: int = 0
+    #: Whether the rows may touch atoms that the System constrains. Such a part calls `program.hold_positions` within
+    #: its own `land`; at most one part of an integrator may.
     meets_system: bool = False
+    #: Whether it adds to x of its own particles only, so that it comes after the constraints of the System.
     lands_last: bool = False
+    #: Force groups that carry rows, not forces.
     groups: frozenset[int] = frozenset()
+    #: Whether `land_alone` can fly exactly, as it does where the program is `exact`.
     flies_exactly: bool = False
+    #: Whether it is known that the System has no constraints: without other parts, `land_alone` is the whole drift.
     alone: bool = False
+    #: Whether x is still a place where forces can be computed after a failure; set-up is faster then.
     stays_finite: bool = False
+    #: Whether the System is known to have virtual sites: they are placed before the applied forces are computed.
     sited: bool = False
     #: The program that the part serves: that of the integrator which made steps last.
     program: Program | None = None

@@ -162,24 +162,10 @@ class Ensemble:
         """A step failed: variables of the ensemble are again what they were before `open`."""
 
     def kick(self, p: Program, h: str, impulse: str = "", tangent: bool = False, unseen: bool = False) -> str:
-        """Let the applied forces act for a time.
+        """Let the applied forces act for a time h; returns the velocities afterwards, which are not yet in v.
 
-        Parameters
-        ----------
-        p : Program
-        h : str
-            Expression of the time.
-        impulse : str
-            Expression that is to be added to v before (that of the drift that came before), or ''.
-        tangent : bool
-            Whether v is tangent before, without the impulse.
-        unseen : bool
-            Whether another kick follows before v is read.
-
-        Returns
-        -------
-        str
-            Expression of the velocities afterwards, which are not yet in v.
+        All are expressions. `impulse`, of the drift that came before, is to be added to v first; v is `tangent` without
+        it; another kick follows before v is read (`unseen`).
         """
         return "+".join(filter(None, ["v", impulse, f"{h}*{p.force}/m"]))
 
@@ -293,53 +279,7 @@ class Line(NamedTuple):
 
 
 class Program:
-    """Variables and lines of a step; `hand_over` gives them to a CustomIntegrator.
-
-    Attributes
-    ----------
-    lines : list of Line
-    numbers : dict of float
-        Global variables, and their values in a new integrator.
-    settings : dict of float
-        Those that the integrator was made with, or was told since. They are kept here and written at each call of
-        `step`: whatever a State or a checkpoint brings is a copy.
-    idle : dict of float
-        Those that control the program, as they are where nothing is asked of it; written at each call as well.
-    memory : set of str
-        Variables that belong to a state as x and v do.
-    vectors : list of str
-        Variables with a value for each degree of freedom.
-    tables : dict
-        Constants, written name(k) in expressions.
-    words : dict of str
-        What variables stand for that Python sets or reads, and tables; what lines compute for others has none.
-    kinetic_energy : str
-        Expression of the kinetic energy that a State tells.
-    operations : tuple of Operation
-        What a step consists of.
-    drifts, kicks : list of float
-        Its stages as fractions of the step; see `stages_of`.
-    halves : bool
-        Whether a bath acts between two halves of the only drift.
-    phases : int
-        Executions of the program that a step takes where virtual sites are placed at the end of each only.
-    sited : bool
-        Whether parts stand beside virtual sites.
-    single : bool
-        Whether there is one part, whose rows are all there is.
-    exact : bool
-        Whether the `land_alone` of that part flies exactly, as the scheme asks.
-    lean : bool
-        Whether velocity Verlet with parts leaves out what only a reader of velocities needs.
-    joined : bool
-        Without parts: whether the kick that ends a step is made with that which begins the next.
-    lazy : bool
-        Whether `between` is of use.
-    filtered : bool
-        Whether drifts change v by impulses without the rounding errors of positions.
-    force : str
-        Name of the applied forces.
-    """
+    """Variables and lines of a step; `hand_over` gives them to a CustomIntegrator."""
 
     #: Whether a plugin has kernels in place of the lines.
     on_device = False
@@ -349,26 +289,43 @@ class Program:
         self._integrator = weakref.ref(integrator)
         self.scheme, self.parts, self.ensemble = scheme, tuple(parts), ensemble
         self.lines: list[Line] = []
+        #: Global variables, and their values in a new integrator.
         self.numbers: dict[str, float] = {}
+        #: Those that the integrator was made with, or was told since: kept here and written at each call of `step`, so
+        #: that what a State or a checkpoint brings is a copy.
         self.settings: dict[str, float] = {}
+        #: Those that control the program, as they are where nothing is asked of it; written at each call as well.
         self.idle: dict[str, float] = {}
+        #: Those that belong to a state as x and v do.
         self.memory: set[str] = set()
+        #: Variables with a value for each degree of freedom.
         self.vectors: list[str] = []
+        #: Constants, written name(k) in expressions.
         self.tables: dict[str, tuple[float, ...]] = {}
+        #: Expression of the kinetic energy that a State tells, and name of the applied forces.
         self.kinetic_energy, self.force = "m*v*v/2", "f"
+        #: What tables stand for, and variables that Python sets or reads.
         self.words: dict[str, str] = {}
         verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
+        #: Whether parts stand beside virtual sites.
         self.sited = any(part.sited for part in self.parts)
+        #: Whether there is one part, whose rows are all there is; whether it flies exactly, as the scheme asks.
         self.single = len(self.parts) == 1 and self.parts[0].alone and not self.sited
         self.exact = self.single and plain and scheme.exact_flight and self.parts[0].flies_exactly
         self.operations = ensemble.operations(Splitting(scheme.kicks, scheme.drifts) if self.exact else scheme)
         self.drifts, self.kicks = stages_of(self.operations)
+        #: Whether a bath acts between two halves of the only drift.
         self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
         self.one_drift = (len(self.drifts) == 1 and not self.exact) or self.halves
+        #: Executions of the program in a step where virtual sites are placed at the end of each only.
         self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
+        #: Whether velocity Verlet with parts leaves out what only a reader of velocities needs.
         self.lean = plain and bool(self.parts) and verlet and not self.sited
+        #: Without parts: whether the kick that ends a step is made with that which begins the next.
         self.joined = ensemble.adds_up and not self.parts and verlet
+        #: Whether `between` is of use.
         self.lazy = self.lean or self.joined or (not self.parts and ensemble.owes)
+        #: Whether drifts change v by impulses without the rounding errors of positions.
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
 
     @property

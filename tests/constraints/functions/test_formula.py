@@ -56,20 +56,6 @@ def test_a_formula_is_the_family_written_by_hand(name):
     np.testing.assert_allclose(a.project_positions(step, x), b.project_positions(step, x), atol=1e-13)
 
 
-@pytest.mark.parametrize("cell", [None, np.array([[9.0, 0, 0], [2, 8, 0], [-1, 2, 10]])], ids=["open", "triclinic"])
-def test_differences_take_minimum_images(cell):
-    x = scattered(2)
-    moved = x if cell is None else x + np.random.default_rng(0).integers(-1, 2, (8, 3)) @ cell
-    row = Formula(f"{LENGTH} - (x2 - x3)*(y1 - y3)/9", [0, 1, 2], target=None)
-    assert row.translation_invariant
-    plain, wrapped = ConstraintSet(row, x, MASSES, cell=cell), ConstraintSet(row, moved, MASSES, cell=cell)
-    np.testing.assert_allclose(wrapped.target(), plain.target(), rtol=1e-12)
-    step = 0.01 * scattered(3)
-    one = Motion(plain, x).project_positions(x + step, x) - x
-    other = Motion(wrapped, moved).project_positions(moved + step, moved) - moved
-    np.testing.assert_allclose(one, other, atol=1e-12)
-
-
 def test_a_moving_formula_is_followed():
     """A bead on a wave that runs; its height and its speed are those of the wave."""
     wave = Formula("z1 - a*sin(k*x1 - t)", 0, {"a": 0.1, "k": 2.0})

@@ -3,7 +3,7 @@
 MUTANTS = {
     "ase/dynamics.py": [
         (
-            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                return replace",
+            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                    last = replace",
             "ase/edits::time_that_is_set_is_no_way_of_moving_targets",
         ),
         (
@@ -38,7 +38,7 @@ MUTANTS = {
             "ase/edits::an_edit_is_named_before_a_class",
         ),
         (
-            "if «found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x, bound.touched)→False»:",
+            "if «found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x)→False»:",
             "ase/edits::frames_on_the_constraints_are_taken",
         ),
     ],

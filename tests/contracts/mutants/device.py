@@ -26,10 +26,16 @@ MUTANTS = {
         ),
         ("if «k not in beside→True» and not", "rows::levels_have_rows_that_share_no_entry"),
     ],
+    "openmm/device/clusters.c": [
+        ("if («missed > 0→1») {", "rows::rows_without_a_solution_are_told"),
+    ],
     "openmm/device/clusters.py": [
+        ("off[bad]«/unit[bad]→»); return", "rows::rows_without_a_solution_are_told"),
+        ("'+' if one[a] «==→!=» other[a] else", "rows::clusters_of_all_sizes"),
         ('"there« && last→»"', "surfaces_on_the_device::the_device_holds_the_same_surfaces"),
     ],
     "openmm/device/device_integrator.py": [
+        ("array in «arrays→rows.arrays» if array.saved", "molecule_spheres::a_failure_puts_auxiliary_variables_back"),
         ("self._advance(context, again«→ - 1»)", "device_integrator::a_failure_leaves_the_state_before_the_step"),
         ("yield x, v, f, time + (k «+ 1→+ 0») * every * self", "device_integrator::records_are_the_states_after_steps"),
         ("part.left «!=→is None and» guard.context.getTime(", "kernel_rows::multipliers_are_summed_where_the_rows_are"),

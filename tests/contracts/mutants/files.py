@@ -25,6 +25,10 @@ MUTANTS = {
     ],
     "mdanalysis/check/constraint_check.py": [
         (
+            "«trajectory.ts = Timestep.from_timestep(trajectory.ts)→pass»",
+            "deviations::rows_that_were_made_for_a_part_are_refused",
+        ),
+        (
             ".half_step(universe.atoms.positions)«→.max()»",
             "mdanalysis/check/precision::a_wild_molecule_of_the_topology_excuses_no_other",
         ),
@@ -45,7 +49,10 @@ MUTANTS = {
             "«self._refuse_cut(item, r, time, int(start))→pass»",
             "custom::atoms_cut_by_a_face_of_the_cell_are_refused_unless_it_is_said_what_is_meant",
         ),
-        ("self.gather(item, x, «together→y»)", "images::lengths_found_far_away_can_be_held_near_the_origin"),
+        (
+            "r if together is y else self.gather(item, x, «together→y»)",
+            "images::lengths_found_far_away_can_be_held_near_the_origin",
+        ),
         ("«x→whole»[item.atoms] if self.moved is None", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
     ],
     "constraints/contradictions.py": [

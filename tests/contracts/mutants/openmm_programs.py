@@ -37,7 +37,7 @@ MUTANTS = {
             "(«2 * rows == particles * (particles - 1)→rows >= particles - 1»).all()",
             "system_checks::rigid_bodies_hold_all_their_distances",
         ),
-        ("        if «→not rows and »_scales_atoms(force):", "projected::what_moves_particles_off_rows_is_refused"),
+        ("        if «→not rows and »_scales_atoms(force):", "hold::agents_that_break_rows_are_refused"),
     ],
     "openmm/integrator/program.py": [
         ("«*delta(v-v_end)→», v_middle, v", "reported_kinetic_energy::of_velocities_that_others_have_set_it_is_theirs"),
@@ -115,7 +115,7 @@ MUTANTS = {
             "«context.applyVelocityConstraints→print»(context.get",
             "collective_rows::restore_keeps_the_constraints_of_other_molecules",
         ),
-        ("(*held[:k], *«held[n:]→()») for k", "collective_rows::row_that_repeats_a_constraint_of_the_system_is_named"),
+        ("(*held[:k], *«held[n:]→()») for k", "collective_rows::rows_without_a_direction_of_their_own_are_named"),
         ("weight{c}*({of('more', i)}«-→+»{of('expected', i)})", "row_program::the_iteration_learns_from_each_push"),
         ('let(f"back{c}_{i}_{j}", f"«-→»({done})*back{c}_{i}_{i}"', "row_program::the_iteration_learns_from_each_push"),
         ('again = f"select({sure}, «3→1», 1)"', "row_program::many_steps_look_less_often"),

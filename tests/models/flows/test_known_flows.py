@@ -252,10 +252,6 @@ def test_reference_of_constant_force():
         (lambda: Thermostat(MASSES, quartic).state(np.zeros(6), np.zeros(6)), "non-zero kinetic energy"),
         (lambda: Thermostat(np.ones(2), lambda x: -x).state([1.0, 2.0, 0.3], [0.4]), "2 components each"),
         (lambda: Thermostat(np.ones(2), lambda x: [1.0, 2.0, 3.0]).friction(np.ones(4)), "force returned shape"),
-        (
-            lambda: Thermostat(np.ones(2), lambda x: -x).compression([1.0, 0.2, 0.3, 0.4], [0.0, 1.0], pieces=0),
-            "pieces is 0",
-        ),
     ],
 )
 def test_thermostats_that_cannot_be(make, words: str) -> None:

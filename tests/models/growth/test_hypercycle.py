@@ -264,7 +264,8 @@ SYSTEMS = {
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_entropy_produced_is_the_integral_of_its_rate(name):
-    balance = entropy_balance(solve(SYSTEMS[name], (0.0, 4.0), X0, dense_output=True))
+    there = solve(SYSTEMS[name], (0.0, 4.0), X0, t_eval=[2.0], dense_output=True)  # whatever times are shown
+    balance = entropy_balance(there)
     assert balance.prescribed == pytest.approx(PRODUCED[name], abs=1e-14)
     assert balance.lost == pytest.approx(PRODUCED[name], abs=1e-13)
     assert balance.integrated == pytest.approx(PRODUCED[name], abs=1e-9)

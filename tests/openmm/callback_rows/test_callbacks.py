@@ -12,82 +12,14 @@ import openmm
 import pytest
 from carried_systems import begun, context_of, driven, free, off_target, peptide, started, state_of
 from openmm import unit
-from openmm_systems import GPUS
 from openmm_systems import context_of as context_on
 
 from kcons.constraints import Custom, Distance
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import CarriedConstraints, ProjectedIntegrator, hold
-from kcons.openmm.callback_rows import CARRY_SCALE, CallbackEngine
 from kcons.openmm.integrator.part import Precision
 
 # -- what passes ------------------------------------------------------------------------------------
-
-ATOMS = np.array([1, 3, 4])
-X = np.array([[3.0, -4.0, 5.0], [1 / 3, 2.7, -0.1], [8.0, 0.3, 1.0], [2e-3, 1.234567890123, 4.4], [-6.6, 0.7, 1e-9]])
-CHANGE = 1e-3 * np.random.default_rng(0).normal(size=(3, 3))
-
-
-class Messenger:
-    """Takes positions down, and gives the change back."""
-
-    def __init__(self, engine):
-        self.engine, self.taken = engine, np.zeros((3, 3))
-
-    def __call__(self, state):
-        self.engine.take(state, self.taken)
-        return 0.0, self.engine.give(self.engine.carried(CHANGE)[0])
-
-
-def sent(platform, some, monkeypatch):
-    """Where particles are after the change, and what the messenger has seen."""
-    monkeypatch.setattr("kcons.openmm.callback_rows.hands_over_all", lambda: not some)
-    system = openmm.System()
-    for _ in X:
-        system.addParticle(1.0)
-    engine = CallbackEngine((Distance([[1, 3], [3, 4]]),), X, np.ones(len(X)), None, 0.0)
-    assert engine.atoms.tolist() == ATOMS.tolist()
-    messenger = Messenger(engine)
-    force = openmm.PythonForce(messenger)
-    if some:
-        force.setParticles(ATOMS.tolist())
-    system.addForce(force)
-    integrator = openmm.CustomIntegrator(1.0)
-    integrator.addComputePerDof("x", f"x+f*{1 / CARRY_SCALE!r}")
-    context = context_on(system, integrator, platform)
-    engine.precision = Precision.of(context)
-    context.setPositions(X)
-    integrator.step(1)
-    return state_of(context)[0], messenger
-
-
-@pytest.mark.parametrize("platform", ["Reference", "CPU", *(p for p in GPUS if "single" not in str(p.id))])
-def test_what_arrives_is_known(platform, monkeypatch):
-    there, messenger = sent(platform, False, monkeypatch)
-    engine = messenger.engine
-    rounding = 2 * engine.precision.place * np.abs(X).max()
-    assert np.abs(messenger.taken - X[ATOMS]).max() <= rounding
-    expected = messenger.taken + engine.carried(CHANGE)[1]
-    assert np.abs(there[ATOMS] - expected).max() <= rounding
-    assert engine.same(there[ATOMS], expected)
-    assert not engine.same(there[ATOMS] + 1e-10, expected)
-    assert np.abs(there - X)[[0, 2]].max() <= rounding
-    # A correction keeps the digits of a single number, at least.
-    lost = np.abs(engine.carried(CHANGE)[1] - CHANGE) / np.abs(CHANGE)
-    assert lost.max() < (2.0**-24 if engine.precision.name == "mixed" else 1e-10)
-
-
-@pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
-def test_of_some_particles_mixed_precision_hands_over_single_numbers(platform, monkeypatch):
-    """Why the positions of all are asked for."""
-    _, messenger = sent(platform, True, monkeypatch)
-    np.testing.assert_array_equal(messenger.taken, X[ATOMS].astype(np.float32))
-
-
-def test_the_grain_of_coordinates():
-    assert Precision("CPU", "double").grain(5.0) == np.spacing(5.0)
-    assert Precision("CUDA", "mixed").grain(5.0) == pytest.approx(5 * 2.0**-47)
-    assert Precision("CUDA", "mixed").limits[0] > 1e-9
 
 
 def test_positions_come_back_to_the_last_bit():
@@ -170,22 +102,6 @@ def test_a_step_too_large_is_taken_back(platform):
     assert all(np.array_equal(a, b) for a, b in zip(before, state_of(context), strict=True))
     integrator.setStepSize(0.1 * unit.picosecond)
     integrator.step(3)
-    part.check(context)
-
-
-def test_states_off_the_rows_are_refused_and_put_right():
-    part = hold(system := free([1.0, 1.0]), Distance([[0, 1]], 1.0), [[0, 0, 0], [1.0, 0, 0]])
-    context = context_of(system, ProjectedIntegrator(0.01, parts=[part]))
-    context.setPositions([[0, 0, 0], [1.1, 0, 0]])
-    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0.1.*apply_positions"):
-        part.check(context)
-    part.apply_positions(context)
-    assert np.abs(state_of(context)[0] - [[0.05, 0, 0], [1.05, 0, 0]]).max() <= 1e-14
-    context.setVelocities([[0, 0, 0], [1.0, 1.0, 0]])
-    with pytest.raises(InputError, match="apply_velocities"):
-        part.check(context)
-    part.apply_velocities(context)
-    assert np.abs(state_of(context)[1] - [[0.5, 0, 0], [0.5, 1.0, 0]]).max() <= 1e-14
     part.check(context)
 
 
@@ -294,37 +210,6 @@ def test_rows_that_need_the_time_are_not_held_without_their_integrator():
     with pytest.raises(openmm.OpenMMException, match="keep a reference"):
         both.step(1)
     del context
-
-
-def _full(system):
-    for group in range(30):
-        force = openmm.HarmonicBondForce()
-        force.setForceGroup(group)
-        system.addForce(force)
-
-
-def _with_site(system):
-    system.setParticleMass(2, 0.0)
-    system.setVirtualSite(2, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
-
-
-@pytest.mark.parametrize(
-    ("change", "rows", "x", "error", "words"),
-    [
-        (_with_site, Distance([[0, 2]]), np.eye(3), UnsupportedError, "atom 2 is a virtual site"),
-        (_full, Distance([[0, 1]]), np.eye(3), UnsupportedError, "3 force groups, and 2 are free"),
-        (None, [], np.eye(3), InputError, "no rows"),
-        (None, [Distance(np.zeros((0, 2), dtype=int))], np.eye(3), InputError, "no rows"),
-        (None, Distance([[0, 1]]), np.eye(2, 3), InputError, r"shape \(3, 3\)"),
-        (None, Distance([[0, 9]]), np.eye(3), InputError, "9"),
-    ],
-)
-def test_rows_that_cannot_be_held_are_refused(change, rows, x, error, words):
-    system = free([1.0] * 3)
-    if change:
-        change(system)
-    with pytest.raises(error, match=words):
-        CarriedConstraints(system, rows, x)
 
 
 def test_gpus_must_carry_positions_of_more_than_single_numbers():

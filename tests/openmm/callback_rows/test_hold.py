@@ -17,11 +17,12 @@ from carried_systems import (
     started,
     state_of,
 )
+from collective_cases import dihedral
 from openmm import app, unit
 
 from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, FixedAtoms, Plane, RadiusOfGyration, Sphere
 from kcons.errors import ContradictionError, InputError, UnsupportedError
-from kcons.openmm import ProjectedIntegrator, hold, move_constraints
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold, move_constraints
 from kcons.steppers import System, run
 
 TRIANGLE = np.array([[0, 0, 0], [0.09572, 0, 0], [-0.024, 0.09266, 0]])
@@ -116,30 +117,39 @@ def test_hold_moves_what_a_row_touches_and_nothing_else():
             assert np.linalg.norm(there[3 * k + i] - there[3 * k + j]) == pytest.approx(length, abs=1e-7)
 
 
-def test_hold_takes_more_where_asked():
-    system = peptide(app.HAngles)
-    part = hold(system, [Dihedral([[6, 8, 14, 16]])], PEPTIDE.positions, take="all")
-    assert system.getNumConstraints() == 0
-    assert [c.family for c in part.motion.constraint_set.constraints] == ["Distance", "Dihedral"]
+def _full(system):
+    for group in range(30):
+        system.addForce(force := openmm.HarmonicBondForce())
+        force.setForceGroup(group)
+
+
+def _with_site(system):
+    system.setParticleMass(7, 0.0)
+    system.setVirtualSite(7, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
 
 
 @pytest.mark.parametrize(
-    ("rows", "x", "error", "words"),
+    ("rows", "change", "error", "words"),
     [
         ([Distance([[0, 3]], 0.2), Distance([[3, 0]], 0.3)], None, ContradictionError, "different targets"),
         ([Distance([[0, 99]])], None, InputError, "99"),
         (["bond"], None, InputError, "no kcons constraint"),
         (None, None, InputError, "no kcons constraint"),
         ([Distance([[0, 3]], 1.9)], None, InputError, "half the box"),
-        ([Distance([[0, 3]])], np.zeros((3, 3)), InputError, "shape"),
+        ([Distance([[0, 3]])], lambda system: system.addParticle(1.0), InputError, r"shape \(9, 3\)"),
         ([], None, InputError, "no rows"),
+        ([Distance(np.zeros((0, 2), dtype=int))], None, InputError, "no rows"),
+        (Distance([[0, 7]]), _with_site, UnsupportedError, "atom 7 is a virtual site"),
+        (Distance([[0, 3]]), _full, UnsupportedError, "3 force groups, and 2 are free"),
     ],
 )
-def test_nothing_changes_when_hold_is_refused(rows, x, error, words):
-    system, there = waters(2)
+def test_nothing_changes_when_hold_is_refused(rows, change, error, words):
+    system, x = waters(2)
+    if change:
+        change(system)
     before = content(system)
     with pytest.raises(error, match=words):
-        hold(system, rows, there if x is None else x)
+        hold(system, rows, x)
     assert content(system) == before
 
 
@@ -150,45 +160,25 @@ def barostat():
 @pytest.mark.parametrize(
     ("rows", "force", "words"),
     [
-        (Distance([[0, 3]]), barostat(), r"MonteCarloBarostat.*row #6 Distance\(0, 3\).*join=True"),
+        (Distance([[0, 3]]), barostat(), r"MonteCarloBarostat.*row #7 Distance\(0, 3\).*join=True"),
         (Plane([6], [0, 0, 1]), barostat(), "holds particles in space"),
         (Plane([6], [0, 0, 1]), openmm.CMMotionRemover(), "momentum is not conserved"),
         (
             Distance([[6, 7]]),
             openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False),
-            "let it scale molecules as rigid",
+            "rows are held, and MonteCarloFlexibleBarostat .*let it scale molecules as rigid",
         ),
     ],
     ids=["between molecules", "place", "momentum", "scaled atoms"],
 )
 def test_agents_that_break_rows_are_refused(rows, force, words):
     system, x = waters(2, force)
-    integrator = ProjectedIntegrator(0.001, parts=[hold(system, rows, x)])
+    part = hold(system, rows, x, take="all", keep_water=False)
+    integrator = ProjectedIntegrator(0.001, parts=[part])
     context = started(context_of(system, integrator), x)
     with pytest.raises(UnsupportedError, match=words):
         integrator.step(1)
     np.testing.assert_array_equal(state_of(context)[0], x)
-
-
-@pytest.mark.parametrize(
-    ("rows", "options", "groups"),
-    [
-        (Distance([[0, 3]]), {"join": True}, [[0, 1, 2, 3, 4, 5], [6, 7]]),
-        ([], {"take": "all", "keep_water": False}, [[0, 1, 2], [3, 4, 5], [6, 7]]),
-    ],
-    ids=["joined", "within molecules"],
-)
-def test_molecules_move_whole_under_pressure(rows, options, groups):
-    system, x = waters(2, barostat())
-    part = hold(system, rows, x, **options)
-    context = context_of(system, integrator := ProjectedIntegrator(0.001, parts=[part]))
-    assert sorted(sorted(m) for m in context.getMolecules()) == groups
-    start(context, part, x)
-    integrator.applyVelocityConstraints(context)
-    edge = context.getState().getPeriodicBoxVectors()[0][0]._value
-    integrator.step(300)
-    part.check(context)
-    assert context.getState().getPeriodicBoxVectors()[0][0]._value != edge
 
 
 @pytest.mark.usefixtures("without_device")
@@ -216,20 +206,28 @@ def test_what_is_no_system_and_no_context():
 
 
 @pytest.mark.parametrize("constraints", [None, app.HBonds, app.AllBonds, app.HAngles])
-def test_both_torsions_of_the_backbone_far_away(constraints):
+@pytest.mark.parametrize("kind", ["hold", "collective"])
+def test_both_torsions_of_the_backbone_far_away(kind, constraints):
     """With constraints of the System that go into the rows or stay."""
     system = app.ForceField("amber14-all.xml").createSystem(PEPTIDE.topology, constraints=constraints)
+    held = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
     bonds = np.array([(b[0].index, b[1].index) for b in PEPTIDE.topology.bonds()])
-    rows = hold(system, Dihedral([[4, 6, 8, 14], [6, 8, 14, 16]], np.radians([-60.0, -45.0])), X)
-    context = started(context_of(system, ProjectedIntegrator(0.001, parts=[rows])), X)
-    rows.apply_positions(context)
+    torsions, targets = [(4, 6, 8, 14), (6, 8, 14, 16)], np.radians([-60.0, -45.0])
+    if kind == "hold":
+        rows = hold(system, Dihedral(torsions, targets), X)
+    else:
+        rows = CollectiveRows(system, [Row(dihedral(*a), float(t)) for a, t in zip(torsions, targets, strict=True)])
+    context = started(context_of(system, integrator := ProjectedIntegrator(0.001, parts=[rows])), X)
+    integrator.applyConstraints(context)
     y = state_of(context)[0]
-    assert rows.report(context).residual < 1e-13
+    np.testing.assert_allclose(Dihedral(torsions).measure(y[torsions], 0.0), targets, rtol=0, atol=1e-11)
+    assert kind != "hold" or rows.report(context).residual < 1e-13
     length = [np.linalg.norm(z[bonds[:, 0]] - z[bonds[:, 1]], axis=1) for z in (X, y)]
-    held = {tuple(sorted(a)) for c in rows.motion.constraint_set.constraints for a in c.atoms.tolist() if len(a) == 2}
-    others = np.array([tuple(sorted(b)) not in held for b in bonds.tolist()])
+    others = np.array([all({i, j} != set(b) for i, j, _ in held) for b in bonds.tolist()])
     assert np.abs(length[1] - length[0])[others].max(initial=0.0) < 0.002
     assert np.abs(length[1] - length[0]).max() < 0.004  # to the lengths of the force field
+    for i, j, d in held:
+        assert abs(np.linalg.norm(y[i] - y[j]) / d._value - 1) < 1e-9
 
 
 # -- in motion ------------------------------------------------------------------------------------
@@ -239,7 +237,7 @@ def test_particles_without_mass_take_no_degree_of_freedom():
     """Bonds to a particle that OpenMM does not move, and one that is held there as well: two degrees go, not eight."""
     system = free([0.0, 12.0, 12.0, 0.0])
     x = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0.5, 0.5, 0.5]])
-    part = hold(system, [Distance([[0, 1], [1, 2]]), FixedAtoms([3])], x)
+    part = hold(system, [Distance([[0, 1], [1, 2], [2, 1]]), FixedAtoms([3])], x)  # a row twice
     integrator = ProjectedIntegrator(0.001, parts=[part])
     context = context_of(system, integrator)
     context.setPositions(x)
@@ -249,17 +247,6 @@ def test_particles_without_mass_take_no_degree_of_freedom():
     integrator.step(5)
     twice = 2 * integrator.kinetic_energy() / (4 * unit.MOLAR_GAS_CONSTANT_R)
     assert integrator.computeSystemTemperature() / unit.kelvin == pytest.approx(twice / unit.kelvin, rel=1e-12)
-
-
-@pytest.mark.parametrize("calls", [[40], [1, 2, 3]])
-def test_targets_move_with_the_time_after_a_new_step_size(calls):
-    """On Reference and CPU, OpenMM's clock goes on with the first step size within a call."""
-    integrator, context = begun(*driven())
-    integrator.step(20)
-    integrator.setStepSize(0.005)
-    for steps in calls:
-        integrator.step(steps)
-        assert off_target(context) < 1e-12
 
 
 def test_time_that_is_set_is_no_way_of_moving_targets():
@@ -272,8 +259,8 @@ def test_time_that_is_set_is_no_way_of_moving_targets():
 
 
 @pytest.mark.usefixtures("without_device")
-def test_steps_within_a_call_have_the_time_of_a_new_step_size():
-    """Targets moved with the old one in the middle of a call, and leapt back before its end."""
+def test_targets_move_with_the_time_after_a_new_step_size():
+    """On Reference and CPU, OpenMM's clock goes on with the first step size within a call."""
     seen = []
 
     def target(t):
@@ -282,12 +269,15 @@ def test_steps_within_a_call_have_the_time_of_a_new_step_size():
 
     x = np.array([[0.0, 0, 0], [0.3, 0, 0]])
     system = free([12.0, 12.0])
-    integrator, _ = begun(system, hold(system, Distance([[0, 1]], target), x), x)
+    integrator, context = begun(system, hold(system, Distance([[0, 1]], target), x), x)
     integrator.step(20)
     integrator.setStepSize(0.005)
     seen.clear()
     integrator.step(40)
     np.testing.assert_allclose(seen[:38], 0.2 + 0.005 * np.arange(1, 39), rtol=0, atol=1e-12)
+    for steps in (0, 1, 2, 3):
+        integrator.step(steps)
+        assert off_target(context) < 1e-12
 
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])

@@ -19,18 +19,16 @@ from collective_cases import (
     energy_of,
     held_chain,
     peptide,
-    points,
     some_velocities,
     spring_forces,
 )
-from openmm import app, unit
+from openmm import unit
 from openmm_systems import GPUS, PLATFORMS, residuals, started, state_of
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, RadiusOfGyration
 from kcons.constraints.projection import project_velocities
 from kcons.errors import (
-    ConstraintError,
     ConvergenceError,
     InfeasibleError,
     InputError,
@@ -231,6 +229,8 @@ def test_what_is_no_context_and_no_integrator():
     for row in (1, -1):
         with pytest.raises(InputError, match=f"there is no row {row}; rows are numbered from 0 to 0"):
             rows.set_target(integrator, row, 0.3)
+    with pytest.raises(InputError, match="without a rate"):
+        rows.set_target(integrator, 0, 0.3, rate=1.0)
 
 
 @pytest.mark.parametrize(
@@ -323,23 +323,20 @@ def test_an_angle_is_held_far_from_the_origin_of_a_wide_box(platform):
         assert part.tolerance == part.finest(context)
 
 
-def test_dependent_rows_are_named():
-    context, integrator, part = _held_without_check([bond(0, 3), Row(bond(0, 3), name="again")])
-    assert part.rank(context) == 1
-    with pytest.raises(SingularGeometryError, match="row 1 \\(again\\)") as caught:
-        part.check(context)
-    assert caught.value.rows == (1,)
-    with pytest.raises(SingularGeometryError, match="again"):
-        integrator.step(1)
-
-
-def test_row_that_repeats_a_constraint_of_the_system_is_named():
-    context, integrator, part = _held_without_check([bond(1, 2), bond(0, 1)], constrained=True)
-    assert part.rank(context) == 1
-    with pytest.raises(SingularGeometryError, match="row 1"):
-        part.check(context)
-    with pytest.raises(SingularGeometryError, match="row 1"):
-        integrator.step(1)
+@pytest.mark.parametrize(
+    ("rows", "constrained", "words"),
+    [
+        (lambda: [bond(0, 3), Row(bond(0, 3), name="again")], False, r"row 1 \(again\)"),
+        (lambda: [bond(1, 2), bond(0, 1)], True, "row 1"),  # which repeats a constraint of the System
+        (lambda: [openmm.RMSDForce(CHAIN, list(range(6)))], False, "row 0"),  # without a gradient
+    ],
+)
+def test_rows_without_a_direction_of_their_own_are_named(rows, constrained, words):
+    context, integrator, part = _held_without_check(rows(), constrained)
+    for call in (part.check, lambda _: integrator.step(1)):
+        with pytest.raises(SingularGeometryError, match=words):
+            call(context)
+    assert words == "row 0" or part.rank(context) == 1
 
 
 def _held_without_check(rows, constrained=False):
@@ -357,42 +354,6 @@ def test_functions_that_cannot_be_copied_are_refused():
         part.restore(context)
 
 
-def test_row_without_gradient_is_named():
-    context, integrator, part = _held_without_check([openmm.RMSDForce(CHAIN, list(range(6)))])
-    with pytest.raises((SingularGeometryError, ConstraintError), match="row 0"):
-        part.check(context)
-    with pytest.raises((SingularGeometryError, ConstraintError), match="row 0"):
-        integrator.step(1)
-
-
-def test_a_start_off_the_rows_is_refused_and_can_be_restored():
-    system = chain_system()
-    part = CollectiveRows(system, [Row(bond(0, 3), 0.3)])
-    integrator = ProjectedIntegrator(0.002, parts=[part])
-    context = started(system, integrator, CHAIN, some_velocities())
-    with pytest.raises(ConstraintError, match="restore"):
-        integrator.step(1)
-    v = state_of(context)[1]
-    part.apply_positions(context)
-    assert np.array_equal(state_of(context)[1], v)
-    part.apply_velocities(context)
-    part.check(context)
-    integrator.step(10)
-    assert np.abs(part.residuals(context)).max() <= 1e-12
-
-
-def test_positions_that_cannot_be_restored_stay():
-    system = chain_system()
-    part = CollectiveRows(system, [Row(points("cos(angle(p1, p2, p3))", (0, 2, 5)), 1.5, name="impossible")])
-    integrator = ProjectedIntegrator(0.002, parts=[part])
-    context = started(system, integrator, CHAIN, some_velocities())
-    x, v = state_of(context)
-    with pytest.raises((ConvergenceError, SingularGeometryError), match="impossible"):
-        part.apply_positions(context)
-    assert np.array_equal(state_of(context)[0], x)
-    assert np.array_equal(state_of(context)[1], v)
-
-
 @pytest.mark.parametrize("constrained", [False, True])
 def test_velocity_projection_is_the_nearest_in_the_mass_metric(constrained):
     context, _, part = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=constrained)
@@ -402,24 +363,6 @@ def test_velocity_projection_is_the_nearest_in_the_mass_metric(constrained):
     held = [Distance([0, 3]), Angle([2, 3, 4]), *[Distance([[0, 1], [2, 3]])] * constrained]
     A = ConstraintSet(held, CHAIN, MASSES).jacobian(CHAIN).toarray()
     assert state_of(context)[1] == pytest.approx(project_velocities(A, MASSES, v), abs=1e-12)
-
-
-@pytest.mark.parametrize("constraints", [None, app.HBonds, app.AllBonds])
-def test_far_torsions_keep_bonds_and_angles(constraints):
-    system, x, bonds = peptide(constraints)
-    names = [(4, 6, 8, 14), (6, 8, 14, 16)]
-    targets = np.radians([-60.0, -45.0])
-    rows = CollectiveRows(system, [Row(dihedral(*a), float(t)) for a, t in zip(names, targets, strict=True)])
-    context = started(system, ProjectedIntegrator(1e-3, parts=[rows]), x)
-    rows.restore(context)
-    y = state_of(context)[0]
-    np.testing.assert_allclose(rows.values(context), targets, atol=1e-11)
-    lengths = [np.linalg.norm(r[bonds[:, 0]] - r[bonds[:, 1]], axis=1) for r in (x, y)]
-    held = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-    free = [k for k, pair in enumerate(map(set, bonds.tolist())) if all({i, j} != pair for i, j, _ in held)]
-    assert np.abs(lengths[1] - lengths[0])[free].max(initial=0.0) < 0.002
-    for i, j, d in held:
-        assert abs(np.linalg.norm(y[i] - y[j]) / d._value - 1) < 1e-9
 
 
 def test_a_target_out_of_reach_is_infeasible():

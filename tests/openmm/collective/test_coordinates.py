@@ -1,8 +1,7 @@
-"""Forces and formulas as coordinates: units, terms, atoms, plain ones among them, force groups; what is refused."""
+"""Forces as coordinates: units, terms, atoms, plain ones among them, force groups; what is refused."""
 
 from __future__ import annotations
 
-import copy
 import math
 
 import numpy as np
@@ -17,19 +16,14 @@ from collective_cases import (
     with_variable,
 )
 from openmm import unit
-from openmm_systems import loose_alanine, started, state_of
+from openmm_systems import loose_alanine, started
 
 from kcons import ConstraintSet
-from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Formula, VelocityFormula
-from kcons.constraints.functions.expressions import FUNCTIONS, parsed
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
 from kcons.openmm.collective.coordinates import (
     as_constraint,
-    expression,
-    finite_number,
-    formula_rows,
-    found_values,
     moved_atoms,
     period_of,
     unit_of,
@@ -54,24 +48,6 @@ def torsion(text="theta"):
 
 
 # -- units ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [
-        (0.3, 0.3),
-        (3 * unit.angstrom, 0.3),
-        (3 * unit.angstrom**2, 0.03),
-        (90 * unit.degree, math.pi / 2),
-        (1 * unit.kilocalorie_per_mole, 4.184),
-    ],
-)
-def test_units_of_the_user(value, expected):
-    assert finite_number(value, "target") == pytest.approx(expected, rel=1e-15)
-    if unit.is_quantity(value):
-        assert finite_number(value / unit.femtosecond, "rate", per=unit.picosecond) == pytest.approx(
-            1e3 * expected, rel=1e-15
-        )
 
 
 def test_rows_are_in_units_of_openmm():
@@ -166,60 +142,6 @@ def test_the_constraint_measures_what_the_force_does(force, kind):
     np.testing.assert_allclose(off, rows.residuals(context)[0])
 
 
-# -- formulas -----------------------------------------------------------------------------------------
-
-
-def beads():
-    springs = openmm.HarmonicBondForce()
-    for i in range(4):
-        for j in range(i):
-            springs.addBond(j, i, 1.05 * float(np.linalg.norm(X[i] - X[j])), 900.0)
-    return particles(4, springs)
-
-
-def ran(system, part, steps=20):
-    context = started(system, ProjectedIntegrator(0.002, parts=[part]), X, 0.5 * X[::-1])
-    (part.restore if hasattr(part, "restore") else part.apply_velocities)(context)
-    context._integrator.step(steps)
-    return np.hstack(state_of(context))
-
-
-def test_every_operation_means_the_same():
-    text = " + ".join(
-        f"{name}(0.3 + x1*y2{', 2' if name == 'atan2' else ''})" for name in sorted(FUNCTIONS)
-    ) + " - -x1**2**z1*(a - z2)/3.5 - 2**-x2/pi + (x1 - 1)**3 - 4 - (2 - 1)"  # fmt: skip
-    force = points(expression(parsed(text, ["a"])[0], {"a": -1e-3}), [0, 1])
-    row = Formula(text, [0, 1], {"a": -1e-3}, None)
-    x = X + 0.1
-    assert found_values(particles(), [force], x)[0] == pytest.approx(row.measure(x[None, :2], 0.0)[0], rel=1e-13)
-
-
-def test_expressions_and_the_engine_hold_the_same():
-    row = Formula("a*(x1 - x2)*(z1 - y2) + sqrt((y1 - y2)**2 + z2**2)", [[0, 1], [2, 3]], {"a": [2.0, 1.5]}, None)
-    one, other = beads(), beads()
-    expressed = ran(one, CollectiveRows(one, [row], positions=X))
-    carried = ran(other, hold(other, copy.deepcopy(row), X))
-    np.testing.assert_allclose(expressed, carried, atol=1e-10)
-    values = row.measure(expressed[:, :3][row.atoms], 0.0)
-    np.testing.assert_allclose(values, row.measure(X[row.atoms], 0.0), atol=1e-12)
-    still = formula_rows(Formula("z1", 0, target=None))[0]
-    assert isinstance(still, Row) and still.target is None
-
-
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [
-        (Formula("z1 - 0.3 - 0.01*sin(5*t)", 0), "moves with the time"),
-        (VelocityFormula("x1*vy1 - y1*vx1", 0), "holds velocities, not positions"),
-    ],
-)
-def test_what_moves_is_carried_and_not_expressed(row, words):
-    system = beads()
-    with pytest.raises(UnsupportedError, match=rf"{words}.*hold it by kcons\.openmm\.hold"):
-        CollectiveRows(system, [row], positions=X)
-    assert system.getNumForces() == 1
-
-
 # -- force groups -------------------------------------------------------------------------------------
 
 
@@ -260,6 +182,7 @@ def _owned():
         (lambda s: [s.getForce(0), s.getForce(0)], {}, "more than once"),
         (lambda s: [_owned()], {}, "another System"),
         (lambda s: ["r"], {}, "is no Force of OpenMM"),
+        (lambda s: Distance([[0, 3]]), {}, "is no Force of OpenMM"),
         (lambda s: [Distance([[0, 3]])], {}, r"kcons\.openmm\.hold holds constraints of kcons"),
         (lambda s: [], {}, "no rows"),
         (lambda s: [Row(bond(0, 1), math.nan)], {}, "target of row 0"),

@@ -14,20 +14,18 @@ from collective_cases import (
     FORCES,
     angle,
     bond,
+    dihedral,
     dipeptide,
     energy_of,
     held_chain,
 )
 from openmm import app, unit
-from openmm_systems import DATA, started, state_of
+from openmm_systems import loose_alanine, started, state_of
 
 from kcons.constraints import Dihedral
-from kcons.errors import ConstraintError, ConvergenceError, InputError
+from kcons.errors import ConstraintError, ConvergenceError
 from kcons.openmm import CollectiveRows, Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
 from kcons.openmm.collective.coordinates import Row
-
-# -- multipliers ----------------------------------------------------------------------------------------
-
 
 # -- order, reversibility, energy -----------------------------------------------------------------------
 
@@ -94,57 +92,24 @@ def test_failed_steps_and_constraints_alone_do_not_move_the_target():
     assert part.values(context)[0] == pytest.approx(start + 0.2 * 0.02, abs=1e-12)
 
 
-def test_another_target_from_now_on():
-    context, integrator, part = held_chain([bond(0, 3)])
-    part.set_target(integrator, 0, 2.5 * unit.angstrom)
-    with pytest.raises(ConstraintError, match="restore"):
-        part.check(context)
-    part.restore(context)
-    integrator.step(3)
-    assert part.values(context) == pytest.approx([0.25], abs=1e-12)
-    with pytest.raises(InputError, match="without a rate"):
-        part.set_target(integrator, 0, 0.25, rate=1.0)
-
-
 # -- a bath between two halves of the drift -------------------------------------------------------------
 
-PEPTIDE = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
-PHI = [4, 6, 8, 14]
 
-
-def held_peptide(ensemble, dt, carried=False):
-    """Alanine dipeptide with bonds of hydrogen held by the System and phi by rows."""
-    field = app.ForceField("amber14-all.xml")
-    system = field.createSystem(PEPTIDE.topology, constraints=app.HBonds, removeCMMotion=False)
-    force = openmm.CustomTorsionForce("theta")
-    force.addTorsion(*PHI, [])
-    x = PEPTIDE.positions
-    part = hold(system, [Dihedral([PHI])], x) if carried else CollectiveRows(system, [force], positions=x)
-    integrator = ProjectedIntegrator(dt, parts=[part], ensemble=ensemble)
-    integrator.setRandomNumberSeed(3)
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    context.setPositions(x)
-    integrator.applyConstraints()
-    return context, integrator, part
-
-
-@pytest.mark.filterwarnings("ignore:total momentum is not zero")
+@pytest.mark.filterwarnings("ignore:total momentum is not zero", "ignore:the forces exert no torque")
 @pytest.mark.parametrize(
     "ensemble", [Langevin(300, 0), NoseHooverMiddle(300, 1e-6)], ids=["Langevin", "NoseHooverMiddle"]
 )
 def test_the_second_half_of_a_drift_begins_in_the_middle(ensemble):
     """Where the bath does nothing: the trajectory of rows held by `hold`, whose code is another one."""
-    ends, starts = [], []
-    v = np.random.default_rng(5).normal(size=(22, 3))
+    ends, phi = [], (4, 6, 8, 14)
     for carried in (False, True):
-        context, integrator, _ = held_peptide(ensemble, 0.001, carried)
-        if starts:
-            context.setPositions(starts[0])
-        starts.append(state_of(context)[0])
-        context.setVelocities(v - v.mean(axis=0))
-        integrator.applyVelocityConstraints()
+        system, x, v = loose_alanine()  # whose bonds of hydrogen the System holds
+        part = hold(system, Dihedral([phi]), x) if carried else CollectiveRows(system, [dihedral(*phi)], positions=x)
+        integrator = ProjectedIntegrator(0.001, parts=[part], ensemble=ensemble)
+        context = started(system, integrator, x, v)
         integrator.step(40)
         ends.append(np.hstack(state_of(context)))
+        assert carried or part.meets_system
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-7)
 
 

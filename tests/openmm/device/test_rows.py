@@ -232,13 +232,16 @@ def test_rows_without_a_solution_are_told(n, what):
     plain, start, w = held(items, x, masses)
     d = np.zeros_like(x)
     d[1] = np.nan if what == "nan" else [0.0, 0.0, 30.0]
-    plain.positions(start, d, w)
+    found = start + plain.positions(start, d, w)
     launch, step, row = plain.arrays["failure"]
     assert (launch, step) == (8, 4)
     error = plain.rows.failure(int(row), float(plain.arrays["failure_residual"][0]), int(step))
     assert error.step == 4 and 0 <= error.row < n and error.row in error.atoms
     assert error.row in (0, 1) or (what, n) == ("far", 40)
     assert ("not finite" in str(error)) == (what == "nan") and "smaller time step" in str(error)
+    if (what, n) == ("far", 3):  # distances are held by their squares, and told as lengths
+        length, held_at = np.linalg.norm(np.subtract(*found[list(error.atoms)])), plain.rows.target[error.row]
+        assert error.residual == pytest.approx(abs(length**2 - held_at**2) / (2 * held_at), rel=1e-9)
 
 
 def test_a_bond_that_has_turned_over_is_no_solution():

@@ -41,24 +41,22 @@ TWO = {0: 1, 1: 4}
 KT = 300 * unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 
 
-def grouped(**options):
+def grouped():
     """Alanine dipeptide: bonds held, angles and torsions fast (group 1), the rest slow (group 0)."""
-    system, x, v = alanine(**options)
+    system, x, v = alanine()
     for force in system.getForces():
         force.setForceGroup(0 if isinstance(force, openmm.NonbondedForce | openmm.CustomNonbondedForce) else 1)
     return system, x, v
 
 
-def trapped(n=4, constraints=0):
+def trapped(n=4):
     """Free atoms in a trap with a softer slow force."""
-    system, fast, slow = openmm.System(), openmm.CustomExternalForce("40*(x^2+2*y^2+z^2)"), None
+    system, fast = openmm.System(), openmm.CustomExternalForce("40*(x^2+2*y^2+z^2)")
     slow = openmm.CustomExternalForce("10*(cos(3*x)+y^4+z*y)")
     for k in range(n):
         system.addParticle(10.0 + k)
         fast.addParticle(k)
         slow.addParticle(k)
-    for k in range(constraints):
-        system.addConstraint(2 * k, 2 * k + 1, 0.1)
     fast.setForceGroup(1)
     system.addForce(fast)
     system.addForce(slow)
@@ -110,24 +108,6 @@ def test_constraints_are_held_and_a_seed_repeats(platform):
         ends.append(state_of(context))
     assert np.abs(ends[0][0] - ends[-1][0]).max() <= 1e-6
     assert np.abs(ends[0][0] - x).max() > 1e-3
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"steps": 4}, "steps must name each force group"),
-        ({"steps": {0: 1}}, "give two or more"),
-        ({"steps": {0: 1, 32: 4}}, "force group 32 is no number from 0 to 31"),
-        ({"steps": {0: 1, "fast": 4}}, "force group 'fast' is no number"),
-        ({"steps": {0: 1, 1: 0}}, "steps is 0"),
-        ({"steps": {0: 1, 1: 4, 2: 6}}, "does not divide"),
-        ({"friction": -1.0}, "friction"),
-        ({"slow_kicks": "middle", "steps": {0: 1, 1: 3}}, "no middle"),
-    ],
-)
-def test_bad_input(options, words):
-    with pytest.raises(InputError, match=words):
-        LangevinRespa(**{"temperature": 300, "friction": 1.0, "steps": TWO, **options})
 
 
 def test_forces_of_other_groups_and_virtual_sites_and_parts():

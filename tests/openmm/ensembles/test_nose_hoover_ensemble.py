@@ -12,11 +12,9 @@ from ensemble_runs import (
 from openmm import unit
 from openmm_systems import (
     alanine,
-    context_of,
     dumbbell,
     loose_alanine,
     masses_of,
-    residuals,
     started,
     state_of,
 )
@@ -88,22 +86,6 @@ def test_calls_of_any_length_make_the_same_motion():
 
 
 # -- the chain in the middle of a step -------------------------------------------------------------------
-
-
-def test_a_chain_in_the_middle_conserves_energy_to_order_two():
-    system, x, v = alanine("HBonds")
-    spans = []
-    for n in (1, 2, 4):
-        ensemble = NoseHooverMiddle(300.0, 20.0)
-        integrator = ProjectedIntegrator(1e-3 / n, ensemble=ensemble, tolerance=1e-12)
-        context = started(system, integrator, x, v, "CPU")
-        values = []
-        for _ in range(100):
-            integrator.step(n)
-            values.append(ensemble.conserved_energy(integrator))
-        spans.append(np.std(values))
-        assert max(residuals(system, context)) <= 1e-9
-    np.testing.assert_allclose(-np.diff(np.log2(spans)), 2, atol=0.2)
 
 
 def test_a_chain_in_the_middle_is_the_same_chain_in_small_steps():
@@ -186,6 +168,7 @@ def test_a_nan_leaves_the_chain_of_the_last_check():
         integrator.step(10)
     assert integrator.program.remembered() == before
     assert np.array_equal(state_of(context), good)
+    assert context.getStepCount() == 10 and context.getTime()._value == pytest.approx(0.01)
     context.setParameter("edge", 1e6)
     integrator.step(5)
     assert np.isfinite(state_of(context)[1]).all()
@@ -198,45 +181,12 @@ def test_a_nan_leaves_the_chain_of_the_last_check():
 BODY = 0.063 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 
 
-def test_rigid_bodies_of_more_rows_than_they_need_have_all_their_momenta():
-    """36 of six rigid bodies; rows counted one by one would leave 30."""
-    system = openmm.System()
-    field = openmm.CustomExternalForce("50*(x^2+1.3*y^2+0.7*z^2)+60*sin(5*x)*cos(4*y+1)*cos(6*z)")
-    x = np.vstack([BODY + 0.1 * b for b in range(6)])
-    for k in range(30):
-        field.addParticle(system.addParticle(12.0 + k), [])
-    pairs = [(i + b, j + b) for b in range(0, 30, 5) for i in range(5) for j in range(i)]
-    system.addForce(field)
-    part = hold(system, [Distance(pairs)], positions=x)
-    ensemble = NoseHoover(300.0, 20.0)
-    integrator = ProjectedIntegrator(2e-3, parts=[part], ensemble=ensemble)
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    integrator.setVelocitiesToTemperature(context, 300, 1)
-    integrator.step(1)
-    assert ensemble.count(integrator) == 36
-
-
 # -- settings --------------------------------------------------------------------------------------------
 
 
 def test_frequency_or_relaxation_time():
     assert NoseHoover(300, 20) == NoseHoover(300 * unit.kelvin, 50 * unit.femtosecond)
     assert NoseHoover(300, 20).frequency == pytest.approx(NoseHoover(300, 0.02 / unit.femtosecond).frequency)
-    for arguments, match in (
-        ((0.0, 1.0), "temperature"),
-        ((300.0, 0.0), "frequency"),
-        ((300.0, 1.0 * unit.nanometer), "frequency is 1.0 nm; give it in 1/ps"),
-        ((1.0 * unit.nanometer, 1.0), "give it in K"),
-    ):
-        with pytest.raises(InputError, match=match):
-            NoseHoover(*arguments)
-    for options, match in (
-        ({"length": 0}, "length is 0"),
-        ({"momentum": "maybe"}, "momentum"),
-    ):
-        with pytest.raises(InputError, match=match):
-            NoseHoover(300.0, 1.0, **options)
 
 
 def test_what_cannot_be_thermostatted_is_refused():

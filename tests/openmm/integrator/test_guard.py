@@ -220,11 +220,11 @@ def test_rows_that_constraints_of_the_system_pull_off_are_put_right_too():
     integrator.check()
 
 
-def test_a_part_that_is_far_off_keeps_the_others_where_they_are():
-    system, x, v, near = on_a_plane()
-    x[3, 2] += 0.004
-    far = hold(system, Plane([9], normal=(0.0, 0.0, 1.0), offset=float(x[9, 2]) + 0.5), x)
-    integrator = ProjectedIntegrator(1e-3, parts=[near, far])
+@pytest.mark.parametrize("together", [False, True])
+def test_a_row_that_is_far_off_keeps_the_others_where_they_are(together):
+    system, x, v = unconstrained_alanine()
+    planes = [Plane([k], (0.0, 0.0, 1.0), float(x[k, 2]) + off) for k, off in ((3, 0.004), (9, 0.5))]
+    integrator = ProjectedIntegrator(1e-3, parts=[hold(system, rows, x) for rows in ([planes] if together else planes)])
     context = started(system, integrator, x, v)
     with pytest.raises(InputError, match="apply_positions"):
         integrator.step(1)
@@ -268,32 +268,6 @@ def test_solvers_that_do_not_converge_are_found(rows, error, platform):
         np.testing.assert_array_equal(state_of(context), state_of(other))
 
 
-@platforms
-def test_explosion_puts_back_what_was_checked_last(platform):
-    system = openmm.System()
-    well = openmm.CustomExternalForce("k*x^4")
-    well.addGlobalParameter("k", 1.0)
-    well.addParticle(system.addParticle(1.0), [])
-    system.addForce(well)
-    start = [[1.0, 0, 0]], [[0.5, 0, 0]], platform
-    context = started(system, integrator := ProjectedIntegrator(1e-3, check_every=10), *start)
-    integrator.step(20)
-    good = state_of(context)
-    context.setParameter("k", 1e12)
-    with pytest.raises(NonFiniteError) as caught:
-        integrator.step(1000)
-    assert caught.value.item in ("position", "velocity")
-    np.testing.assert_array_equal(state_of(context), good)
-    assert context.getStepCount() == 20
-    assert context.getTime() / PS == pytest.approx(0.02)
-    context.setParameter("k", 1.0)
-    integrator.step(10)
-    assert context.getStepCount() == 30
-    other = started(system, untroubled := ProjectedIntegrator(1e-3, check_every=10), *start)
-    untroubled.step(30)
-    np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize(("given", "number"), [({}, 2), ({"check_every": 100}, 104)])
 def test_checks_that_would_take_too_long_come_later(monkeypatch, given, number):
     """No share of the time is left for them here; an interval that was asked for is kept."""
@@ -322,6 +296,29 @@ def test_clock_follows_the_step_size():
     assert context.getStepCount() == 7
 
 
+#: With motion removers, which meet complete velocities: half a kick has momentum where forces add up to something.
+BATHS = {
+    "Isokinetic": Isokinetic(300, momentum="free"),
+    "Langevin": Langevin(300, 0.0),
+    "NoseHoover": NoseHoover(300, 5.0, momentum="free"),
+}
+
+
+def the_same_in_any_calls(system, x, v, steps, parts=(), bath=None):
+    """Where steps lead, however they are divided into calls."""
+    ends = []
+    for calls in ([steps], [5, steps - 5], [1] * steps):
+        integrator = ProjectedIntegrator(1e-3, parts=parts, ensemble=bath, tolerance=1e-13)
+        context = started(system, integrator, x, v)
+        for each in calls:
+            integrator.step(each)
+        ends.append(state_of(context))
+    for places, speeds in ends[1:]:
+        np.testing.assert_allclose(places, ends[0][0], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(speeds, ends[0][1], rtol=0, atol=1e-9)
+    return ends[0]
+
+
 def external(n):
     pull = openmm.CustomExternalForce("50*((x-1)^2+y^2+z^2)")
     for k in range(n):
@@ -329,54 +326,33 @@ def external(n):
     return pull
 
 
-def compound(n):
-    pull = openmm.CustomCompoundBondForce(1, "500*x1^2")
-    pull.addBond([0], [])
-    return pull
-
-
 def collective(n):
-    pull = openmm.CustomCVForce("20*pull")
-    pull.addCollectiveVariable("pull", compound(n))
+    inner, pull = openmm.CustomCompoundBondForce(1, "500*x1^2"), openmm.CustomCVForce("20*pull")
+    inner.addBond([0], [])
+    pull.addCollectiveVariable("pull", inner)
     return pull
 
 
 @pytest.mark.parametrize(
     ("kind", "force"),
     [
-        *((kind, external) for kind in ("constant energy", "Isokinetic", "Langevin", "NoseHoover", "carried")),
-        *(("Langevin", force) for force in (compound, collective)),
+        *((kind, external) for kind in ("constant energy", *BATHS, "carried")),
+        ("Langevin", collective),
     ],
 )
 def test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place(kind, force):
-    """Half a kick has momentum there, and how steps are divided into calls would decide what is removed."""
     system, x, v = alanine()
     system.addForce(force(len(x)))
     assert openmm.CMMotionRemover in {type(force) for force in system.getForces()}
-    parts = [hold(carried := copy.deepcopy(system), [], x, take="all")] if kind == "carried" else []
-    ensemble = {
-        "Isokinetic": Isokinetic(300, momentum="free"),
-        "Langevin": Langevin(300, 0.0),
-        "NoseHoover": NoseHoover(300, 5.0, momentum="free"),
-    }.get(kind)
-    ends = []
-    for calls in ([12], [5, 7], [1] * 12):
-        integrator = ProjectedIntegrator(1e-3, parts=parts, ensemble=ensemble, tolerance=1e-13)
-        context = started(carried if parts else system, integrator, x, v)
-        for steps in calls:
-            integrator.step(steps)
-        ends.append(state_of(context))
-    if parts:
-        context = started(system, plain := ProjectedIntegrator(1e-3, tolerance=1e-13), x, v)
-        for _ in range(12):
-            plain.step(1)
-        ends.append(state_of(context))
-    for places, speeds in ends[1:]:
-        np.testing.assert_allclose(places, ends[0][0], rtol=0, atol=1e-11)
-        np.testing.assert_allclose(speeds, ends[0][1], rtol=0, atol=1e-8)
+    end = the_same_in_any_calls(system, x, v, 12, bath=BATHS.get(kind))
+    if kind == "carried":
+        carried = copy.deepcopy(system)
+        same = the_same_in_any_calls(carried, x, v, 12, [hold(carried, [], x, take="all")])
+        np.testing.assert_allclose(same[0], end[0], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(same[1], end[1], rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("kind", ["Isokinetic", "Langevin", "NoseHoover", "constant energy"])
+@pytest.mark.parametrize("kind", [*BATHS, "constant energy"])
 def test_a_motion_remover_meets_complete_velocities_beside_particles_without_mass(kind):
     """They take up momentum that forces between particles give: half a kick has some for the others."""
     system, pairs, rng = openmm.System(), openmm.CustomBondForce("200*(r-0.3)^2"), np.random.default_rng(1)
@@ -388,21 +364,7 @@ def test_a_motion_remover_meets_complete_velocities_beside_particles_without_mas
     system.addForce(openmm.CMMotionRemover())
     x = np.array([[0, 0, 0], [0.4, 0, 0], [0.1, 0.3, 0], [0.2, 0.1, 0.3], [0.3, 0.3, 0.3]])
     v = np.vstack([np.zeros((2, 3)), rng.normal(size=(3, 3))])
-    ensemble = {
-        "Isokinetic": Isokinetic(300, momentum="free"),
-        "Langevin": Langevin(300, 0.0),
-        "NoseHoover": NoseHoover(300, 5.0, momentum="free"),
-    }.get(kind)
-    ends = []
-    for calls in ([40], [13, 27], [1] * 40):
-        integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
-        context = started(system, integrator, x, v)
-        for steps in calls:
-            integrator.step(steps)
-        ends.append(state_of(context))
-    for places, speeds in ends[1:]:
-        np.testing.assert_allclose(places, ends[0][0], rtol=0, atol=1e-11)
-        np.testing.assert_allclose(speeds, ends[0][1], rtol=0, atol=1e-9)
+    the_same_in_any_calls(system, x, v, 40, bath=BATHS.get(kind))
 
 
 def test_rows_beside_a_motion_remover_know_no_place():

@@ -9,24 +9,6 @@ from openmm_systems import started, state_of
 
 from kcons.constraints import Distance
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
-from kcons.openmm.integrator.part import Violation
-
-
-def worst(off, allowed, near=0.0):
-    return Violation.worst("positions", np.array(off), allowed, lambda k: f"row {k}", lambda k: [k, k + 1], near)
-
-
-def test_the_worst_is_relative_to_what_is_allowed():
-    miss = worst([1e-3, -2e-3, 1e-9], [1e-4, 1e-3, 1e-8])
-    assert (miss.row, miss.off, miss.allowed, miss.atoms) == (0, 1e-3, 1e-4, [0, 1])
-    assert worst([1e-3, 2e-3], 1e-2) is None
-    assert worst([1e-3, np.nan], 1e-9).row == 1
-
-
-def test_near_are_only_rows_of_which_all_are():
-    assert worst([1e-3, 2e-3], 1e-6, 0.01).near
-    assert not worst([1e-3, 2e-2], 1e-6, 0.01).near
-    assert not worst([1e-3, np.nan], 1e-6, 0.01).near
 
 
 def held(kind):

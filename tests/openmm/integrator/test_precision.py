@@ -30,7 +30,6 @@ from kcons.openmm import (
     Row,
     hold,
 )
-from kcons.openmm.integrator.guard import SystemRows
 from kcons.openmm.integrator.part import Precision
 
 mixed = pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
@@ -146,25 +145,6 @@ def test_no_integrator_is_off_by_more_than_twice_what_openmm_is(make, kind, plat
     tolerance = Precision(*platform.split()).tolerance
     assert residuals(system, context)[0] <= 2 * held_by_openmm(make, platform) + 2 * tolerance
     assert integrator.getConstraintTolerance() == tolerance
-
-
-@pytest.mark.parametrize("platform", on_gpus("single", "mixed"))
-def test_lengths_of_a_gpu_are_known_to_rounding(platform):
-    """Squares of lengths in single precision where its SHAKE is responsible, the lengths themselves elsewhere."""
-    precision = Precision(*platform.split())
-    for make in (hydrogens, bonds):
-        system, x, v = make()
-        tolerance = 1e-6 if precision.name == "single" else 1e-12
-        context = started(system, openmm.VerletIntegrator(STEP), x, v, platform)
-        for _ in range(3):
-            context.applyConstraints(tolerance)
-        rows = SystemRows.of(system, rounded=precision.rounds_lengths)
-        y = state_of(context)[0]
-        reach = np.abs(y).max() / rows.lengths.min()
-        off = np.abs(rows.stretches(y)).max()
-        assert off <= 2 * tolerance + precision.solvers + 4 * precision.place * reach
-        if precision.name != "single" and make is hydrogens:
-            assert np.abs(SystemRows.of(system).stretches(y)).max() > 1e-9  # the lengths that were given
 
 
 @pytest.mark.parametrize("platform", on_gpus("mixed"))

@@ -6,7 +6,7 @@ import re
 
 import openmm
 import pytest
-from openmm_systems import context_of, holding, state_of
+from openmm_systems import holding
 from tied_cluster import KINDS
 
 from kcons import thermostats
@@ -15,60 +15,9 @@ from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 from kcons.openmm.integrator.program import (
     SCHEMES,
     VARIABLES,
-    ConstantEnergy,
-    Program,
-    forces_at_old_positions,
     to_scheme,
 )
 from kcons.steppers import Geodesic, Rattle
-
-
-def test_computations_and_listing_go_together():
-    integrator = openmm.CustomIntegrator(0.5)
-    p = Program(integrator, Rattle(), (), ConstantEnergy())
-    p.number("k", "stiffness", 2.0)
-    p.number("k", "declared twice is declared once", 3.0)
-    p.vector("old", "positions before")
-    p.table("share", [0.25, 0.75], "parts of the step")
-    p.number("stage", "number of the stage")
-    p.each("old", "x", "remember")
-    with p.loop("stage < 2", "both stages"):
-        p.each("x", "x+share(stage)*dt*v", "fly")
-        p.let("stage", "stage+1", "next")
-        with p.when("k = 1", "in which nothing is written"):
-            pass
-    with p.when("k = 2", "always"):
-        p.sum("total", "v*(x-old)", "how far")
-    p.let_others_act()
-    p.hold_positions("nothing to hold")
-    p.hold_velocities("nothing to hold")
-    p.hand_over()
-    assert p.listing().splitlines() == [
-        "variables",
-        "  x, v, m, f, dt: positions, velocities, masses, applied forces, time step",
-        "  k: stiffness",
-        "  old: positions before (each degree of freedom)",
-        "  share(k): parts of the step",
-        "  stage: number of the stage",
-        "each step",
-        "  old = x                      # remember",
-        "  while stage < 2:             # both stages",
-        "      x = x+share(stage)*dt*v  # fly",
-        "      stage = stage+1          # next",
-        "  if k = 2:                    # always",
-        "      total = sum(v*(x-old))   # how far",
-        "  update context state         # barostats and other outside agents may act",
-        "  constrain positions          # nothing to hold",
-        "  constrain velocities         # nothing to hold",
-    ]
-    system = openmm.System()
-    system.addParticle(1.0)
-    context = context_of(system, integrator)
-    context.setPositions([[0, 0, 0]])
-    context.setVelocities([[1, 2, 3]])
-    integrator.step(1)
-    assert state_of(context)[0].tolist() == [[0.5, 1.0, 1.5]]
-    assert integrator.getGlobalVariableByName("total") == 0.5 * (1 + 4 + 9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -77,12 +26,17 @@ def test_listings_are_complete(kind):
     integrator = KINDS[kind]().integrator
     text = integrator.listing()
     assert str(integrator).endswith(text)
-    steps = text.split("each step\n")[1].splitlines()
-    made = [integrator.getComputationStep(k) for k in range(integrator.getNumComputations())]
-    written = [k for k in made if k[0] != openmm.CustomIntegrator.BlockEnd]
-    assert len(steps) == len(written)
-    for line, (_, variable, expression) in zip(steps, written, strict=True):
+    lines, depth, kinds = iter(text.split("each step\n")[1].splitlines()), 0, openmm.CustomIntegrator
+    for k in range(integrator.getNumComputations()):
+        kind, variable, expression = integrator.getComputationStep(k)
+        if kind == kinds.BlockEnd:
+            depth -= 1
+            continue
+        line = next(lines)
+        assert len(line) - len(line.lstrip()) == 2 + 4 * depth
         assert "#" in line and variable in line and expression in line
+        depth += kind in (kinds.IfBlockStart, kinds.WhileBlockStart)
+    assert next(lines, None) is None
 
 
 def test_every_variable_of_the_list_is_used_and_controls_are_idle_between_calls():
@@ -118,21 +72,6 @@ def ways(program):
 def test_few_ways_through_the_program(kind, most):
     """The set-up of a Context takes time for each."""
     assert ways(KINDS[kind]().integrator.program) <= most
-
-
-def test_forces_at_old_positions_are_seen():
-    """GPUs keep what a computation makes of x as a difference, until constraints are applied to positions."""
-
-    def written(*lines):
-        p = Program(openmm.CustomIntegrator(1e-3), Rattle(), (), ConstantEnergy())
-        for line in lines:
-            p.hold_positions("hold") if line == "hold" else p.each(*line, "words")
-        return p.lines
-
-    assert forces_at_old_positions(written(("x", "x+v"), ("v", "f3"), "hold"))
-    assert not forces_at_old_positions(written(("x", "x+v"), "hold", ("v", "f3")))
-    assert not forces_at_old_positions(written(("x", "x+v"), ("v", "f3")))
-    assert not forces_at_old_positions(written(("v", "f3"), ("x", "x+v"), "hold"))
 
 
 # -- schemes ----------------------------------------------------------------------------------------

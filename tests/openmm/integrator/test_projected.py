@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import re
 
 import numpy as np
 import openmm
@@ -19,10 +18,8 @@ from openmm_systems import (
     water_box,
 )
 
-from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import Isokinetic, ProjectedIntegrator
-from kcons.openmm.integrator.guard import refuse_agents
+from kcons.openmm import ProjectedIntegrator
 
 PS = unit.picosecond
 
@@ -33,24 +30,6 @@ PS = unit.picosecond
 def test_units_and_arguments():
     assert ProjectedIntegrator(2 * unit.femtoseconds).getStepSize() == 0.002 * PS
     assert ProjectedIntegrator(0.002).getConstraintTolerance() == 1e-10
-    for bad in (np.nan, np.inf, -1 * unit.femtosecond):
-        with pytest.raises(InputError, match="positive"):
-            ProjectedIntegrator(bad)
-    integrator = ProjectedIntegrator(0.001)
-    with pytest.raises(InputError, match="positive"):
-        integrator.setStepSize(-0.001)
-    with pytest.raises(InputError, match="tolerance"):
-        integrator.setConstraintTolerance(0.0)
-    with pytest.raises(InputError, match="no scheme 'rattel'; known: rattle, geodesic"):
-        ProjectedIntegrator(0.001, "rattel")
-    for ensemble in ("langevin", 300, Isokinetic):
-        words = re.escape(f"ensemble is {ensemble!r}; give one of kcons.openmm, such as Langevin")
-        with pytest.raises(InputError, match=words) as caught:
-            ProjectedIntegrator(0.001, ensemble=ensemble)
-        assert caught.value.item == "ensemble"
-    for parts in (Distance([[0, 1]]), [Distance([[0, 1]])]):
-        with pytest.raises(InputError, match=r"no part of an integrator; kcons\.openmm\.hold"):
-            ProjectedIntegrator(0.001, parts=parts)
     alone = holding()
     assert ProjectedIntegrator(0.001, parts=alone).parts == (alone,)
     meeting = [holding(), holding()]
@@ -92,34 +71,6 @@ def test_barostat_with_a_part_that_keeps_forces():
         volumes.add(context.getState().getPeriodicBoxVolume() / unit.nanometer**3)
     assert len(volumes) > 5
     assert integrator.getGlobalVariableByName("worst_gap") == 0
-
-
-def test_what_moves_particles_off_rows_is_refused():
-    system, x = water_box(64)
-    molecules = started(system, integrator := ProjectedIntegrator(1e-3), x).getMolecules
-
-    def refuse(*atoms, bound=None):
-        refuse_agents(system, bound, [(np.array([each]), "number {}".format) for each in atoms], molecules)
-
-    refuse([0, 3], [5], bound="a plane")  # no barostat
-    system.addForce(openmm.MonteCarloBarostat(1.0, 300.0))
-    refuse([0, 1], [3, 4, 5])
-    with pytest.raises(
-        UnsupportedError, match=r"MonteCarloBarostat .*row number 0 holds atoms of several; .*join=True"
-    ):
-        refuse([0, 1], [0, 3])
-    for mover in (None, openmm.CMMotionRemover()):
-        if mover is not None:
-            system.removeForce(system.getNumForces() - 1)
-            system.addForce(mover)
-        with pytest.raises(UnsupportedError, match=r"a plane holds particles in space.*removeCMMotion=False"):
-            refuse([2], bound="a plane")
-    system.removeForce(system.getNumForces() - 1)
-    system.addForce(flexible := openmm.MonteCarloFlexibleBarostat(1.0, 300.0))
-    flexible.setScaleMoleculesAsRigid(False)
-    with pytest.raises(UnsupportedError, match=r"rows are held, and MonteCarloFlexibleBarostat .*let it scale"):
-        refuse([0, 1])
-    del integrator
 
 
 def test_a_barostat_that_scales_atoms_is_refused_beside_constraints():

@@ -23,7 +23,7 @@ from tied_cluster import (
 )
 
 from kcons.constraints import Plane
-from kcons.errors import InputError, KconsError, OverdeterminedError, UnsupportedError
+from kcons.errors import KconsError, OverdeterminedError, UnsupportedError
 from kcons.openmm import (
     HamiltonianMonteCarlo,
     Isokinetic,
@@ -239,24 +239,6 @@ def test_what_an_ensemble_lacks():
         with pytest.raises(UnsupportedError, match="ensemble=Langevin"):
             getattr(one, name)
     assert smooth.getTemperature() == 300 * unit.kelvin
-
-
-@pytest.mark.parametrize(
-    ("wrong", "match"),
-    [
-        (lambda: Langevin(float("nan"), 1), "temperature"),
-        (lambda: ProjectedIntegrator(0.002, ensemble=Isokinetic(300)).setTemperature(0), "temperature"),
-        (lambda: ProjectedIntegrator(0.002, ensemble=Langevin), "give one of kcons.openmm"),
-        *((lambda g=g: ProjectedIntegrator(1e-3).setIntegrationForceGroups(g), "group") for g in ({40}, [0.5], "0")),
-        *((lambda g=g: ProjectedIntegrator(1e-3).setIntegrationForceGroups(g), "group") for g in (1.5, None)),
-        *((lambda t=t: ProjectedIntegrator(1e-3).setConstraintTolerance(t), "tolerance") for t in ("small", None)),
-        (lambda: ProjectedIntegrator(1e-3).setConstraintTolerance(float("nan")), "tolerance"),
-        (lambda: ProjectedIntegrator(1e-3).setConstraintTolerance(1 * unit.nanometer), "tolerance"),
-    ],
-)
-def test_settings_that_are_none_are_refused(wrong, match):
-    with pytest.raises(InputError, match=match):
-        wrong()
 
 
 def test_a_tolerance_that_was_left_open_stays_so_where_it_is_copied():

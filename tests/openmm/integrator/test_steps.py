@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 
 import numpy as np
@@ -16,7 +15,6 @@ from openmm_systems import (
     dumbbell,
     holding,
     loose_alanine,
-    masses_of,
     on_gpus,
     residuals,
     started,
@@ -36,7 +34,6 @@ from kcons.openmm import (
     Row,
     hold,
 )
-from kcons.openmm.integrator.program import Ensemble
 
 #: The trap of `tied_cluster` is round.
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -123,33 +120,6 @@ def test_parameters_of_forces_are_used_in_the_next_step(kind):
     old.context.setState(state)
     old.run(1)
     assert np.abs(state_of(old.context)[1] - state_of(made.context)[1]).max() > 1e-2
-
-
-class Friction(Ensemble):
-    """An ensemble that is seen to be right: v falls exponentially during kicks."""
-
-    def declare(self, p):
-        p.number("rate", "of the friction", 1e3 * np.log(4.0))
-
-    def kick(self, p, h, impulse="", tangent=False, unseen=False):
-        p.project()
-        return f"(v+{impulse or 0})*exp(-rate*{h})"
-
-
-@pytest.mark.parametrize("parts", [False, True])
-def test_an_ensemble_writes_the_kicks(parts):
-    system, x, v = loose_alanine()
-    integrator = ProjectedIntegrator(1e-3, parts=[holding()] if parts else [], ensemble=Friction(), tolerance=1e-12)
-    context = started(system, integrator, x, v)
-    integrator.applyVelocityConstraints(context)
-    before = state_of(context)[1]
-    integrator.step(1)
-    mass = masses_of(system)
-    kinetic = [mass @ np.sum(u**2, axis=1) for u in (before, state_of(context)[1])]
-    # Of the bonds' curvature and the projection this knows nothing: they cost little.
-    assert kinetic[1] / kinetic[0] == pytest.approx(1 / 16, rel=0.02)
-    assert copy.copy(integrator).program.listing() == integrator.program.listing()
-    assert integrator.program.listing().count("constrain velocities") == 3
 
 
 # -- calls ------------------------------------------------------------------------------------------
@@ -352,33 +322,6 @@ def test_an_explosion_is_told_where_its_call_ends(name, call, platform):
     assert context.getStepCount() == 0
     integrator.setStepSize(0.5 * unit.femtosecond)
     integrator.step(call)
-
-
-@pytest.mark.parametrize(
-    ("name", "platform"),
-    [
-        *((name, "Reference") for name in LOOKING),
-        *(pytest.param("rattle", *p.values, id=p.id, marks=p.marks) for p in on_gpus("mixed")),
-    ],
-)
-def test_a_look_changes_nothing(name, platform, monkeypatch):
-    system, x, v = springs()
-    ends = []
-    for looked in (True, False):
-        integrator = LOOKING[name](0.5 * unit.femtosecond)
-        if name.startswith("Langevin"):
-            integrator.setFriction(0)  # no noise, which numbers drawn for the look would change
-        context = started(system, integrator, x, v, platform)
-        if not looked:
-            control = integrator._control
-            integrator._control = lambda name, value=1.0, of=control: (
-                contextlib.nullcontext() if name == "ending" else of(name, value)
-            )
-            integrator._watch().look = lambda: None
-        for _ in range(3):
-            integrator.step(7)
-        ends.append(state_of(context))
-    np.testing.assert_array_equal(*ends)
 
 
 def test_light_is_the_limit_and_no_smaller_speed():

@@ -7,7 +7,6 @@ import openmm
 import pytest
 from openmm_systems import (
     context_of,
-    dumbbell,
     started,
     water_box,
 )
@@ -39,13 +38,6 @@ def test_rows_of_a_system():
     assert rows.name(9) == "constraint 9 of the System (particles 5 and 9, 0.2 nm)"
     x = np.random.default_rng(0).normal(size=(13, 3))
     assert rows.rank(x) == 10
-
-
-def test_residuals_by_hand():
-    system, x, _ = dumbbell(length=0.1)
-    rows = SystemRows.of(system)
-    np.testing.assert_allclose(rows.stretches(x + np.array([[0, 0, 0], [0.001, 0, 0]])), [0.01])
-    np.testing.assert_allclose(rows.speeds(x, np.array([[1.0, 0, 0], [0, 1, 0]])), [-1.0])
 
 
 @pytest.mark.parametrize("kind", [ProjectedIntegrator, openmm.VerletIntegrator])
