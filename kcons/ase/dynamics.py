@@ -37,7 +37,7 @@ from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed, require_stepper
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, NoseHooverChain
-from kcons.thermostats.barostats import in_cell
+from kcons.thermostats.barostats import Barostat, ConstantPressure, in_cell
 from kcons.thermostats.monte_carlo import POTENTIAL
 
 #: Steps longer than this are asked about: 20 fs, above which no motion of molecules at room temperature is followed.
@@ -99,6 +99,8 @@ class ConstrainedDynamics(MolecularDynamics):
     _calculators: tuple[Any, ...] = ()
     #: Equal parts of a step in which the atoms move.
     _parts = 1
+    #: What changes the cell, beside a stepper that keeps a temperature.
+    barostat: Barostat | None = None
 
     def __init__(
         self,
@@ -223,7 +225,7 @@ class ConstrainedDynamics(MolecularDynamics):
     @property
     def _mover(self) -> Stepper:
         """What makes the steps."""
-        return self.stepper
+        return self.stepper if self.barostat is None else ConstantPressure(self.stepper, self.barostat)
 
     # -- steps ----------------------------------------------------------------------------------
 

@@ -116,19 +116,17 @@ class PressureReporter:
 
     @property
     def _axes(self) -> NDArray[np.bool_]:
-        barostat = getattr(self.dynamics, "barostat", None)
+        barostat = self.dynamics.barostat
         return np.ones(3, dtype=bool) if barostat is None else barostat.strains.axes
 
     def _system(self) -> tuple[AtomsSystem, BarostatBodies | None]:
         dynamics, motion = self.dynamics, self.dynamics.motion
         if self._known is None or self._known[0] is not motion:
             system = AtomsSystem(dynamics, motion)
-            barostat, pieces = getattr(dynamics, "barostat", None), None
-            if self.virial != "atomic":
-                x = dynamics.atoms.arrays["positions"]
-                if barostat is None:
-                    pieces = find_pieces(system, x, self._axes, None, "refuse", dynamics.time)
-                else:
-                    pieces = barostat.pieces(dynamics._systems(), x, dynamics.time)
+            x, barostat, pieces = dynamics.atoms.arrays["positions"], dynamics.barostat, None
+            if self.virial != "atomic" and barostat is None:
+                pieces = find_pieces(system, x, self._axes, None, "refuse", dynamics.time)
+            elif self.virial != "atomic" and barostat is not None:
+                pieces = barostat.pieces(dynamics._systems(), x, dynamics.time)  # type: ignore[arg-type]
             self._known = motion, system, pieces
         return self._known[1:]

@@ -34,7 +34,7 @@ from kcons.thermostats import (
     NoseHooverChain,
     thermal_velocities,
 )
-from kcons.thermostats.barostats import Barostat, ConstantPressure, require_barostat
+from kcons.thermostats.barostats import Barostat, require_barostat
 from kcons.thermostats.freedom import Momentum
 from kcons.thermostats.monte_carlo import POTENTIAL
 
@@ -85,10 +85,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
         else:
             self._momenta = momenta
         self._state = begun
-
-    @property
-    def _mover(self) -> Stepper:
-        return self.stepper if self.barostat is None else ConstantPressure(self.stepper, self.barostat)
 
     def _made(self, motion: Motion) -> System:
         if self.barostat is None:

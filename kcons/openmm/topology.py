@@ -63,23 +63,11 @@ def snapshot_of(
     *,
     system: openmm.System | None = None,
     velocities: unit.Quantity | ArrayLike | None = None,
-    box: Any = None,
 ) -> Snapshot:
-    """Topology, positions, box of OpenMM; in nm.
+    """Topology, positions, box of OpenMM; in nm, plain velocities in nm/ps.
 
-    Parameters
-    ----------
-    system : openmm.System, optional
-        For masses and charges, and for the box if the Topology has none.
-    velocities : Quantity or array_like, optional
-        Plain numbers are in nm/ps.
-    box : box vectors, optional
-        In place of those of the Topology.
-
-    Raises
-    ------
-    InputError
-        No Topology; different numbers of atoms.
+    The System is for masses and charges, and for the box if the Topology has none. `InputError` for what is no
+    Topology, and for different numbers of atoms.
     """
     require_kind(topology, app.Topology, "topology", "an openmm.app.Topology, such as PDBFile(file).topology")
     atoms = list(topology.atoms())
@@ -115,22 +103,15 @@ def snapshot_of(
         bonds=sorted_pairs([(b[0].index, b[1].index) for b in topology.bonds()]),
         charges=charges,
     )
-    vectors = box if box is not None else topology.getPeriodicBoxVectors()
+    vectors = topology.getPeriodicBoxVectors()
     if vectors is None and system is not None and system.usesPeriodicBoundaryConditions():
         vectors = system.getDefaultPeriodicBoxVectors()
     cell = None if vectors is None else array(vectors, unit.nanometer, "box")
     # One angstrom on all sides is what files without a box say.
     if cell is not None and np.diag(cell).max() < 0.2:
         cell = None
-    return Snapshot(
-        described,
-        x,
-        ANGSTROM,
-        cell,
-        np.full(3, cell is not None),
-        None if velocities is None else array(velocities, unit.nanometer / unit.picosecond, "velocities"),
-        "OpenMM Topology",
-    )
+    v = None if velocities is None else array(velocities, unit.nanometer / unit.picosecond, "velocities")
+    return Snapshot(described, x, ANGSTROM, cell, np.full(3, cell is not None), v, "OpenMM Topology")
 
 
 def openmm_topology(snapshot: Snapshot) -> tuple[Any, unit.Quantity]:

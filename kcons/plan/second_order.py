@@ -429,14 +429,8 @@ class FlatBody:
 
     def renumbered(self, atoms: IntArray, rows: IntArray) -> FlatBody:
         """The same body where atom a is called atoms[a] and row k rows[k]."""
-        return replace(
-            self,
-            atoms=atoms[self.atoms],
-            rows=rows[self.rows],
-            bases=atoms[self.bases],
-            pairs=atoms[self.pairs],
-            tied=atoms[self.tied],
-        )
+        named = {name: atoms[getattr(self, name)] for name in ("atoms", "bases", "pairs", "tied")}
+        return replace(self, rows=rows[self.rows], **named)
 
 
 def find_flat_bodies(block: LocalRows) -> list[FlatBody]:

@@ -60,56 +60,43 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
     except (RecursionError, MemoryError):
         raise _too_large(formula, "is nested too deeply") from None
     _check_depth(formula, tree)
+
+    def wrong(part: str, what: str, item: str) -> InputError:
+        return InputError(f"Formula: {part} in {formula!r} {what}", item=item)
+
     found, called = set(), set()
     for node in ast.walk(tree):  # what contains something comes before it
         match node:
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
                 called.add(node.func)
                 if name not in FUNCTIONS or len(args) != 1 + (name == "atan2"):
-                    raise InputError(
-                        f"Formula: {ast.unparse(node)} in {formula!r} is no function of formulas; these are "
-                        f"{', '.join(sorted(FUNCTIONS))}, of one number each, atan2 of two",
-                        item=name,
-                    )
+                    known = f"{', '.join(sorted(FUNCTIONS))}, of one number each, atan2 of two"
+                    raise wrong(ast.unparse(node), f"is no function of formulas; these are {known}", name)
             case ast.Name(id=name):
                 known_as = _COORDINATE.fullmatch(name) or _SPEED.fullmatch(name)
                 if known_as and (speeds or name[0] != "v"):
                     found.add(int(known_as[1]))
                 elif known_as:
-                    raise InputError(
-                        f"Formula: {name!r} in {formula!r} is a velocity; what is linear in velocities is held by "
-                        "VelocityFormula",
-                        item=name,
-                    )
+                    held = "what is linear in velocities is held by VelocityFormula"
+                    raise wrong(repr(name), f"is a velocity; {held}", name)
                 elif name in FUNCTIONS and node not in called:
-                    raise InputError(
-                        f"Formula: {name} in {formula!r} is a function; write what it is of, as in {name}(x1)",
-                        item=name,
-                    )
+                    raise wrong(name, f"is a function; write what it is of, as in {name}(x1)", name)
                 elif name not in (*FUNCTIONS, *parameters, "t", "pi"):
                     places = "x1, y1, z1, x2, ..." + (", vx1, vy1, ..." if speeds else "")
                     known = ", ".join([places, "t", "pi", *parameters])
-                    raise InputError(
-                        f"Formula: {name!r} in {formula!r} is not known; known are {known}. Give it as a parameter: "
-                        f"parameters={{{name!r}: ...}}",
-                        item=name,
-                    )
+                    remedy = f"Give it as a parameter: parameters={{{name!r}: ...}}"
+                    raise wrong(repr(name), f"is not known; known are {known}. {remedy}", name)
             case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
                 if not value <= sys.float_info.max:
                     raise _too_large(formula, "has a number that is too large", "write it in other units")
-            case ast.UnaryOp(op=ast.USub() | ast.UAdd()):
-                pass
             case ast.BinOp(op=operation) if type(operation) in _OPERATIONS:
                 pass
-            case ast.operator() | ast.unaryop() | ast.expr_context():
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd()) | ast.operator() | ast.unaryop() | ast.expr_context():
                 pass
             case _:
                 hint = "; a power is written **" if isinstance(node, ast.BinOp) else ""
-                raise InputError(
-                    f"Formula: {ast.unparse(node)!r} in {formula!r} is not allowed; use + - * / **, numbers, names "
-                    f"and functions{hint}",
-                    item="formula",
-                )
+                allowed = f"use + - * / **, numbers, names and functions{hint}"
+                raise wrong(repr(ast.unparse(node)), f"is not allowed; {allowed}", "formula")
     undefined = undefined_part(tree, _PI)
     if undefined is not None:
         raise InputError(f"Formula: {undefined} in {formula!r:.200}; give numbers with a finite value", item="formula")

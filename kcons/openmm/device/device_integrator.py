@@ -148,10 +148,9 @@ class DeviceProgram(Program):
 
     def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
-        memory = {"memory": self.integrator.read("memory")}  # which makes the kernels if there are none yet
+        self.integrator.read("memory")  # makes the kernels if there are none yet
         self.made_under = self.integrator.conditions(self.integrator.context)
-        saved = [array.name for array in self.integrator.rows.arrays if array.saved]
-        return memory | {name: self.integrator.read(name) for name in saved}
+        return {name: self.integrator.read(name) for name in self.integrator.saved}
 
     def recall(self, values: Mapping[str, Any]) -> None:
         """Write what `remembered` gave back into the Context."""
@@ -177,8 +176,9 @@ class DeviceIntegrator(ProjectedIntegrator):
     """
 
     program: DeviceProgram
-    #: Rows of the Context, once they are known.
+    #: Rows of the Context, once they are known, and the arrays that belong to a state.
     rows: Any = None
+    saved: Sequence[str] = ()
     _seed = 0
     _described = ""
     _recorded: Sequence[int] = ()
@@ -458,9 +458,9 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
     positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
     box = np.array(given.box[:9]).reshape(3, 3)
     rows = part.rows_at(masses, pairs, lengths, positions, box if box.any() else None, given.time)
-    if integrator is not None:
-        integrator.rows = rows
     source, arrays, parts, sizes = plan(described, platform, masses, given.groups, rows)
+    if integrator is not None:
+        integrator.rows, integrator.saved = rows, [array.name for array in arrays if array.saved]
     compiled = str(build.kernels_library(source)) if platform in PLAIN else ""
     library.kcons_plan_source(made, source.encode(), compiled.encode(), *sizes)
     for array in arrays:

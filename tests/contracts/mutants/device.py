@@ -35,6 +35,7 @@ MUTANTS = {
         ('"there« && last→»"', "surfaces_on_the_device::the_device_holds_the_same_surfaces"),
     ],
     "openmm/device/device_integrator.py": [
+        ("array in «arrays→rows.arrays» if array.saved", "molecule_spheres::a_failure_puts_auxiliary_variables_back"),
         ("self._advance(context, again«→ - 1»)", "device_integrator::a_failure_leaves_the_state_before_the_step"),
         ("yield x, v, f, time + (k «+ 1→+ 0») * every * self", "device_integrator::records_are_the_states_after_steps"),
         ("part.left «!=→is None and» guard.context.getTime(", "kernel_rows::multipliers_are_summed_where_the_rows_are"),

@@ -25,6 +25,10 @@ MUTANTS = {
     ],
     "mdanalysis/check/constraint_check.py": [
         (
+            "«trajectory.ts = Timestep.from_timestep(trajectory.ts)→pass»",
+            "deviations::rows_that_were_made_for_a_part_are_refused",
+        ),
+        (
             ".half_step(universe.atoms.positions)«→.max()»",
             "mdanalysis/check/precision::a_wild_molecule_of_the_topology_excuses_no_other",
         ),

@@ -160,20 +160,21 @@ def barostat():
 @pytest.mark.parametrize(
     ("rows", "force", "words"),
     [
-        (Distance([[0, 3]]), barostat(), r"MonteCarloBarostat.*row #6 Distance\(0, 3\).*join=True"),
+        (Distance([[0, 3]]), barostat(), r"MonteCarloBarostat.*row #7 Distance\(0, 3\).*join=True"),
         (Plane([6], [0, 0, 1]), barostat(), "holds particles in space"),
         (Plane([6], [0, 0, 1]), openmm.CMMotionRemover(), "momentum is not conserved"),
         (
             Distance([[6, 7]]),
             openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False),
-            "let it scale molecules as rigid",
+            "rows are held, and MonteCarloFlexibleBarostat .*let it scale molecules as rigid",
         ),
     ],
     ids=["between molecules", "place", "momentum", "scaled atoms"],
 )
 def test_agents_that_break_rows_are_refused(rows, force, words):
     system, x = waters(2, force)
-    integrator = ProjectedIntegrator(0.001, parts=[hold(system, rows, x)])
+    part = hold(system, rows, x, take="all", keep_water=False)
+    integrator = ProjectedIntegrator(0.001, parts=[part])
     context = started(context_of(system, integrator), x)
     with pytest.raises(UnsupportedError, match=words):
         integrator.step(1)

@@ -180,7 +180,7 @@ def test_a_protein_goes_the_way_of_the_engine_on_arrays():
         state = stepper.step(arrays, state, 0.002)
     found, context = run(system, x, v, "CPU", 20, tolerance=1e-12)
     levels = [array for array in context.getIntegrator().rows.arrays if array.name == "rows_level"]
-    assert [len(array.values) - 1 for array in levels] == [12]
+    assert [len(array.values) - 1 for array in levels] == [11]
     assert np.abs(found - state.positions).max() < 1e-10
     assert np.abs(held.value(found) / held.scale).max() < 2e-12
 

@@ -8,7 +8,7 @@ from openmm_systems import masses_of, started, state_of
 
 from kcons import ConstraintSet, Motion, System, run
 from kcons.constraints import Distance
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import IsokineticSpheres, ProjectedIntegrator
 from kcons.openmm.device import build
 from kcons.openmm.device.clusters import Shape
@@ -137,6 +137,20 @@ def test_configurations_are_canonical_at_long_steps():
             now = state_of(context)[0]
             found.append(4 * stiffness * np.square((now[::2] + now[1::2]) / 2).sum() / (3 * n * GAS_CONSTANT))
         assert np.mean(found) == pytest.approx(300.0, abs=8.0)
+
+
+def test_a_failure_puts_auxiliary_variables_back():
+    system, x, v, _ = system_of()
+    bath = IsokineticSpheres(300.0, 1.0, spheres="split", auxiliary=2)
+    context = started(system, integrator := ProjectedIntegrator(0.002, ensemble=bath, device=True), x, v)
+    integrator.step(5)
+    integrator.check()
+    before = [*state_of(context), integrator.read("auxiliary")]
+    integrator.setStepSize(0.5 * openmm.unit.picosecond)
+    with pytest.raises(ConvergenceError, match="The Context is at step 5"):
+        integrator.step(20)
+    for now, then in zip([*state_of(context), integrator.read("auxiliary")], before, strict=True):
+        np.testing.assert_array_equal(now, then)
 
 
 def test_what_is_refused():
