@@ -17,15 +17,7 @@ from kcons.steppers.stepper import explained
 
 
 class ProjectedEquation:
-    """Velocity Verlet or the classical Runge-Kutta scheme on the projected equation of motion.
-
-    Parameters
-    ----------
-    order : {2, 4}
-        Verlet, with the velocity in b predicted, takes one force evaluation a step, Runge-Kutta four.
-    project : bool
-        Whether to project positions, along the gradients at the start, and velocities after each step.
-    """
+    """Velocity Verlet (order 2) or Runge-Kutta (4) on the projected equation; with `project`, each is projected."""
 
     reversible = False
     symplectic = False

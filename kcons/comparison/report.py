@@ -197,15 +197,8 @@ def figure(table: pd.DataFrame, width: float = 9.0) -> Figure:
     for engine, rows in done.groupby("engine", sort=False):
         best = pareto(rows, cost)
         look: dict[str, Any] = {"linewidth": 9, "alpha": 0.5, "solid_capstyle": "round", "marker": "o", "markersize": 8}
-        axes.plot(
-            best[cost],
-            best.error,
-            color=BANDS[str(engine)],
-            markeredgewidth=0,
-            label=f"front, {engine}",
-            zorder=0,
-            **look,
-        )
+        look |= {"color": BANDS[str(engine)], "markeredgewidth": 0, "zorder": 0, "label": f"front, {engine}"}
+        axes.plot(best[cost], best.error, **look)
     curves = chosen_curves(table)
     for k, name in enumerate(curves):
         rows = done[done.method == name]

@@ -242,12 +242,13 @@ def make_plan(
         if shape.kind == "SingleRows" and rank < shape.rows.size:
             shape = replace(shape, kind="SparseRows")
         alone = shape.independent or shape.kind == "SingleRows"
-        clusters = [] if alone else _by_cluster(shape.rows.ravel(), labels)
-        sizes = [len(rows) for rows in clusters] or [0]
         sparse = shape.kind in ("SparseDistances", "SparseRows")
-        if (sparse or rank < shape.rows.size) and max(sizes) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL:
+        asked = not alone and (sparse or rank < shape.rows.size)
+        clusters = _by_cluster(shape.rows.ravel(), labels) if asked else []
+        sizes = [len(rows) for rows in clusters] or [0]
+        if asked and max(sizes) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL:
             marked = _mark_dependent_rows(plan, clusters, positions, time)
-            if sparse and clusters:
+            if sparse:
                 # The pivots of an order that knows nothing of dependence say less.
                 seen, rank = rank, marked
                 if seen < rank and shape.kind == "SparseRows":

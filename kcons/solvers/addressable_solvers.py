@@ -260,12 +260,8 @@ def packed_positions(x, x_ref, v, inv_dt, tables):
     pinned, places = at_piece(u, h, _PINNED), at_piece(t, h, _PLACES)
     for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
         store_double(x, 3 * load_index(pinned, k // 3) + k % 3, load_double(places, k))
-    words, lattice, kind, none = (
-        table_array(h, h, _SOLVERS),
-        lattice_piece(t, h, _CELL),
-        h[h[2 * _KIND]],
-        _borrowed(0, 0),
-    )
+    words, none = table_array(h, h, _SOLVERS), _borrowed(0, 0)
+    lattice, kind = lattice_piece(t, h, _CELL), h[h[2 * _KIND]]
     most = 0
     for k in range(0, words.size, WORDS):
         mine, numbers = _arrays(words, k)
@@ -302,12 +298,8 @@ def packed_tangents(x, v, tables):
     pinned = at_piece(u, h, _PINNED)
     for k in range(3 * (h[2 * _PINNED + 1] - h[2 * _PINNED])):
         store_double(v, 3 * load_index(pinned, k // 3) + k % 3, 0.0)
-    words, lattice, kind, none = (
-        table_array(h, h, _SOLVERS),
-        lattice_piece(t, h, _CELL),
-        h[h[2 * _KIND]],
-        _borrowed(0, 0),
-    )
+    words, none = table_array(h, h, _SOLVERS), _borrowed(0, 0)
+    lattice, kind = lattice_piece(t, h, _CELL), h[h[2 * _KIND]]
     for k in range(0, words.size, WORDS):
         mine, numbers = _arrays(words, k)
         if not _call_solve(words[k + 1], (False, v, x, v, 0.0, none, lattice, kind, mine, numbers))[0]:

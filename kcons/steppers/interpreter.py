@@ -425,8 +425,11 @@ class Interpreter:
         if self.shift is not None:
             x = self.x + self.shift
             remainder = self.x - (x - self.shift)
-        elif self.room[FAR]:
-            remainder = np.zeros_like(x) if self.low is None else self.low.copy()
+        else:
+            if not x.flags.writeable:  # lent to a function, which may have kept it
+                x = x.copy()
+            if self.room[FAR]:
+                remainder = np.zeros_like(x) if self.low is None else self.low.copy()
         time, v, forces, variables = self.then, self.v, self.applied(here), self.variables()
         for array in (x, v, remainder, variables, None if system.force is None else forces):
             if array is not None:

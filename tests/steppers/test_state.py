@@ -121,7 +121,7 @@ def test_what_is_no_motion_or_force_and_energy_without_a_potential() -> None:
         assert caught.value.item == item
     with pytest.raises(InputError, match=r"constraint_set is None; give a kcons\.ConstraintSet"):
         Motion(None, np.zeros((2, 3)))
-    with pytest.raises(InputError, match="constraints is None; give"):
+    with pytest.raises(InputError, match=r"constraints has None, .* see kcons"):
         ConstraintSet(None, np.zeros((2, 3)), np.ones(2))
 
 

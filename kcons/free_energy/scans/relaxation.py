@@ -77,11 +77,11 @@ class Internals:
         self._images = [lined_up(x[atoms], lattice) - x[atoms] for atoms in self._tables]
         self._frames = self._sideways(x)
         constants = [
-            strength * math.prod((close[*table[:, k : k + 2].T] for k in range(table.shape[1] - 1)), start=1.0)
-            for strength, table in zip((STRETCH / units.Bohr**2, BEND, TURN, BEND), self._tables, strict=True)
+            math.prod((close[*table[:, k : k + 2].T] for k in range(table.shape[1] - 1)), start=size) * units.Hartree
+            for size, table in zip((STRETCH, BEND, TURN, BEND), self._tables, strict=True)
         ]
         #: In eV and angstrom or radian; and the atoms of each.
-        self.constants: FloatArray = units.Hartree * np.concatenate([*constants, constants[-1]])
+        self.constants: FloatArray = np.concatenate([constants[0] / units.Bohr**2, *constants[1:], constants[3]])
         self.terms = [tuple(row) for item in self._families for row in item.atoms.tolist()]
         # The two directions across a straight angle are those of this structure alone.
         self.terms += [(*row, -1, side) for side in (0, 1) for row in straight.tolist()]

@@ -288,12 +288,8 @@ def evaluate(
             whole, change = 0.0, 0.0
             for p in range(slot, load_index(links, 4 * k + 6)):
                 i = 4 * load_index(slot_atoms, p)
-                c = quad(
-                    load_double(parameters, offset),
-                    load_double(parameters, offset + 1),
-                    load_double(parameters, offset + 2),
-                    0.0,
-                )
+                one, two = load_double(parameters, offset), load_double(parameters, offset + 1)
+                c = quad(one, two, load_double(parameters, offset + 2), 0.0)
                 _put(lines, 8 * p + which, extract(c, 0), extract(c, 1), extract(c, 2))
                 whole += dot(c, load_quad(base, i) - load_quad(moved, 4 * p))
                 change += dot(c, load_quad(moves, i))
