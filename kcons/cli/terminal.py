@@ -49,7 +49,10 @@ class Command(NamedTuple):
 
 
 def numbers(text: str) -> list[float]:
-    return [float(word) for word in names(text)]
+    try:
+        return [float(word) for word in names(text)]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 4,2,1") from None
 
 
 def names(text: str) -> list[str]:

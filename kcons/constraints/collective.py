@@ -85,7 +85,7 @@ class CenterOfMass(MassWeighted, LinearRows):
         pass
 
     def parameters(self) -> FloatArray:
-        return (self.weights()[:, :, None] * self.directions[:, None]).reshape(self.n_rows, -1)
+        return (self.weights()[:, :, None] * self.directions[:, None]).reshape(self.n_rows, 3 * self.width)
 
 
 class CenterDistance(MassWeighted):

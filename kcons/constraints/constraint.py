@@ -15,6 +15,7 @@ Both are differentiated to A a = b (notes eqs. 81-92): A_k is `gradient`, and
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Self
@@ -279,8 +280,9 @@ class Constraint:
 
     def parameters(self) -> FloatArray:
         """Numbers for `row` and the compiled kernels, shape (n_rows, p): the width, where `alike`, and the data."""
-        data = [getattr(self, name).reshape(self.n_rows, -1) for name in self.per_row]
-        return np.hstack([np.full((self.n_rows, min(self.alike, 1)), float(self.width)), *data])
+        data = [getattr(self, name) for name in self.per_row]
+        flat = [array.reshape(self.n_rows, math.prod(array.shape[1:])) for array in data]
+        return np.hstack([np.full((self.n_rows, min(self.alike, 1)), float(self.width)), *flat])
 
     @property
     def linked(self) -> IntArray:

@@ -352,7 +352,7 @@ def _refuse_coincident(item: Constraint, r: FloatArray, first_row: int, slots: S
     """Two atoms at one point leave a direction undefined."""
     for i, j in slots:
         item.refuse(
-            np.all(r[:, i] == r[:, j], axis=1),
+            norm(r[:, i] - r[:, j]) == 0,
             first_row,
             lambda k, i=i, j=j: (  # type: ignore[misc]
                 f"atoms {item.atoms[k, i]} and {item.atoms[k, j]} coincide: gradient undefined; move them apart"

@@ -42,7 +42,7 @@ class LinearRows(Constraint, base=True):
         return np.zeros(self.n_rows)
 
     def parameters(self) -> FloatArray:
-        return self.coefficients.reshape(self.n_rows, -1)
+        return self.coefficients.reshape(self.n_rows, 3 * self.width)
 
 
 class LinearCombination(LinearRows):

@@ -22,6 +22,7 @@ from kcons.constraints import (
     DistanceDifference,
     Ellipsoid,
     FixedAtoms,
+    Formula,
     KnifeEdge,
     Line,
     LinearCombination,
@@ -314,6 +315,7 @@ SINGULAR = [
     (Distance([[2, 3], [0, 1]]), COINCIDENT, r"row 1, Distance\(0, 1\): atoms 0 and 1 coincide: gradient undefined"),
     (Angle([0, 1, 2]), COINCIDENT, "row 0, Angle.*: atoms 0 and 1 coincide"),
     (Dihedral([2, 0, 1, 3]), COINCIDENT, "row 0, Dihedral.*: atoms 0 and 1 coincide"),
+    (Dihedral([2, 0, 1, 3]), np.array([ORIGIN, [1e-200, 0, 0], UP, [0, 1, 0]]), "atoms 0 and 1 coincide"),
     (DistanceDifference([[2, 0], [0, 1]]), COINCIDENT, "row 0, .*: atoms 0 and 1 coincide"),
     # |ab| + |bc| - |ac| is 0 on a line, and least there.
     (DistanceDifference([[0, 1], [1, 2], [0, 2]], weights=[1, 1, -1]), LINE, "vanishes"),
@@ -341,6 +343,16 @@ def test_undefined_gradients_are_refused(item, x, words):
     with pytest.raises(SingularGeometryError, match=words) as caught:
         ConstraintSet(item, x, np.ones(len(x)))
     assert set(caught.value.atoms) <= set(item.atoms.ravel().tolist())
+
+
+FORMULA = Formula("k*(x1 - x2)", [[0, 1]], {"k": 2.0})
+
+
+@pytest.mark.parametrize("item", [*(item for item, _, _ in SINGULAR), FORMULA, FixedAtoms(0)], ids=lambda i: i.family)
+def test_no_rows_hold_nothing(item):
+    held = ConstraintSet(item.select(np.zeros(0, np.int64)), CROSS, np.ones(len(CROSS)))
+    assert held.value(CROSS).shape == held.acceleration_target(CROSS, CROSS).shape == (0,)
+    assert held.jacobian(CROSS).shape == (0, 3 * len(CROSS))
 
 
 DIFFERENCE = DistanceDifference(TRANSFER).todict()

@@ -284,7 +284,7 @@ class Mixture:
             if not (np.all(np.isfinite(terms)) and np.all(np.isfinite(p.x))):
                 return math.nan
             more = math.fsum([*p.x, -total])
-            over = (1.0 + more / total) * math.log1p(more / total) - more / total
+            over = (1.0 + more / total) * np.log1p(more / total) - more / total
             return self.kT * math.fsum([*terms, -total * over, a * more])
 
 

@@ -163,6 +163,11 @@ def test_excess_off_the_total_is_that_of_the_actual_sum():
     assert plain == pytest.approx(0.7 * rel_entr(x, np.exp(mixture.equilibrium(x.sum()))).sum(), rel=1e-12)
 
 
+def test_excess_of_species_that_are_all_extinct_is_no_number():
+    p = Populations.from_logarithms(0.0, np.full(3, -800.0))
+    assert np.isnan(Mixture([0.1, 0.2, 0.3]).excess(p, 1.0))  # as trial steps find it, which are then rejected
+
+
 def test_potentials_are_the_gradient_of_the_excess():
     mixture, x = Mixture(MU0, 0.7), np.array([0.3, 0.2, 0.4, 0.1, 0.05])
     p = Populations.from_values(0.0, x)
