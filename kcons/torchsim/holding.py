@@ -221,7 +221,7 @@ def hold(
         options.setdefault("guess_bonds", True)  # a state has none
     holding = Holding(kinds[0], **options) if words else None
     marked = _fixed_atoms(state)
-    if holding is None and not objects and not marked.any():
+    if holding is None and not any(item.n_rows for item in objects) and not marked.any():
         raise InputError("nothing is to be held; give names or constraints", item="constraints")
     known: dict[tuple[bytes, ...], tuple[Motion, FloatArray]] = {}
     found = []
@@ -291,8 +291,8 @@ def _bound(rows: Sequence[Constraint], snapshot: Snapshot, project: bool, eps: f
         return motion, motion.restore_positions(x)
     found = held.residuals(x)
     excess = np.abs(found.sigma) / np.maximum(START_TOLERANCE * held.scale, eps / np.finfo(float).eps * found.allowed)
-    row = int(np.argmax(excess))
-    if excess[row] > 1:
+    if excess.max(initial=0.0) > 1:
+        row = int(np.argmax(excess))
         raise InputError(
             f"positions are off {held.row_name(row)} by {abs(found.sigma[row]):.6g}; pass project=True to bring them "
             "there",

@@ -30,6 +30,7 @@ def held(n=2):
         ("water", {"water_geometry": "tip9p"}, "no water model"),
         ("allbonds", {"bonds": [[0, 99]]}, "99"),
         ([], {}, "nothing is to be held"),
+        ([Distance(np.zeros((0, 2), int))], {}, "nothing is to be held"),
         ([Distance([0, 40])], {}, "40"),
         ([Distance([0, 1], [2.0])], {}, "project=True"),
         ([3.0], {}, "constraints of kcons.constraints"),
@@ -42,6 +43,13 @@ def test_bad_input_is_named_and_leaves_the_state(constraints, options, says):
     with pytest.raises(InputError, match=says):
         hold(state, constraints, **options)
     assert state.constraints == [] and torch.equal(state.positions, x)
+
+
+def test_fixed_atoms_of_one_system_leave_the_others_free():
+    state = ts.concatenate_states([drop(1), drop(1, 1)])
+    state.constraints = ts.constraints.FixAtoms([0, 1])
+    held = hold(state, [])
+    assert held.get_removed_dof(state).tolist() == [6, 0]
 
 
 def test_the_system_is_named():
