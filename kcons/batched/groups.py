@@ -51,6 +51,8 @@ def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
     parameters: list[FloatArray] = []
     offsets: list[FloatArray] = []
     for item, start in zip(held.constraints, held.starts, strict=False):
+        if not item.n_rows:
+            continue
         function = None if item.fixes_atoms else row_function(item)
         table = item.parameters().reshape(item.n_rows, -1)
         whole = np.zeros(item.n_rows, bool) if item.whole is None else item.whole

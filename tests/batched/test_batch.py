@@ -10,6 +10,7 @@ import torch
 from kcons import ConstraintSet, Motion
 from kcons.batched import Batch, gbaoab, rattle
 from kcons.constraints import (
+    Angle,
     CenterDistance,
     Custom,
     CustomVelocity,
@@ -47,6 +48,15 @@ def test_shapes_follow_what_is_given():
     lengths = torch.tensor([1.0, 1.0, 1.6], dtype=torch.float64)
     other = batch.project_positions(flat, x, targets=lengths)
     assert ((other[1::3] - other[::3]).norm(dim=1) - 1).abs().max() < 1e-14
+
+
+@pytest.mark.parametrize("cell", [None, 9.0 * np.eye(3)])
+def test_constraints_of_no_rows_hold_nothing(cell):
+    items = [Distance(np.zeros((0, 2), int)), Distance(PAIRS), Angle(np.zeros((0, 3), int))]
+    batch = Batch(Motion(ConstraintSet(items, WATER, MASSES, cell=cell), WATER))
+    x = torch.as_tensor(WATER)
+    there = moved(batch, x)
+    assert torch.equal(batch.project_positions(there, x), Batch(water(cell=cell)).project_positions(there, x))
 
 
 def test_a_failure_names_copy_and_row_when_it_is_looked_for():

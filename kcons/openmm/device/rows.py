@@ -177,6 +177,8 @@ class DeviceRows:
         atoms: list[IntArray] = []
         rows: list[Row] = []
         for item, start in zip(held.constraints, held.starts, strict=False):
+            if not item.n_rows:
+                continue
             self.parameters += list(item.parameters().reshape(item.n_rows, -1))
             atoms += list(item.atoms)
             number = -1 if item.fixes_atoms else known.setdefault(function_on_device(item), len(known))

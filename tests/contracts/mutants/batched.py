@@ -9,6 +9,7 @@ MUTANTS = {
         ("[which] * s[beside], alpha=«-1→1»)", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
     ],
     "batched/groups.py": [
+        ("if «not item.n_rows→False»:", "batched/batch::constraints_of_no_rows_hold_nothing"),
         ("sums = «-→+»torch.round(", "batched/against_the_engine::rows_take_the_images_that_the_engine_takes"),
     ],
     "batched/row_functions.py": [

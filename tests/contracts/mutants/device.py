@@ -8,6 +8,7 @@ MUTANTS = {
         ("scale = 1+(1«-→+»cosine)*twice/2;", "molecule_spheres::trajectories_are_those_on_arrays"),
     ],
     "openmm/device/rows.py": [
+        ("if «not item.n_rows→False»:", "rows::constraints_of_no_rows_hold_nothing"),
         (
             "part._engine._integrator = «weakref.ref(integrator)→other»",
             "kernel_rows::states_with_energies_of_rows_of_hold_that_move",

@@ -78,6 +78,17 @@ def test_functions_of_python_are_refused_with_the_remedy(name):
         DeviceRows(MASSES, NONE, [item], positions=scattered(7), time=TIME)
 
 
+def test_constraints_of_no_rows_hold_nothing():
+    x, masses, items = chain_of(5, True)
+    d = 1e-3 * np.random.default_rng(0).normal(size=x.shape)
+    found = []
+    for some in (items, [Distance(np.zeros((0, 2), int)), *items, Plane([], [0, 0, 1.0])]):
+        plain, start, w = held(some, x, masses)
+        found.append(plain.positions(start, d, w, STEP, TIME))
+    np.testing.assert_array_equal(*found)
+    assert not DeviceRows(masses, NONE, [Distance(np.zeros((0, 2), int))], positions=x).shapes
+
+
 def test_what_else_is_refused():
     assert refused([Distance([[0, 1]])]) == ""
     assert "not held on the device" in refused([object()])
