@@ -75,8 +75,8 @@ COMMANDS = (
     Command(
         "check",
         "how well a trajectory of any engine kept its constraints",
-        "Judged by the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a "
-        "file that ends too early, or has a NaN.",
+        "How far each constraint was from its target, judged by the precision of the file. Exit status 0: kept; 1: "
+        "violated; 2: wrong use; 3: incomplete, such as a file that ends too early, or has a NaN.",
         (
             Option("trajectory", "any trajectory that MDAnalysis reads", type=Path),
             Option("--topology", "any topology that MDAnalysis reads", type=Path, required=True),

@@ -33,7 +33,7 @@ def check_name(chosen: argparse.Namespace) -> None:
 
     known, name = ", ".join(test_systems.SYSTEMS), chosen.system
     if name is None:
-        raise InputError(f"name a test system: {known}; or a PDB file", item="system")
+        raise InputError(f"name a test system: {known}; or give a file", item="system")
     if test_systems.is_file(name):
         if not Path(name).is_file():
             raise InputError(f"there is no file {name}", item="system")
@@ -41,7 +41,7 @@ def check_name(chosen: argparse.Namespace) -> None:
             raise InputError("a file has the size it has; leave --size out", item="size")
     elif name not in test_systems.SYSTEMS:
         said = f"there is no test system {name!r}{did_you_mean(name, test_systems.SYSTEMS)}"
-        raise InputError(f"{said}; there are {known}; or give a PDB file", item="system")
+        raise InputError(f"{said}; there are {known}; or give a file", item="system")
 
 
 def molecules(chosen: argparse.Namespace) -> dict[str, Any]:
@@ -157,7 +157,9 @@ def _asks_for_averages(chosen: argparse.Namespace) -> bool:
     thermal, bad = two or chosen.criterion == "temperature", target is not None and not 0 < target < inf
     other = "--slow and --fast" if two else "--criterion temperature"
     lost = [name for name in NOT_WITH_CHEAP_FORCES if two and getattr(chosen, name) not in (None, "temperature")]
+    poor = chosen.budget is not None and not 0 < chosen.budget < inf
     for item, wrong, said in (
+        ("budget", poor, f"--budget is {chosen.budget}; give a positive number of seconds"),
         ("dt", chosen.dt == [], "--dt is empty; give time steps such as --dt 4,2,1"),
         ("target_error", bad, f"--target-error is {target}; give a positive number such as 1e-6"),
         ("criterion", thermal and target is not None, f"--target-error is an error of trajectories; leave {other} out"),
@@ -291,7 +293,7 @@ COMMANDS = (
     Command(
         "plan",
         "clusters, rank, degrees of freedom and the solver picked for each kind of cluster",
-        "What the engine will do for a system, before any run.",
+        "What the engine will do for a system, before any run. Files take --constrain, --coordinates, --select only.",
         SYSTEM,
         _plan,
     ),

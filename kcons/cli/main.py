@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from kcons import __version__
 from kcons.cli import check, compare, free_energy, machine
 from kcons.cli.terminal import Terminated, drop_what_follows, in_order
-from kcons.errors import KconsError, with_extra
+from kcons.errors import KconsError, did_you_mean, with_extra
 
 COMMANDS = (*compare.COMMANDS, *check.COMMANDS, *free_energy.COMMANDS, *machine.COMMANDS)
 
@@ -44,8 +44,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
-    parser, _ = parsers()
-    chosen = parser.parse_args(arguments)
+    parser, commands = parsers()
+    chosen, unknown = parser.parse_known_args(arguments)
+    if unknown:  # argparse would show the usage of kcons, not that of the command
+        mine = commands.get(chosen.command, parser)
+        names = [option.name for command in COMMANDS if command.name == chosen.command for option in command.options]
+        near = did_you_mean(unknown[0].partition("=")[0], names)
+        mine.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
     if chosen.command is None:
         parser.print_help()
         return 0

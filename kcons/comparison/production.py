@@ -97,9 +97,10 @@ def sentence(rows: Sequence[Mapping[str, Any]], unit: str, kelvin: float = 300.0
     doubt = next((row for row in rows if not known(row)), None)
     if doubt is not None and (not good or doubt["setting"] > good[-1]):
         before = f"A step of {good[-1]:g} {unit} is right for averages at {kelvin:g} K; at" if good else "At"
+        known_to = float(f"{200 * _worst(doubt)[2]:.2g}")  # 140, not 1.4e+02
         return (
             f"{before} {doubt['setting']:g} {unit} the temperature of configurations is known to "
-            f"{200 * _worst(doubt)[2]:.2g} % only (two standard errors): give a larger --budget to know it to "
+            f"{known_to:g} % only (two standard errors): give a larger --budget to know it to "
             f"{100 * RIGHT:g} %."
         )
     last = rows[-1]

@@ -94,7 +94,7 @@ def test_mistakes_give_one_line_and_status_2(words, text, capsys, tmp_path):
     ("words", "meant"),
     [
         ("comapre water", "invalid choice: 'comapre'"),
-        ("compare water --metods rattle", "unrecognized arguments: --metods rattle"),
+        ("compare water --metods rattle", "unrecognized arguments: --metods rattle (did you mean '--methods'?)"),
         ("compare water --constrain hbond", "invalid choice: 'hbond'"),
         ("compare chain --dt a,b", "'a,b' is no list of numbers such as 4,2,1"),
         ("compare --size x", "invalid int value"),

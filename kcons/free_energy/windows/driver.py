@@ -168,7 +168,7 @@ class FreeEnergy:
         titles += [f"dF/d {name}" for name in self.names] if len(self.names) > 1 else ["dF/dq"]
         titles += ["raw multiplier", "independent samples", "p of both sides"]
         made = Table(*(Column(title, justify="right") for title in titles))
-        made.title = f"mean force (kJ/mol by {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})"
+        made.title = f"mean force (kJ/mol per {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})"
         for window in self.windows:
             shown = [np.degrees(q) if angle else q for q, angle in zip(window.value, self.angles, strict=True)]
             mark = "!" if window.p_value < UNLIKELY else ""

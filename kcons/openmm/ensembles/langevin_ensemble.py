@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 
 import openmm
@@ -116,6 +116,38 @@ def _loops(operations: Sequence[Operation], fastest: str) -> Iterator[tuple[Sequ
                 yield block, 1
 
 
+def by_group(steps: Mapping[int, int]) -> dict[int, int]:
+    """Steps of each force group of OpenMM; `InputError` for what is no such group."""
+    try:
+        steps = dict(steps)
+    except (TypeError, ValueError):
+        raise InputError("steps must name each force group, as {0: 1, 1: 4}", item="steps") from None
+    for group in steps:
+        if isinstance(group, bool) or not isinstance(group, int) or not 0 <= group < 32:
+            raise InputError(f"force group {group!r} is no number from 0 to 31", item="steps")
+    return steps
+
+
+def refuse_other_groups(integrator: Integrator, context: openmm.Context, steps: Iterable[tuple[int, int]]) -> None:
+    """Refuse groups with a number of steps that do not act, and forces of others, which nobody would compute."""
+    known, carried = dict(steps), frozenset[int]().union(*(part.groups for part in integrator.parts))
+    idle = set(known) - groups_in(integrator)
+    if idle:
+        raise InputError(
+            f"force group {min(idle)} is left out by setIntegrationForceGroups, and steps give it "
+            f"{known[min(idle)]}: all groups in steps act; take those forces out of the System",
+            item="steps",
+        )
+    for force in context.getSystem().getForces():
+        left = groups_of(force) - set(known) - carried
+        if left:
+            raise InputError(
+                f"{type(force).__name__} is in force group {min(left)}, which has no number of steps; "
+                f"there are {', '.join(map(str, known))}",
+                item="steps",
+            )
+
+
 class LangevinRespa(Langevin):
     """Langevin dynamics with several time steps, for `ProjectedIntegrator(timestep, ensemble=...)`.
 
@@ -157,13 +189,7 @@ class LangevinRespa(Langevin):
         slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(temperature, friction)
-        try:
-            steps = dict(steps)
-        except (TypeError, ValueError):
-            raise InputError("steps must name each force group, as {0: 1, 1: 4}", item="steps") from None
-        for group in steps:
-            if isinstance(group, bool) or not isinstance(group, int) or not 0 <= group < 32:
-                raise InputError(f"force group {group!r} is no number from 0 to 31", item="steps")
+        steps = by_group(steps)
         levels = levels_of({str(group): count for group, count in steps.items()})
         if len(levels) < 2:
             raise InputError(f"steps are of {len(levels)} force group; give two or more, or use Langevin", item="steps")
@@ -184,30 +210,14 @@ class LangevinRespa(Langevin):
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse groups that do not act, and virtual sites, which are placed at the end of a step only."""
-        steps = dict(self.steps)
-        idle = set(steps) - groups_in(integrator)
-        if idle:
-            raise InputError(
-                f"force group {min(idle)} is left out by setIntegrationForceGroups, and steps give it "
-                f"{steps[min(idle)]}: all groups in steps act; take those forces out of the System",
-                item="steps",
-            )
-        self.verify(integrator)
+        refuse_other_groups(integrator, context, self.steps)
         system = context.getSystem()
         if any(system.isVirtualSite(k) for k in range(system.getNumParticles())):
             raise UnsupportedError(f"{self!r} has no virtual sites: they are placed at the end of a step; use Langevin")
 
     def verify(self, integrator: Integrator) -> None:
-        """Refuse forces of other groups, which nobody would compute: a Context takes a new group at once."""
-        steps = dict(self.steps)
-        for force in integrator.context.getSystem().getForces():
-            left = groups_of(force) - set(steps)
-            if left:
-                raise InputError(
-                    f"{type(force).__name__} is in force group {min(left)}, which has no number of steps; "
-                    f"there are {', '.join(map(str, steps))}",
-                    item="steps",
-                )
+        """Refuse forces of other groups: a Context takes a new group at once."""
+        refuse_other_groups(integrator, integrator.context, self.steps)
 
     # -- program --------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ from openmm import unit
 
 from kcons.constraints.arguments import positive
 from kcons.errors import UnsupportedError
+from kcons.openmm.ensembles.langevin_ensemble import by_group, refuse_other_groups
 from kcons.openmm.integrator.program import Ensemble, Integrator, Program
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Operation
@@ -60,6 +61,7 @@ class IsokineticSpheres(Ensemble):
     friction: float
     spheres: Literal["split", "axes", "cluster"]
     auxiliary: int
+    steps: tuple[tuple[int, int], ...] | None
 
     def __init__(
         self,
@@ -79,7 +81,7 @@ class IsokineticSpheres(Ensemble):
         self._keep(
             temperature=positive(kelvins(temperature), "temperature"),
             friction=number(friction, unit.picosecond**-1, "friction"),
-            steps=None if steps is None else tuple(dict(steps).items()),
+            steps=None if steps is None else tuple(by_group(steps).items()),
             spheres=spheres,
             auxiliary=auxiliary,
             substeps=substeps,
@@ -115,9 +117,16 @@ class IsokineticSpheres(Ensemble):
             raise UnsupportedError(f"{self!r} is made by kernels: give device=True, or take LangevinRespa")
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
-        """Refuse targets that move."""
+        """Refuse targets that move, and forces of groups without a number of steps."""
         if any(part.driven for part in integrator.parts):
             raise UnsupportedError(f"{self!r} needs constant targets; use Langevin")
+        if self.steps is not None:
+            refuse_other_groups(integrator, context, self.steps)
+
+    def verify(self, integrator: Integrator) -> None:
+        """Refuse forces that got another group in the run."""
+        if self.steps is not None:
+            refuse_other_groups(integrator, integrator.context, self.steps)
 
     def settings(self) -> dict[str, float]:
         return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}

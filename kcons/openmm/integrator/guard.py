@@ -764,7 +764,7 @@ class Guard:
                 atom=atom,
                 step=step,
             )
-        except (ConvergenceError, NonFiniteError) as error:
+        except (ConvergenceError, InputError, NonFiniteError) as error:
             self._go_back(error)
             raise
 

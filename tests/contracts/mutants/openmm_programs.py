@@ -21,6 +21,10 @@ MUTANTS = {
         ),
         ("«self._left == self._place(context)→True»", "steps::change_of_the_box"),
         (
+            "except (ConvergenceError, «InputError, →»NonFiniteError) as",
+            "langevin_ensemble::a_force_that_gets_another_group_before_an_explosion_leaves_the_state_that_was_checked",
+        ),
+        (
             "rows = replace(rows, «lengths=given, others=given→others=given»)",
             "system_checks::lengths_of_rigid_water_are_compared_with_those_of_the_system",
         ),
@@ -106,6 +110,12 @@ MUTANTS = {
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         ('(name, «f"{name}_last"→name», "the', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),
+    ],
+    "openmm/ensembles/spheres_ensemble.py": [
+        (
+            "if «self.steps is not None→False»:\n            refuse_other_groups(integrator, integrator.context",
+            "molecule_spheres::forces_of_groups_without_a_number_of_steps_are_refused",
+        ),
     ],
     "openmm/integrator/projected.py": [
         ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),

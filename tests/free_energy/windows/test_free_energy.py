@@ -139,7 +139,7 @@ def test_a_formula_has_its_own_unit(sampled, tmp_path):
     """Of OpenMM it is in nm, and nobody knows whether it is a length."""
     sampled.angles = (None,)
     text = rendered(sampled.table())
-    assert "torsion (own unit)" in text and "kJ/mol by own unit" in text and "angstrom" not in text
+    assert "torsion (own unit)" in text and "kJ/mol per own unit" in text and "angstrom" not in text
     (_, columns, _) = sampled.write(tmp_path)
     assert columns.read_text().startswith("torsion (own unit),F")
 

@@ -177,3 +177,15 @@ def test_a_force_that_gets_another_group_in_a_run_is_noticed_at_the_next_check()
     with pytest.raises(InputError, match=r"CustomExternalForce is in force group 7.*back at step 5"):
         integrator.step(5)
     np.testing.assert_array_equal(state_of(context), kept)
+
+
+def test_a_force_that_gets_another_group_before_an_explosion_leaves_the_state_that_was_checked():
+    system, x, v = trapped()
+    integrator = ProjectedIntegrator(1e-3, check_every=1000, ensemble=LangevinRespa(300, 1.0, TWO))
+    context = started(system, integrator, x, v)
+    integrator.step(5)
+    context.setVelocities(1e9 * v)
+    context.getSystem().getForces()[0].setForceGroup(7)
+    with pytest.raises(InputError, match=r"CustomExternalForce is in force group 7.*back at step"):
+        integrator.step(5)
+    assert np.abs(state_of(context)[0]).max() < 100
