@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 #: Methods that a ranking shows, and curves of a figure.
 PLACES, CURVES = 5, 9
+#: Steps of a run below which the sentence says how few they were: a step that is too long may fail later.
+FEW_STEPS = 20
 #: Bands behind the curves, one an engine.
 BANDS = {"arrays": "#bdbdbd", "ASE": "#e0c39a", "OpenMM": "#c6b8d9"}
 #: Color-blind safe; of a few methods always the same.
@@ -107,6 +109,8 @@ def sentence(table: pd.DataFrame, found: Ranking | None) -> str:
     first = found.table.iloc[0]
     spent = f"the least {COSTS[found.cost]} {_per(about)}, {_spent(first.cost, found.cost)}"
     words = f"Use {first.title} at {shown_setting(first, about)}: {spent}, for {limit}"
+    if first.steps < FEW_STEPS and not first.adaptive:
+        words += f" (it made {first.steps:.0f} steps only: see how a longer run goes before you rely on it)"
     ties = found.table[found.table.place == 1].iloc[1:]
     if len(ties):
         named = ", ".join(ties.title[:3]) + (f" and {len(ties) - 3} more" if len(ties) > 3 else "")

@@ -85,13 +85,7 @@ class ForceGroups:
     def __call__(self, x: FloatArray, time: float) -> FloatArray:
         """The sum over all groups."""
         first, *others = [np.array(self.of(name, x, time)) for name in self.groups]  # functions may share an array
-        for name, f in zip(list(self.groups)[1:], others, strict=True):
-            if f.shape != first.shape:
-                raise InputError(
-                    f"group {name!r} gives forces of shape {f.shape}, the groups before it {first.shape}: they are of "
-                    "different systems",
-                    item=name,
-                )
+        for f in others:
             first += f
         return first
 
@@ -99,6 +93,11 @@ class ForceGroups:
         """Forces of one group."""
         f = as_float_array(self.groups[name](x, time), f"forces of group {name!r}")
         self.evaluations[name] += 1
+        if f.shape != x.shape:
+            raise InputError(
+                f"group {name!r} gives forces of shape {f.shape}; give a function of these atoms, {x.shape}",
+                item=name,
+            )
         return f
 
 

@@ -42,6 +42,16 @@ def test_the_sentence_names_ties_and_no_winner_within_the_scatter():
     assert rank(nothing) is None and "No method reached the horizon" in sentence(nothing, None)
 
 
+def test_a_run_of_few_steps_says_how_few_they_were():
+    """A step that is too long may fail later."""
+    found = rank(table())
+    few = found.table.assign(steps=2)
+    assert "made 2 steps only: see how a longer run goes" in sentence(
+        table(), type(found)(**{**vars(found), "table": few})
+    )
+    assert "steps only" not in sentence(table(), type(found)(**{**vars(found), "table": found.table.assign(steps=20)}))
+
+
 def test_times_that_were_taken_once_say_so():
     once = table().assign(rounds=0)
     once.attrs = {**table().attrs, "force_seconds": 1.0}

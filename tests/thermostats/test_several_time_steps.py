@@ -25,6 +25,15 @@ def test_the_sum_and_how_often_each_was_asked_for():
     assert groups.evaluations == {"fast": 2, "slow": 1}
 
 
+def test_forces_of_other_atoms_are_named_by_their_group():
+    groups = ForceGroups({"fast": springs, "slow": lambda x, t: x[:1]})
+    for asked in (groups, lambda x, t: groups.of("slow", x, t)):
+        with pytest.raises(
+            InputError, match=r"group 'slow' gives forces of shape \(1, 3\).*give a function of these atoms"
+        ):
+            asked(X, 0.0)
+
+
 def test_a_difference_is_what_the_expensive_forces_are_more():
     groups = ForceGroups.difference(springs, quartic)
     np.testing.assert_allclose(groups(X, 0.0), quartic(X), rtol=1e-13)
