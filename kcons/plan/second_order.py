@@ -61,6 +61,8 @@ UNSOLVABLE = 1e-4
 FLAT = 1e-6
 #: Relative misfit between the targets and a flat geometry above which the conversion is refused.
 MISFIT = 1e-6
+#: Bases are exchanged where the volume that they span grows by more than this part.
+LARGER = 1e-3
 #: Of rigid groups of one, two and three dimensions: where they lie, what they are, their degrees of freedom, and what
 #: holds them.
 _GROUPS = (
@@ -528,8 +530,15 @@ def _bases(block: LocalRows, atoms: IntArray, plane: FloatArray) -> tuple[IntArr
     from scipy.linalg import qr  # slow to import
 
     system = np.vstack([plane.T / np.abs(plane).max(), np.ones(len(plane))])
-    order = qr(system * np.where(block.pinned[atoms], 2.0, 1.0), mode="r", pivoting=True)[1]
-    bases = np.sort(order[: len(system)])
+    preferred = system * np.where(block.pinned[atoms], 2.0, 1.0)
+    bases = qr(preferred, mode="r", pivoting=True)[1][: len(system)]
+    while True:  # an atom that weighs more than the base it would replace spans a larger volume
+        shares = np.abs(np.linalg.solve(preferred[:, bases], preferred))
+        base, atom = np.unravel_index(int(np.argmax(shares)), shares.shape)
+        if shares[base, atom] <= 1 + LARGER:
+            break
+        bases[base] = atom
+    bases = np.sort(bases)
     weights = np.linalg.solve(system[:, bases], system).T
     # Round so that the weights sum to one: the relation then does not depend on the origin.
     weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
