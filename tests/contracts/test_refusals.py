@@ -275,7 +275,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("slow_share(GROUPED, ?)", "positions", "X[None, :3]", "X[None, ::-1]"),
     ("slow_share(GROUPED, X[None], displacement=0.0)", "displacement"),
     ("ForceGroups.difference(force, force)", "slow"),
-    ("ForceGroups.difference(lambda x, t: x[:2], force)(X, 0.0)", "forces"),
+    ("ForceGroups.difference(lambda x, t: x[:2], force)(X, 0.0)", "fast"),
     ('ForceGroups({"fast": force, "slow": lambda x, t: x[:2]})(X, 0.0)', "slow"),
     ("ConstrainedMonteCarlo(ATOMS.copy(), 0.1, 300, 3, keep=1.5)", "keep"),
     ("MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=?, **TWO)", "slow", "ATOMS.calc", "3"),

@@ -103,7 +103,7 @@ MUTANTS = {
     ],
     "openmm/ensembles/langevin_ensemble.py": [
         (
-            "«groups_of(force)→{force.getForceGroup()}» - set(steps)",
+            "«groups_of(force)→{force.getForceGroup()}» - set(known)",
             "langevin_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
         ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),

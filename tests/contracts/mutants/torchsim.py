@@ -11,7 +11,7 @@ MUTANTS = {
         ("(0, atoms, «positions→new[atoms]»)", "torchsim/torchsim_states::systems_with_nothing_held_stay_free"),
         ("«self.check(state)→pass»", "torchsim/torchsim_optimizers::steps_that_cannot_be_held_are_told"),
         ("self.system_idx + «system_offset→0»", "torchsim/torchsim_states::splitting_joining_popping_and_copies"),
-        ("if excess[row] > «1→1e9»", "torchsim/torchsim_refusals::bad_input_is_named_and_leaves_the_state"),
+        ("if excess.max(initial=0.0) > «1→1e9»", "torchsim/torchsim_refusals::bad_input_is_named_and_leaves_the_state"),
         ("[FixedAtoms(fixed)] if «len(fixed)→False»", "torchsim/torchsim_states::fixed_atoms_are_taken_over"),
     ],
     "torchsim/dynamics.py": [
