@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 #: Methods that a ranking shows, and curves of a figure.
 PLACES, CURVES = 5, 9
 #: Steps of a run below which the sentence says how few they were: a step that is too long may fail later.
-FEW_STEPS = 20
+FEW_STEPS = 10
 #: Bands behind the curves, one an engine.
 BANDS = {"arrays": "#bdbdbd", "ASE": "#e0c39a", "OpenMM": "#c6b8d9"}
 #: Color-blind safe; of a few methods always the same.
