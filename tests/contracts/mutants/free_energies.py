@@ -20,7 +20,7 @@ MUTANTS = {
         ),
     ],
     "cli/free_energy.py": [
-        ('if «family in ("angle", "dihedral")→family != "distance"» else axis)', "cli/scan::a_difference_of_distances"),
+        ("made.constraint(«chosen.count_from→0»)", "cli/scan::a_torsion"),
     ],
     "free_energy/windows/driver.py": [
         (".«pop(job.name, None→clear(»)", "driver::windows_that_failed_before_others_are_added_are_still_told_of"),
