@@ -49,9 +49,8 @@ from kcons.errors import (
     UnreadableError,
     UnsupportedError,
 )
-from kcons.free_energy.held_coordinates import HeldCoordinates
+from kcons.free_energy.held_coordinates import HeldCoordinates, warn_of_gaps
 from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals, Relaxed
-from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.minimization import minimize
 from kcons.motion.motion import Motion
 from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, text

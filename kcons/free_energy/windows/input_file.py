@@ -26,7 +26,7 @@ from kcons.constraints.arguments import ANGLE, Count, Positive, Rule, rules_of, 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, did_you_mean
 from kcons.free_energy.profiles.pulls import MIN_PULLS
-from kcons.free_energy.windows.window import Sampler, Settings
+from kcons.free_energy.windows.driver import Sampler, Settings
 from kcons.steppers.files import as_path
 
 #: Windows of an input file, at most.
@@ -235,7 +235,10 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         windows; a calculator that is neither in `kcons.ase.named_calculators.LISTED` nor of one of these modules.
     """
     path = as_path(file, "file")
-    data = _toml(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no TOML that can be read: {error}", item="file") from error
     tables: dict[str, Any] = {}
     for name, content in {"forces": {}, "sampling": {}, **data}.items():
         _refuse_unknown(name, _TABLES, "the input file")
@@ -276,13 +279,6 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         None if pulls is None else _pulls(pulls, coordinates, targets),
         Pulls.steps if pulls is None else pulls.steps,
     )
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no TOML that can be read: {error}", item="file") from error
 
 
 def _read(kind: Any, name: str, entry: Any) -> Any:
@@ -376,7 +372,14 @@ def _sampler(
     if forces.system is not None:
         if "held" in tables:
             raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
-        return _of_openmm(place, folder / forces.system, forces.platform, coordinates)
+        from openmm import app
+
+        from kcons.free_energy.scans.system_calculator import read_system
+        from kcons.free_energy.windows.openmm_windows import OpenMMWindows
+
+        system = read_system(folder / forces.system, "system")
+        pdb = _opened("OpenMM", app.PDBxFile if place.suffix == ".cif" else app.PDBFile, place)
+        return OpenMMWindows(pdb.topology, system, pdb.positions, coordinates, platform=forces.platform)
     from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
     from kcons.free_energy.windows.ase_windows import AseWindows
 
@@ -387,14 +390,3 @@ def _sampler(
     if forces.calculator in LISTED:
         make()  # complain of settings
     return AseWindows(atoms, make, coordinates, rows)
-
-
-def _of_openmm(structure: Path, system: Path, platform: str | None, coordinates: Mapping[str, Constraint]) -> Sampler:
-    from openmm import app
-
-    from kcons.free_energy.scans.system_calculator import read_system
-    from kcons.free_energy.windows.openmm_windows import OpenMMWindows
-
-    made = read_system(system, "system")
-    pdb = _opened("OpenMM", app.PDBxFile if structure.suffix == ".cif" else app.PDBFile, structure)
-    return OpenMMWindows(pdb.topology, made, pdb.positions, coordinates, platform=platform)

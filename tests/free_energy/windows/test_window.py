@@ -10,7 +10,7 @@ from ase.calculators.emt import EMT
 from kcons.constraints import Dihedral, Distance, Formula
 from kcons.errors import InfeasibleError
 from kcons.free_energy import AseWindows, Window
-from kcons.free_energy.windows.window import digest_of
+from kcons.free_energy.windows.driver import digest_of
 
 X = np.array([[0.0, 1.0, 0.1], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.6, 1.0, 0.2], [2.0, -0.6, 0.8]])
 TURN = Dihedral([[0, 1, 2, 3]])
