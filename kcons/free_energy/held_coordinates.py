@@ -239,12 +239,11 @@ class HeldCoordinates:
             item, atom = _ITEMS[which], int(self.atoms[first])
             raise NonFiniteError(f"{item} of atom {atom} are not finite at time {times[k]:g}", item=item, atom=atom)
         gathered = self._gathered(here)
-        metric = self._at(gathered, time)
-        along, respond = metric.directions, metric.respond
+        log_det_z, respond, shares, along, of_rows = self._at(gathered, time)
         pairs = [along[:, s] + sign * along[:, j] for s in range(d) for j in range(s) for sign in (1, -1)]
         fields = np.stack([speed.reshape(n, -1), *along.swapaxes(0, 1), *pairs], axis=1)
         if self._averages:
-            fields = np.concatenate([fields, metric.fields], axis=1)
+            fields = np.concatenate([fields, of_rows], axis=1)
         bent, traces = self._curvatures(gathered, fields, time)
         rest, driven = np.zeros((n, len(order))), -bent[:, 0]
         if rows.moving:
@@ -263,8 +262,8 @@ class HeldCoordinates:
         for k, turn in enumerate(self._turns):
             if turn is not None:
                 turned[:, k] = turn.force(whole[0], whole[2])
-        gradient = self._change_of_z(bent[:, 1 : 1 + d * d] @ metric.shares.swapaxes(1, 2))
-        columns = (value, moving, moving - still, metric.log_det_z.tolist(), gradient, off.tolist(), turned, mean)
+        gradient = self._change_of_z(bent[:, 1 : 1 + d * d] @ shares.swapaxes(1, 2))
+        columns = (value, moving, moving - still, log_det_z.tolist(), gradient, off.tolist(), turned, mean)
         return [Sample(*each) for each in zip(times, *columns, strict=True)]
 
     # -- pieces, on the atoms of the clusters ---------------------------------------------------
@@ -281,8 +280,13 @@ class HeldCoordinates:
         self._rows.lattice = self._source.lattice
         return [np.stack([self._rows.gather(item, y) for y in x]) for item in self._rows.constraints]
 
-    def _at(self, gathered: Sequence[FloatArray], time: float) -> _Metric:
-        """Z and all that follows from the gradients; raises where a coordinate depends on other constraints."""
+    def _at(self, gathered: Sequence[FloatArray], time: float) -> tuple[FloatArray, ...]:
+        """Z and all that follows from the gradients; raises where a coordinate depends on other constraints.
+
+        Of n configurations, d coordinates among r rows on a atoms: ln det Z; rows of (A M^-1 A^T)^-1, (n, d, r); the
+        share of each row in a coordinate's gradient that the others have answered, (n, d, r); directions, (n, d, 3 a);
+        fields, whose squares are what the rows take from M^-1, (n, r, 3 a).
+        """
         d, n = len(self), len(gathered[0])
         table = np.zeros((n, len(self._order), len(self.atoms), 3))
         for k, (item, r) in enumerate(zip(self._rows.constraints, gathered, strict=True)):
@@ -307,7 +311,7 @@ class HeldCoordinates:
         if left[worst, 0] < DEPENDENT:
             self._refuse(np.flatnonzero(np.abs(mixture[worst, :, 0]) > 0.1).tolist())
         log_det_z = np.log(left).sum(axis=1) + 2 * np.log(own).sum(axis=1)
-        return _Metric(log_det_z, respond, z @ respond, respond @ weighed, root @ weighed)
+        return log_det_z, respond, z @ respond, respond @ weighed, root @ weighed
 
     def _refuse(self, dependent: list[int]) -> None:
         if dependent:
@@ -347,21 +351,6 @@ class HeldCoordinates:
                 result[:, s] += mixed[:, j]
                 result[:, j] += mixed[:, s]
         return result
-
-
-class _Metric(NamedTuple):
-    """At n configurations, for d coordinates among r rows on a atoms.
-
-    `respond` (n, d, r), rows of (A M^-1 A^T)^-1; `shares` (n, d, r), of each row in a coordinate's gradient that the
-    other rows have answered; `directions` (n, d, 3 a); `fields` (n, r, 3 a), whose squares are what the rows take from
-    M^-1.
-    """
-
-    log_det_z: FloatArray
-    respond: FloatArray
-    shares: FloatArray
-    directions: FloatArray
-    fields: FloatArray
 
 
 def _root(product: FloatArray) -> tuple[FloatArray, FloatArray]:

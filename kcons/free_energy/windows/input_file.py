@@ -263,7 +263,15 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
-    pulls = tables.get("pulls")
+    pulls, ways = tables.get("pulls"), None
+    if pulls is not None:
+        start, end = (
+            place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
+            for key, given, place in (("from", pulls.begin, targets[0]), ("to", pulls.to, targets[-1]))
+        )
+        if np.array_equal(start, end):
+            raise InputError("[pulls] begin where they end; give from and to", item="pulls")
+        ways = {"start": start, "end": end, "count": pulls.count}
     if "improve" in data and (len(coordinates) > 1 or count < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
@@ -276,7 +284,7 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         targets,
         options,
         data.get("improve"),
-        None if pulls is None else _pulls(pulls, coordinates, targets),
+        ways,
         Pulls.steps if pulls is None else pulls.steps,
     )
 
@@ -301,17 +309,6 @@ def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
     if key not in known:
         hint = did_you_mean(key, known)
         raise InputError(f"{where} has an unknown key {key!r}{hint}; there are {', '.join(known)}", item=key)
-
-
-def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatArray) -> dict[str, Any]:
-    """Arguments of `Windows.pull`; by default from the first window to the last."""
-    start, end = (
-        place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
-        for key, given, place in (("from", entry.begin, targets[0]), ("to", entry.to, targets[-1]))
-    )
-    if np.array_equal(start, end):
-        raise InputError("[pulls] begin where they end; give from and to", item="pulls")
-    return {"start": start, "end": end, "count": entry.count}
 
 
 def coordinate_of(family: str, atoms: Sequence[int], first: int) -> Constraint:
