@@ -57,7 +57,7 @@ def test_kept(folder, capsys):
 def test_violated(folder, capsys):
     assert command(folder, "bad.xtc") == 1
     page = capsys.readouterr().out
-    assert "violated by" in page and "SOL3" in page and "0.001 nm" in page
+    assert "violated by" in page and "SOL3:OW–HW1 (6, 7)" in page and "0.001 nm" in page
 
 
 def test_a_file_that_ends_too_early(folder, capsys):
