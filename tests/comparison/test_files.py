@@ -230,9 +230,6 @@ def test_plans_of_files(ethanol, gro, tmp_path, capsys):
         ("broken.gro", "broken.gro: MDAnalysis cannot read this topology"),
         ("empty.xyz", "empty.xyz is empty"),
         ("run.odd", "its name tells no format of a topology that MDAnalysis reads; rename it"),
-        ("missing.gro", "kcons: there is no file missing.gro\n"),
-        ("watr", "there is no test system 'watr'"),
-        ("chain --forces emt", "chain takes no options, not forces"),
     ],
 )
 def test_errors_name_the_file_and_the_item(words, said, gro, ethanol, tmp_path, monkeypatch, capsys):
