@@ -25,11 +25,9 @@ _NAMES = {
     "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
     "windows.input_file": ("InputFile", "read_input"),
     "averages": ("Mean", "weighted_mean"),
-    "profiles.profile": ("Profile", "integrate", "plot_profile"),
-    "profiles.mean_force_surface": ("Surface", "fit_surface"),
+    "profiles.profile": ("Profile", "Surface", "fit_surface", "integrate", "plot_profile"),
     "profiles.pulls": ("Pulled", "pull_free_energy"),
-    "scans.relaxed_scan": ("scan",),
-    "scans.scan_result": ("Scan",),
+    "scans.relaxed_scan": ("Scan", "scan"),
     "scans.system_calculator": ("SystemCalculator",),
 }
 

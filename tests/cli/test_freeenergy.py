@@ -53,7 +53,7 @@ def test_an_input_runs_and_goes_on(tmp_path, capsys, monkeypatch):
     assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
     assert json.loads((tmp_path / "input" / "free_energy.json").read_text()) == known
     assert main(["freeenergy", "nothing.toml"]) == 2
-    assert "there is no file" in capsys.readouterr().err
+    assert "No such file or directory: 'nothing.toml'" in capsys.readouterr().err
 
 
 PULLS = """

@@ -144,9 +144,13 @@ TURN = ("--dihedral", 2, 0, 1, 3)
     [
         (("none.xyz", *TURN), "there is no file none.xyz"),
         (("peroxide.xyz",), "name what is scanned: --dihedral"),
+        (("peroxide.xyz", "--distance", 0, 1, "--from", 0, "--to", 1), "there is no distance of 0 to hold"),
         (("peroxide.xyz", "--distance", 0, 1), "give --from: only dihedrals have a range by themselves"),
         (("peroxide.xyz", "--difference", 0, 2, 2, 1, "--to", 1), "give --from: only dihedrals have a range by"),
-        (("peroxide.xyz", "--angle", 0, 1, 2, "--from", 60, "--to", 190), "angles are between 0 and 180 degrees"),
+        (
+            ("peroxide.xyz", "--angle", 0, 1, 2, "--from", 60, "--to", 190),
+            "there is no angle of 184",
+        ),
         (("peroxide.xyz", *TURN, "--to", 1, 2), "--to has 2 numbers for 1 coordinates"),
         (("peroxide.xyz", *TURN, "--steps", 0), "--steps is 0; give a positive number"),
         (("peroxide.xyz", *TURN, "--count-from", 1), "there is no atom 0; atoms are counted from 1"),
@@ -157,7 +161,7 @@ TURN = ("--dihedral", 2, 0, 1, 3)
         (("peroxide.xyz", *TURN, "--calculator", "ase.calculators.emt:None"), "no calculator 'ase.calculators.emt:N"),
         (("peroxide.xyz", *TURN, "--calculator", "none.xml"), "there is no file none.xml"),
         (("peroxide.xyz", *TURN, "--fmax", 0), "fmax is 0.0; give a positive number"),
-        (("peroxide.xyz", *TURN, "--hold-dihedral", *TURN[1:]), "depends on what else is held"),
+        (("peroxide.xyz", *TURN, "--hold-dihedral", *TURN[1:]), "dihedral_2_0_1_3 depends on the other constraints"),
     ],
 )
 def test_wrong_use(run, capsys, words, said):

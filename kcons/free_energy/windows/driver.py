@@ -28,8 +28,7 @@ from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force, thermal_multipliers
-from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
-from kcons.free_energy.profiles.profile import Profile, integrate, plot_profile
+from kcons.free_energy.profiles.profile import Profile, Surface, fit_surface, integrate, plot_profile
 from kcons.free_energy.profiles.pulls import MIN_PULLS, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of

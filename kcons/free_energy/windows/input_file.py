@@ -16,7 +16,7 @@ from itertools import product
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,22 +33,12 @@ from kcons.steppers.files import as_path
 MOST_WINDOWS = 100_000
 
 
-def _difference(rows: Sequence[Sequence[int]]) -> DistanceDifference:
-    """r(i, j) - r(k, l) of each row i, j, k, l."""
-    for row in rows:
-        if len(row) != 4:
-            raise InputError(
-                f"difference names {len(row)} atoms; give four, i j k l for r(i, j) - r(k, l)", item="difference"
-            )
-    return DistanceDifference([[row[:2], row[2:]] for row in rows])
-
-
-#: What each kind of coordinate becomes, from the atoms of its rows.
-FAMILIES: dict[str, Callable[[list[list[int]]], Constraint]] = {
-    "distance": Distance,
-    "difference": _difference,
-    "angle": Angle,
-    "dihedral": Dihedral,
+#: How many atoms each kind of coordinate has, and what it becomes.
+FAMILIES: dict[str, tuple[int, Callable[[ArrayLike], Constraint]]] = {
+    "distance": (2, Distance),
+    "difference": (4, lambda rows: DistanceDifference(np.reshape(rows, (-1, 2, 2)))),
+    "angle": (3, Angle),
+    "dihedral": (4, Dihedral),
 }
 #: Values between which each kind lies, in angstrom and degrees; the others may have any.
 _RANGES = {"distance": (0.0, math.inf), "angle": (0.0, 180.0)}
@@ -82,7 +72,6 @@ Text: TypeAlias = Annotated[str, _is("a text", lambda v: isinstance(v, str))]
 Table: TypeAlias = Annotated[dict, _is("a table", lambda v: isinstance(v, dict))]
 Truth: TypeAlias = Annotated[bool, _is("true or false", lambda v: isinstance(v, bool))]
 Number: TypeAlias = Annotated[float, _is("a number", _number)]
-ZeroOrOne: TypeAlias = Annotated[int, _is("0 or 1", lambda v: _whole(v) and v in (0, 1))]
 Numbers: TypeAlias = Annotated[list, _is("numbers", _NUMBERS)]
 NumberOrNumbers: TypeAlias = Annotated[Any, _is("a number, or numbers", lambda v: _number(v) or _NUMBERS(v))]
 Atoms: TypeAlias = Annotated[list, _is("whole numbers", _ATOMS)]
@@ -94,7 +83,7 @@ Single: TypeAlias = Annotated[Any, _is("one value", lambda v: not isinstance(v, 
 @dataclass(kw_only=True)
 class Structure:
     file: Text
-    count_from: ZeroOrOne = 0
+    count_from: Literal[0, 1] = 0
 
 
 @dataclass(kw_only=True)
@@ -136,7 +125,7 @@ class Coordinate:
         self.count = len(self.values) if self.values is not None else self.windows or 0
 
     def constraint(self, first: int) -> Constraint:
-        return FAMILIES[self.family]([counted(getattr(self, self.family), first)])
+        return coordinate_of(self.family, getattr(self, self.family), first)
 
     def places(self) -> FloatArray:
         """Where windows are, in angstrom and radian."""
@@ -292,16 +281,8 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
 def _toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"there is no file {path}", item="file") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error}", item="file") from error
-    except ValueError as error:
-        raise InputError(f"{path} is no TOML: {error}", item="file") from error
-    except RecursionError:
-        raise InputError(
-            f"{path}: lists or tables are too deep in each other; an input file needs two levels", item="file"
-        ) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no TOML that can be read: {error}", item="file") from error
 
 
 def _read(kind: Any, name: str, entry: Any) -> Any:
@@ -335,6 +316,14 @@ def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatAr
     if np.array_equal(start, end):
         raise InputError("[pulls] begin where they end; give from and to", item="pulls")
     return {"start": start, "end": end, "count": entry.count}
+
+
+def coordinate_of(family: str, atoms: Sequence[int], first: int) -> Constraint:
+    """A coordinate of one of `FAMILIES`, on atoms that are counted from `first`."""
+    size, made = FAMILIES[family]
+    if len(atoms) != size:
+        raise InputError(f"{family} names {len(atoms)} atoms; give {size}", item=family)
+    return made([counted(atoms, first)])
 
 
 def counted(atoms: Sequence[int], first: int) -> list[int]:

@@ -3,7 +3,6 @@
 MUTANTS = {
     "free_energy/scans/relaxed_scan.py": [
         ("attempt.energy «<→>» best[point].energy:", "relaxed_scan::both_ways_find_the_lower_of_two_minima"),
-        ("if «with_it.rank != rank + n + 1→False»:", "free_energy/refusals::refusals"),
         (
             "if attempt is «not None and (attempt.point, attempt.source) != (point, source)→None and source == point»:",
             "relaxed_scan::relaxations_in_files_are_whole_and_of_this_scan",
@@ -21,7 +20,7 @@ MUTANTS = {
         ),
     ],
     "cli/free_energy.py": [
-        ('if «family in ("angle", "dihedral")→family != "distance"» else axis)', "cli/scan::a_difference_of_distances"),
+        ("made.constraint(«chosen.count_from→0»)", "cli/scan::a_torsion"),
     ],
     "free_energy/windows/driver.py": [
         (".«pop(job.name, None→clear(»)", "driver::windows_that_failed_before_others_are_added_are_still_told_of"),
@@ -46,6 +45,9 @@ MUTANTS = {
     "openmm/integrator/guard.py": [
         ("force.getForceGroup() not in «row_groups→range(32)»", "openmm/integrator/edits::forgotten_parts_are_refused"),
     ],
+    "free_energy/held_coordinates.py": [
+        ("if left[worst, 0] < «DEPENDENT→-1.0»:", "free_energy/refusals::refusals"),
+    ],
     "free_energy/averages.py": [
         ("covariance *= «np.outer(widening, widening)→1.0»", "correlated_series::errors_are_as_large_as_they_say"),
         ("fluctuation = «factors[:, None]→1.0» * (series", "free_energy/averages::weights_that_belong_to_the_values"),
@@ -63,8 +65,6 @@ MUTANTS = {
     ],
     "free_energy/profiles/profile.py": [
         ("process = process«.closed()→»", "profile::a_period_closes"),
-    ],
-    "free_energy/profiles/mean_force_surface.py": [
         ("if chance < «_CHANCE→0.0»:", "mean_force_surface::vectors_that_are_no_gradient_are_warned_of"),
     ],
     "free_energy/profiles/pulls.py": [
