@@ -14,14 +14,7 @@ import numpy as np
 from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 
-from kcons.ase.binding import (
-    FORCES_ONLY,
-    Binding,
-    applied_forces,
-    bind,
-    company,
-    unchanged_on_failure,
-)
+from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind, company, unchanged_on_failure
 from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, differ, require_on_surface

@@ -10,23 +10,13 @@ import pytest
 from ase import Atoms
 from ase.build import bcc100, molecule
 from ase.calculators.emt import EMT
-from ase.constraints import (
-    FixAtoms,
-    Hookean,
-)
+from ase.constraints import FixAtoms, Hookean
 from ase.io import read, write
 from ase.vibrations import Vibrations
 from ase_systems import AS_ASE
 
 from kcons.ase import Constraints, ConstraintsWithFixedAtoms, constrain, from_ase_constraints, to_ase_constraints
-from kcons.constraints import (
-    CenterOfMass,
-    Distance,
-    FixedAtoms,
-    LinearCombination,
-    Plane,
-    Sphere,
-)
+from kcons.constraints import CenterOfMass, Distance, FixedAtoms, LinearCombination, Plane, Sphere
 from kcons.errors import UnsupportedError
 
 FORMATS = {

@@ -31,14 +31,7 @@ from ase.md.verlet import VelocityVerlet
 from ase_systems import AS_ASE, loose_waters, rigid
 
 from kcons.ase import ConstrainedDynamics, Constraints, attach, constrain, from_ase_constraints, rigid_water
-from kcons.constraints import (
-    Angle,
-    Dihedral,
-    Distance,
-    FixedAtoms,
-    ImplicitSurface,
-    LinearCombination,
-)
+from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, ImplicitSurface, LinearCombination
 from kcons.errors import UnsupportedError
 
 

@@ -11,15 +11,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 from scipy.special import ellipj, ellipkinc
 
-from kcons.constraints.arguments import (
-    FloatArray,
-    NotNegative,
-    Positive,
-    as_float_array,
-    check_call,
-    checked,
-    positive,
-)
+from kcons.constraints.arguments import FloatArray, NotNegative, Positive, as_float_array, check_call, checked, positive
 from kcons.errors import InputError
 from kcons.models.flows.flow import Flow, phase_volume
 from kcons.models.flows.linear import JordanBlocks, JordanForm, LinearFlow, jordan_block

@@ -24,7 +24,7 @@ MUTANTS = {
     "ase/thermostat_dynamics.py": [
         (
             "known[POTENTIAL] = «self._systems().potential_energy(state.positions, state.time)→math.nan»",
-            "thermostat_dynamics::a_state_of_monte_carlo_can_be_saved_and_exchanged_where_calculators_give_new_results",
+            "thermostat_dynamics::a_state_of_monte_carlo_knows_its_energy_where_calculators_give_new_results",
         ),
     ],
     "thermostats/langevin.py": [
