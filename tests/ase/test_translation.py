@@ -82,16 +82,6 @@ def test_from_fix_linear_triatomic():
     assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-10)
 
 
-@pytest.mark.parametrize(
-    "other", [Hookean(a1=0, a2=1, rt=1.0, k=1.0), MirrorForce(0, 1)], ids=lambda v: type(v).__name__
-)
-def test_unknown_ase_constraints_are_named(other):
-    atoms = molecule("H2O")
-    atoms.set_constraint(other)
-    with pytest.raises(UnsupportedError, match=f"{type(other).__name__}.*Custom"):
-        from_ase_constraints(atoms)
-
-
 # -- copies, slices, files --------------------------------------------------------------------------
 
 
@@ -237,12 +227,14 @@ def test_attach_keeps_objects_that_add_forces_and_refuses_unknown_ones():
     atoms = molecule("CH3CH2OH")
     spring = Hookean(a1=0, a2=5, rt=1.0, k=1.0)
     atoms.set_constraint([FixAtoms([8]), spring, FixBondLengths([[0, 1]])])
+    with pytest.raises(UnsupportedError, match=r"Hookean.*Custom"):
+        from_ase_constraints(atoms)
     held = attach(atoms)
     assert atoms.constraints == [held, spring]
     assert [row.family for row in held.constraints] == ["FixedAtoms", "Distance"]
     before = [FixAtoms([8]), MirrorForce(0, 1)]
     atoms.set_constraint(before)
-    with pytest.raises(UnsupportedError, match="MirrorForce"):
+    with pytest.raises(UnsupportedError, match=r"MirrorForce.*Custom"):
         attach(atoms)
     assert atoms.constraints == before
 
