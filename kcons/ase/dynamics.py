@@ -323,8 +323,8 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time, self.nsteps = float(state.time), int(state.step)
         self._put(x, v)
         # Forces are asked for anew: nobody knows which calculator those of a file are of.
-        kept = replace(state.copied(), forces=None, origin=None)
-        self._state = replace(kept, positions=x, velocities=v, time=self.time, step=self.nsteps)
+        known: dict[str, Any] = {"positions": x, "velocities": v, "time": self.time, "step": self.nsteps}
+        self._state = replace(state.copied(), **known, forces=None, origin=None)
         self._cell = surroundings(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:

@@ -11,7 +11,7 @@ MUTANTS = {
             "logger::with_noise_the_log_is_of_the_middle_of_the_step",
         ),
         (
-            "«replace(state.copied(), forces=None, origin=None→state.copied(»)",
+            "replace(state.copied(), **known«, forces=None, origin=None→»)",
             "thermostat_dynamics::a_restart_asks_the_calculator_for_forces",
         ),
         (
