@@ -61,7 +61,7 @@ class PythonRows(Constraint, base=True):
     @property
     def called(self) -> tuple[Any, ...]:
         """The functions that kernels call where Numba has compiled all of them: value and gradient, or coefficients."""
-        raise NotImplementedError
+        return tuple(getattr(self, name) for name in self.functions)
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         """Gradient, or coefficients, of row `k` alone, shape (width, 3), at an `r` that cannot be changed."""
@@ -153,10 +153,6 @@ class Custom(PythonRows):
         self._take(time_dependent, length, time_step, function=function, gradient=gradient)
         self.function, self.gradient_function = function, gradient
         self.translation_invariant, self.period = bool(translation_invariant), period
-
-    @property
-    def called(self) -> tuple[Any, ...]:
-        return self.function, self.gradient_function
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         return self._values(r, time, 0)
@@ -367,10 +363,6 @@ class CustomVelocity(PythonRows, VelocityRows):
         super().__init__(atoms, target)
         self._take(time_dependent, length, time_step, coefficients=coefficients)
         self.coefficients, self.translation_invariant = coefficients, bool(translation_invariant)
-
-    @property
-    def called(self) -> tuple[Any, ...]:
-        return (self.coefficients,)
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         return np.zeros(self.n_rows)

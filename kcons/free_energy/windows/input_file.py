@@ -26,7 +26,7 @@ from kcons.constraints.arguments import ANGLE, Count, Positive, Rule, rules_of, 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, did_you_mean
 from kcons.free_energy.profiles.pulls import MIN_PULLS
-from kcons.free_energy.windows.window import Sampler, Settings
+from kcons.free_energy.windows.driver import Sampler, Settings
 from kcons.steppers.files import as_path
 
 #: Windows of an input file, at most.
@@ -235,7 +235,10 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         windows; a calculator that is neither in `kcons.ase.named_calculators.LISTED` nor of one of these modules.
     """
     path = as_path(file, "file")
-    data = _toml(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no TOML that can be read: {error}", item="file") from error
     tables: dict[str, Any] = {}
     for name, content in {"forces": {}, "sampling": {}, **data}.items():
         _refuse_unknown(name, _TABLES, "the input file")
@@ -260,7 +263,15 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
-    pulls = tables.get("pulls")
+    pulls, ways = tables.get("pulls"), None
+    if pulls is not None:
+        start, end = (
+            place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
+            for key, given, place in (("from", pulls.begin, targets[0]), ("to", pulls.to, targets[-1]))
+        )
+        if np.array_equal(start, end):
+            raise InputError("[pulls] begin where they end; give from and to", item="pulls")
+        ways = {"start": start, "end": end, "count": pulls.count}
     if "improve" in data and (len(coordinates) > 1 or count < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
@@ -273,16 +284,9 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         targets,
         options,
         data.get("improve"),
-        None if pulls is None else _pulls(pulls, coordinates, targets),
+        ways,
         Pulls.steps if pulls is None else pulls.steps,
     )
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no TOML that can be read: {error}", item="file") from error
 
 
 def _read(kind: Any, name: str, entry: Any) -> Any:
@@ -305,17 +309,6 @@ def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
     if key not in known:
         hint = did_you_mean(key, known)
         raise InputError(f"{where} has an unknown key {key!r}{hint}; there are {', '.join(known)}", item=key)
-
-
-def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatArray) -> dict[str, Any]:
-    """Arguments of `Windows.pull`; by default from the first window to the last."""
-    start, end = (
-        place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
-        for key, given, place in (("from", entry.begin, targets[0]), ("to", entry.to, targets[-1]))
-    )
-    if np.array_equal(start, end):
-        raise InputError("[pulls] begin where they end; give from and to", item="pulls")
-    return {"start": start, "end": end, "count": entry.count}
 
 
 def coordinate_of(family: str, atoms: Sequence[int], first: int) -> Constraint:
@@ -376,7 +369,14 @@ def _sampler(
     if forces.system is not None:
         if "held" in tables:
             raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
-        return _of_openmm(place, folder / forces.system, forces.platform, coordinates)
+        from openmm import app
+
+        from kcons.free_energy.scans.system_calculator import read_system
+        from kcons.free_energy.windows.openmm_windows import OpenMMWindows
+
+        system = read_system(folder / forces.system, "system")
+        pdb = _opened("OpenMM", app.PDBxFile if place.suffix == ".cif" else app.PDBFile, place)
+        return OpenMMWindows(pdb.topology, system, pdb.positions, coordinates, platform=forces.platform)
     from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
     from kcons.free_energy.windows.ase_windows import AseWindows
 
@@ -387,14 +387,3 @@ def _sampler(
     if forces.calculator in LISTED:
         make()  # complain of settings
     return AseWindows(atoms, make, coordinates, rows)
-
-
-def _of_openmm(structure: Path, system: Path, platform: str | None, coordinates: Mapping[str, Constraint]) -> Sampler:
-    from openmm import app
-
-    from kcons.free_energy.scans.system_calculator import read_system
-    from kcons.free_energy.windows.openmm_windows import OpenMMWindows
-
-    made = read_system(system, "system")
-    pdb = _opened("OpenMM", app.PDBxFile if structure.suffix == ".cif" else app.PDBFile, structure)
-    return OpenMMWindows(pdb.topology, made, pdb.positions, coordinates, platform=platform)
