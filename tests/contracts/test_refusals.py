@@ -152,6 +152,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("System(MOTION, force, far=-1.0)", "far"),
     ("SYSTEM.initial_state(?, V)", "positions", "X[:2]", "X * nan", "X * 1.5"),
     ("SYSTEM.initial_state(X, V[:2])", "velocities"),
+    ("SYSTEM.total_energy(STATE)", "potential"),
     ("SYSTEM.initial_state(X, V, time=nan)", "time"),
     ("run(3, STATE, 0.01, 1)", "system"),
     ("run(SYSTEM, 3, 0.01, 1)", "state"),

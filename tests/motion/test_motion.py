@@ -1,4 +1,4 @@
-"""The engine's public calls: what they change, what they leave alone, and what they refuse."""
+"""The engine's public calls: what they change, what they leave alone, what they refuse, and what they say."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import (
     ContradictionError,
     ConvergenceError,
-    InfeasibleError,
     InputError,
-    KconsError,
     SingularGeometryError,
 )
 from kcons.motion import Motion
-from kcons.solvers.cluster_solver import Request
+from kcons.motion.solver_sequence import Failures
+from kcons.solvers.cluster_solver import Outcome, Request
 
 # -- in place, pure, wrong arguments ----------------------------------------------------------------
 
@@ -208,34 +207,15 @@ def test_rescue_by_damped_newton(name: str, crowd: int) -> None:
     assert motion.report(y).iterations > 0
 
 
-# -- every failure has a remedy ---------------------------------------------------------------------
+# -- what has no solution ---------------------------------------------------------------------------
 
 
-def raised(call) -> KconsError:
-    with pytest.raises(KconsError) as caught:
-        call()
-    return caught.value
-
-
-def test_messages_say_what_to_do() -> None:
-    far = WATER + np.array([[0, 0, 0], [7.0, 0, 0], [0, 0, 0]])
-    motion = Motion(ConstraintSet(held.Distance(TRIANGLE), WATER, np.ones(3)), WATER)
-    error = raised(lambda: motion.project_positions(far, WATER))
-    assert isinstance(error, ConvergenceError) and "use a smaller time step" in str(error)
-    rows = [held.Distance([0, 1]), held.Plane([0, 1], [1.0, 0, 0], [0.0, 3.0])]
-    bent = WATER[1:]
-    twice = Motion(ConstraintSet(rows, bent, np.ones(2)), bent)
-    error = raised(lambda: twice.restore_positions(bent))
-    assert isinstance(error, InfeasibleError) and "Check its target" in str(error)
-    contrary = [held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.0), held.LinearVelocity([[0, 1]], np.eye(3)[[0, 1]], 0.0)]
-    contrary += [held.LinearVelocity([[1]], [[0, 1.0, 0]], 1.0)]
-    error = raised(
-        lambda: Motion(ConstraintSet(contrary, WATER, np.ones(3)), WATER).project_velocities(WATER, 0 * WATER)
-    )
-    assert isinstance(error, ConvergenceError) and "contradict" in str(error) and "Remove or change" in str(error)
-    between = [held.FixedAtoms([0, 1]), held.Distance([0, 1], 2.0)]
-    error = raised(lambda: Motion(ConstraintSet(between, WATER, np.ones(3)), WATER))
-    assert isinstance(error, ContradictionError) and "free one of its atoms" in str(error)
+def test_rows_of_velocities_that_contradict_each_other() -> None:
+    rows = [held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.0), held.LinearVelocity([[0, 1]], np.eye(3)[[0, 1]], 0.0)]
+    rows += [held.LinearVelocity([[1]], [[0, 1.0, 0]], 1.0)]
+    motion = Motion(ConstraintSet(rows, WATER, np.ones(3)), WATER)
+    with pytest.raises(ConvergenceError, match=r"contradict.*Remove or change"):
+        motion.project_velocities(WATER, 0 * WATER)
 
 
 def test_nothing_held() -> None:
@@ -291,3 +271,39 @@ def test_a_cell_that_moves_the_image_of_a_fixed_atom_is_refused(free, of_the_set
         motion.certify(x)
     motion.set_cell([10.0, 12, 11])
     motion.certify(motion.project_positions(x + 0.01, x))
+
+
+# -- what is said where a solve fails ---------------------------------------------------------------
+
+
+def test_curvature_that_is_undefined() -> None:
+    x = np.array([[1.0, 0, 0], [0.0, 0, 0], [0.0, 1.0, 0]])
+    motion = Motion(ConstraintSet(held.Angle([0, 1, 2]), x, np.ones(3)), x)
+    straight = np.array([[1.0, 0, 0], [0.0, 0, 0], [-1.0, 0.0, 0]])
+    with pytest.raises(SingularGeometryError) as caught:
+        motion.acceleration(straight, x, x)
+    assert caught.value.rows == (0,) and caught.value.atoms == (0, 1, 2)
+
+
+def chain(x: np.ndarray) -> Motion:
+    rows = [held.Distance([[0, 1], [1, 2], [2, 3]]), held.Dihedral([[0, 1, 2, 3]])]
+    return Motion(ConstraintSet(rows, x, np.ones(len(x))), x)
+
+
+def folded(degrees: float) -> np.ndarray:
+    """Four atoms whose last three are so far from one line, to the one side or to the other, and one elsewhere."""
+    bend = np.radians(degrees)
+    return np.array([[0, 1.0, 0], [0, 0, 0], [1.0, 0, 0], [1.0 + np.cos(bend), 0, np.sin(bend)], [5.0, 5, 5]])
+
+
+@pytest.mark.parametrize("numbers", [None, np.array([10, 11, 12, 13, 14])])
+@pytest.mark.parametrize(("before", "after", "named"), [(2.0, -2.0, True), (20.0, -20.0, True), (2.0, 20.0, False)])
+def test_a_dihedral_that_becomes_straight_is_named(numbers, before, after, named) -> None:
+    x = folded(before)
+    motion, request = chain(x), Request(folded(after), x)
+    told = Failures(motion.constraint_set, motion.plan, numbers)
+    error = told.positions(request, Outcome(False, 0.25, 7, 0), motion.plan.solvers[0])
+    assert isinstance(error, ConvergenceError) and "smaller time step" in str(error)
+    names = "1, 2, 3" if numbers is None else "11, 12, 13"
+    assert (f"Atoms {names} of row #3 Dihedral" in str(error)) == named
+    assert np.array_equal(request.changed, folded(after)) and np.array_equal(x, folded(before))

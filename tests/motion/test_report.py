@@ -76,22 +76,15 @@ def test_report_on_fixed_atoms() -> None:
     assert np.isfinite(Motion(whole, x).report(x, np.zeros((3, 3))).velocity_residual)
 
 
-def test_condition_only_where_asked_for() -> None:
-    motion, x = mixed_system()
-    report = motion.report(x, condition=False)
-    assert np.isnan(report.condition) and all(np.isnan(k.condition) for k in report.kinds)
-    assert " - " in str(report) and "nan" not in str(report)
-    assert np.isnan(report.velocity_residual)
-
-
-def test_worst_row_is_named() -> None:
+def test_the_worst_row_is_named_and_the_condition_is_found_where_it_is_asked_for() -> None:
     motion, x = mixed_system()
     off = x.copy()
     off[9] += 0.3
-    report = motion.report(off)
+    report = motion.report(off, condition=False)
     assert report.worst_row in ("#13 Distance(8, 9)", "#15 Angle(9, 8, 10)")
     assert report.residual == np.abs(motion.constraint_set.value(off)).max()
-    assert report.worst_row in str(report)
+    assert np.isnan([report.condition, report.velocity_residual, *(k.condition for k in report.kinds)]).all()
+    assert report.worst_row in str(report) and " - " in str(report) and "nan" not in str(report)
 
 
 # -- condition ------------------------------------------------------------------------------------------

@@ -1,16 +1,19 @@
-"""Which rows belong together, and what shape their clusters have."""
+"""Which rows belong together, what shape their clusters have, and blocks whose ranks add up."""
 
 from __future__ import annotations
 
+import itertools
 from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
 
 from kcons import constraints as held
+from kcons.constraints import Angle, Distance, FixedAtoms, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.plan import make_plan
-from kcons.plan.clusters import LANES_CLUSTERS, LANES_ROWS, Shape, classify, cluster_labels
+from kcons.plan.clusters import LANES_CLUSTERS, LANES_ROWS, Shape, classify
+from kcons.plan.independent_blocks import row_blocks
 
 NONE = np.zeros(0, np.int64)
 TRIANGLE = list(combinations(range(3), 2))
@@ -30,20 +33,7 @@ def copies(pairs, atoms: int, times: int) -> held.Distance:
     return held.Distance(np.concatenate([np.array(pairs) + atoms * k for k in range(times)]))
 
 
-def same_partition(labels, groups) -> bool:
-    found = {frozenset(np.flatnonzero(labels == label).tolist()) for label in set(labels.tolist()) if label >= 0}
-    return found == {frozenset(group) for group in groups}
-
-
 # -- labels -----------------------------------------------------------------------------------------
-
-
-def test_fixed_atoms_separate_and_their_rows_belong_to_no_cluster() -> None:
-    rows = [held.FixedAtoms([2, 5]), held.Distance([[0, 1], [1, 2], [2, 3], [3, 4], [2, 5]])]
-    x = places(6)
-    labels = cluster_labels(ConstraintSet(rows, x, np.ones(6)), np.array([2, 5]))
-    assert same_partition(labels, [(6, 7), (8, 9)])
-    assert (labels[:6] == -1).all() and labels[10] == -1
 
 
 # -- shapes -----------------------------------------------------------------------------------------
@@ -108,21 +98,6 @@ def test_open_chains_beyond_the_lanes(rows: int) -> None:
                 assert {a, b} == set(walked[row])
 
 
-@pytest.mark.parametrize(
-    ("pairs", "independent"),
-    [
-        ([(k, k + 1) for k in range(9)] + [(9, 0)], False),  # a ring
-        ([(0, k) for k in range(1, 10)], True),  # a star
-        ([(k, k + 1) for k in range(8)] + [(4, 9)], True),  # a branch
-        ([(k, k + 1) for k in range(9)] + [(0, 1)], False),  # one bond twice
-    ],
-)
-def test_other_graphs_are_sparse(pairs: list[tuple[int, int]], independent: bool) -> None:
-    (shape,) = shapes_of(held.Distance(pairs), places(10))
-    assert shape.kind == "SparseDistances" and shape.clusters == 1
-    assert shape.independent is independent
-
-
 def test_mixed_and_general_rows() -> None:
     rows = [
         held.Distance([[0, 1], [4, 5], [8, 9], [12, 13]]),
@@ -153,3 +128,47 @@ def test_every_row_goes_to_exactly_one_shape(seed: int) -> None:
     taken = np.concatenate([s.rows.ravel() for s in classify(constraint_set, plan.labels, plan.inverse_masses)])
     np.testing.assert_array_equal(np.sort(taken), np.flatnonzero(plan.labels >= 0))
     assert sum(k.clusters for k in plan.kinds) == plan.labels.max() + 1
+
+
+# -- blocks -----------------------------------------------------------------------------------------
+
+
+def blocks(rows, n_atoms, only=None):
+    x = np.random.default_rng(1).normal(size=(n_atoms, 3))
+    held = ConstraintSet(rows, x, np.ones(n_atoms))
+    members, starts = row_blocks(held, lambda item: True, only)
+    return held, x, sorted(members[a:b].tolist() for a, b in itertools.pairwise(starts))
+
+
+def test_a_row_of_several_atoms_is_a_cycle_through_them():
+    assert blocks([Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2]])], 4)[2] == [[0, 1, 2]]
+    assert blocks([Distance([[0, 1]]), Angle([[1, 2, 3]])], 4)[2] == []
+
+
+def test_fixed_atoms_and_space_are_one_vertex():
+    """A chain between two fixed atoms, or between a sphere and a fixed atom, is closed."""
+    chain = Distance([[0, 1], [1, 2]])
+    assert blocks([chain, FixedAtoms([0])], 3)[2] == []
+    assert blocks([chain, FixedAtoms([0, 2])], 3)[2] == [[0, 1]]
+    ((_, *rows),) = [[0, *found] for found in blocks([chain, FixedAtoms([0]), Sphere([2], np.zeros(3), None)], 3)[2]]
+    assert rows == [0, 1, 5]  # rows 2 to 4 hold the fixed atom
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_ranks_of_blocks_add_up_to_the_rank_of_all(seed):
+    """And no block falls apart: without any one of its atoms, its rows still hang together."""
+    rng = np.random.default_rng(seed)
+    n = 12
+    every = np.array([(i, j) for i in range(n) for j in range(i)])
+    pairs = every[rng.choice(len(every), 20, replace=False)]
+    held, x, found = blocks([Distance(pairs)], n)
+    jacobian = held.jacobian(x).toarray()
+    single = len(pairs) - sum(map(len, found))
+    assert np.linalg.matrix_rank(jacobian) == single + sum(np.linalg.matrix_rank(jacobian[rows]) for rows in found)
+    for rows in found:
+        for atom in np.unique(pairs[rows]):
+            left = [set(pair) - {atom} for pair in pairs[rows].tolist()]
+            reached = set(left[0])
+            for _ in left:
+                reached |= set().union(*(pair for pair in left if pair & reached))
+            assert reached == set(np.unique(pairs[rows]).tolist()) - {atom}

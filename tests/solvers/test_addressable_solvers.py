@@ -6,12 +6,14 @@ import numba
 import numpy as np
 import pytest
 
-from kcons import ConstraintSet
-from kcons.constraints import Angle, Custom, Dihedral, Distance, Sphere
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Angle, Dihedral, Distance, Sphere
+from kcons.errors import ConvergenceError
 from kcons.solvers.addressable_solvers import pack_solver_tables, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.mixed_rows import SparseRows
+from kcons.steppers.packed_system import packed_rows
 
 X = np.array([[0.0, 0, 0], [1.5, 0, 0], [2.0, 1.4, 0], [3.5, 1.4, 0.5], [0.3, 0.2, 4.0], [1.0, 1.0, 5.0]])
 MASSES = np.array([12.0, 14.0, 1.0, 16.0, 2.0, 3.0])
@@ -66,27 +68,6 @@ def test_where_one_fails_nothing_has_changed(bad) -> None:
     np.testing.assert_array_equal(v, unlike)
 
 
-def test_python_functions_can_be_called_and_what_they_raise_is_kept() -> None:
-    broken = []
-
-    def function(r):
-        if broken:
-            raise ZeroDivisionError("of its own")
-        return float(r[0] @ r[0])
-
-    held = ConstraintSet(Custom([[4]], function, lambda r: 2 * r), X, MASSES)
-    solver = SingleRows(held, np.arange(1), 1 / MASSES)
-    tables, new = tables_of([solver]), X + 0.01
-    assert packed_positions(new, X, new, 0.0, tables) > 0
-    np.testing.assert_allclose(held.value(new), 0.0, atol=1e-13)
-    broken.append(True)
-    kept = new.copy()
-    assert packed_positions(new, X, new, 0.0, tables) == -1
-    np.testing.assert_array_equal(new, kept)
-    with pytest.raises(ZeroDivisionError, match="of its own"):
-        solver.positions(Request(new, X))
-
-
 def test_kernels_are_compiled_for_their_own_solver_only() -> None:
     """Those of the solver serve Python and other kernels."""
     solver = solvers()[0]
@@ -95,3 +76,52 @@ def test_kernels_are_compiled_for_their_own_solver_only() -> None:
     tables_of([solver])
     for kernel in solver.kernels[:3]:
         assert isinstance(kernel, numba.core.registry.CPUDispatcher) and len(kernel.signatures) == 1
+
+
+# -- long chains, whose kernel writes at once -------------------------------------------------------
+
+
+TRIANGLE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])
+
+
+def engine(chains=(100,), triangles: int = 0, stars: int = 0, ions: int = 0):
+    """Helices of so many bonds, then molecules, then free atoms: the engine, where they are, and the packed rows."""
+    rng = np.random.default_rng(5)
+    shapes = []
+    for number, n in enumerate(chains):
+        k = np.arange(n + 1)
+        helix = np.stack([np.cos(k), np.sin(k), 0.3 * k], axis=1) + 0.7 * number
+        shapes.append((helix, np.stack([k[:-1], k[1:]], axis=1)))
+    shapes += [(TRIANGLE + rng.normal(size=3), np.array([[0, 1], [0, 2], [1, 2]]))] * triangles
+    shapes += [(rng.normal(size=(4, 3)), np.array([[0, 1], [0, 2], [0, 3]])) for _ in range(stars)]
+    first = np.cumsum([0, *(len(where) for where, _ in shapes)])
+    x = np.concatenate([*(where for where, _ in shapes), rng.normal(size=(ions, 3))])
+    masses = [[16.0, 1.0, 1.0] if len(where) == 3 else np.linspace(1.0, 14.0, len(where)) for where, _ in shapes]
+    pairs = np.concatenate([rows + begin for (_, rows), begin in zip(shapes, first, strict=False)])
+    motion = Motion(ConstraintSet(Distance(pairs), x, np.concatenate([*masses, np.full(ions, 23.0)])), x)
+    packed = packed_rows(motion)
+    assert packed is not None and packed.called[-1].name == "Chains"
+    set_lattice(packed.tables, None)
+    return motion, x, packed  # tables are good as long as their solvers
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"triangles": 11}, {"triangles": 11, "stars": 3}, {"stars": 2, "ions": 300}, {"chains": [200, 7]}]
+)
+def test_nothing_changes_where_a_chain_has_no_solution(options) -> None:
+    """Also not what was solved before it."""
+    motion, x, packed = engine(**options)
+    rng = np.random.default_rng(4)
+    bad = 203 if "chains" in options else 50  # of the last chain
+    for wrong in (40.0, np.nan):
+        ends, v = x + 0.01 * rng.normal(size=x.shape), rng.normal(size=x.shape)
+        ends[bad] += wrong
+        there, speed = ends.copy(), v.copy()
+        assert packed_positions(there, x, speed, 10.0, packed.tables) == -1
+        assert np.array_equal(there, ends, equal_nan=True) and np.array_equal(speed, v)
+    with pytest.raises(ConvergenceError):
+        motion.project_positions(np.where(np.isnan(ends), 99.0, ends), x)
+    v[bad] = np.nan
+    speed = v.copy()
+    assert not packed_tangents(x, speed, packed.tables)
+    assert np.array_equal(speed, v, equal_nan=True)

@@ -323,16 +323,6 @@ def test_a_third_side_that_turned_round_is_no_solution():
     np.testing.assert_array_equal(x, c.x_new)
 
 
-def test_triangles_that_cannot_be():
-    c = clusters("triangles-8")
-    c.lengths[9:12] = 1.0, 1.0, 3.0
-    outcome = c.positions(c.x_new.copy())
-    assert not outcome.converged and outcome.worst_row // 3 == 3
-    c.x_ref[c.atoms[5]] = [[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]
-    outcome = c.tangents(c.y.copy())
-    assert not outcome.converged and outcome.worst_row // 3 == 5
-
-
 # -- chains ---------------------------------------------------------------------------------------------------
 
 
@@ -356,14 +346,6 @@ def test_ten_thousand_bonds(shape, monkeypatch):
     assert np.abs(speed).max() <= 5e-15 * np.sqrt(3)
 
 
-def test_what_is_no_cluster_of_the_shape_is_refused():
-    with pytest.raises(ValueError, match="at least two"):
-        Chains([0], [0, 2, 3], [0, 1, 2], [1.0], [1.0, 1.0, 1.0])
-    pairs = [(k, k + 1) for k in range(7)]
-    with pytest.raises(ValueError, match="1 to 6"):
-        SmallClusters(np.arange(7), np.arange(8)[None], pairs, np.ones((1, 7)), np.ones(8))
-
-
 @pytest.mark.parametrize(("at", "miss", "expected"), [(0.0, 5e-15, True), (0.0, 1e-12, False), (1e4, 1e-12, True)])
 def test_lengths_are_resolved_as_far_as_positions_are(at, miss, expected):
     x, pairs = np.array([[at, 0, 0], [at + 1.0, 0, 0]]), np.array([0, 1], dtype=np.uint32)
@@ -371,19 +353,3 @@ def test_lengths_are_resolved_as_far_as_positions_are(at, miss, expected):
 
 
 # -- any connection -------------------------------------------------------------------------------------------
-
-
-def test_dependent_rows_are_dropped():
-    """Five points in space joined in all ten ways: nine rows are independent."""
-    pairs = np.array([(i, j) for i in range(5) for j in range(i)])
-    rng = np.random.default_rng(8)
-    x_ref = rng.normal(size=(5, 3))
-    lengths = np.linalg.norm(x_ref[pairs[:, 0]] - x_ref[pairs[:, 1]], axis=1)
-    solver = SparseDistances(np.arange(10), pairs, lengths, np.ones(5))
-    assert solver.rank(x_ref, None) == 9
-    x = x_ref + 0.01 * rng.normal(size=x_ref.shape)
-    assert positions(solver, x, x_ref, lengths[solver.rows]).converged
-    np.testing.assert_allclose(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1), lengths, rtol=1e-13)
-    y = rng.normal(size=x_ref.shape)
-    assert tangents(solver, x_ref, y).converged
-    assert np.abs(jacobian(x_ref, pairs) @ y.ravel()).max() <= 1e-13

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from stepper_systems import growing_rod, rotor, skate, system_of
+from stepper_systems import growing_rod, skate, system_of
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import (
@@ -34,15 +34,6 @@ def flown(system, state, h: float, *, exact: bool = False, flights: int = 1):
     steps = Interpreter(system, state, h, Program([Fly(1.0, parts, ends, exact)]))
     end = steps.through()
     return end.positions, end.velocities + (steps.push if steps.program.pairs else 0.0)
-
-
-def test_free_flight_absorbs_velocities_along_the_gradients() -> None:
-    """Kicks need no projection between: M^-1 A^T times anything makes no difference."""
-    system, state = rotor(omega=1.0)
-    along = system.motion.constraint_set.jacobian(state.positions).toarray().reshape(2, 3)
-    pushed = type(state)(state.positions, state.velocities + 0.7 * along * system.inverse_masses)
-    for a, b in zip(flown(system, state, 0.1), flown(system, pushed, 0.1), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=5e-14)
 
 
 def literal_flight(system, state, h: float):
@@ -89,24 +80,16 @@ def bodies_apart():
     return system, system.initial_state(x, np.random.default_rng(1).normal(size=(5, 3)), project=True)
 
 
+#: The plane of `swept` has turned by the end, and pushes where it was; speeds, and their directions, depend on time.
+DENSE = [skate, pivoting_skate, wheel, bodies_apart, lambda: swept(), lambda: swept(pushed(np.cos)), growing_rod]
+
+
 @pytest.mark.parametrize("h", [0.1, -0.3])
-@pytest.mark.parametrize(
-    "make", [skate, pivoting_skate, wheel, bodies_apart, lambda: swept(pushed(np.cos)), growing_rod]
-)
+@pytest.mark.parametrize("make", DENSE)
 def test_flights_are_those_of_dense_algebra(make, h) -> None:
     system, state = make()
     for one, other in zip(flown(system, state, h), literal_flight(system, state, h), strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=3e-14)
-
-
-@pytest.mark.parametrize("make", [skate, pivoting_skate, wheel])
-def test_velocity_rows_at_rest_go_through_the_kernels(make) -> None:
-    (system, state), (slow, _) = make(), make()
-    assert [solver.name for solver in system.motion.plan.solvers] == ["SparseRows"] and system.packed is not None
-    slow.packed = None
-    one, other = run(system, state, 0.02, 5), run(slow, state, 0.02, 5)
-    np.testing.assert_allclose(one.positions, other.positions, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(one.velocities, other.velocities, rtol=0, atol=1e-13)
 
 
 def test_velocity_row_that_cannot_be_met_names_itself() -> None:
@@ -170,32 +153,6 @@ def swept(*more) -> tuple:
     system = system_of([turning(), Distance([[0, 1], [1, 2]]), *more], x, [1.0, 0.4, 2.0])
     v = np.array([[0.3, 0.0, 0.1], [0.2, 0.5, -0.4], [0.0, 0.3, 0.6]])
     return system, system.initial_state(x, v, project=True)
-
-
-@pytest.mark.parametrize("h", [0.2, -0.2])
-@pytest.mark.parametrize("driven", [False, True], ids=["position rows", "with a velocity row"])
-def test_impulses_act_along_the_gradients_of_the_time_of_the_start(driven, h) -> None:
-    """u - v = M^-1 A(x0, t0)^T l: the plane has turned by the end, and pushes where it was."""
-    system, state = swept(*([pushed(np.cos)] if driven else []))
-    x, u = flown(system, state, h)
-    held = system.motion.constraint_set
-    assert np.abs(held.value(x, h)[held.holonomic]).max() <= 1e-14
-    np.testing.assert_allclose(x - state.positions, h * u, rtol=0, atol=1e-15)
-    along = held.jacobian(state.positions, 0.0).toarray()
-    push = (u - state.velocities).ravel() * np.repeat(system.masses, 3)
-    left = push - along.T @ np.linalg.lstsq(along.T, push, rcond=None)[0]
-    assert np.abs(push).max() > 1e-2
-    assert np.abs(left).max() <= 1e-13
-
-
-@pytest.mark.parametrize("h", [0.2, -0.2])
-def test_driven_velocities_hold_at_the_middle_of_the_time(h) -> None:
-    """a((x0 + x1)/2, t0 + h/2) . u = c(t0 + h/2), for coefficients and for speeds that depend on time."""
-    speed = lambda t: np.cos(3 * t + 0.4)  # noqa: E731
-    system, state = swept(pushed(speed))
-    x, u = flown(system, state, h)
-    middle = 0.5 * (state.positions + x)[2, 0]
-    assert np.array([np.cos(h), np.sin(h), middle]) @ u[2] == pytest.approx(speed(0.5 * h), abs=1e-14)
 
 
 @pytest.mark.parametrize("slope, dt", [(0.0, 0.0001), (0.17, 0.005), (0.17, 0.001)])

@@ -12,11 +12,8 @@ from stepper_systems import (
     NYSTROM,
     PROJECTED,
     angle_of,
-    growing_rod,
     rotor,
-    skate,
     slope,
-    spherical_pendulum,
     system_of,
     verlet,
 )
@@ -29,7 +26,6 @@ from kcons.steppers import (
     Composition,
     Geodesic,
     Rattle,
-    Splitting,
     State,
     run,
 )
@@ -104,16 +100,6 @@ def test_what_is_not_held_moves_by_velocity_verlet(atoms, held):
     assert not held or np.abs(end.positions - x1)[held].max() > 1e-3
 
 
-@pytest.mark.parametrize("stepper", COMPOSED, ids=repr)
-def test_a_skate_never_slips(stepper):
-    system, state = skate()
-    held, slips = system.motion.constraint_set, []
-    observe = lambda s: slips.append(held.jacobian(s.positions) @ s.velocities.ravel())  # noqa: E731
-    end = run(system, state, 0.05, 20, stepper=stepper, observers=[observe])
-    assert np.abs(slips).max() <= 1e-13
-    assert abs(system.total_energy(end) - system.total_energy(state)) <= 1e-3
-
-
 def test_huge_force_along_a_bond_cancels():
     pull = np.array([[1e12, 0, 0], [-1e12, 0, 0]])
     system, state = rotor(omega=0.0, force=lambda x, t: pull)
@@ -139,17 +125,6 @@ def test_forces_that_depend_on_velocities_are_taken_back(stepper):
 # -- compositions -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stepper", COMPOSITIONS, ids=repr)
-def test_it_is_rattle_steps_in_turn(stepper) -> None:
-    system, state = rotor(force=lambda x, t: -np.cos(3 * t) * x)
-    whole = stepper.step(system, state, 0.1)
-    for g in stepper.fractions:
-        state = Rattle().step(system, state, g * 0.1)
-    np.testing.assert_allclose(whole.positions, state.positions, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(whole.velocities, state.velocities, rtol=0, atol=2e-15)
-    assert whole.time == pytest.approx(state.time, abs=1e-16)
-
-
 @pytest.mark.parametrize(
     ("fractions", "order", "match"),
     [
@@ -167,20 +142,6 @@ def test_bad_fractions(fractions, order, match) -> None:
 
 
 # -- the geodesic splitting -------------------------------------------------------------------------
-
-
-def flights(substeps: int) -> Splitting:
-    """`Geodesic`, also where great circles are possible."""
-    return Splitting((0.5, 0.5), (1.0,), (1.0 / substeps,) * substeps)
-
-
-@pytest.mark.parametrize("make", [spherical_pendulum, rotor, growing_rod, skate])
-@pytest.mark.parametrize("stepper", [flights(1), Composition([1.0], 2)], ids=repr)
-def test_one_substep_and_one_fraction_are_rattle(stepper, make) -> None:
-    system, state = make()
-    a, b = run(system, state, 0.05, 20, stepper=stepper), run(system, state, 0.05, 20)
-    np.testing.assert_allclose(a.positions, b.positions, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(a.velocities, b.velocities, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize(("substeps", "omega_dt"), [(1, 0.7), (2, 0.7), (5, 0.7), (2, 1.2)])

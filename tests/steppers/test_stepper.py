@@ -97,29 +97,6 @@ def test_copies_leave_behind_what_was_found_for_a_system(stepper) -> None:
     )
 
 
-@REVERSIBLE
-def test_step_is_pure(stepper) -> None:
-    system, state = molecule()
-    state = system.with_forces(state)
-    before = copies(state)
-    first, second = (stepper.step(system, state, 0.05) for _ in range(2))
-    assert np.array_equal(first.positions, second.positions)
-    assert np.array_equal(first.velocities, second.velocities)
-    assert first.time == 0.05 and first.step == 1
-    assert_untouched(state, before)
-
-
-@REVERSIBLE
-def test_too_large_a_step_raises_and_changes_nothing(stepper) -> None:
-    system, state = rotor(omega=1.0)
-    state = State(state.positions, state.velocities, step=41)
-    before = copies(state)
-    with pytest.raises(ConvergenceError, match=r"step 42: time step too large \(dt = 100\)") as caught:
-        stepper.step(system, state, 100.0)
-    assert caught.value.step == 42 and caught.value.atoms == (0, 1)
-    assert_untouched(state, before)
-
-
 # -- time steps -------------------------------------------------------------------------------------
 
 
@@ -154,30 +131,6 @@ def test_steps_are_taken_back(stepper, make) -> None:
 
 
 # -- invariance -------------------------------------------------------------------------------------
-
-
-@REVERSIBLE
-def test_order_of_atoms_orientation_place_and_moving_frame_do_not_matter(stepper) -> None:
-    system, start = molecule()
-    end = run(system, start, 0.02, 100, stepper=stepper)
-    new = np.array([2, 0, 3, 1])  # atom new[i] of the old order is atom i of the new one
-    place, x = np.argsort(new), start.positions[new]
-    rows = [Angle([place[[0, 1, 2]]]), Distance([place[[1, 2]], place[[0, 1]]])]
-    other = system_of(rows, x, system.masses[new], springs)
-    b = run(other, other.initial_state(x, start.velocities[new]), 0.02, 100, stepper=stepper)
-    assert np.abs(end.positions[new] - b.positions).max() <= 1e-12
-    assert np.abs(end.velocities[new] - b.velocities).max() <= 1e-12
-
-    turn, _ = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))
-    turn *= np.linalg.det(turn)
-    shift, drift = np.array([3.0, -2.0, 5.0]), np.array([0.3, -0.2, 0.1])
-    there = molecule()[0].initial_state(start.positions @ turn.T + shift, start.velocities @ turn.T)
-    b = run(molecule()[0], there, 0.02, 100, stepper=stepper)
-    assert np.abs(end.positions @ turn.T + shift - b.positions).max() <= 1e-12
-    assert np.abs(end.velocities @ turn.T - b.velocities).max() <= 1e-12
-
-    b = run(system, system.initial_state(start.positions, start.velocities + drift), 0.02, 100, stepper=stepper)
-    assert np.abs(end.positions + 2.0 * drift - b.positions).max() <= 1e-12
 
 
 def test_reprs_build_the_stepper_again() -> None:
@@ -221,13 +174,10 @@ def test_check_reports_a_step_that_cannot_be_taken_back() -> None:
     assert caught.value.atoms == (0, 1) and caught.value.step == 1
 
 
-def test_check_refuses_schemes_that_are_not_reversible_and_bad_tolerances() -> None:
+def test_check_refuses_schemes_that_are_not_reversible() -> None:
     for stepper in PROJECTED:
         with pytest.raises(UnsupportedError, match="use Rattle, Geodesic, a Composition or a RungeKuttaNystrom"):
             ReversibilityCheck(stepper)
-    for tolerance in (0.0, -1.0, np.nan):
-        with pytest.raises(InputError, match="tolerance"):
-            ReversibilityCheck(Rattle(), tolerance)
 
 
 def test_check_works_far_from_the_origin_and_at_rest() -> None:
@@ -235,13 +185,6 @@ def test_check_works_far_from_the_origin_and_at_rest() -> None:
     run(system, state, 0.05, 20, stepper=ReversibilityCheck(Geodesic(2)))
     system, state = rotor(omega=0.0)
     run(system, state, 0.05, 3, stepper=ReversibilityCheck(Rattle()))
-
-
-def test_observers_see_start_and_every_kth_step() -> None:
-    system, state = rotor()
-    seen: list[int] = []
-    run(system, state, 0.01, 10, observers=[lambda s: seen.append(s.step)], every=4)
-    assert seen == [0, 4, 8]
 
 
 IMPOSSIBLE = [{"time": np.nan}, {"time": -np.inf}, {"time": 1j}, {"time": "a"}, {"time_remainder": np.nan}]
@@ -294,13 +237,6 @@ def test_frames_of_a_run_that_stops_are_kept(error):
     with pytest.raises(error) as raised:
         run(System(system.motion, forces), state, 0.01, 10, record=2)
     assert [frame.step for frame in raised.value.trajectory.frames] == [0, 2, 4, 6]
-
-
-def test_what_raises_at_the_first_state_has_a_trajectory_too() -> None:
-    def refuses(state: State) -> None:
-        raise KeyError("first")
-
-    system, state = rotor()
-    with pytest.raises(KeyError) as raised:
-        run(system, state, 0.01, 3, observers=[refuses], record=1)
+    with pytest.raises(ZeroDivisionError) as raised:
+        run(system, state, 0.01, 3, observers=[lambda s: 1 / 0], record=1)
     assert raised.value.trajectory.frames == []

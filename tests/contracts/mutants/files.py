@@ -75,8 +75,8 @@ MUTANTS = {
             "turning = «(earlier.sum(axis=1) == 1) & ~earlier[:, 0]→earlier.sum(axis=1) > 9»",
             "angle_rows::beside_a_rigid_body_only_what_it_leaves_is_held",
         ),
-        ("FLAT_RING = «2→»0.0", "ring_systems::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
-        ("_independent(rows[«held→:0»], rows[~held])", "ring_systems::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
+        ("FLAT_RING = «2→»0.0", "angle_rows::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
+        ("_independent(rows[«held→:0»], rows[~held])", "angle_rows::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         ('(p, "«2→1»")', "nose_hoover_ensemble::a_chain_in_the_middle_is_the_same_chain_in_small_steps"),
@@ -92,7 +92,7 @@ MUTANTS = {
         ("single &= «~anchored→anchored >= 0»", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
     ],
     "motion/solver_sequence.py": [
-        ("_beside(then[first], then[first + 1]) <= «0→-1».0", "failures::a_dihedral_that_becomes_straight_is_named"),
+        ("_beside(then[first], then[first + 1]) <= «0→-1».0", "motion::a_dihedral_that_becomes_straight_is_named"),
         (
             "                moved = None« if places is None else rows.moved_places(places, x)→»",
             "places::a_molecule_is_the_same_in_the_cell_as_in_open_space",

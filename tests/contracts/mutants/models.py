@@ -52,8 +52,8 @@ MUTANTS = {
         ("«self.D[0] += y - self.y→pass»", "integration::the_next_step_starts_from_the_projection"),
     ],
     "solvers/sparse/row_functions.py": [
-        ("_from(p, «stride→0» * i)", "rows_at_once::solutions_are_those_of_rows_called_one_by_one"),
-        ("alike[«first + size - 1→:»] = True", "rows_at_once::who_is_called_one_by_one"),
+        ("_from(p, «stride→0» * i)", "single_rows::solutions_are_those_of_rows_called_one_by_one"),
+        ("alike[«first + size - 1→:»] = True", "single_rows::who_is_called_one_by_one"),
         ("] == time« and before[2] == value→»", "row_functions::a_gradient_is_found_again_where_the_value_has_changed"),
     ],
 }

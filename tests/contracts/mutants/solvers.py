@@ -83,7 +83,10 @@ MUTANTS = {
         ("f, g = h / «(rho * q)→rho», up / q", "constraint::gradient_and_curvature_by_taylor_remainder[Torus-0]"),
     ],
     "solvers/sparse/row_functions.py": [
-        ("if np.a«ll→ny»(table == table[0]):", "single_rows::rows_agree_with_the_dense_solver[Sphere-open]"),
+        (
+            "if np.a«ll→ny»(table == table[0]):",
+            "row_functions::kernels_agree_with_the_dense_solver[SingleRows-Sphere-near]",
+        ),
     ],
     "solvers/single_rows.py": [
         ("store_double(solution, k, la«st + 0.5 * (lam - last)→m»)", "single_rows::steps_that_overshoot_are_halved"),

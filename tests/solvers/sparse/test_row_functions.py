@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from itertools import product
 
 import numba
 import numpy as np
@@ -11,10 +12,11 @@ import pytest
 from constraint_cases import CASES, MASSES, TIME, scattered
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Custom, Distance, RowKind
+from kcons.constraints import Angle, Custom, Cylinder, Dihedral, Distance, Plane, RowKind, Sphere
 from kcons.errors import InputError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.mixed_rows import SparseRows
 
 FUNCTIONS = [name for name in CASES if CASES[name]().kind == RowKind.FUNCTION]
@@ -45,30 +47,59 @@ def wave_gradient(r, t):
     return np.array([[-np.cos(r[0, 0] - t), 0.0, 1.0]])
 
 
-def both(rows, x, time=TIME):
-    whole = ConstraintSet(rows, x, MASSES, time=time)
+#: Bonds, angles and dihedrals of a chain, and surfaces beside them.
+COUPLED = [
+    Distance([[0, 1], [1, 2], [2, 3], [3, 4], [6, 7]]),
+    Angle([[0, 1, 2], [2, 3, 4]]),
+    Dihedral([[0, 1, 2, 3], [1, 2, 3, 4]]),
+    Plane([4], [0.0, 0.6, 0.8]),
+    Sphere([6], [5.0, 5.0, 5.0]),
+    Cylinder([7], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]),
+]
+CELL = np.array([[40.0, 0, 0], [6, 36, 0], [-4, 8, 44]])
+
+
+def both(rows, x, time=TIME, solver=SparseRows, cell=None, inverse_masses=1 / MASSES):
+    """A solver of kernels and the dense one, which takes rows that share no atom apart."""
+    whole = ConstraintSet(rows, x, MASSES, time=time, cell=cell)
     numbers = np.arange(whole.n_rows)
-    return SparseRows(whole, numbers, 1 / MASSES), GeneralClusters(whole, numbers, 0 * numbers, 1 / MASSES), whole
+    labels = numbers if solver is SingleRows else 0 * numbers
+    fast, dense = solver(whole, numbers, inverse_masses), GeneralClusters(whole, numbers, labels, inverse_masses)
+    return fast, dense, whole
 
 
-@pytest.mark.parametrize("far", [0.0, 50.0], ids=["near", "far"])
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_kernels_agree_with_the_dense_solver(name, far):
-    x = scattered(1) + (far if CASES[name]().translation_invariant else 0.0)
-    fast, dense, whole = both([CASES[name](), Distance([[6, 7]])], x)
-    rng = np.random.default_rng(2)
-    new, y = x + 0.02 * rng.normal(size=x.shape), rng.normal(size=x.shape)
-    wanted = whole.target(TIME + 0.01)
+WHERE = ["near", "far", "triclinic"]
+KERNELS = [*product([SparseRows, SingleRows], FUNCTIONS, WHERE)]
+KERNELS += [(SparseRows, "coupled", where) for where in (*WHERE, "infinite mass")]
+
+
+@pytest.mark.parametrize(("solver", "name", "where"), KERNELS)
+def test_kernels_agree_with_the_dense_solver(solver, name, where):
+    """In positions, velocities, tangents and multipliers, with targets and rates that are not those of the start."""
+    rows = COUPLED if name == "coupled" else [CASES[name](), Distance([[6, 7]])]
+    if solver is SingleRows:
+        (item, _), one = rows, np.unique(rows[0].atoms, return_counts=True)[1].max() > 1
+        rows = [item.select([0]) if one else item]
+    anywhere, x = all(item.translation_invariant for item in rows), scattered(1)
+    cell, far, inverse_masses = CELL if where == "triclinic" else None, where == "far" and anywhere, 1 / MASSES
+    if cell is not None and anywhere:
+        x = x + np.random.default_rng(0).integers(-1, 2, (8, 3)) @ cell
+    x, rng = x + 50.0 * far, np.random.default_rng(2)
+    new, y, w = x + 0.02 * rng.normal(size=x.shape), *rng.normal(size=(2, *x.shape))
+    if where == "infinite mass":
+        inverse_masses, new[2], y[2] = np.where(np.arange(8) == 2, 0.0, inverse_masses), x[2], 0.0
+    fast, dense, whole = both(rows, x, TIME, solver, cell, inverse_masses)
+    wanted, rates = whole.target(TIME + 0.01), rng.normal(size=whole.n_rows)
     found = []
-    for solver in (fast, dense):
-        positions, tangents, multipliers = new.copy(), y.copy(), np.empty((2, whole.n_rows))
-        moved = Request(positions, x, wanted, None, TIME + 0.01, TIME)
-        assert solver.positions(moved, multipliers[0]).converged
-        assert solver.tangents(Request(tangents, x, wanted, None, TIME), multipliers[1]).converged
-        order = np.argsort(solver.rows)
-        found.append((positions, tangents, multipliers[:, order]))
+    for each in (fast, dense):
+        positions, velocities, tangents, multipliers = new.copy(), w.copy(), y.copy(), np.empty((2, whole.n_rows))
+        moved = Request(positions, x, wanted, whole.lattice, TIME + 0.01, TIME, velocities, 7.0)
+        assert each.positions(moved, multipliers[0]).converged
+        assert each.tangents(Request(tangents, x, rates, whole.lattice, TIME), multipliers[1]).converged
+        found.append((positions, velocities, tangents, multipliers[:, np.argsort(each.rows)]))
+    digits = 2e-11 if "ithout" in name else 2e-12 if cell is not None else 1e-11 if far else 4e-13
     for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, atol=2e-11 if "ithout" in name else 1e-13 * max(1, far))
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=digits)
     assert np.all(np.abs(whole.value(found[0][0], TIME + 0.01)) <= 2 * whole.tolerance(x, TIME + 0.01))
 
 
