@@ -126,7 +126,9 @@ class _Stack:
         """Blocks that are singular at second order at `x`, shape (n_blocks,)."""
         unit, _, curvature = self.dense(x)
         doubtful: BoolArray = np.asarray(np.isfinite(unit).all(axis=(1, 2)))
-        doubtful[doubtful] = _deficient(unit[doubtful])
+        if unit.shape[1] <= unit.shape[2]:  # dependent rows
+            squares = np.linalg.eigvalsh(unit[doubtful] @ unit[doubtful].transpose(0, 2, 1))
+            doubtful[doubtful] = squares[:, 0] <= LOST**2 * squares[:, -1]
         if doubtful.any() and not doubtful.all():
             doubtful[doubtful] = self.chosen(doubtful).suspects(x)
         elif doubtful.any():
@@ -206,16 +208,8 @@ class _Stack:
         return result
 
 
-def _deficient(unit: FloatArray) -> BoolArray:
-    """Which blocks have dependent rows, shape (n_blocks,)."""
-    if unit.shape[1] > unit.shape[2]:
-        return np.ones(len(unit), bool)
-    squares = np.linalg.eigvalsh(unit @ unit.transpose(0, 2, 1))
-    return np.asarray(squares[:, 0] <= LOST**2 * squares[:, -1])
-
-
 def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> Iterator[_Stack]:
-    """All blocks small enough for dense algebra, by shape; tests larger ones on the way."""
+    """All blocks small enough for dense algebra, by shape; refuses larger ones whose rank is higher nearby."""
     rows: IntArray | None = None
     pinned = fixed_atoms(constraint_set)
     for accept in _LEVELS:
@@ -242,14 +236,10 @@ def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -
         if len(rows) == 0:
             return
     for k in np.flatnonzero(large).tolist():
-        _check_large(LocalRows(constraint_set, members[starts[k] : starts[k + 1]], positions, time))
-
-
-def _check_large(block: LocalRows) -> None:
-    """Refuse a block too large for dense algebra whose rank is lower here than at positions nearby."""
-    here, nearby = (_sparse_rank(block, x) for x in (block.x, block.nearby(np.random.default_rng(20090131))))
-    if here < nearby:
-        raise _unresolved(block, here, nearby)
+        block = LocalRows(constraint_set, members[starts[k] : starts[k + 1]], positions, time)
+        here, nearby = (_sparse_rank(block, x) for x in (block.x, block.nearby(np.random.default_rng(20090131))))
+        if here < nearby:
+            raise _unresolved(block, here, nearby)
 
 
 def _sparse_rank(block: LocalRows, x: FloatArray) -> int:

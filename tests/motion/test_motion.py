@@ -8,12 +8,7 @@ from motion_systems import TRIANGLE, WATER, steps, system
 
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import (
-    ContradictionError,
-    ConvergenceError,
-    InputError,
-    SingularGeometryError,
-)
+from kcons.errors import ContradictionError, ConvergenceError, InputError, SingularGeometryError
 from kcons.motion import Motion
 from kcons.motion.solver_sequence import Failures
 from kcons.solvers.cluster_solver import Outcome, Request

@@ -12,8 +12,9 @@ from kcons import constraints as held
 from kcons.constraints import Angle, Distance, FixedAtoms, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.plan import make_plan
-from kcons.plan.clusters import LANES_CLUSTERS, LANES_ROWS, Shape, classify
+from kcons.plan.clusters import LANES_CLUSTERS, Shape, classify
 from kcons.plan.independent_blocks import row_blocks
+from kcons.solvers.small_clusters import LARGEST
 
 NONE = np.zeros(0, np.int64)
 TRIANGLE = list(combinations(range(3), 2))
@@ -79,15 +80,15 @@ def test_many_kinds_of_few_clusters_go_to_the_sparse_solver(few: int) -> None:
     assert sum(s.clusters for s in shapes) == 4 * few
 
 
-@pytest.mark.parametrize("rows", [LANES_ROWS, LANES_ROWS + 1])
+@pytest.mark.parametrize("rows", [LARGEST, LARGEST + 1])
 def test_open_chains_beyond_the_lanes(rows: int) -> None:
     rng = np.random.default_rng(1)
     label = rng.permutation(2 * (rows + 1))
     pairs = [(label[k], label[k + 1]) for k in range(2 * rows + 1) if k != rows]
     pairs = np.array(pairs)[rng.permutation(len(pairs))]
     shapes = shapes_of(held.Distance(pairs), places(len(label)))
-    assert {s.kind for s in shapes} == ({"SmallClusters"} if rows <= LANES_ROWS else {"Chains"})
-    if rows > LANES_ROWS:
+    assert {s.kind for s in shapes} == ({"SmallClusters"} if rows <= LARGEST else {"Chains"})
+    if rows > LARGEST:
         (shape,) = shapes
         assert shape.clusters == 2 and shape.independent
         assert shape.starts.tolist() == [0, rows + 1, 2 * rows + 2]
@@ -96,23 +97,6 @@ def test_open_chains_beyond_the_lanes(rows: int) -> None:
             walked = pairs[shape.rows[k * rows : (k + 1) * rows]]
             for row, (a, b) in enumerate(pairwise(atoms)):
                 assert {a, b} == set(walked[row])
-
-
-def test_mixed_and_general_rows() -> None:
-    rows = [
-        held.Distance([[0, 1], [4, 5], [8, 9], [12, 13]]),
-        held.Angle([[0, 1, 2]]),  # compiled: mixed
-        held.RadiusOfGyration([[4, 5, 6, 7, 8]]),  # a function: mixed
-        held.LinearVelocity([[10, 11]], [[1.0, 0, 0], [0, 1.0, 0]]),  # velocity rows: mixed
-        held.Sphere([3], [9.0, 0, 0]),  # a function alone
-        held.ImplicitSurface([14, 15], lambda r: r[:, 0] - 3.0, target=None),  # a function of two rows at once
-    ]
-    shapes = {s.kind: s for s in shapes_of(rows, places(16))}
-    assert set(shapes) == {"SmallClusters", "SingleRows", "SparseRows", "GeneralClusters"}
-    assert shapes["SparseRows"].rows.tolist() == [0, 1, 2, 4, 5, 6] and shapes["SparseRows"].clusters == 3
-    assert shapes["SingleRows"].rows.tolist() == [7] and shapes["SingleRows"].clusters == 1
-    assert shapes["GeneralClusters"].rows.tolist() == [8, 9] and shapes["GeneralClusters"].clusters == 2
-    assert shapes["SmallClusters"].rows.tolist() == [[3]]
 
 
 @pytest.mark.parametrize("seed", range(5))

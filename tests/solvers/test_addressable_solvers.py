@@ -13,7 +13,7 @@ from kcons.solvers.addressable_solvers import pack_solver_tables, packed_positio
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.mixed_rows import SparseRows
-from kcons.steppers.packed_system import packed_rows
+from kcons.steppers.packed_system import packed_system
 
 X = np.array([[0.0, 0, 0], [1.5, 0, 0], [2.0, 1.4, 0], [3.5, 1.4, 0.5], [0.3, 0.2, 4.0], [1.0, 1.0, 5.0]])
 MASSES = np.array([12.0, 14.0, 1.0, 16.0, 2.0, 3.0])
@@ -99,7 +99,7 @@ def engine(chains=(100,), triangles: int = 0, stars: int = 0, ions: int = 0):
     masses = [[16.0, 1.0, 1.0] if len(where) == 3 else np.linspace(1.0, 14.0, len(where)) for where, _ in shapes]
     pairs = np.concatenate([rows + begin for (_, rows), begin in zip(shapes, first, strict=False)])
     motion = Motion(ConstraintSet(Distance(pairs), x, np.concatenate([*masses, np.full(ions, 23.0)])), x)
-    packed = packed_rows(motion)
+    packed = packed_system(motion)
     assert packed is not None and packed.called[-1].name == "Chains"
     set_lattice(packed.tables, None)
     return motion, x, packed  # tables are good as long as their solvers

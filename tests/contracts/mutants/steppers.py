@@ -24,7 +24,7 @@ MUTANTS = {
         ),
         ("self.time + «(end * self.dt + self.left_over)→end * self.dt»", "interpreter::times_within_a_step_are_exact"),
         ("(«start, float(np.abs(push).max(initial=0.0)), →0.0, »", "coming_to_rest::a_damped_pendulum_comes_to_rest"),
-        ("change <= «2→1e8» * _EPS * size", "coming_to_rest::settled_velocities_are_those_of_the_implicit_equation"),
+        ("change <= «2→1e8» * EPS * size", "coming_to_rest::settled_velocities_are_those_of_the_implicit_equation"),
     ],
     "solvers/sparse/mixed_rows.py": [
         (
