@@ -74,7 +74,7 @@ def as_float_array(values: ArrayLike | Any, item: str) -> FloatArray:
     return np.asarray(array, dtype=np.float64)
 
 
-def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray:
+def as_array(values: ArrayLike, shape: tuple[int, ...], item: str) -> FloatArray:
     """`values` themselves if the kernels can take them, or a float64 copy of that shape."""
     if type(values) is np.ndarray and values.dtype is _FLOAT and values.shape == shape and values.flags.carray:
         return values
@@ -164,14 +164,13 @@ def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") ->
             item=item,
             atoms=table[row],
         )
-    if table.shape[1] > 1:
-        ordered = np.sort(table, axis=1)
-        repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
-        if repeated.any():
-            row = int(np.argmax(repeated))
-            raise InputError(
-                f"{name}: row {row} names an atom twice: {tuple(table[row].tolist())}", item=item, atoms=table[row]
-            )
+    ordered = np.sort(table, axis=1)
+    repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+    if repeated.any():
+        row = int(np.argmax(repeated))
+        raise InputError(
+            f"{name}: row {row} names an atom twice: {tuple(table[row].tolist())}", item=item, atoms=table[row]
+        )
     return table
 
 

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +40,8 @@ from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.errors import ConstraintError, InputError, SingularGeometryError, UnsupportedError
 
 IntArray = NDArray[np.int64]
+#: Rows that are marked, what is said of row k, and the argument at fault, if one is.
+Fault: TypeAlias = tuple[Any, ...]
 #: A step along which derivatives are imaginary parts: its square vanishes beside 1, and a power of two does not round.
 _COMPLEX_STEP = 2.0**-100
 
@@ -301,22 +303,18 @@ class Constraint:
 
         `first_row` is the number of this object's first row in its set, for messages.
         """
+        for bad, say, *item in self.faults(r, time):
+            self.refuse(bad, first_row, say, *item)
+
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
+        """What `check` refuses."""
         with np.errstate(all="ignore"):
             value, slope = self.value_and_gradient(r, time)
             size = np.sqrt(np.einsum("kai,kai->k", slope, slope))
-        bad = ~(np.isfinite(value) & np.isfinite(size) & (size > 0))
-        self.refuse(bad, first_row, lambda k: self.undefined(k, r[k], time))
+        yield ~(np.isfinite(value) & np.isfinite(size) & (size > 0)), lambda k: self.undefined(k, r[k], time)
         if self.positive and self.target is not None:
-            length = self.target_at(time)
-            self.refuse(
-                ~(length > 0),
-                first_row,
-                lambda k: (
-                    f"{self.positive} {length[k]:g} is not positive; give a length greater than zero, or None to hold "
-                    "the present one"
-                ),
-                self.positive,
-            )
+            length, remedy = self.target_at(time), "give a length greater than zero, or None to hold the present one"
+            yield ~(length > 0), lambda k: f"{self.positive} {length[k]:g} is not positive; {remedy}", self.positive
 
     def undefined(self, k: int, r: FloatArray, time: float) -> str:
         """What is said of row `k`, which has no gradient at `r`, shape (width, 3)."""

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_float_array, finite_number, read_only
+from kcons.constraints.arguments import as_array, as_float_array, finite_number, read_only
 from kcons.constraints.constraint import Constraint, IntArray, constraints_in
 from kcons.constraints.contradictions import agreed_targets
 from kcons.constraints.periodic.images import Images, find_images
@@ -116,13 +116,11 @@ class ConstraintSet:
                     item="units",
                 )
         time = finite_number(time, "time")
-        x = contiguous(positions, "positions")
+        x = as_float_array(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"positions must have shape (n_atoms, 3), not {x.shape}", item="positions")
-        m = contiguous(masses, "masses").copy()
-        if m.shape != (len(x),):
-            raise InputError(f"masses must have shape ({len(x)},), not {m.shape}", item="masses")
         self.n_atoms = len(x)
+        m = as_array(masses, (self.n_atoms,), "masses").copy()
         self.masses = read_only(m)  # engines know their inverse
         self._set_cell(cell, pbc)
         self.starts = _starts(given)
@@ -151,12 +149,11 @@ class ConstraintSet:
 
     def _set_scale(self, x: FloatArray, time: float) -> None:
         """Rows that hold no length take sum |dq/dx_i| |x_i|; at the origin, the size of the system; then 1."""
-        scale = self._rows(lambda c: c.scale(time))
-        if not np.all(scale > 0):
-            size, length = self._reach(x, time), extent(x)
-            size = np.where(size > 0, size, length if length > 0 else 1.0)
-            scale = np.where(scale > 0, scale, size)
-        self.scale: FloatArray = scale
+        self.scale: FloatArray = self._rows(lambda c: c.scale(time))
+        if not np.all(self.scale > 0):
+            size = self._reach(x, time)
+            size = np.where(size > 0, size, extent(x) or 1.0)
+            self.scale = np.where(self.scale > 0, self.scale, size)
 
     def _reach(self, x: FloatArray, time: float) -> FloatArray:
         """sum |dq/dx_i| |x_i| of each row."""
@@ -180,14 +177,13 @@ class ConstraintSet:
     @cached_property
     def holonomic(self) -> NDArray[np.bool_]:
         """True for position rows, False for velocity rows, shape (n_rows,)."""
-        return np.repeat(np.array([c.holonomic for c in self.constraints], bool), np.diff(self.starts))
+        return self._rows(lambda c: np.full(c.n_rows, c.holonomic)).astype(bool)
 
     @cached_property
     def incidence(self) -> sp.csr_array:
         """Which row touches which atom, shape (n_rows, n_atoms), entries 1."""
-        columns = np.concatenate([np.zeros(0, np.int64), *(c.atoms.ravel() for c in self.constraints)])
-        widths = np.repeat(np.array([c.width for c in self.constraints], np.int64), np.diff(self.starts))
-        indptr = np.concatenate([[0], np.cumsum(widths)])
+        columns = _atoms_of(self.constraints)
+        indptr = np.concatenate([[0], np.cumsum(self._rows(lambda c: np.full(c.n_rows, c.width)))]).astype(np.int64)
         return sp.csr_array((np.ones(len(columns)), columns, indptr), shape=(self.n_rows, self.n_atoms))
 
     @cached_property
@@ -250,8 +246,7 @@ class ConstraintSet:
 
     def velocity_target(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """c with A v = c for admissible velocities, shape (n_rows,); 0 where nothing moves by itself."""
-        time = finite_number(time, "time")
-        x = self._positions(x)
+        time, x = finite_number(time, "time"), self._positions(x)
         y = self.whole(x)
         return self._rows(lambda c: _speed_of(c, self.gather(c, x, y), time) if c.moving else _rate_of(c, time))
 
@@ -307,15 +302,11 @@ class ConstraintSet:
             for item, start, lo, hi in zip(self.constraints, self.starts, bounds[:-1], bounds[1:], strict=False)
             if hi > lo
         ]
-        used = np.concatenate([p.atoms.ravel() for p in pieces] or [np.zeros(0, np.int64)])
-        atoms = np.unique(used)
-        images = None
-        if self.images is not None:
-            wholes = [p.atoms.ravel() for p in pieces if p.whole is not None]
-            if wholes:
-                between = self.images.ancestors(np.concatenate(wholes), self.n_atoms)
-                atoms = np.union1d(atoms, between)
-            images = self.images.among(atoms, rows)
+        atoms, images = np.unique(_atoms_of(pieces)), self.images
+        if images is not None:
+            wholes = _atoms_of([piece for piece in pieces if piece.whole is not None])
+            atoms = np.union1d(atoms, images.ancestors(wholes, self.n_atoms))
+            images = images.among(atoms, rows)
         renumbered = [p.changed(atoms=read_only(np.searchsorted(atoms, p.atoms))) for p in pieces]
         part = self._other(len(atoms), self.masses[atoms], renumbered)
         part.images, part.scale = images, self.scale[rows]
@@ -359,10 +350,7 @@ class ConstraintSet:
         return self._rows(lambda c: function(c, self.gather(c, positions, whole), time))
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
-        array = as_float_array(x, item)
-        if array.shape != (self.n_atoms, 3):
-            raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
-        return array
+        return as_array(x, (self.n_atoms, 3), item)
 
     # -- the cell -------------------------------------------------------------------------------
 
@@ -370,7 +358,7 @@ class ConstraintSet:
         self.lattice: FloatArray | None = None
         if cell is None:
             return
-        matrix = contiguous(cell, "cell")
+        matrix = as_float_array(cell, "cell")
         if matrix.shape == (3,):
             matrix = np.diag(matrix)
         if matrix.shape != (3, 3):
@@ -492,20 +480,20 @@ class ConstraintSet:
             return
         as_before = x + cells @ self.lattice[0]
 
-        def miss(c: Constraint, whole: FloatArray) -> FloatArray:
-            if time is None and c.moving:
-                return np.ones(c.n_rows)
-            return np.abs(self._sigma(c, self.gather(c, x, whole), 0.0 if time is None else time))
+        def miss(whole: FloatArray) -> FloatArray:
+            def of(c: Constraint) -> FloatArray:
+                unknown = time is None and c.moving
+                return np.ones(c.n_rows) if unknown else self._sigma(c, self.gather(c, x, whole), time or 0.0)
 
-        here = self._rows(lambda c: miss(c, y)) / self.scale
-        there = self._rows(lambda c: miss(c, as_before)) / self.scale
+            return np.abs(self._rows(of)) / self.scale
+
+        here, there = miss(y), miss(as_before)
         other = np.concatenate([changed[c.atoms].any(axis=1) & c.relative for c in self.constraints if c.n_rows])
         bad = other & (here > np.maximum(1e-9, 0.5 * there))
         if bad.any():
             row = int(np.argmax(np.where(bad, here, -1.0)))
             atoms = self.row_atoms(row)
-            pair = atoms[[0, int(np.argmax(changed[atoms]))]]
-            raise self._image_error(row, pair, numbers)
+            raise self._image_error(row, atoms[[0, int(np.argmax(changed[atoms]))]], numbers)
 
     @cached_property
     def _longest_plain(self) -> tuple[float, int]:
@@ -517,8 +505,7 @@ class ConstraintSet:
             return c.target_at(0.0) if c.whole is None else np.where(c.whole, 0.0, c.target_at(0.0))
 
         length = self._rows(lengths)
-        row = int(np.argmax(length)) if len(length) else 0
-        return float(length.max(initial=0.0)), row
+        return float(length.max(initial=0.0)), int(np.argmax(length)) if len(length) else 0
 
     def whole(self, x: FloatArray) -> FloatArray:
         """Positions in which atoms of whole rows stand in the images that these rows mean; see `periodic.images`.
@@ -532,10 +519,8 @@ class ConstraintSet:
     @cached_property
     def placed(self) -> IntArray | None:
         """Atoms of `images` at which rows with a place in space look, but for `FixedAtoms`; None if there are none."""
-        rows = [c.atoms.ravel() for c in self.constraints if not c.relative and not c.fixes_atoms]
-        if self.images is None or not rows:
-            return None
-        found = np.intersect1d(self.images.atoms, np.concatenate(rows))
+        rows = [c for c in self.constraints if not c.relative and not c.fixes_atoms]
+        found = np.intersect1d(_atoms_of(()) if self.images is None else self.images.atoms, _atoms_of(rows))
         return found if len(found) else None
 
     def moved_places(self, stored: FloatArray, x: FloatArray) -> FloatArray | None:
@@ -602,17 +587,12 @@ class ConstraintSet:
 
 
 def _starts(constraints: Sequence[Constraint]) -> IntArray:
-    """The first rows, and the end."""
     return np.cumsum([0, *(c.n_rows for c in constraints)], dtype=np.int64)
 
 
 def joined(pieces: Sequence[FloatArray]) -> FloatArray:
     """Rows of all pieces, which are the last axis."""
     return np.concatenate(pieces, axis=-1) if pieces else np.zeros(0)
-
-
-def contiguous(values: ArrayLike, item: str) -> FloatArray:
-    return np.ascontiguousarray(as_float_array(values, item))
 
 
 def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
@@ -635,6 +615,11 @@ def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: Floa
     return make_whole(x, *spanning_tree(links, len(x)), lattice)
 
 
+def _atoms_of(constraints: Iterable[Constraint]) -> IntArray:
+    """Atoms of all rows, one row after the other."""
+    return np.concatenate([np.zeros(0, np.int64), *(c.atoms.ravel() for c in constraints)])
+
+
 def _check_atoms(given: Sequence[Constraint], starts: IntArray, x: FloatArray, m: FloatArray) -> None:
     """Raise `InputError` where rows name atoms that do not exist, have no place, or no mass."""
     held = np.zeros(len(x), dtype=bool)
@@ -649,7 +634,7 @@ def _check_atoms(given: Sequence[Constraint], starts: IntArray, x: FloatArray, m
             )
         if item.fixes_atoms:
             held[item.atoms] = True
-    used = np.concatenate([np.zeros(0, np.int64), *(item.atoms.ravel() for item in given)])
+    used = _atoms_of(given)
     bad = ~np.isfinite(x[used]).all(axis=1)
     if bad.any():
         atom = int(used[np.argmax(bad)])

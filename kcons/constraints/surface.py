@@ -7,7 +7,7 @@ taken from the positions as they are: surfaces are not repeated in periodic cell
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,7 +25,7 @@ from kcons.constraints.arguments import (
     read_only,
     unit,
 )
-from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import Target
 from kcons.errors import InputError
@@ -244,17 +244,11 @@ class Ellipsoid(Surface):
         logs = np.log(np.where(finite, self.inverse_axes, 1.0)).sum(axis=1)
         return np.asarray(np.exp(-logs / finite.sum(axis=1)))
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        super().check(r, time, first_row)
-        if self.target is None:
-            return
-        target = self.target_at(time)
-        self.refuse(
-            ~(target > -self.scale()),
-            first_row,
-            lambda k: f"target {target[k]:g} lies beyond the center of the ellipsoid; use 0 for its surface",
-            "target",
-        )
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
+        yield from super().faults(r, time)
+        if self.target is not None:
+            target, words = self.target_at(time), "lies beyond the center of the ellipsoid; use 0 for its surface"
+            yield ~(target > -self.scale()), lambda k: f"target {target[k]:g} {words}", "target"
 
 
 class Plane(LinearRows):

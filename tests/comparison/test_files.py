@@ -288,24 +288,3 @@ def test_virtual_sites_have_a_plan_and_no_system(tmp_path):
     assert len(found.rows.virtual_sites) == 1 and found.motion.degrees_of_freedom == 6
     with pytest.raises(UnsupportedError, match="1 virtual sites"):
         quietly(from_file, path)
-
-
-def test_a_protein_in_water_with_force_fields_by_name(monkeypatch):
-    """Villin in water: rows and parameters are those of OpenMM alone, in a box that is not NumPy's."""
-    monkeypatch.setenv("OPENMM_CPU_THREADS", "1")
-    found = quietly(from_file, VILLIN, select="all", forces="amber14-all,amber14/tip3p")
-    pdb = app.PDBFile(str(VILLIN))
-    system = app.ForceField("amber14-all.xml", "amber14/tip3p.xml").createSystem(
-        pdb.topology, nonbondedMethod=app.PME, constraints=app.HBonds, rigidWater=True
-    )
-    rows = map(system.getConstraintParameters, range(system.getNumConstraints()))
-    assert {tuple(sorted(pair)) for pair in found.bonds.tolist()} == {tuple(sorted(p[:2])) for p in rows}
-    assert found.constraint_set.n_atoms == 8867
-    box = [list(v.value_in_unit(unit.angstrom)) for v in system.getDefaultPeriodicBoxVectors()]
-    np.testing.assert_allclose(found.cell, box, atol=1e-4)
-    theirs, ours = (
-        next(f for f in one.getForces() if isinstance(f, openmm.NonbondedForce))
-        for one in (system, found.openmm.system)
-    )
-    for k in range(0, 8867, 7):
-        assert theirs.getParticleParameters(k) == ours.getParticleParameters(k)

@@ -8,7 +8,7 @@ import pytest
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Distance, FixedAtoms, Formula, Plane
 from kcons.free_energy import HeldCoordinates, Sample, Series, mean_force, weighted_mean
-from kcons.free_energy.mean_forces import _quietest, local_mean_force
+from kcons.free_energy.series import _quietest, local_mean_force
 
 KT = 0.8
 SAMPLES = 1000

@@ -16,7 +16,7 @@ from itertools import product
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,29 +26,19 @@ from kcons.constraints.arguments import ANGLE, Count, Positive, Rule, rules_of, 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, did_you_mean
 from kcons.free_energy.profiles.pulls import MIN_PULLS
-from kcons.free_energy.windows.window import Sampler, Settings
+from kcons.free_energy.windows.driver import Sampler, Settings
 from kcons.steppers.files import as_path
 
 #: Windows of an input file, at most.
 MOST_WINDOWS = 100_000
 
 
-def _difference(rows: Sequence[Sequence[int]]) -> DistanceDifference:
-    """r(i, j) - r(k, l) of each row i, j, k, l."""
-    for row in rows:
-        if len(row) != 4:
-            raise InputError(
-                f"difference names {len(row)} atoms; give four, i j k l for r(i, j) - r(k, l)", item="difference"
-            )
-    return DistanceDifference([[row[:2], row[2:]] for row in rows])
-
-
-#: What each kind of coordinate becomes, from the atoms of its rows.
-FAMILIES: dict[str, Callable[[list[list[int]]], Constraint]] = {
-    "distance": Distance,
-    "difference": _difference,
-    "angle": Angle,
-    "dihedral": Dihedral,
+#: How many atoms each kind of coordinate has, and what it becomes.
+FAMILIES: dict[str, tuple[int, Callable[[ArrayLike], Constraint]]] = {
+    "distance": (2, Distance),
+    "difference": (4, lambda rows: DistanceDifference(np.reshape(rows, (-1, 2, 2)))),
+    "angle": (3, Angle),
+    "dihedral": (4, Dihedral),
 }
 #: Values between which each kind lies, in angstrom and degrees; the others may have any.
 _RANGES = {"distance": (0.0, math.inf), "angle": (0.0, 180.0)}
@@ -82,7 +72,6 @@ Text: TypeAlias = Annotated[str, _is("a text", lambda v: isinstance(v, str))]
 Table: TypeAlias = Annotated[dict, _is("a table", lambda v: isinstance(v, dict))]
 Truth: TypeAlias = Annotated[bool, _is("true or false", lambda v: isinstance(v, bool))]
 Number: TypeAlias = Annotated[float, _is("a number", _number)]
-ZeroOrOne: TypeAlias = Annotated[int, _is("0 or 1", lambda v: _whole(v) and v in (0, 1))]
 Numbers: TypeAlias = Annotated[list, _is("numbers", _NUMBERS)]
 NumberOrNumbers: TypeAlias = Annotated[Any, _is("a number, or numbers", lambda v: _number(v) or _NUMBERS(v))]
 Atoms: TypeAlias = Annotated[list, _is("whole numbers", _ATOMS)]
@@ -94,7 +83,7 @@ Single: TypeAlias = Annotated[Any, _is("one value", lambda v: not isinstance(v, 
 @dataclass(kw_only=True)
 class Structure:
     file: Text
-    count_from: ZeroOrOne = 0
+    count_from: Literal[0, 1] = 0
 
 
 @dataclass(kw_only=True)
@@ -136,7 +125,7 @@ class Coordinate:
         self.count = len(self.values) if self.values is not None else self.windows or 0
 
     def constraint(self, first: int) -> Constraint:
-        return FAMILIES[self.family]([counted(getattr(self, self.family), first)])
+        return coordinate_of(self.family, getattr(self, self.family), first)
 
     def places(self) -> FloatArray:
         """Where windows are, in angstrom and radian."""
@@ -246,7 +235,10 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         windows; a calculator that is neither in `kcons.ase.named_calculators.LISTED` nor of one of these modules.
     """
     path = as_path(file, "file")
-    data = _toml(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no TOML that can be read: {error}", item="file") from error
     tables: dict[str, Any] = {}
     for name, content in {"forces": {}, "sampling": {}, **data}.items():
         _refuse_unknown(name, _TABLES, "the input file")
@@ -271,7 +263,15 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
-    pulls = tables.get("pulls")
+    pulls, ways = tables.get("pulls"), None
+    if pulls is not None:
+        start, end = (
+            place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
+            for key, given, place in (("from", pulls.begin, targets[0]), ("to", pulls.to, targets[-1]))
+        )
+        if np.array_equal(start, end):
+            raise InputError("[pulls] begin where they end; give from and to", item="pulls")
+        ways = {"start": start, "end": end, "count": pulls.count}
     if "improve" in data and (len(coordinates) > 1 or count < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
@@ -284,24 +284,9 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         targets,
         options,
         data.get("improve"),
-        None if pulls is None else _pulls(pulls, coordinates, targets),
+        ways,
         Pulls.steps if pulls is None else pulls.steps,
     )
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"there is no file {path}", item="file") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error}", item="file") from error
-    except ValueError as error:
-        raise InputError(f"{path} is no TOML: {error}", item="file") from error
-    except RecursionError:
-        raise InputError(
-            f"{path}: lists or tables are too deep in each other; an input file needs two levels", item="file"
-        ) from None
 
 
 def _read(kind: Any, name: str, entry: Any) -> Any:
@@ -326,15 +311,12 @@ def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
         raise InputError(f"{where} has an unknown key {key!r}{hint}; there are {', '.join(known)}", item=key)
 
 
-def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatArray) -> dict[str, Any]:
-    """Arguments of `Windows.pull`; by default from the first window to the last."""
-    start, end = (
-        place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
-        for key, given, place in (("from", entry.begin, targets[0]), ("to", entry.to, targets[-1]))
-    )
-    if np.array_equal(start, end):
-        raise InputError("[pulls] begin where they end; give from and to", item="pulls")
-    return {"start": start, "end": end, "count": entry.count}
+def coordinate_of(family: str, atoms: Sequence[int], first: int) -> Constraint:
+    """A coordinate of one of `FAMILIES`, on atoms that are counted from `first`."""
+    size, made = FAMILIES[family]
+    if len(atoms) != size:
+        raise InputError(f"{family} names {len(atoms)} atoms; give {size}", item=family)
+    return made([counted(atoms, first)])
 
 
 def counted(atoms: Sequence[int], first: int) -> list[int]:
@@ -387,7 +369,14 @@ def _sampler(
     if forces.system is not None:
         if "held" in tables:
             raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
-        return _of_openmm(place, folder / forces.system, forces.platform, coordinates)
+        from openmm import app
+
+        from kcons.free_energy.scans.system_calculator import read_system
+        from kcons.free_energy.windows.openmm_windows import OpenMMWindows
+
+        system = read_system(folder / forces.system, "system")
+        pdb = _opened("OpenMM", app.PDBxFile if place.suffix == ".cif" else app.PDBFile, place)
+        return OpenMMWindows(pdb.topology, system, pdb.positions, coordinates, platform=forces.platform)
     from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
     from kcons.free_energy.windows.ase_windows import AseWindows
 
@@ -398,14 +387,3 @@ def _sampler(
     if forces.calculator in LISTED:
         make()  # complain of settings
     return AseWindows(atoms, make, coordinates, rows)
-
-
-def _of_openmm(structure: Path, system: Path, platform: str | None, coordinates: Mapping[str, Constraint]) -> Sampler:
-    from openmm import app
-
-    from kcons.free_energy.scans.system_calculator import read_system
-    from kcons.free_energy.windows.openmm_windows import OpenMMWindows
-
-    made = read_system(system, "system")
-    pdb = _opened("OpenMM", app.PDBxFile if structure.suffix == ".cif" else app.PDBFile, structure)
-    return OpenMMWindows(pdb.topology, made, pdb.positions, coordinates, platform=platform)

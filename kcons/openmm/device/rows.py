@@ -35,7 +35,7 @@ from kcons.openmm.device.clusters import (
     large_clusters,
 )
 from kcons.openmm.integrator.guard import SystemRows, settled_rows
-from kcons.openmm.integrator.part import Precision, Solver
+from kcons.openmm.integrator.part import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import accepted, masses_of, positions_of
 from kcons.plan.clusters_alike import alike
@@ -399,10 +399,6 @@ class KernelRows(CarriedConstraints):
 
     def attach(self, program: Program, context: openmm.Context) -> None:
         self.bind(context)
-
-    def solver_at(self, context: openmm.Context) -> Solver:
-        self.bind(context)
-        return super().solver_at(context)
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
         self.bind(context)

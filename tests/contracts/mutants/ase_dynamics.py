@@ -3,7 +3,7 @@
 MUTANTS = {
     "ase/dynamics.py": [
         (
-            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                    last = replace",
+            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                last = replace",
             "ase/edits::time_that_is_set_is_no_way_of_moving_targets",
         ),
         (

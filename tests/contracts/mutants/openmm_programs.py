@@ -131,7 +131,7 @@ MUTANTS = {
         ('again = f"select({sure}, «3→1», 1)"', "row_program::many_steps_look_less_often"),
     ],
     "openmm/surface_integrator.py": [
-        ("«positions is None→False»:", "surface_integrator::great_circles_at_any_time_step"),
+        ("«positions is None→False»:", "surface_integrator::far_from_the_origin"),
     ],
     "openmm/callback_rows.py": [
         ("if self._count == count + «1 > 0→2 > 0»:", "callbacks::an_integrator_that_does_not_hold_the_rows_is_refused"),
@@ -144,8 +144,6 @@ MUTANTS = {
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "part::integrators_in_turn_hold_the_same_part",
         ),
-        ("u * np.cos(w) - d * (w * np.sin(w))« - way→»", "surface_integrator::great_circles_at_any_time_step"),
-        ('"ij,ij->i", d, way)[:, None] / radius«**2→»)', "surface_integrator::the_steps_are_those_of_the_core"),
         ("self.motion.rank« - 3 * fixed→»", "hold::particles_without_mass_take_no_degree_of_freedom"),
     ],
 }

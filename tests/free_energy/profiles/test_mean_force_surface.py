@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from kcons.free_energy.profiles.mean_force_surface import fit_surface
+from kcons.free_energy.profiles.profile import fit_surface
 
 TURN = 2 * math.pi
 

@@ -14,7 +14,7 @@ from openmm_systems import DATA
 from kcons.constraints import Angle, Dihedral, Distance, MovingTarget
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy import HeldCoordinatesReporter
-from kcons.free_energy.mean_forces import local_mean_force
+from kcons.free_energy.series import local_mean_force
 from kcons.openmm import CollectiveRows, Langevin, ProjectedIntegrator, hold
 
 PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
