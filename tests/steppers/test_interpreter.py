@@ -27,6 +27,7 @@ from kcons.constraints import (
     Sphere,
 )
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
+from kcons.solvers.addressable_solvers import packed_positions, packed_tangents
 from kcons.solvers.tolerances import MANY_ITERATIONS
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Rattle, ReversibilityCheck, Splitting, State, Suzuki4, System, run
 from kcons.steppers.interpreter import Interpreter
@@ -578,6 +579,33 @@ def test_steps_without_solution_are_the_engines(name) -> None:
                 assert not many
             assert distance(stepper.step(system, state, 0.02), stepper.step(other, state, 0.02)) <= 2e-14
     assert taken >= 3 and failed >= 3
+
+
+@pytest.mark.parametrize(
+    ("others", "ions", "bad"),
+    [
+        ([], 0, 50),
+        (["triangles"] * 11, 0, 50),
+        ([*["triangles"] * 11, *["methyl"] * 3], 0, 50),
+        (["methyl"] * 2, 300, 50),
+        (["long"], 0, 200),
+    ],
+)
+def test_nothing_changes_where_a_chain_has_no_solution(others, ions, bad) -> None:
+    """Also not what was solved before it: the kernel of chains writes at once."""
+    system, state = molecules("longer", *others, ions=ions)
+    packed, x, rng = system.packed, state.positions.copy(), np.random.default_rng(4)
+    assert packed.called[-1].name == "Chains"
+    for wrong in (40.0, np.nan):
+        ends, v = x + 0.01 * rng.normal(size=x.shape), rng.normal(size=x.shape)
+        ends[bad] += wrong
+        there, speed = ends.copy(), v.copy()
+        assert packed_positions(there, x, speed, 10.0, packed.tables) == -1
+        assert np.array_equal(there, ends, equal_nan=True) and np.array_equal(speed, v)
+    v[bad] = np.nan
+    speed = v.copy()
+    assert not packed_tangents(x, speed, packed.tables)
+    assert np.array_equal(speed, v, equal_nan=True)
 
 
 @pytest.mark.parametrize("stepper", [Rattle(), Suzuki4(), Langevin(0.1, 0.3, 5)], ids=lambda each: type(each).__name__)
