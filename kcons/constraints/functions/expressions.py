@@ -242,17 +242,11 @@ def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bo
     signs = rng.choice([-1.0, 1.0], (len(tape.steps), 40))
 
     def looked(places: Any) -> Any:
-        some, done = iter(signs), list[Any]()
-        known: dict[str, Any] = {"r": places, "p": p, "t": p[-1:], "k": done}
+        some = iter(signs)
         own: dict[str, Any] = {"absolute": lambda x: next(some) * x, "copysign": lambda _, x: next(some)}
         own["arctan2"] = lambda a, b: np.arctan(a / b)
-
-        def number(operand: Operand) -> Any:
-            return known[operand[0]][operand[1]] if isinstance(operand, tuple) else np.float64(operand)
-
-        for name, operands in tape.steps:
-            done.append((own.get(name) or getattr(np, name))(*map(number, operands)))
-        return np.array([np.broadcast_to(number(each), 40) for each in tape.results[:-1]])
+        found = tape.run(places, p, p[-1], lambda name, *given: (own.get(name) or getattr(np, name))(*given))
+        return np.array([np.broadcast_to(each, 40) for each in found[:-1]])
 
     with np.errstate(all="ignore"):
         value, *slopes = looked(r)
