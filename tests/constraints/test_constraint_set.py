@@ -15,8 +15,6 @@ from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.steppers import System
 
-TRICLINIC = np.array([[10.0, 0.0, 0.0], [3.0, 9.0, 0.0], [-2.0, 1.0, 8.0]])
-
 
 def everything(x):
     return ConstraintSet([make() for make in CASES.values()], x, MASSES, time=TIME)
@@ -99,40 +97,6 @@ def test_tolerance_knows_what_double_precision_can_reach():
     assert near.tolerance(far)[0] == pytest.approx(reach, rel=1e-12)
 
 
-# -- cells ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("cell", [np.diag([9.0, 8.0, 10.0]), TRICLINIC], ids=["orthorhombic", "triclinic"])
-def test_wrapped_atoms_give_the_rows_of_whole_molecules(cell):
-    rng = np.random.default_rng(0)
-    whole = 0.3 * scattered(0) + [4.0, 4.0, 4.0]
-    wrapped = whole + rng.integers(-2, 3, size=(N_ATOMS, 3)) @ cell
-    v = rng.normal(size=(N_ATOMS, 3))
-    names = [name for name, make in CASES.items() if make().translation_invariant]
-    assert {"Distance", "Angle", "Dihedral", "LinearRelation", "RadiusOfGyration", "Custom", "KnifeEdge"} <= set(names)
-    for name in names:
-        free = ConstraintSet([CASES[name]()], whole, MASSES, time=TIME)
-        periodic = ConstraintSet([CASES[name]()], wrapped, MASSES, cell=cell, time=TIME)
-        assert np.allclose(periodic.target(TIME), free.target(TIME), rtol=1e-12, atol=1e-12), name
-        assert np.allclose(periodic.value(wrapped, TIME), free.value(whole, TIME), atol=1e-12), name
-        assert np.allclose(periodic.jacobian(wrapped, TIME).toarray(), free.jacobian(whole, TIME).toarray(), atol=1e-12)
-        assert np.allclose(
-            periodic.acceleration_target(wrapped, v, TIME),
-            free.acceleration_target(whole, v, TIME),
-            rtol=1e-8,
-            atol=1e-9,
-        ), name
-
-
-def test_only_periodic_directions_are_wrapped():
-    x = np.array([[0.2, 0.2, 0.2], [0.2, 0.2, 9.8]])
-    assert ConstraintSet([Distance([[0, 1]])], x, np.ones(2), cell=[10.0] * 3).target() == pytest.approx([0.4])
-    slab = ConstraintSet([Distance([[0, 1]], 3.0)], x, np.ones(2), cell=[10.0] * 3, pbc=[True, True, False])
-    assert slab.measure(x) == pytest.approx([9.6])
-    flat = np.diag([10.0, 10.0, 0.0])
-    assert ConstraintSet([Distance([[0, 1]], 3.0)], x, np.ones(2), cell=flat, pbc=[1, 1, 0]).half_width == 5.0
-
-
 # -- bad input --------------------------------------------------------------------------------------
 
 
@@ -156,15 +120,6 @@ def test_arrays_of_the_wrong_shape_are_named_later_too():
         held.value(np.zeros((7, 3)))
     with pytest.raises(InputError, match=r"velocities must have shape \(8, 3\)"):
         held.acceleration_target(scattered(0), np.zeros((7, 3)))
-
-
-def test_nothing_held():
-    x = scattered(0)
-    for rows in ([], [Distance([])]):
-        held = ConstraintSet(rows, x, MASSES)
-        assert held.n_rows == 0 and not held.moving
-        assert held.value(x).shape == held.target().shape == held.acceleration_target(x, x).shape == (0,)
-        assert held.jacobian(x).shape == (0, 24)
 
 
 def test_what_was_given_may_be_changed_afterwards():
