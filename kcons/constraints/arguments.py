@@ -142,14 +142,18 @@ def atom_column(atoms: Any, item: str) -> NDArray[Any]:
 
 
 def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") -> IntArray:
-    """Different atoms, a row of them for each row, shape (n, width); `item` is at fault where they are none."""
+    """Different atoms, a row of them for each row, shape (n, width); `item` is at fault where they are none.
+
+    Of rows of one atom a list of atoms is taken, too.
+    """
     table = atom_array(atoms, name, item)
     if table.size == 0:
         return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
     if not np.issubdtype(table.dtype, np.integer):
         remedy = "; of a mask give np.flatnonzero(mask)" if table.dtype == bool else ""
         raise InputError(f"{name}: atom indices must be integers, not {table.dtype}{remedy}", item=item)
-    table = np.atleast_2d(table.astype(np.int64))
+    table = table.astype(np.int64)
+    table = table.reshape(-1, 1) if width == 1 and table.ndim < 2 else np.atleast_2d(table)
     if table.ndim != 2:
         raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item=item)
     if width is not None and table.shape[1] != width:

@@ -385,7 +385,12 @@ class Constraint:
             name: read_only(array[rows]) for name, array in data.items() if isinstance(array, np.ndarray)
         }
         if isinstance(self.target, MovingTarget):
-            own["target"] = _selected(self.target, rows, self.n_rows, self.period)
+            target, n, period = self.target, self.n_rows, self.period
+            own["target"] = MovingTarget(
+                value=lambda t: target.at(t, n)[rows],
+                rate=lambda t: target.rate_at(t, n, period)[rows],
+                acceleration=lambda t: target.acceleration_at(t, n, period)[rows],
+            )
         return self.changed(**own)
 
     def renumbered(self, new_index: IntArray) -> Self:
@@ -456,14 +461,6 @@ class Constraint:
 @functools.cache
 def _compiled(row: Callable[[Any, Any, Any, Any], None]) -> Any:
     return njit(cache=has_a_file(row), error_model="numpy")(row)
-
-
-def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float | None) -> MovingTarget:
-    return MovingTarget(
-        value=lambda t: target.at(t, n_rows)[rows],
-        rate=lambda t: target.rate_at(t, n_rows, period)[rows],
-        acceleration=lambda t: target.acceleration_at(t, n_rows, period)[rows],
-    )
 
 
 def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:

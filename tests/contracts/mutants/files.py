@@ -41,6 +41,7 @@ MUTANTS = {
         ("_off_grid(x, «10 * step) >→step) <=» error", "mdanalysis/check/precision::what_is_no_grid"),
     ],
     "constraints/constraint_set.py": [
+        ("agreed = np.where(«open_→False», np.repeat", "images::a_length_found_and_the_same_one_given"),
         (
             "change = change[«periodic→:»]",
             "images::directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
@@ -54,9 +55,6 @@ MUTANTS = {
             "images::lengths_found_far_away_can_be_held_near_the_origin",
         ),
         ("«x→whole»[item.atoms] if self.moved is None", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
-    ],
-    "constraints/contradictions.py": [
-        ("agreed = np.where(«open_→False», np.repeat", "images::a_length_found_and_the_same_one_given"),
     ],
     "constraints/constraint.py": [
         ('powers.get("length", «0→1»)', "constraint::the_same_points_fulfil_it"),
