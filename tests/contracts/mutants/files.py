@@ -100,15 +100,15 @@ MUTANTS = {
         ("good = np.«abs(values) <= LARGEST→isfinite(values)»", "target::numbers_whose_squares_overflow_are_refused"),
     ],
     "constraints/periodic/images.py": [
-        ("«| (not self._in_line)→»", "distance_difference::each_pair_takes_its_shortest_image"),
-        ("«self.item.links is None and →»2 < self.", "distance_difference::pairs_of_a_row_need_not_be_near_each_other"),
+        ("«| (not self._in_line)→»", "families::each_pair_takes_its_shortest_image"),
+        ("«self.item.links is None and →»2 < self.", "families::pairs_of_a_row_need_not_be_near_each_other"),
         (
             "«np.where(distance, length, BOND_LIKE * length)→length»",
             "images::a_chain_of_moving_bonds_may_open_beyond_half_the_cell",
         ),
     ],
     "motion/restoring/kept_geometry.py": [
-        ("leg in («(i, k), (k, i)→»)", "distance_difference::a_proton_goes_over_within_a_molecule_that_stays_as_it_is"),
+        ("leg in («(i, k), (k, i)→»)", "families::a_proton_goes_over_within_a_molecule_that_stays_as_it_is"),
     ],
     "solvers/tolerances.py": [
         ("FLAT = 0.0«1→»", "mixed_rows::a_dihedral_that_turns_over_has_no_solution_far_away"),
