@@ -33,6 +33,7 @@ from kcons.constraints.arguments import (
     check_range,
     checked,
     read_only,
+    rules_of,
     without_units,
 )
 from kcons.constraints.compilation import has_a_file, njit
@@ -447,9 +448,14 @@ class Constraint:
 
     @classmethod
     def _rebuilt(cls, data: Mapping[str, Any]) -> Self:
-        item = object.__new__(cls)
+        item, rules = object.__new__(cls), rules_of(cls.__init__)
         for name in cls.shared:
             setattr(item, name, data[name])
+        for name in cls.per_row.keys() & rules.keys():
+            for rule in rules[name].rules:  # of directions too, which have length 1 where they are written
+                taken = rule(data[name], f"{cls.family}: {name}")
+                if np.abs(taken - np.asarray(data[name])).max(initial=0.0) > 1e-10:
+                    raise InputError(f"{cls.family} cannot be read: {name} has vectors not of length 1", item=name)
         Constraint.__init__(item, data["atoms"], data["target"], **{name: data[name] for name in cls.per_row})
         return item
 

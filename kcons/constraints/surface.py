@@ -132,18 +132,10 @@ class Torus(Surface):
         atoms: ArrayLike,
         center: Lengths,
         axis: Directions,
-        major_radius: Lengths,
+        major_radius: PositiveLengths,
         minor_radius: Target = None,
     ) -> None:
         super().__init__(atoms, minor_radius, center=center, axis=axis, major_radius=major_radius)
-
-    def _settle(self) -> None:
-        self.refuse(
-            ~(self.major_radius > 0),
-            0,
-            lambda k: f"major_radius {self.major_radius[k]:g} is not positive",
-            "major_radius",
-        )
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
