@@ -115,10 +115,8 @@ class Batch:
         self.degrees_of_freedom = self._joined(lambda each: [each.degrees_of_freedom], torch.int64)
         self._still, self._calls = torch.zeros_like(self.targets), 0
         # Fixed atoms, in the order of their rows.
-        self._fixed_rows = self._placed(self.row_starts, lambda each: each.plan.pinned_rows)
-        self._fixed = self._placed(
-            self.atom_starts, lambda each: [each.constraint_set.row_atoms(row)[0] for row in each.plan.pinned_rows[::3]]
-        )
+        self._fixed_rows = self._joined(lambda each: each.plan.pinned_rows, torch.int64, self.row_starts)
+        self._fixed = self._joined(_fixed_atoms, torch.int64, self.atom_starts)
         self._free = self.masses > 0
         self._free[self._fixed] = False
         self._inverse_masses = self._inverse(self.masses)
@@ -128,16 +126,12 @@ class Batch:
         self._set_lattices()
         self._groups = self._grouped(True)
 
-    def _joined(self, of: Any, dtype: torch.dtype | None = None) -> Tensor:
-        """Numbers of each system, one after another."""
-        known = {each: of(each) for each in self._numbers}
-        whole = np.concatenate([known[each] for each in self.systems])
+    def _joined(self, of: Any, dtype: torch.dtype | None = None, starts: Any = None) -> Tensor:
+        """Numbers of each system, one after another; those of atoms or rows from where these of a system begin."""
+        known = {each: np.asarray(of(each)) for each in self._numbers}
+        begins = np.zeros(self.n_systems, int) if starts is None else starts
+        whole = np.concatenate([known[each] + start for each, start in zip(self.systems, begins, strict=False)])
         return torch.as_tensor(whole, device=self.device, dtype=dtype or self.dtype)
-
-    def _placed(self, starts: IntArray, of: Any) -> Tensor:
-        """Numbers of atoms or rows of all systems."""
-        some = [np.asarray(of(each), dtype=np.int64) + start for each, start in zip(self.systems, starts, strict=False)]
-        return torch.as_tensor(np.concatenate(some), device=self.device)
 
     def _inverse(self, masses: Tensor) -> Tensor:
         return torch.where(self._free, 1.0 / torch.where(self._free, masses, 1.0), 0.0)
@@ -148,7 +142,8 @@ class Batch:
             for pattern, kind in kinds_of(motion, velocity_rows).items():
                 where = np.stack([numbers, self.atom_starts[numbers], self.row_starts[numbers]], axis=1)
                 parts.setdefault(pattern, []).append((kind, where))
-        return [Group(pattern, each, self.masses, self.compiled) for pattern, each in parts.items()]
+        own = [self._inverse_masses], [self.targets, self._still]
+        return [Group(pattern, each, own, self.compiled) for pattern, each in parts.items()]
 
     @cached_property
     def _position_groups(self) -> list[Group]:
@@ -160,30 +155,25 @@ class Batch:
     def _set_lattices(self) -> None:
         """Cells and their inverses, with zeros for directions without periodicity, and the trees of whole rows."""
         self._lattice: Tensor | None = None
-        self._tree: list[Tensor] = []
-        sets = {each: each.constraint_set for each in self._numbers}
-        if all(each.lattice is None for each in sets):
+        if all(each.lattice is None for each in self._numbers):
             return
         open_ = np.stack([np.eye(3), np.zeros((3, 3))])
         self._lattice = self._joined(lambda each: [open_ if each.lattice is None else each.lattice])
-        if all(held.images is None for held in sets.values()):
-            return
 
         def parents(each: Motion) -> IntArray:
-            found, images = np.arange(each.n_atoms), sets[each].images
+            found, images = np.arange(each.n_atoms), each.constraint_set.images
             if images is not None:
                 found[images.atoms] = images.parents
             return found
 
         # By turns atoms farther along the tree.
-        self._tree = [self._placed(self.atom_starts, parents)]
+        self._tree = [self._joined(parents, torch.int64, self.atom_starts)]
         while bool((self._tree[-1] != self._tree[-1][self._tree[-1]]).any()):
             self._tree.append(self._tree[-1][self._tree[-1]])
 
-    def _tree_cells(self, x: Tensor) -> Tensor | None:
+    def _tree_cells(self, x: Tensor) -> Tensor:
         """Cells by which atoms of whole rows stand off where they are stored, (n_atoms, 3)."""
-        if not self._tree or self._lattice is None:
-            return None
+        assert self._lattice is not None
         inverse = self._lattice[self.system_idx, 1]
         cells = -torch.round(torch.einsum("nx,nxy->ny", x - x[self._tree[0]], inverse))
         for parent in self._tree[:-1]:
@@ -311,12 +301,6 @@ class Batch:
         """
         here, task = self._flat(x, "x"), self._task(False, time, time)
         rates = self._rates_at(time, 1)
-        if self._moving:
-            drift = torch.zeros_like(rates)
-            for group in task.groups:
-                each = group.solver.drift(task.problem(group, here, here, rates, self._inverse_masses))
-                drift = drift.index_put((group.rows,), each.expand(group.rows.shape))
-            rates = rates - drift
         speeds = self._with_fixed(self._flat(v, "v"), rates)
         return Projection.apply(speeds, here, rates, self.weights(masses), task)[0].reshape(v.shape)
 
@@ -397,6 +381,10 @@ def _starts(counts: Sequence[int]) -> IntArray:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
+def _fixed_atoms(motion: Motion) -> list[int]:
+    return [motion.constraint_set.row_atoms(row)[0] for row in motion.plan.pinned_rows[::3]]
+
+
 def _by_copy(rows: Tensor, like: Tensor) -> Tensor:
     return rows.reshape(like.shape[0], -1) if like.ndim == 3 else rows
 
@@ -423,9 +411,7 @@ class Task(NamedTuple):
         there = group.coordinates(start, batch._lattice, batch._tree_cells)
         here = there if x is start else group.coordinates(x, batch._lattice, batch._tree_cells)
         flies = self.flies and any(not row.function.holonomic for row in group.pattern.rows)
-        # Inverse masses and targets of the batch do not change from call to call.
-        weights = group.lanes(w, group.atoms, w is batch._inverse_masses)
-        wanted = group.lanes(held, group.rows, held is batch.targets or held is batch._still)
+        weights, wanted = group.lanes(w, group.atoms), group.lanes(held, group.rows)
         return Problem(here[0], there[0], here[1], there[1], flies, weights, wanted, group.p, self.t, self.t_start)
 
 
@@ -465,7 +451,7 @@ class Projection(torch.autograd.Function):
                 lam, moved = _solve(group, of)
             else:
                 lam, moved = group.solver.tangent(of, given.reshape(-1)[group.flat])
-            group.put(push, moved)
+            push.view(-1)[group.flat] = moved  # nothing for fixed atoms, which may belong to several clusters
             multipliers[group.rows[: group.pattern.rank]] = lam
         found = given + push
         ctx.task = task
@@ -482,11 +468,10 @@ class Projection(torch.autograd.Function):
         sums = [torch.zeros_like(each) for each in (found, place, held, w)]
         for group in task.groups:
             of = task.problem(group, found if task.of_positions else place, place, held, w)
-            adjoint = group.solver.newton_adjoint if task.of_positions else group.solver.tangent_adjoint
             rows = group.rows[: group.pattern.rank]
             bent = torch.zeros_like(multipliers[rows]) if by_multipliers is None else by_multipliers[rows]
-            here, h = found.reshape(-1)[group.flat], pushed.reshape(-1)[group.flat]
-            parts = adjoint(of, multipliers[rows], h, bent, here)
+            v = None if task.of_positions else found.reshape(-1)[group.flat]
+            parts = group.solver.adjoint(of, multipliers[rows], pushed.reshape(-1)[group.flat], bent, v)
             for k, (part, index) in enumerate(zip(parts, (group.flat, group.flat, rows, group.atoms), strict=True)):
                 # Atoms that are fixed may belong to several clusters.
                 flat = sums[k].reshape(-1).index_add(0, index.reshape(-1), part.expand(index.shape).reshape(-1))

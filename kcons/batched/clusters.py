@@ -1,29 +1,32 @@
 """Clusters that look alike, side by side: the equations of their multipliers, by positions, velocities and gradients.
 
-Vectors of small clusters are lists with a tensor of shape (clusters,) for each number, and their elimination is written
-out (`Lanes`), so that one kernel does all of a step; those of larger ones are tensors, and rows that share nothing are
-eliminated together (`Levels`). What is done with these is written once, for both.
+What is done with vectors is written once, by tables of numbers. Vectors of small clusters are lists with a tensor of
+shape (clusters,) for each number (`Lanes`), so that one kernel does all of a step; those of larger ones are tensors, in
+which rows that share nothing are eliminated together (`Levels`).
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from functools import reduce
+from itertools import accumulate
+from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kcons.batched.row_functions import RowFunction
 from kcons.plan.clusters_alike import elimination
 
-#: Rows, and atoms in all rows, up to which elimination is written out.
+#: Rows, and atoms in all rows, up to which a vector is a list.
 LANES_ROWS, LANES_PLACES = 6, 24
 
-#: A list of tensors, or a tensor; lists of rows with None where two share no atom, or a tensor (entries, n).
+#: A list of tensors, or a tensor; numbers for it, a list or a tensor.
 Vector = Any
-Matrix = Any
+Table = Any
+#: Gradients along x, y and z, each a vector with a number for each atom of each row.
+Slope = tuple[Vector, Vector, Vector]
 
 
 class Row(NamedTuple):
@@ -42,15 +45,11 @@ class Row(NamedTuple):
 
 
 class Pattern(NamedTuple):
-    """Clusters that look alike: the `rank` first rows are solved for, the others depend on them.
-
-    `fixed` are atoms that do not move.
-    """
+    """Clusters that look alike: the `rank` first rows are solved for, the others depend on them."""
 
     rows: tuple[Row, ...]
     rank: int
     n_atoms: int
-    fixed: tuple[int, ...]
 
     @property
     def small(self) -> bool:
@@ -84,45 +83,93 @@ class Problem(NamedTuple):
 class Clusters:
     """Equations of the clusters of one pattern.
 
-    Vectors of rows have shape (rank, n) or (n_rows, n), those of atoms (3 n_atoms, n). `unpacked` makes vectors of
-    tensors, `packed` tensors of vectors, and `take` lists of what a vector has at some numbers. `couple` gives A W B^T
-    of the rows that are solved for, `spread` A^T lambda, `contract` A v.
+    Vectors of rows have shape (rank, n) or (n_rows, n), those of coordinates, all x before y and z, (3 n_atoms, n).
+    `unpacked` makes vectors of tensors, `packed` tensors of vectors. Matrices are vectors of entries, the diagonal
+    first. `take` gives what a vector has at some numbers, `summed` sums of what goes to each number, and `subtract`
+    takes such terms from a vector, in place. `joined` puts together what was computed at once. `table` are numbers of a
+    vector, and `columns` those of rows that are computed at once.
     """
 
+    #: Whether rows that are computed alike are computed at once.
+    together: ClassVar[bool]
     unpacked: Any
     packed: Any
     take: Any
-    couple: Any
-    solve: Any
-    diagonal: Any
-    spread: Any
-    contract: Any
+    summed: Any
+    subtract: Any
+    joined: Any
+    table: Any
+    columns: Any
 
     def __init__(self, pattern: Pattern) -> None:
-        self.pattern = pattern
-        #: Rows that are computed at once: the first, and of all their numbers, those of coordinates of their atoms, of
-        #: images, and of parameters.
-        self.kinds: list[tuple[Row, Any, Any, Any, Any]] = []
-        image = parameter = 0
-        for k, row in enumerate(pattern.rows):
-            ends = image + 3 * (len(row.atoms) - 1) * row.relative, parameter + row.parameters
-            coordinates = [3 * atom + c for atom in row.atoms for c in range(3)]
-            self.kinds.append((row, k, coordinates, [*range(image, ends[0])], [*range(parameter, ends[1])]))
-            image, parameter = ends
+        self.pattern, rows, n = pattern, pattern.rows, pattern.n_atoms
+        self.timed = any(row.function.timed and row.function.holonomic for row in rows)
+        images = [0, *accumulate(3 * (len(row.atoms) - 1) * row.relative for row in rows)]
+        parameters = [0, *accumulate(row.parameters for row in rows)]
+        alike: dict[Any, list[int]] = {}
+        for k, row in enumerate(rows):
+            key = k < pattern.rank, row.function, row.relative, row.period
+            alike.setdefault(key if self.together else k, []).append(k)
+        #: Rows that are computed at once: one, and of all their numbers, those of coordinates, images and parameters.
+        self.kinds: list[tuple[Row, Table, Table, Table, Table]] = []
+        for some in alike.values():
+            coordinates = [[c * n + a for a in rows[k].atoms for c in range(3)] for k in some]
+            ranges = ([[*range(ends[k], ends[k + 1])] for k in some] for ends in (images, parameters))
+            self.kinds.append((rows[some[0]], *map(self.columns, (some, coordinates, *ranges))))
+        #: Rows and their atoms in the order in which gradients are computed; how many are those of so many first rows.
+        slots = [
+            (k, rows[k].atoms[i]) for some in alike.values() for i in range(len(rows[some[0]].atoms)) for k in some
+        ]
+        self.slot_rows, self.slot_atoms = (self.table([slot[i] for slot in slots]) for i in range(2))
+        self.slots = {count: sum(k < count for k, _ in slots) for count in (pattern.rank, len(rows))}
+        self._set_elimination(slots)
+
+    def _set_elimination(self, slots: list[tuple[int, int]]) -> None:
+        """Tables of matrices, and of their elimination by levels.
+
+        A level has the rows that are eliminated at once in factors, and products of these with what is beside the
+        pivots. A factor has its entry, the row, a later row, and the entry `across` the diagonal; a product the factor,
+        the entry beside, and that it is taken from. A term of an entry has this entry and two slots.
+        """
+        mine: list[dict[int, int]] = [{} for _ in range(self.pattern.rank)]
+        for k, (row, atom) in enumerate(slots[: self.slots[self.pattern.rank]]):
+            mine[row][atom] = k
+        found = elimination([*map(tuple, mine)], set())
+        order, later = found.rows.tolist(), [found.rows[some].tolist() for some in found.later]
+        pairs = [pair for here, some in zip(order, later, strict=True) for i in some for pair in ((here, i), (i, here))]
+        entries = {pair: k for k, pair in enumerate([*((k, k) for k in range(len(order))), *pairs])}
+        both = [(k, i, j, a) for (i, j), k in entries.items() for a in mine[i].keys() & mine[j].keys()]
+
+        def tables(rows: list[tuple[int, ...]], width: int) -> list[Table]:
+            return [self.table([row[k] for row in rows]) for k in range(width)]
+
+        self.terms = tables([(k, mine[i][a], mine[j][a]) for k, i, j, a in both], 3)
+        self.n_entries, self.across = len(entries), self.table([entries[j, i] for i, j in entries])
+        self.levels = []
+        for begin, end in zip(found.levels[:-1], found.levels[1:], strict=True):
+            factors: list[tuple[int, ...]] = []
+            products: list[tuple[int, ...]] = []
+            for here, some in zip(order[begin:end], later[begin:end], strict=True):
+                for there in some:
+                    products += [(len(factors), entries[here, j], entries[there, j]) for j in some]
+                    factors.append((entries[there, here], here, there, entries[here, there]))
+            self.levels.append((tables(factors, 4), tables(products, 3)))
+
+    # -- rows -----------------------------------------------------------------------------------------
 
     def weights(self, w: Tensor) -> Vector:
-        return self.unpacked(w.repeat_interleave(3, 0))
+        return self.unpacked(w.repeat(3, 1))
 
     def _places(self, kind: tuple[Row, Any, Any, Any, Any], x: Vector, apart: Tensor | None) -> list[Any]:
         """Coordinates of the atoms of rows; of relative ones how far they are from the first, and `apart` beside it."""
         row, _, coordinates, images, _ = kind
-        found = self.take(x, coordinates)
+        found = list(self.take(x, coordinates))
         if row.relative:
             found = [a - found[k % 3] for k, a in enumerate(found[3:])]
-            found = [0.0, 0.0, 0.0, *(found if apart is None else _added(found, self.take(apart, images)))]
+            found = [0.0, 0.0, 0.0, *(found if apart is None else _added(found, list(self.take(apart, images))))]
         return found
 
-    def evaluate(self, of: Problem, u: Vector | None) -> tuple[Any, Any]:
+    def evaluate(self, of: Problem, u: Vector | None = None) -> tuple[Vector, Slope]:
         """Values less what is held, and gradients, with atoms moved by `u`."""
         values, slopes = [], []
         for kind in self.kinds:
@@ -134,18 +181,59 @@ class Clusters:
             if flies:
                 there = self._places(kind, of.start, of.start_images)
                 r = [0.5 * (a + b) for a, b in zip(r, there, strict=True)]
-                way = _each(operator.sub, self.take(of.x, coordinates), self.take(of.start, coordinates))
-                r += way if u is None else _added(way, self.take(u, coordinates))
+                way = _each(operator.sub, list(self.take(of.x, coordinates)), list(self.take(of.start, coordinates)))
+                r += way if u is None else _added(way, list(self.take(u, coordinates)))
             elif not row.function.holonomic:
                 r += [0.0] * len(coordinates)
             t = 0.5 * (of.t + of.t_start) if flies else of.t
-            value, slope = row.function(r, self.take(of.p, parameters), t)
+            value, slope = row.function(r, list(self.take(of.p, parameters)), t)
             off = value - of.held[numbers]
             values.append(off - row.period * torch.round(off / row.period) if row.period else off)
             slopes.append(slope)
-        return values, slopes
+        return self.joined(values, slopes, of.x)
 
-    # -- positions ----------------------------------------------------------------------------------
+    def rates(self, of: Problem, moved: Tensor | None = None) -> Tensor:
+        """What A v is to be: what is held, less dq/dt of rows with the time in them, where atoms rest."""
+        if not self.timed:
+            return of.held
+        u = None if moved is None else self.unpacked(moved)
+        along = (of.t,), (torch.ones_like(of.t),)
+        return of.held - torch.func.jvp(lambda t: self.packed(self.evaluate(of._replace(t=t), u)[0], of.x), *along)[1]
+
+    # -- vectors --------------------------------------------------------------------------------------
+
+    def spread(self, slope: Slope, lam: Vector) -> Vector:
+        """A^T lambda of the first rows, as many as have one."""
+        end, n = self.slots[len(lam)], self.pattern.n_atoms
+        force, atoms = self.take(lam, self.slot_rows[:end]), self.slot_atoms[:end]
+        x, y, z = (self.summed(_times(steep[:end], force), atoms, n) for steep in slope)
+        return torch.cat([x, y, z]) if isinstance(x, Tensor) else [*x, *y, *z]
+
+    def contract(self, slope: Slope, v: Vector) -> Vector:
+        """A v."""
+        n = self.pattern.n_atoms
+        parts = (_times(slope[c], self.take(v[c * n : (c + 1) * n], self.slot_atoms)) for c in range(3))
+        return self.summed(reduce(_added, parts), self.slot_rows, len(self.pattern.rows))
+
+    def couple(self, left: Slope, right: Slope, weights: Vector) -> Vector:
+        """A W B^T of the rows that are solved for."""
+        entry, one, other = self.terms
+        w = self.take(weights[: self.pattern.n_atoms], self.slot_atoms)
+        parts = (_times(self.take(a, one), self.take(_times(w, b), other)) for a, b in zip(left, right, strict=True))
+        return self.summed(reduce(_added, parts), entry, self.n_entries)
+
+    def solve(self, s: Vector, b: Vector, transposed: bool = False) -> Vector:
+        take, s, b = self.take, self.take(s, self.across) if transposed else _copied(s), _copied(b)
+        for (entry, here, there, _), (which, beside, taken) in self.levels:
+            factor = _each(operator.truediv, take(s, entry), take(s, here))
+            self.subtract(s, taken, _times(take(factor, which), take(s, beside)))
+            self.subtract(b, there, _times(factor, take(b, here)))
+        b = _each(operator.truediv, b, s[: len(b)])
+        for (_, here, there, across), _ in reversed(self.levels):
+            self.subtract(b, here, _times(_each(operator.truediv, take(s, across), take(s, here)), take(b, there)))
+        return b
+
+    # -- positions and velocities ---------------------------------------------------------------------
 
     def newton(self, of: Problem, lam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One step of Newton's method: the next multipliers; what these ones come to.
@@ -153,71 +241,54 @@ class Clusters:
         That is how far they move the atoms, and by how much all rows are off then, infinite where one has turned.
         """
         weights, known, rank = self.weights(of.w), self.unpacked(lam), self.pattern.rank
-        there = self.evaluate(of.at_start, None)[1]
+        there = self.evaluate(of.at_start)[1]
         u = _times(weights, self.spread(there, known))
         off, slope = self.evaluate(of, u)
         s = self.couple(slope, there, weights)
         step = self.solve(s, _each(operator.neg, off[:rank]))
         size = self.packed(off, of.x).abs()
-        turned = self.packed(_each(lambda d: torch.where(d > 0, 0.0, torch.inf), self.diagonal(s)), of.x)
+        turned = self.packed(_each(lambda d: torch.where(d > 0, 0.0, torch.inf), s[:rank]), of.x)
         size = size + turned if rank == len(size) else torch.cat([size[:rank] + turned, size[rank:]])
         return self.packed(_added(known, step), of.x), self.packed(u, of.x), size
 
-    def newton_adjoint(self, of: Problem, lam: Tensor, pushed: Tensor, bent: Tensor, _: Tensor) -> tuple[Tensor, ...]:
-        """Derivatives at the solution `of.x`, by one solve with the transposed matrix.
-
-        By positions, by those of the start, by targets and by inverse masses; of derivatives by how far atoms are
-        `pushed` and by multipliers (`bent`).
-        """
-        there, slope = self.evaluate(of.at_start, None)[1], self.evaluate(of, None)[1]
-        s = self.couple(slope, there, self.weights(of.w))
-
-        def of_start(moved: Tensor, wz: Vector, a: Vector) -> Tensor:
-            found = self.evaluate(of.at_start, self.unpacked(moved))[1]
-            total = _dot(self.contract(found, wz)[: self.pattern.rank], self.unpacked(lam))
-            if not of.flies:
-                return total
-            # The way and the middle of the flight change with where it starts.
-            flown = of._replace(start=of.start + moved)
-            return total - _dot(self.evaluate(flown, None)[0][: self.pattern.rank], a)
-
-        return self._adjoint(of, there, slope, s, lam, pushed, bent, of_start)
-
-    def _adjoint(
-        self, of: Problem, there: Any, slope: Any, s: Any, lam: Tensor, pushed: Tensor, bent: Tensor, of_place: Any
-    ) -> tuple[Tensor, ...]:
-        """Of atoms moved by W B^T lambda, where A and what else depends on `of_place`."""
-        weights, h = self.weights(of.w), self.unpacked(pushed)
-        b = _added(self.contract(there, _times(weights, h))[: self.pattern.rank], self.unpacked(bent))
-        a = self.solve(s, b, transposed=True)
-        back = _each(operator.neg, self.spread(slope, a))
-        z = _added(h, back)
-        wz = _times(weights, z)
-        by_place = torch.func.grad(lambda moved: of_place(moved, wz, a))(torch.zeros_like(pushed))
-        force = self.packed(self.spread(there, self.unpacked(lam)), of.x) * self.packed(z, of.x)
-        by_weight = force.reshape(-1, 3, force.shape[-1]).sum(1)
-        return self.packed(back, of.x), by_place, self.packed(a, of.x), by_weight
-
-    # -- velocities ---------------------------------------------------------------------------------
-
     def tangent(self, of: Problem, v: Tensor) -> tuple[Tensor, Tensor]:
         """Multipliers of velocities with A v as it is held, and by how much these change."""
-        weights, slope = self.weights(of.w), self.evaluate(of, None)[1]
-        off = _each(operator.sub, self.unpacked(of.held), self.contract(slope, self.unpacked(v)))
+        weights, slope = self.weights(of.w), self.evaluate(of)[1]
+        off = _each(operator.sub, self.unpacked(self.rates(of)), self.contract(slope, self.unpacked(v)))
         mu = self.solve(self.couple(slope, slope, weights), off[: self.pattern.rank])
         return self.packed(mu, of.x), self.packed(_times(weights, self.spread(slope, mu)), of.x)
 
-    def tangent_adjoint(self, of: Problem, mu: Tensor, pushed: Tensor, bent: Tensor, v: Tensor) -> tuple[Tensor, ...]:
-        """As `newton_adjoint`: by velocities, positions, rates and inverse masses, at the velocities v found."""
-        slope = self.evaluate(of, None)[1]
-        s = self.couple(slope, slope, self.weights(of.w))
+    def adjoint(self, of: Problem, lam: Tensor, pushed: Tensor, bent: Tensor, v: Tensor | None) -> tuple[Tensor, ...]:
+        """Derivatives at the solution, positions `of.x` or velocities v there, by one solve with the transposed matrix.
 
-        def of_place(moved: Tensor, wz: Vector, a: Vector) -> Tensor:
-            found = self.evaluate(of, self.unpacked(moved))[1]
-            speeds = _dot(self.contract(found, self.unpacked(v))[: self.pattern.rank], a)
-            return _dot(self.contract(found, wz)[: self.pattern.rank], self.unpacked(mu)) - speeds
+        By what is projected, by positions of which directions are taken, by what is held and by inverse masses; of
+        derivatives by how far atoms (or velocities) are `pushed`, and by multipliers (`bent`).
+        """
+        rank, known, h, weights = self.pattern.rank, self.unpacked(lam), self.unpacked(pushed), self.weights(of.w)
+        at, slope = of.at_start if v is None else of, self.evaluate(of)[1]
+        there = self.evaluate(at)[1] if v is None else slope
+        b = _added(self.contract(there, _times(weights, h))[:rank], self.unpacked(bent))
+        a = self.solve(self.couple(slope, there, weights), b, transposed=True)
+        back = _each(operator.neg, self.spread(slope, a))
+        z = _added(h, back)
+        wz = _times(weights, z)
 
-        return self._adjoint(of, slope, slope, s, mu, pushed, bent, of_place)
+        def of_place(moved: Tensor) -> Tensor:
+            found = self.evaluate(at, self.unpacked(moved))[1]
+            total: Tensor = _dot(self.contract(found, wz)[:rank], known)
+            if v is not None:
+                off = self.contract(found, self.unpacked(v))
+                off = _each(operator.sub, off, self.unpacked(self.rates(of, moved))) if self.timed else off
+            elif of.flies:  # the way and the middle of the flight change with where it starts
+                off = self.evaluate(of._replace(start=of.start + moved))[0]
+            else:
+                return total
+            return total - _dot(off[:rank], a)
+
+        by_place = torch.func.grad(of_place)(torch.zeros_like(pushed))
+        force = self.packed(self.spread(there, known), of.x) * self.packed(z, of.x)
+        by_weight = force.reshape(3, -1, force.shape[-1]).sum(0)
+        return self.packed(back, of.x), by_place, self.packed(a, of.x), by_weight
 
     # -- forces ---------------------------------------------------------------------------------------
 
@@ -226,12 +297,13 @@ class Clusters:
 
         A (a + W A^T lambda) is what is held, less the curvature along v.
         """
-        weights, slope = self.weights(of.w), self.evaluate(of, None)[1]
+        weights, slope = self.weights(of.w), self.evaluate(of)[1]
         s = self.couple(slope, slope, weights)
 
         def speeds(moved: Tensor, time: Tensor) -> Tensor:
-            found = self.contract(self.evaluate(of._replace(t=time), self.unpacked(moved))[1], self.unpacked(v))
-            return self.packed(found, v) + self.drift(of._replace(t=time), moved)
+            there = of._replace(t=time)
+            found = self.contract(self.evaluate(there, self.unpacked(moved))[1], self.unpacked(v))
+            return self.packed(found, v) - self.rates(there, moved)
 
         bend = torch.func.jvp(speeds, (torch.zeros_like(v), of.t), (v, torch.ones_like(of.t)))[1]
         b = of.held - bend - self.packed(self.contract(slope, self.unpacked(a)), v)
@@ -239,29 +311,18 @@ class Clusters:
         lam = self._least_norm(slope, s, weights, lam)
         return lam, self.packed(self.spread(slope, self.unpacked(lam)), v)
 
-    def drift(self, of: Problem, moved: Tensor | None = None) -> Tensor:
-        """dq/dt of rows with the time in them, where atoms rest."""
-        if not any(row.function.timed and row.function.holonomic for row in self.pattern.rows):
-            return of.x.new_zeros(())
-        u = None if moved is None else self.unpacked(moved)
-        along = (of.t,), (torch.ones_like(of.t),)
-        return torch.func.jvp(lambda t: self.packed(self.evaluate(of._replace(t=t), u)[0], of.x), *along)[1]
-
-    def _least_norm(self, slope: Any, s: Any, weights: Vector, lam: Tensor) -> Tensor:
-        """Multipliers of all rows with the same force, where the last ones are sums D of those that are solved for."""
+    def _least_norm(self, slope: Slope, s: Vector, weights: Vector, lam: Tensor) -> Tensor:
+        """Multipliers of all rows with the same force, where the last ones are sums of those that are solved for."""
         count, rank = len(self.pattern.rows), self.pattern.rank
         if count == rank:
             return lam
         sums = []
-        for row in range(rank, count):
-            unit = lam.new_zeros(count, lam.shape[-1])
-            unit[row] = 1.0
-            force = _times(weights, self.spread(slope, self.unpacked(unit)))
-            sums.append(self.packed(self.solve(s, self.contract(slope, force)[: self.pattern.rank]), lam))
-        d = torch.stack(sums)
-        metric = torch.einsum("krc,lrc->ckl", d, d) + torch.eye(count - rank, dtype=lam.dtype, device=lam.device)
-        rest = torch.linalg.solve(metric, (d * lam).sum(1).T.unsqueeze(-1)).squeeze(-1)
-        return torch.cat([lam - torch.einsum("krc,ck->rc", d, rest), rest.T])
+        for unit in torch.eye(count, dtype=lam.dtype, device=lam.device):
+            force = _times(weights, self.spread(slope, self.unpacked(unit[:, None].expand(count, lam.shape[-1]))))
+            sums.append(self.packed(self.solve(s, self.contract(slope, force)[:rank]), lam))
+        # Of all multipliers x with D x = lambda those of least norm.
+        d = torch.stack(sums, 1).permute(2, 0, 1)
+        return (d.mT @ torch.linalg.solve(d @ d.mT, lam.T.unsqueeze(-1))).squeeze(-1).T
 
 
 def _each(act: Callable[..., Any], *vectors: Vector) -> Any:
@@ -277,126 +338,64 @@ def _times(one: Vector, other: Vector) -> Vector:
     return _each(operator.mul, one, other)
 
 
+def _copied(vector: Vector) -> Vector:
+    return vector.clone() if isinstance(vector, Tensor) else [*vector]
+
+
 def _dot(one: Vector, other: Vector) -> Any:
     return sum((a * b).sum() for a, b in zip(one, other, strict=True))
 
 
 class Lanes(Clusters):
-    """Clusters with a tensor for each number; gradients are lists of numbers by row."""
+    """Clusters with a tensor for each number."""
+
+    together = False
+
+    def table(self, numbers: list[int]) -> Table:
+        return numbers
+
+    def columns(self, rows: list[Any]) -> Any:
+        return rows[0]
 
     def unpacked(self, packed: Tensor) -> Vector:
         return list(packed.unbind(0))
-
-    def take(self, vector: Vector, numbers: Any) -> list[Any]:
-        return [vector[k] for k in numbers]
 
     def packed(self, vector: Vector, like: Tensor) -> Tensor:
         lane = like[0]
         return torch.stack([each.expand_as(lane) if isinstance(each, Tensor) else lane * 0 + each for each in vector])
 
-    def couple(self, left: Any, right: Any, weights: Vector) -> Matrix:
-        rows = self.pattern.rows[: self.pattern.rank]
-        slot = [{a: 3 * i for i, a in enumerate(row.atoms) if a not in self.pattern.fixed} for row in rows]
-        heavy = [
-            {a: [weights[3 * a] * right[k][i + c] for c in range(3)] for a, i in mine.items()}
-            for k, mine in enumerate(slot)
-        ]
+    def joined(self, values: list[Any], slopes: list[list[Any]], like: Tensor) -> tuple[Vector, Slope]:
+        x, y, z = ([each for some in slopes for each in some[c::3]] for c in range(3))
+        return values, (x, y, z)
 
-        def entry(k: int, other: int) -> Any:
-            terms = [
-                left[k][i + c] * each
-                for atom, i in slot[k].items()
-                for c, each in enumerate(heavy[other].get(atom, ()))
-            ]
-            return sum(terms[1:], terms[0]) if terms else None
+    def take(self, vector: Vector, numbers: Table) -> Vector:
+        return [vector[k] for k in numbers]
 
-        return [[entry(k, other) for other in range(len(rows))] for k in range(len(rows))]
+    def summed(self, terms: Vector, numbers: Table, count: int) -> Vector:
+        found: dict[int, Any] = {}
+        for k, term in zip(numbers, terms, strict=True):
+            found[k] = found[k] + term if k in found else term
+        return [found.get(k, 0.0) for k in range(count)]
 
-    def solve(self, s: Matrix, b: Vector, transposed: bool = False) -> Vector:
-        n, b = len(b), list(b)
-        s = [[s[j][i] if transposed else s[i][j] for j in range(n)] for i in range(n)]
-        for k in range(n):
-            s[k][k] = 1.0 / s[k][k]
-            for i in range(k + 1, n):
-                if s[i][k] is None:
-                    continue
-                factor = s[i][k] * s[k][k]
-                for j in range(k + 1, n):
-                    if s[k][j] is not None:
-                        s[i][j] = -factor * s[k][j] if s[i][j] is None else s[i][j] - factor * s[k][j]
-                b[i] = b[i] - factor * b[k]
-        for k in reversed(range(n)):
-            for j in range(k + 1, n):
-                if s[k][j] is not None:
-                    b[k] = b[k] - s[k][j] * b[j]
-            b[k] = b[k] * s[k][k]
-        return b
-
-    def diagonal(self, s: Matrix) -> Vector:
-        return [s[k][k] for k in range(len(s))]
-
-    def spread(self, slope: Any, lam: Vector) -> Vector:
-        found: Vector = [0.0] * (3 * self.pattern.n_atoms)
-        for row, steep, each in zip(self.pattern.rows, slope, lam, strict=False):
-            for i, k in enumerate(3 * atom + c for atom in row.atoms for c in range(3)):
-                found[k] = found[k] + steep[i] * each
-        return found
-
-    def contract(self, slope: Any, v: Vector) -> Vector:
-        return [
-            sum(steep[3 * i + c] * v[3 * atom + c] for i, atom in enumerate(row.atoms) for c in range(3))
-            for row, steep in zip(self.pattern.rows, slope, strict=True)
-        ]
+    def subtract(self, vector: Vector, numbers: Table, terms: Vector) -> None:
+        for k, term in zip(numbers, terms, strict=True):
+            vector[k] = vector[k] - term
 
 
 class Levels(Clusters):
-    """Clusters whose numbers are all in one tensor; gradients have shape (atoms in rows, 3, n).
+    """Clusters whose numbers are all in one tensor."""
 
-    A level of elimination has rows that are eliminated at once, their factors, and products of these with what is
-    beside the pivots. A factor has its entry, the row and a later row; a product the factor, the entry beside, and that
-    it is taken from. The entry beyond the diagonal from one is `across`.
-    """
+    together = True
 
     def __init__(self, pattern: Pattern, device: torch.device) -> None:
+        self.device = device
         super().__init__(pattern)
-        rows = pattern.rows
-        moving = [tuple(a for a in row.atoms if a not in pattern.fixed) for row in rows[: pattern.rank]]
-        found = elimination(moving, set())
-        place, later = found.rows.tolist(), [found.rows[some].tolist() for some in found.later]
-        pairs = [pair for here, some in zip(place, later, strict=True) for i in some for pair in ((here, i), (i, here))]
-        entries = {pair: k for k, pair in enumerate([*((k, k) for k in range(len(place))), *pairs])}
-        self.levels = []
-        for begin, end in zip(found.levels[:-1], found.levels[1:], strict=True):
-            factor: list[tuple[int, int, int]] = []
-            product: list[tuple[int, int, int]] = []
-            for here, some in zip(place[begin:end], later[begin:end], strict=True):
-                for there in some:
-                    product += [(len(factor), entries[here, j], entries[there, j]) for j in some]
-                    factor.append((entries[there, here], here, there))
-            done = torch.tensor(place[begin:end], device=device)
-            self.levels.append((done, _table(factor, 3, device), _table(product, 3, device)))
-        self.across = torch.tensor([entries[j, i] for i, j in entries], device=device)
-        alike: dict[Any, list[Any]] = {}
-        for kind in self.kinds:
-            alike.setdefault((kind[0].function, kind[0].relative, kind[0].period), []).append(kind)
-        self.kinds = []
-        for some in alike.values():
-            first, *numbers = zip(*some, strict=True)
-            tables = [torch.tensor(each, dtype=torch.long, device=device).movedim(0, -1) for each in numbers]
-            self.kinds.append((first[0], *tables))
-        order = [k for kind in self.kinds for k in kind[1].tolist()]
-        self.order = torch.tensor(order, device=device).argsort()
-        ends = np.cumsum([0, *(len(row.atoms) for row in rows)]).tolist()
-        self.slots = torch.tensor([i for k in order for i in range(*ends[k : k + 2])], device=device).argsort()
-        self.atom, self.row = _table(((a, k) for k, row in enumerate(rows) for a in row.atoms), 2, device)
-        products = [
-            (entry, ends[k] + i, ends[other] + j, 3 * atom)
-            for (k, other), entry in entries.items()
-            for i, atom in enumerate(rows[k].atoms)
-            for j, same in enumerate(rows[other].atoms)
-            if atom == same and atom not in pattern.fixed
-        ]
-        self.products = _table(products, 4, device)
+
+    def table(self, numbers: list[Any]) -> Table:
+        return torch.tensor(numbers, dtype=torch.long, device=self.device)
+
+    def columns(self, rows: list[Any]) -> Any:
+        return self.table(rows).movedim(0, -1)
 
     def unpacked(self, packed: Tensor) -> Vector:
         return packed
@@ -404,53 +403,24 @@ class Levels(Clusters):
     def packed(self, vector: Any, like: Tensor) -> Tensor:
         return vector.expand(len(vector), like.shape[-1])
 
-    def take(self, vector: Any, numbers: Tensor) -> list[Any]:
-        return list(vector[numbers].unbind(0))
-
-    def evaluate(self, of: Problem, u: Vector | None) -> tuple[Any, Any]:
-        values, slopes = super().evaluate(of, u)
+    def joined(self, values: list[Any], slopes: list[list[Any]], like: Tensor) -> tuple[Vector, Slope]:
         sizes = [len(kind[1]) for kind in self.kinds]
 
-        def whole(value: Any, size: int) -> Tensor:
-            return (of.x.new_zeros(()) + value).expand(size, of.x.shape[-1])
+        def whole(parts: list[list[Any]]) -> Tensor:
+            shaped = ((e, (n, like.shape[-1])) for some, n in zip(parts, sizes, strict=True) for e in some)
+            return torch.cat(
+                [(e if isinstance(e, Tensor) else like.new_tensor(e)).expand(shape) for e, shape in shaped]
+            )
 
-        steep = [torch.stack([whole(e, n) for e in some], 1) for some, n in zip(slopes, sizes, strict=True)]
-        off = torch.cat([whole(value, n) for value, n in zip(values, sizes, strict=True)])[self.order]
-        return off, torch.cat([each.reshape(-1, 3, of.x.shape[-1]) for each in steep])[self.slots]
+        x, y, z = (whole([some[c::3] for some in slopes]) for c in range(3))
+        numbers = torch.cat([kind[1] for kind in self.kinds])
+        return whole([[value] for value in values])[numbers.argsort()], (x, y, z)
 
-    def couple(self, left: Any, right: Any, weights: Any) -> Tensor:
-        entry, one, other, atom = self.products
-        terms = (left[one] * (weights[atom].unsqueeze(1) * right[other])).sum(1)
-        return _summed(terms, entry, len(self.across))
+    def take(self, vector: Any, numbers: Tensor) -> Vector:
+        return vector[numbers]
 
-    def solve(self, s: Tensor, b: Any, transposed: bool = False) -> Vector:
-        s, b = (s[self.across] if transposed else s.clone()), b.clone()
-        for _, (entry, here, there), (which, beside, taken) in self.levels:
-            factor = s[entry] / s[here]
-            s.index_add_(0, taken, factor[which] * s[beside], alpha=-1)
-            b.index_add_(0, there, factor * b[here], alpha=-1)
-        for rows, (entry, here, there), _ in reversed(self.levels):
-            b.index_add_(0, here, s[self.across[entry]] * b[there], alpha=-1)
-            b[rows] = b[rows] / s[rows]
-        return b
+    def summed(self, terms: Tensor, numbers: Tensor, count: int) -> Vector:
+        return terms.new_zeros(count, terms.shape[-1]).index_add(0, numbers, terms)
 
-    def diagonal(self, s: Tensor) -> Vector:
-        return s[: self.pattern.rank]
-
-    def spread(self, slope: Any, lam: Any) -> Vector:
-        some = self.row < len(lam)
-        terms = slope[some] * lam[self.row[some]].unsqueeze(1)
-        return _summed(terms, self.atom[some], self.pattern.n_atoms).reshape(3 * self.pattern.n_atoms, -1)
-
-    def contract(self, slope: Any, v: Any) -> Vector:
-        places = v.reshape(self.pattern.n_atoms, 3, -1)[self.atom]
-        return _summed((slope * places).sum(1), self.row, len(self.pattern.rows))
-
-
-def _summed(terms: Tensor, index: Tensor, count: int) -> Tensor:
-    return terms.new_zeros(count, *terms.shape[1:]).index_add(0, index, terms)
-
-
-def _table(entries: Iterable[Iterable[int]], width: int, device: torch.device) -> Tensor:
-    rows = [list(each) for each in entries]
-    return torch.tensor(rows, dtype=torch.long, device=device).reshape(len(rows), width).T
+    def subtract(self, vector: Any, numbers: Tensor, terms: Tensor) -> None:
+        vector.index_add_(0, numbers, terms, alpha=-1)

@@ -39,38 +39,34 @@ def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
     known = _KNOWN.setdefault(motion, {})
     if velocity_rows in known:
         return known[velocity_rows]
-    held, plan, fixed = motion.constraint_set, motion.plan, set(motion.fixed_atoms.tolist())
+    held, plan = motion.constraint_set, motion.plan
     missing = int(((plan.labels >= 0) & ~plan.eliminate_last).sum()) + len(plan.pinned_rows) - motion.rank
     if missing:
         raise UnsupportedError(
             f"{missing} rows depend on others, in clusters of so many rows that nobody knows which; leave out what "
             "others hold (Motion.report names the kinds of clusters)"
         )
-    what: list[Any] = []
+    what: list[tuple[Row, bool]] = []
     atoms: list[IntArray] = []
     parameters: list[FloatArray] = []
     offsets: list[FloatArray] = []
     for item, start in zip(held.constraints, held.starts, strict=False):
-        if not item.n_rows:
+        n = item.n_rows
+        if not n:
             continue
         function = None if item.fixes_atoms else row_function(item)
-        table = item.parameters().reshape(item.n_rows, -1)
-        whole = np.zeros(item.n_rows, bool) if item.whole is None else item.whole
+        table = item.parameters().reshape(n, -1)
         cells = np.zeros((*item.atoms.shape, 3)) if item.cell_offsets is None else 1.0 * item.cell_offsets
         offsets += list((cells - cells[:, :1])[:, 1 if item.relative else item.width :])
         atoms, parameters = atoms + list(item.atoms), parameters + list(table)
-        for k, row in enumerate(item.atoms.tolist()):
-            still, last = tuple(a in fixed for a in row), bool(plan.eliminate_last[start + k])
-            what.append(
-                (function, item.relative, bool(whole[k]), float(item.period or 0.0), table.shape[1], still, last)
-            )
+        whole, last = np.zeros(n) if item.whole is None else item.whole, plan.eliminate_last[start : start + n]
+        row = Row(function, (), item.relative, False, item.period or 0.0, table.shape[1])  # type: ignore[arg-type]
+        what += [(row._replace(whole=bool(w)), bool(l)) for w, l in zip(whole, last, strict=True)]
     labels = plan.labels if velocity_rows else np.where(held.holonomic, plan.labels, -1)
     found: dict[Pattern, Kind] = {}
     for key, clusters in alike(labels, plan.eliminate_last, what, atoms).items():
-        rows = tuple(Row(each[0], local, *each[1:5]) for each, local in key)
-        still_atoms = {a for each, local in key for a, still in zip(local, each[5], strict=True) if still}
-        rank = sum(not each[6] for each, _ in key)
-        pattern = Pattern(rows, rank, clusters.atoms.shape[1], tuple(sorted(still_atoms)))
+        rows = tuple(row._replace(atoms=local) for (row, _), local in key)
+        pattern = Pattern(rows, sum(not last for (_, last), _ in key), clusters.atoms.shape[1])
         numbers = (
             np.array([np.concatenate([t[row] for row in some]) for some in clusters.rows])
             for t in (parameters, offsets)
@@ -81,11 +77,11 @@ def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
 
 
 @lru_cache(512)
-def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Any:
+def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Clusters:
     """The equations of a pattern; of small ones compiled where that is asked for."""
     made: Clusters = Lanes(pattern) if pattern.small else Levels(pattern, device)
     if compiled and pattern.small:
-        for name in ("newton", "newton_adjoint", "tangent", "tangent_adjoint"):
+        for name in ("newton", "tangent", "adjoint"):
             setattr(made, name, torch.compile(getattr(made, name), dynamic=True))
     return made
 
@@ -93,27 +89,36 @@ def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Any:
 class Group:
     """All clusters of one pattern in a batch.
 
-    `parts` are kinds, with the numbers of their systems, and where atoms and rows of these begin. What has a last axis
-    of n is by cluster: `atoms`, (n_atoms, n), their coordinates `flat`, (3 n_atoms, n), `rows`, (n_rows, n), `systems`,
-    (n,), and `worst`, (n_rows, n), by how much rows were off at most since that was looked at, in parts of their scale.
+    `parts` are kinds, with the numbers of their systems, and where atoms and rows of these begin; `own` are numbers by
+    atom and by row that do not change. What has a last axis of n is by cluster: `atoms`, (n_atoms, n), their
+    coordinates `flat`, (3 n_atoms, n), `rows`, (n_rows, n), `systems`, (n,), and `worst`, (n_rows, n), by how much rows
+    were off at most since that was looked at, in parts of their scale.
     """
 
-    def __init__(self, pattern: Pattern, parts: Sequence[tuple[Kind, IntArray]], like: Tensor, compiled: bool) -> None:
+    def __init__(
+        self,
+        pattern: Pattern,
+        parts: Sequence[tuple[Kind, IntArray]],
+        own: tuple[Sequence[Tensor], Sequence[Tensor]],
+        compiled: bool,
+    ) -> None:
+        like = own[0][0]
         self.pattern, self.solver = pattern, solver_of(pattern, like.device, compiled)
 
-        def of_all(of: Any, dtype: Any = None) -> Tensor:
-            """Numbers of clusters in all systems, the last axis by cluster; of one where real ones are all alike."""
-            whole = np.moveaxis(np.concatenate([of(kind, *where) for kind, some in parts for where in some]), 0, -1)
-            if dtype is not None and whole.size and (whole == whole[..., :1]).all():
-                whole = whole[..., :1]
-            return torch.as_tensor(np.ascontiguousarray(whole), device=like.device, dtype=dtype)
+        def of_all(of: Any, dtype: torch.dtype = torch.int64) -> Tensor:
+            """Numbers of clusters in all systems, the last axis by cluster."""
+            whole = np.concatenate([of(kind, *where) for kind, some in parts for where in some])
+            return torch.as_tensor(np.ascontiguousarray(np.moveaxis(whole, 0, -1)), device=like.device, dtype=dtype)
 
         self.atoms = of_all(lambda kind, system, atom, row: kind.clusters.atoms + atom)
         self.rows = of_all(lambda kind, system, atom, row: kind.clusters.rows + row)
         self.systems = of_all(lambda kind, system, atom, row: np.full(len(kind.scale), system))
-        self.p, self.scale, self._offsets = (of_all(lambda kind, *_, k=k: kind[k], like.dtype) for k in (1, 2, 3))
+        self.p, self.scale, self._offsets = (
+            _once(of_all(lambda kind, *_, k=k: kind[k], like.dtype)) for k in (1, 2, 3)
+        )
+        self._own = {id(each): _once(each[self.atoms]) for each in own[0]}
+        self._own |= {id(each): _once(each[self.rows]) for each in own[1]}
         self.flat = _flat(self.atoms)
-        self.moving = [3 * a + c for a in range(pattern.n_atoms) if a not in pattern.fixed for c in range(3)]
         # Of relative rows each atom but the first, and the one before it.
         some = [row for row in pattern.rows if row.relative]
         sizes = [len(row.atoms) - 1 for row in some]
@@ -123,46 +128,42 @@ class Group:
         self._now, self._before, self._first = (_flat(self.atoms[each]) for each in (now, before, first))
         begins, whole = np.repeat([np.cumsum([0, *sizes])[:-1], [row.whole for row in some]], sizes, axis=1)
         self._begin = torch.as_tensor(begins, device=like.device)
-        self._whole = torch.as_tensor(whole, device=like.device, dtype=torch.bool)[:, None, None]
+        self._whole = torch.as_tensor(whole, device=like.device, dtype=torch.bool)[:, None]
         self.worst = torch.zeros(self.rows.shape, dtype=like.dtype, device=like.device)
-        self._known: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
 
-    def lanes(self, values: Tensor, numbers: Tensor, keep: bool) -> Tensor:
-        """Values of all atoms or rows by cluster; kept where they are those of the batch."""
-        if not keep:
-            return values[numbers]
-        key = id(numbers), id(values)
-        if key not in self._known:
-            found = values[numbers]
-            some = found[..., :1].contiguous()
-            self._known[key] = values, some if bool((found == some).all()) else found
-        return self._known[key][1]
+    def lanes(self, values: Tensor, numbers: Tensor) -> Tensor:
+        """Values of all atoms or rows by cluster."""
+        found = self._own.get(id(values))
+        return values[numbers] if found is None else found
 
     def coordinates(self, x: Tensor, lattice: Tensor | None, tree: Any) -> tuple[Tensor, Tensor | None]:
         """Of the atoms of clusters, and by how much the images that relative rows mean stand off: see `Problem`.
 
         The lattice has shape (n_systems, 2, 3, 3); `tree` gives whole cells by which atoms of whole rows stand off
-        where they are stored, of the shape of x, or None.
+        where they are stored, of the shape of x.
         """
         flat, n = x.reshape(-1), self.atoms.shape[1]
         if lattice is None or not len(self._begin):
             return flat[self.flat], None
-        cell, inverse = lattice[self.systems].unbind(1)
-        step = (flat[self._now] - flat[self._before]).reshape(-1, 3, n)
-        sums = -torch.round(torch.einsum("exn,nxy->eyn", step, inverse)).cumsum(0)
-        cells = sums - torch.cat([torch.zeros_like(sums[:1]), sums])[self._begin]
-        if (found := tree(x)) is not None:
-            found = found.reshape(-1)
-            apart = (found[self._now] - found[self._first]).reshape(-1, 3, n)
-            cells = torch.where(self._whole, apart + self._offsets, cells)
-        return flat[self.flat], torch.einsum("exn,nxy->eyn", cells, cell).reshape(-1, n)
 
-    def put(self, into: Tensor, vector: Tensor) -> None:
-        """Write a vector of atoms, (3 n_atoms, n), into a tensor of all atoms; those that are fixed keep theirs."""
-        some = self.moving if self.pattern.fixed else slice(None)
-        into.view(-1)[self.flat[some]] = vector[some]
+        def apart(values: Tensor, others: Tensor) -> Tensor:
+            return (values[self._now] - values[others]).reshape(3, -1, n)
+
+        cell, inverse = lattice[self.systems].unbind(1)
+        sums = -torch.round(torch.einsum("xen,nxy->yen", apart(flat, self._before), inverse)).cumsum(1)
+        cells = sums - torch.cat([torch.zeros_like(sums[:, :1]), sums], 1)[:, self._begin]
+        if bool(self._whole.any()):
+            found = apart(tree(x).reshape(-1), self._first) + self._offsets.movedim(1, 0)
+            cells = torch.where(self._whole, found, cells)
+        return flat[self.flat], torch.einsum("xen,nxy->eyn", cells, cell).reshape(-1, n)
+
+
+def _once(values: Tensor) -> Tensor:
+    """Values by cluster, one where real ones are all alike."""
+    some = values[..., :1].contiguous()
+    return some if bool((values == some).all()) else values
 
 
 def _flat(atoms: Tensor) -> Tensor:
-    """Numbers of coordinates, shape (3 n_atoms, n)."""
-    return (3 * atoms.unsqueeze(1) + torch.arange(3, device=atoms.device)[:, None]).reshape(-1, atoms.shape[-1])
+    """Numbers of coordinates, x before y and z, shape (3 n_atoms, n)."""
+    return (3 * atoms + torch.arange(3, device=atoms.device)[:, None, None]).flatten(0, 1)

@@ -1,6 +1,6 @@
 """Rows of constraints on tensors: what the declaration of a family does, operation by operation, for many rows at once.
 
-Functions of users that are written with NumPy become such a list too, which torch differentiates.
+Functions of users that are written with NumPy become such a list too.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kcons.constraints import Constraint, CustomVelocity, ImplicitSurface
-from kcons.constraints.functions.straight_line import Tape, function_of, record
+from kcons.constraints.functions.straight_line import Tape, differentiated, function_of
 from kcons.errors import UnsupportedError
 
 _OPERATORS: dict[str, Callable[..., Any]] = {
@@ -43,8 +43,8 @@ def run(tape: Tape, r: Sequence[Any], p: Sequence[Any], t: Any) -> list[Any]:
 class RowFunction(NamedTuple):
     """What rows are computed by, equal for rows that are computed alike.
 
-    The `tape` has value and gradient of a declaration, and the value alone of a user's function. What is not
-    `holonomic` is a function of the middle of a flight and of the way; `timed` is what depends on the time.
+    The `tape` has value and gradient. What is not `holonomic` is a function of the middle of a flight and of the way;
+    its gradient is by where the flight ends, or, of functions of users, by both. `timed` is what depends on the time.
     """
 
     tape: Tape
@@ -60,14 +60,9 @@ class RowFunction(NamedTuple):
 
         `r` are coordinates x, y, z by atom, and the way behind them for velocity rows; `p` are parameters.
         """
-        if len(self.tape.results) > 1:
-            value, *slope = run(self.tape, r, p, t)
-            return value, slope
-        like = next(each for each in r if isinstance(each, Tensor))
-        r = [each if isinstance(each, Tensor) else torch.full_like(like, each) for each in r]
-        value, pull = torch.func.vjp(lambda *places: run(self.tape, places, p, t)[0], *r)
-        slope, n = list(pull(torch.ones_like(value))), 3 * self.width
-        if not self.holonomic:
+        value, *slope = run(self.tape, r, p, t)
+        n = 3 * self.width
+        if len(slope) > n:
             slope = [0.5 * middle + way for middle, way in zip(slope[:n], slope[n:], strict=True)]
         return value, slope
 
@@ -77,19 +72,22 @@ def row_function(item: Constraint) -> RowFunction:
     found = function_of(item)
     if found is not None:
         return RowFunction(found.tape(), item.width, item.holonomic)
-    n, function = 3 * item.width, _of_user(item)
+    n, function = 3 * item.width * (1 if item.holonomic else 2), _of_user(item)
 
-    def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        places = np.array([r[k] for k in range(n if item.holonomic else 2 * n)], dtype=object).reshape(-1, 3)
+    def row(r: Any, p: Any, t: Any) -> Any:
+        places = np.array([r[k] for k in range(n)], dtype=object).reshape(-1, 3)
         value = function(places[: item.width], *((t,) if item.time_dependent else ()))  # type: ignore[attr-defined]
         value = value if item.holonomic else (value * places[item.width :]).sum()
-        out[0] = value.item() if isinstance(value, np.ndarray) else value
+        return value.item() if isinstance(value, np.ndarray) else value
 
     try:
-        return RowFunction(record(row), item.width, item.holonomic)
-    except UnsupportedError as error:
-        remedy = "write it with elementary functions of NumPy, or as a Formula"
-        raise UnsupportedError(f"{item!r} cannot be run on tensors: {error}; {remedy}") from error
+        tape = differentiated(row, n)
+    except (TypeError, AttributeError, IndexError, ValueError) as error:
+        raise UnsupportedError(
+            f"{item!r} cannot be run on tensors ({error}); write it with elementary functions of NumPy without "
+            "branches, or as a Formula"
+        ) from error
+    return RowFunction(tape._replace(results=tape.results[:-1]), item.width, item.holonomic)
 
 
 def _of_user(item: Any) -> Callable[..., Any]:

@@ -58,6 +58,7 @@ from kcons.openmm.quantities import (
     accepted,
     cell_of,
     forces_at,
+    held_pairs,
     masses_of,
     nanometers,
     number,
@@ -194,11 +195,8 @@ class _Table:
             raise InputError(
                 f"system is a {type(system).__name__}; give the openmm.System, as createSystem makes it", item="system"
             )
-        known = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
         self.system = system
-        self.pairs = np.array([[i, j] for i, j, _ in known], dtype=np.int64).reshape(-1, 2)
-        # In nm; converting a Quantity takes longer than all else here.
-        self.lengths = np.array([length._value for _, _, length in known], dtype=np.float64)
+        self.pairs, self.lengths = held_pairs(system)
         self.clusters = components(system.getNumParticles(), self.pairs)
         self.cluster = self.clusters[self.pairs[:, 0]]
 
@@ -598,7 +596,8 @@ class CarriedConstraints(Part):
 
     def solver_at(self, context: openmm.Context) -> Solver:
         """The engine at the time of the context."""
-        return Solver(self.motion, time=self._state(context)[2])
+        time = self._state(context)[2]
+        return Solver(self.motion, time=time)
 
     @property
     def atoms(self) -> IntArray:
@@ -654,14 +653,12 @@ class CarriedConstraints(Part):
                 "the System got constraints after the rows were added to it; add the rows, by hold, last",
                 item="system",
             )
-        touched = set(engine.atoms.tolist())
-        for k in range(system.getNumConstraints()):
-            i, j, _ = system.getConstraintParameters(k)
-            if touched & {i, j}:
-                raise UnsupportedError(
-                    f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
-                    "kcons hold it too: hold(system, ...) moves such constraints, or add move_constraints(system)"
-                )
+        pairs = held_pairs(system)[0]
+        for k in np.flatnonzero(np.isin(pairs, engine.atoms).any(axis=1))[:1]:
+            raise UnsupportedError(
+                f"constraint {k} of the System, between atoms {pairs[k, 0]} and {pairs[k, 1]}, shares an atom with the "
+                "rows; let kcons hold it too: hold(system, ...) moves such constraints, or add move_constraints(system)"
+            )
 
     def check_masses(self, system: openmm.System) -> None:
         """Raise where masses are not those that the rows were built for."""

@@ -127,6 +127,8 @@ _PARTIALS: dict[str, Callable[..., tuple[Any, ...]]] = {
     "power": lambda y, a, b: (b * a ** (b - 1.0), y * np.log(a)),
     "negative": lambda y, a: (-1.0,),
     "absolute": lambda y, a: (np.copysign(1.0, a),),
+    "copysign": lambda y, a, b: (np.copysign(1.0, a) * np.copysign(1.0, b), 0.0),
+    "rint": lambda y, a: (0.0,),
     "sqrt": lambda y, a: (0.5 / y,),
     "exp": lambda y, a: (y,),
     "log": lambda y, a: (1.0 / a,),

@@ -23,7 +23,7 @@ from kcons.constraints.arguments import Finite, FloatArray, Positive, as_float_a
 from kcons.constraints.target import nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
-from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, inside, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, Learned, inside, learn
 from kcons.thermostats import Estimate
 
 if TYPE_CHECKING:
@@ -173,7 +173,41 @@ def integrate(
     UserWarning
         The integral over the period is more than 4 standard errors from 0: some mean force is wrong, or its error.
     """
-    places, forces, errors = _windows(x, f, e, period)
+    arrays = [finite(values, name, "window") for values, name in ((x, "x"), (f, "f"), (e, "e"))]
+    for array, name in zip(arrays, "xfe", strict=True):
+        if array.ndim != 1 or array.shape != arrays[0].shape:
+            raise InputError(f"{name} must have shape {(arrays[0].size,)}, not {array.shape}", item=name)
+    place, force, error = arrays
+    if (error < 0).any():
+        raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
+    if period is not None and place.size:
+        if np.ptp(place) > period * (1 + _SAME):
+            raise InputError(
+                f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
+                item="period",
+            )
+        place = place.min() + (place - place.min()) % period
+        place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
+    # Places that differ by rounding are one, with the weights that the errors give them.
+    order = np.argsort(place, kind="stable")
+    new = np.diff(place[order], prepend=-np.inf) > _SAME * (np.ptp(place) if place.size else 0.0)
+    places, which = place[order][new], np.empty(len(place), dtype=np.int64)
+    which[order] = np.cumsum(new) - 1
+    if len(places) < 3:
+        raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
+    for k in np.flatnonzero(np.bincount(which[error == 0]) > 1):
+        exact = force[(which == k) & (error == 0)]
+        if np.ptp(exact) > 1e-9 * np.abs(exact).max():
+            raise InputError(
+                f"windows at {places[k]:g} have mean forces from {exact.min():g} to {exact.max():g}, all with an error "
+                "of 0; give their errors",
+                item="e",
+            )
+    # Errors of 0 among others: exact values count alone.
+    weights = 1.0 / np.maximum(error, 1e-12 * float(error.max()) or 1.0) ** 2
+    total = np.bincount(which, weights)
+    forces, errors = np.bincount(which, weights * force) / total, np.sqrt(np.bincount(which, (weights * error) ** 2))
+    errors /= total
     low, high = float(places[0]), float(places[-1] if period is None else places[0] + period)
     axis = Axis(low, high - low, period is not None, _COEFFICIENTS if len(places) >= _MANY else 1)
     process, closure = learn(places[:, None], forces[:, None], errors[:, None, None] ** 2, [axis], [True]), None
@@ -191,47 +225,8 @@ def integrate(
     if zero is None:
         zero = float(grid[np.argmin(process.mean(grid[:, None], [-1])[0])])
     F, covariance = process.differences(grid[:, None], inside([[zero]], grid[:1], grid[-1:], [period], "zero")[0])
-    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return Profile(grid, F, error, covariance, zero, places, forces, errors, period, closure, process)
-
-
-def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> list[FloatArray]:
-    """Windows in order; those at one place are one, with the weights that their errors give them."""
-    arrays = [finite(values, name, "window") for values, name in ((x, "x"), (f, "f"), (e, "e"))]
-    for array, name in zip(arrays, "xfe", strict=True):
-        if array.ndim != 1 or array.shape != arrays[0].shape:
-            raise InputError(f"{name} must have shape {(arrays[0].size,)}, not {array.shape}", item=name)
-    place, force, error = arrays
-    if (error < 0).any():
-        raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
-    if period is not None and place.size:
-        if np.ptp(place) > period * (1 + _SAME):
-            raise InputError(
-                f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
-                item="period",
-            )
-        place = place.min() + (place - place.min()) % period
-        place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
-    # Places that differ by rounding are one.
-    order = np.argsort(place, kind="stable")
-    new = np.diff(place[order], prepend=-np.inf) > _SAME * (np.ptp(place) if place.size else 0.0)
-    places, which = place[order][new], np.zeros(len(place), dtype=np.int64)
-    which[order] = np.cumsum(new) - 1
-    if len(places) < 3:
-        raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
-    for k in np.flatnonzero(np.bincount(which[error == 0]) > 1):
-        exact = force[(which == k) & (error == 0)]
-        if np.ptp(exact) > 1e-9 * np.abs(exact).max():
-            raise InputError(
-                f"windows at {places[k]:g} have mean forces from {exact.min():g} to {exact.max():g}, all with an error "
-                "of 0; give their errors",
-                item="e",
-            )
-    # Errors of 0 among others: exact values count alone.
-    weights = 1.0 / np.maximum(error, 1e-12 * float(error.max()) or 1.0) ** 2
-    total = np.bincount(which, weights)
-    together = np.bincount(which, weights * force) / total
-    return [places, together, np.sqrt(np.bincount(which, (weights * error) ** 2)) / total]
+    band = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Profile(grid, F, band, covariance, zero, places, forces, errors, period, closure, process)
 
 
 def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "energy") -> Figure:
@@ -373,42 +368,6 @@ def fit_surface(
     UserWarning
         The mean forces are not the gradient of any free energy.
     """
-    places, forces, covariances, turns = _checked(x, f, errors, periods)
-    d, low = places.shape[1], places.min(axis=0)
-    lengths = np.array([spread if p is None else p for spread, p in zip(np.ptp(places, axis=0), turns, strict=True)])
-    axes = [Axis(float(a), float(b), p is not None) for a, b, p in zip(low, lengths, turns, strict=True)]
-    process = learn(places, forces, covariances, axes, [p is None for p in turns])
-    if d > 1:
-        _warn_of_rotation(process.best)
-    if zero is None:
-        lowest = places[np.argmin(process.mean(places, [-1])[0])]
-    else:
-        lowest = as_float_array(zero, "zero")
-        if lowest.shape != (d,) or not np.isfinite(lowest).all():
-            raise InputError(f"zero must be {d} finite numbers", item="zero")
-    surface = Surface(places, forces, low, low + lengths, turns, lowest, process)
-    surface._places(lowest[None])
-    return surface
-
-
-def _warn_of_rotation(process: GradientProcess) -> None:
-    """Warn where a field that is no gradient makes the vectors more likely, all lengths as they are."""
-    found = [replace(process, rotation=float(size)).log_likelihood() for size in _ROTATIONS]
-    best = int(np.argmax(found))
-    # By the ratio of likelihoods. The size cannot be negative: chance has it at 0 half of the time.
-    chance = 0.5 * float(chi2.sf(2 * (found[best] - process.log_likelihood()), 1))
-    if chance < _CHANCE:
-        warnings.warn(
-            f"the mean forces are no gradient: a field beside it of {_ROTATIONS[best]:.0%} of its size is more likely "
-            f"(p = {chance:.1e}). Windows are in different states of what is not held, or their errors are too small",
-            UserWarning,
-            stacklevel=3,
-        )
-
-
-def _checked(
-    x: ArrayLike, f: ArrayLike, errors: ArrayLike, periods: Sequence[float | None] | None
-) -> tuple[FloatArray, FloatArray, FloatArray, tuple[float | None, ...]]:
     places, forces, given = (finite(a, name, "window") for a, name in ((x, "x"), (f, "f"), (errors, "errors")))
     if places.ndim != 2 or not places.shape[1] or len(places) < places.shape[1] + 2:
         raise InputError(f"x has shape {places.shape}; give (n, d) with n of d + 2 or more", item="x")
@@ -432,4 +391,30 @@ def _checked(
         if spread == 0 or (period is not None and spread > period * (1 + 1e-9)):
             reason = "windows are further apart than the period in" if spread else "all windows are at one value of"
             raise InputError(f"{reason} coordinate {j}; check the units, or leave it out", item="x")
-    return places, forces, covariances, turns
+    low = places.min(axis=0)
+    lengths = np.array([spread if p is None else p for spread, p in zip(np.ptp(places, axis=0), turns, strict=True)])
+    axes = [Axis(float(a), float(b), p is not None) for a, b, p in zip(low, lengths, turns, strict=True)]
+    process = learn(places, forces, covariances, axes, [p is None for p in turns])
+    if d > 1:
+        # By the ratio of likelihoods, all lengths as they are. The size cannot be negative: chance has it at 0 half of
+        # the time.
+        found = [replace(process.best, rotation=float(size)).log_likelihood() for size in _ROTATIONS]
+        best = int(np.argmax(found))
+        chance = 0.5 * float(chi2.sf(2 * (found[best] - process.best.log_likelihood()), 1))
+        if chance < _CHANCE:
+            warnings.warn(
+                f"the mean forces are no gradient: a field beside it of {_ROTATIONS[best]:.0%} of its size is more "
+                f"likely (p = {chance:.1e}). Windows are in different states of what is not held, or their errors are "
+                "too small",
+                UserWarning,
+                stacklevel=2,
+            )
+    if zero is None:
+        lowest = places[np.argmin(process.mean(places, [-1])[0])]
+    else:
+        lowest = as_float_array(zero, "zero")
+        if lowest.shape != (d,) or not np.isfinite(lowest).all():
+            raise InputError(f"zero must be {d} finite numbers", item="zero")
+    surface = Surface(places, forces, low, low + lengths, turns, lowest, process)
+    surface._places(lowest[None])
+    return surface

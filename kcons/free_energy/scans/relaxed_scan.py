@@ -49,9 +49,8 @@ from kcons.errors import (
     UnreadableError,
     UnsupportedError,
 )
-from kcons.free_energy.held_coordinates import HeldCoordinates
+from kcons.free_energy.held_coordinates import HeldCoordinates, warn_of_gaps
 from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals, Relaxed
-from kcons.free_energy.torsion_force import warn_of_gaps
 from kcons.motion.minimization import minimize
 from kcons.motion.motion import Motion
 from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, text
@@ -345,14 +344,34 @@ class Grid:
                 f"{len(self.coordinates)} coordinates have {len(values)} lists of values; give one list for each",
                 item="values",
             )
-        for item in self.coordinates:
+        #: Arrays; and whether the first value of a coordinate follows on its last.
+        self.values: list[FloatArray] = []
+        self.rings: list[bool] = []
+        for item, given in zip(self.coordinates, values, strict=True):
             if item.n_rows != 1:
                 raise InputError(f"{item!r} has {item.n_rows} rows; a coordinate of a scan has one", item="coordinates")
             if item.moving or not item.holonomic:
                 raise UnsupportedError(f"{item!r} moves with time or holds velocities; scan a coordinate of positions")
-        made = [_axis(item, given) for item, given in zip(self.coordinates, values, strict=True)]
-        #: Arrays; and whether the first value of a coordinate follows on its last.
-        self.values, self.rings = [axis for axis, _ in made], [ring for _, ring in made]
+            name = item.row_name(0)
+            axis = np.atleast_1d(np.array(as_float_array(given, f"values of {name}")))
+            if axis.ndim != 1 or not len(axis) or not np.isfinite(axis).all():
+                raise InputError(f"the values of {name} are not a list of finite numbers", item="values")
+            ring, span = False, float(np.ptp(axis))
+            if np.diff(np.sort(axis)).min(initial=np.inf) <= SAME * span:
+                raise InputError(f"two values of {name} are the same; give each once", item="values")
+            if len(set(np.sign(np.diff(axis)).tolist())) > 1:
+                raise InputError(f"the values of {name} go up and down; give them in order", item="values")
+            if item.period is not None and len(axis) > 1:
+                if span > item.period * (1 + SAME):
+                    raise InputError(
+                        f"the values of {name} span more than its period, {item.period:.6g}; give one turn",
+                        item="values",
+                    )
+                if span > item.period * (1 - SAME):
+                    axis = axis[:-1]
+                ring = len(axis) > 2 and item.period - float(np.ptp(axis)) <= 1.5 * float(np.abs(np.diff(axis)).max())
+            self.values.append(axis)
+            self.rings.append(ring)
         self.names = [item.row_name(0) for item in self.coordinates]
         # Without blanks, for files: 'dihedral_0_1_2_3'.
         keys = ["_".join([item.family.lower(), *map(str, item.atoms[0].tolist()[:6])]) for item in self.coordinates]
@@ -393,27 +412,6 @@ class Grid:
         steps = [float(np.diff(axis).mean()) if len(axis) > 1 else 1.0 for axis in self.values]
         periods = np.array([item.period or 0.0 for item in self.coordinates])
         return float(np.linalg.norm(nearest_image(np.subtract(self.at(point), place), periods) / steps))
-
-
-def _axis(item: Constraint, given: ArrayLike) -> tuple[FloatArray, bool]:
-    name = item.row_name(0)
-    axis = np.atleast_1d(np.array(as_float_array(given, f"values of {name}")))
-    if axis.ndim != 1 or not len(axis) or not np.isfinite(axis).all():
-        raise InputError(f"the values of {name} are not a list of finite numbers", item="values")
-    ring, span = False, float(np.ptp(axis))
-    if np.diff(np.sort(axis)).min(initial=np.inf) <= SAME * span:
-        raise InputError(f"two values of {name} are the same; give each once", item="values")
-    if len(set(np.sign(np.diff(axis)).tolist())) > 1:
-        raise InputError(f"the values of {name} go up and down; give them in order", item="values")
-    if item.period is not None and len(axis) > 1:
-        if span > item.period * (1 + SAME):
-            raise InputError(
-                f"the values of {name} span more than its period, {item.period:.6g}; give one turn", item="values"
-            )
-        if span > item.period * (1 - SAME):
-            axis = axis[:-1]
-        ring = len(axis) > 2 and item.period - float(np.ptp(axis)) <= 1.5 * float(np.abs(np.diff(axis)).max())
-    return axis, ring
 
 
 #: What of an attempt is no number and no text.

@@ -32,7 +32,8 @@ MUTANTS = {
             "named_calculators::files_name_calculators_of_a_list_or_of_modules_that_their_reader_names",
         ),
     ],
-    "free_energy/torsion_force.py": [
+    "free_energy/held_coordinates.py": [
+        ("if «dependent→False»:", "free_energy/refusals::refusals"),
         ("{*pair} not in joined« and bonded.issuperset(pair)→»", "ase_windows::torsions_over_atoms_that_form_no_bonds"),
     ],
     "constraints/target.py": [
@@ -44,9 +45,6 @@ MUTANTS = {
     ],
     "openmm/integrator/guard.py": [
         ("force.getForceGroup() not in «row_groups→range(32)»", "openmm/integrator/edits::forgotten_parts_are_refused"),
-    ],
-    "free_energy/held_coordinates.py": [
-        ("if left[worst, 0] < «DEPENDENT→-1.0»:", "free_energy/refusals::refusals"),
     ],
     "free_energy/averages.py": [
         ("covariance *= «np.outer(widening, widening)→1.0»", "correlated_series::errors_are_as_large_as_they_say"),

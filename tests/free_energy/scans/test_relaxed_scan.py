@@ -263,21 +263,6 @@ def test_large_structures_need_no_table(monkeypatch):
     np.testing.assert_allclose(found.energies, 0.2 * (1 + np.cos(3 * np.array([0.5, 0.8]))), atol=1e-6)
 
 
-def test_a_second_scan_into_the_same_folder_is_told(tmp_path):
-    refused = []
-
-    def meanwhile(done, points, line):
-        if not refused:
-            with pytest.raises(OccupiedError, match="another run writes into"):
-                scan(chain(4, threefold), TURN, RING, folder=tmp_path)
-            refused.append(line)
-
-    found = scan(chain(4, threefold), TURN, RING, folder=tmp_path, progress=meanwhile)
-    again = scan(chain(4, threefold), TURN, RING, folder=tmp_path)
-    assert refused and np.array_equal(found.energies, again.energies)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["plan.json", "relaxations"]
-
-
 def test_a_torsion_over_atoms_that_are_not_bonded():
     atoms = molecule("trans-butane")
     atoms.calc = EMT()

@@ -14,7 +14,7 @@ from openmm_systems import DATA
 from kcons.constraints import Angle, Dihedral, Distance, MovingTarget
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy import HeldCoordinatesReporter
-from kcons.free_energy.mean_forces import local_mean_force
+from kcons.free_energy.series import local_mean_force
 from kcons.openmm import CollectiveRows, Langevin, ProjectedIntegrator, hold
 
 PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
@@ -182,8 +182,3 @@ def test_bad_input():
     other.reporters = simulation.reporters
     with pytest.raises(InputError, match="belongs to another simulation"):
         other.step(1)
-    simulation.reporters = [
-        HeldCoordinatesReporter(io.StringIO(), 1, {"r": Distance([[0, 99]])}, beside=[Dihedral([psi])])
-    ]
-    with pytest.raises(InputError, match="no atom 99"):
-        simulation.step(1)

@@ -332,11 +332,6 @@ def test_what_cannot_be_is_refused(water, rows, options, match):
         checked(water["dcd"], rows, **options)
 
 
-def test_options_that_do_not_exist_are_refused(water):
-    with pytest.raises(TypeError, match="unexpected keyword argument 'tolerence'"):
-        checked(water["dcd"], ROWS, tolerence=1e-3)
-
-
 def test_rows_that_were_made_for_a_part_are_refused(water):
     whole = files.loaded(water["dcd"], N)
     with pytest.raises(InputError, match=rf"made for 30 atoms, and there are {3 * N} here"):

@@ -63,13 +63,6 @@ def hill(power, *, given=False):
     return HolonomicRow(lambda t, x: x[0] ** power / (1 + x[0] ** power) + x[1], gradient if given else None)
 
 
-@pytest.mark.parametrize("power", [20, 60, 100])
-def test_differences_of_what_changes_fast_keep_their_digits(power):
-    p = Populations.from_values(0.0, [1.02, 0.3])
-    found, exact = (hill(power, given=given).gradient(p) for given in (False, True))
-    np.testing.assert_allclose(found, exact, rtol=2e-7)
-
-
 def test_derivatives_that_contradict_their_function_are_refused():
     HolonomicRow(product, product_gradient, product_rate).bind(P)
     for gradient, rate, said in (
@@ -87,6 +80,9 @@ def test_derivatives_that_contradict_their_function_are_refused():
 def test_differences_that_cannot_serve_are_refused():
     """And derivatives that are right are not, only since differences are too coarse for them."""
     p = Populations.from_values(0.0, [1.02, 0.3])
+    for power in (20, 60, 100):
+        found, exact = (hill(power, given=given).gradient(p) for given in (False, True))
+        np.testing.assert_allclose(found, exact, rtol=2e-7)
     with pytest.raises(InputError, match="changes too fast for differences: give its gradient"):
         hill(400).bind(p)
     hill(400, given=True).bind(p)
@@ -121,12 +117,10 @@ MODEL = GrowthModel(lambda t, x: x, n=2)
         (lambda: TotalPopulation(2).gradient(P), "2 coefficients, there are 3 species"),
         (lambda: VelocityRow([1.0]).gradient(P), r"returned shape \(1,\), not \(3,\)"),
         (lambda: VelocityRow(lambda x: x), "is called with"),
-        (lambda: VelocityRow([1.0, 0.0], lambda: 0.0), "is called with"),
         (lambda: TotalPopulation(2, lambda: (1.0, 0.0)), "is called with"),
         (lambda: TotalPopulation(3, lambda t: ("a", "b")).bind(P), "target is no array of numbers"),
         (lambda: LinearRow([1, 1, 1], lambda t: 1 + 0.1 * t).bind(P), r"give \(value, rate\)"),
         (lambda: ConstrainedGrowth(None, []), "model is None; give a"),
-        (lambda: ConstrainedGrowth(MODEL, None), "rows is None; give rows"),
         (lambda: ConstrainedGrowth(MODEL, [3.0]), "rows is 3.0; give rows"),
         (lambda: ConstrainedGrowth(MODEL).constrained_inverse(0.0, np.ones((2, 2))), "populations have shape"),
         (lambda: ConstrainedGrowth(MODEL).bind(P), r"populations of shape \(3,\), the model 2"),
