@@ -486,6 +486,7 @@ REFUSED = [
     (lambda: DistanceDifference([[0, 1], [1, 0]]), "add the weights"),
     (lambda: DistanceDifference([[[0, 1], [1, 2]], [[3, 4], [5, 6]]]), "rows 0 and 1 share atoms"),
     (lambda: from_dict(DIFFERENCE | {"slots": [[0, 1], [1, 3]]}), "do not belong"),
+    (lambda: from_dict(RadiusOfGyration([0, 1]).todict() | {"mass_weighted": "false"}), "give True or False"),
     (lambda: from_dict(DIFFERENCE | {"slots": 3}), "slots are pairs"),
     (lambda: from_dict(DIFFERENCE | {"weights": ["a", 1]}), "numbers"),
 ]  # fmt: skip
