@@ -360,17 +360,8 @@ class Motion:
             check_out(out, self._shape)
         self.cell()
         start = as_array(x, self._shape, "positions")
-        pairs: Bonds | None = None
-        nearest_only = False
-        if callable(bonds):
-            pairs = bonds
-        elif bonds is not None:
-            table = check_pairs(bonds, self.n_atoms)
-            nearest_only = not len(table)
-
-            def pairs() -> IntArray:
-                return table
-
+        table = None if bonds is None or callable(bonds) else check_pairs(bonds, self.n_atoms)
+        pairs: Bonds | None = bonds if callable(bonds) else None if table is None else lambda: table
         search = FarStart(self._solve, time)
 
         def nearest(y: FloatArray) -> FloatArray:
@@ -382,17 +373,14 @@ class Motion:
             return result
 
         result = restored(self.constraint_set, self.plan, start, time, pairs, nearest)
-        if search.left > LEFT_OVER and nearest_only:
+        if search.left > LEFT_OVER and table is not None and not len(table):
             warnings.warn(
                 f"these positions fulfil all rows, but are not the nearest that do: {search.left:.1g} of the way from "
                 "the start leads along the rows, and the search has done what it may. Start nearer to the rows, or "
                 "bring targets there in several parts",
                 stacklevel=2,
             )
-        if out is None:
-            return result
-        np.copyto(out, result)
-        return out
+        return _in(out, result)
 
     # -- accelerations, forces ------------------------------------------------------------------
 

@@ -66,16 +66,6 @@ def test_report_says_it_all(extra: int) -> None:
     assert f"degrees of freedom {report.degrees_of_freedom}" in text
 
 
-def test_report_on_fixed_atoms() -> None:
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]])
-    whole = ConstraintSet([held.FixedAtoms([0]), held.Distance([(0, 1), (1, 2)])], x, [0.0, 1.0, 1.0])
-    report = Motion(whole, x).report(x)
-    assert report.rank == 5 and report.kinds[0].rank == 2
-    # Unit rows (s_1) and (s_2 - s_1)/sqrt 2 at right angles: no coupling at all.
-    assert report.condition == pytest.approx(1.0, abs=1e-12)
-    assert np.isfinite(Motion(whole, x).report(x, np.zeros((3, 3))).velocity_residual)
-
-
 def test_the_worst_row_is_named_and_the_condition_is_found_where_it_is_asked_for() -> None:
     motion, x = mixed_system()
     off = x.copy()

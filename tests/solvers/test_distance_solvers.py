@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from kcons.solvers.chains import SHORT, Chains
-from kcons.solvers.distance_clusters import resolved
-from kcons.solvers.kernels.lattices import NO_LATTICE, OPEN
+from kcons.solvers.cluster_solver import Request
 from kcons.solvers.rigid_triangles import PAIRS, RigidTriangles
 from kcons.solvers.small_clusters import SmallClusters
 from kcons.solvers.sparse.distances import SparseDistances
-from tests.systems.solver_calls import positions, tangents
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 CELLS = [np.diag([19.0, 18.0, 20.0]), np.array([[19.0, 0, 0], [2.0, 18.0, 0], [-1.5, 2.5, 20.0]])]
@@ -131,15 +129,22 @@ class Clusters:
         place = np.argsort(self.rows)
         return np.asarray(values)[place[np.searchsorted(self.rows[place], solver.rows)]]
 
+    def by_row(self, values):
+        """Values by row number of the set; rows that a solver does not have would show as NaN."""
+        wanted = np.full(self.rows.max() + 1, np.nan)
+        wanted[self.rows] = values
+        return wanted
+
     def positions(self, x, solver=None, reference=None, lattice=None, velocities=None, multipliers=None):
-        solver = self.solver() if solver is None else solver
-        reference, lengths = self.x_ref if reference is None else reference, self.in_order(solver, self.lengths)
-        return positions(solver, x, reference, lengths, lattice, velocities, 500.0, multipliers)
+        solver, reference = solver or self.solver(), self.x_ref if reference is None else reference
+        request = Request(x, reference, self.by_row(self.lengths), lattice, velocities=velocities, inv_dt=500.0)
+        return solver.positions(request, multipliers)
 
     def tangents(self, y, solver=None, reference=None, rates=None, lattice=None, multipliers=None):
-        solver = self.solver() if solver is None else solver
-        rates = None if rates is None else self.in_order(solver, rates)
-        return tangents(solver, self.x_ref if reference is None else reference, y, rates, lattice, multipliers)
+        solver, reference = solver or self.solver(), self.x_ref if reference is None else reference
+        return solver.tangents(
+            Request(y, reference, None if rates is None else self.by_row(rates), lattice), multipliers
+        )
 
     def pulls(self):
         """Of each cluster its rows, its atoms, its pairs by local atoms, and M^-1 A^T at the reference."""
@@ -344,12 +349,6 @@ def test_ten_thousand_bonds(shape, monkeypatch):
     bonds = np.diff(c.x_ref[c.atoms[0]], axis=0)
     speed = (bonds * np.diff(y[c.atoms[0]], axis=0)).sum(axis=1) / np.linalg.norm(bonds, axis=1)
     assert np.abs(speed).max() <= 5e-15 * np.sqrt(3)
-
-
-@pytest.mark.parametrize(("at", "miss", "expected"), [(0.0, 5e-15, True), (0.0, 1e-12, False), (1e4, 1e-12, True)])
-def test_lengths_are_resolved_as_far_as_positions_are(at, miss, expected):
-    x, pairs = np.array([[at, 0, 0], [at + 1.0, 0, 0]]), np.array([0, 1], dtype=np.uint32)
-    assert resolved(x, pairs, np.array([x[1, 0] - x[0, 0] + miss]), NO_LATTICE, OPEN) is expected
 
 
 # -- any connection -------------------------------------------------------------------------------------------

@@ -6,27 +6,11 @@ import pickle
 
 import numpy as np
 import pytest
-from stepper_systems import (
-    PROJECTED,
-    SYMMETRIC,
-    growing_rod,
-    rotor,
-    skate,
-    spherical_pendulum,
-    system_of,
-)
+from stepper_systems import PROJECTED, SYMMETRIC, growing_rod, rotor, skate, spherical_pendulum, system_of
 
 from kcons.constraints import Angle, Distance
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
-from kcons.steppers import (
-    BlanesMoan4,
-    Geodesic,
-    Rattle,
-    ReversibilityCheck,
-    State,
-    System,
-    run,
-)
+from kcons.steppers import BlanesMoan4, Geodesic, Rattle, ReversibilityCheck, State, System, run
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, IsokineticSpheres, Langevin
 
 REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
@@ -223,6 +207,8 @@ def test_frames_are_states_of_the_run(stepper):
     alone = run(system, state, 0.01, 10, stepper=stepper)
     assert found.last.step == 10
     np.testing.assert_array_equal(found.last.positions, alone.positions)
+    for frame in found.frames[1:]:
+        np.testing.assert_array_equal(frame.positions, run(system, state, 0.01, frame.step, stepper=stepper).positions)
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])

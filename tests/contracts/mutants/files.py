@@ -113,7 +113,7 @@ MUTANTS = {
         ("leg in («(i, k), (k, i)→»)", "distance_difference::a_proton_goes_over_within_a_molecule_that_stays_as_it_is"),
     ],
     "solvers/tolerances.py": [
-        ("FLAT = 0.0«1→»", "mixed_rows::a_dihedral_that_turns_over_has_no_solution_far_away"),
+        ("FLAT = 0.0«1→»", "row_functions::a_dihedral_that_turns_over_has_no_solution_far_away"),
     ],
     "topology/topology.py": [
         ("if «not isinstance(given, kind)→given is None»:", "openmm/topology::what_is_no_topology_is_refused"),

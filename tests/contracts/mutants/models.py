@@ -9,7 +9,7 @@ MUTANTS = {
         ("= 1e-«9→10»", "constrained::dependent_rows_may_disagree_by_a_part_in_a_thousand_million"),
     ],
     "steppers/compiled_operations.py": [
-        ("(«(r * n - d) + →»r", "flights::great_circles_end_on_the_sphere_wherever_they_start"),
+        ("(«(r * n - d) + →»r", "schemes::great_circles_end_on_the_sphere_wherever_they_start"),
     ],
     "models/growth/model.py": [
         ("self.alpha1 / self.beta«1→2»])", "models::lotka_volterra_with_four_different_parameters"),
