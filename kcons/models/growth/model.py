@@ -23,6 +23,8 @@ from kcons.models.integration import called
 
 #: Below this |ln x/x_eq| the excess of a species is summed as a power series.
 NEAR = 0.2
+#: Of h(u)/u^2, h(u) = u^2/2 + u^3/3 + u^4/8 + ...: the sum over k >= 2 of (k - 1) u^k/k!.
+_SERIES = [(k - 1) / math.factorial(k) for k in range(14, 1, -1)]
 #: A function of time and populations, arguments in SciPy's order.
 OfState = Callable[[float, FloatArray], ArrayLike]
 
@@ -60,19 +62,16 @@ class Populations(NamedTuple):
         return cls(time, array, np.log(array))
 
     @classmethod
-    def start(cls, time: float, n: int, x0: ArrayLike | None, log_x0: ArrayLike | None) -> Self:
-        """The start of a run with n species, given as populations or as their logarithms."""
-        if x0 is not None and log_x0 is None:
-            p = cls.from_values(time, x0)
-        elif log_x0 is not None and x0 is None:
-            p = cls.from_logarithms(time, as_float_array(log_x0, "log_x0").copy())
-        else:
+    def start(cls, time: float, x0: ArrayLike | None, log_x0: ArrayLike | None) -> Self:
+        """The start of a run, given as populations or as their logarithms."""
+        if (x0 is None) == (log_x0 is None):
             raise InputError("give the start either as x0 or as log_x0", item="x0")
-        if p.log_x.shape != (n,):
-            raise InputError(f"the start has shape {p.log_x.shape}, not ({n},)", item="x0")
-        if not np.all(np.isfinite(p.log_x)):
+        if x0 is not None:
+            return cls.from_values(time, x0)
+        log_x = np.array(as_float_array(log_x0, "log_x0"))
+        if not np.all(np.isfinite(log_x)):
             raise InputError("log_x0 is not finite", item="log_x0")
-        return p
+        return cls.from_logarithms(time, log_x)
 
 
 class GrowthModel:
@@ -278,19 +277,11 @@ class Mixture:
             rest = (p.log_x - (u - part)) - (log_eq + part)  # what rounding took from u (Knuth)
             near = np.abs(u) < NEAR
             x_eq = np.exp(log_eq)
-            terms = np.where(
-                near, x_eq * _series(np.where(near, u + rest, 0.0)) - a * p.x, p.x * ((u - a) + rest) - (p.x - x_eq)
-            )
+            small = np.where(near, u + rest, 0.0)
+            series = np.polyval(_SERIES, small) * small * small
+            terms = np.where(near, x_eq * series - a * p.x, p.x * ((u - a) + rest) - (p.x - x_eq))
             if not (np.all(np.isfinite(terms)) and np.all(np.isfinite(p.x))):
                 return math.nan
             more = math.fsum([*p.x, -total])
             over = (1.0 + more / total) * np.log1p(more / total) - more / total
             return self.kT * math.fsum([*terms, -total * over, a * more])
-
-
-def _series(u: FloatArray) -> FloatArray:
-    """u^2/2 + u^3/3 + u^4/8 + ...: the sum over k >= 2 of (k - 1) u^k/k!."""
-    return np.asarray(np.polyval(_COEFFICIENTS, u) * u * u)
-
-
-_COEFFICIENTS = [(k - 1) / math.factorial(k) for k in range(14, 1, -1)]

@@ -182,8 +182,3 @@ def test_bad_input():
     other.reporters = simulation.reporters
     with pytest.raises(InputError, match="belongs to another simulation"):
         other.step(1)
-    simulation.reporters = [
-        HeldCoordinatesReporter(io.StringIO(), 1, {"r": Distance([[0, 99]])}, beside=[Dihedral([psi])])
-    ]
-    with pytest.raises(InputError, match="no atom 99"):
-        simulation.step(1)
