@@ -12,7 +12,7 @@ from kcons.constraints.periodic.one_piece import BoolArray
 
 #: Rows with more couplings than the fewest that a row has, by so many times and so many, wait for a later level: what
 #: they would fill in costs more than the levels that they save.
-MORE_TIMES, MORE = 1.2, 22
+MORE_TIMES, MORE = 1.2, 20
 
 
 class Alike(NamedTuple):
