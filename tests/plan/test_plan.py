@@ -223,7 +223,6 @@ def test_dependent_rows_are_eliminated_last():
 # -- clusters and blocks ----------------------------------------------------------------------------
 
 
-NONE = np.zeros(0, np.int64)
 TRIANGLE = list(combinations(range(3), 2))
 
 

@@ -330,7 +330,7 @@ def test_many_molecules_are_found_one_by_one() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["bonds and angles", "bonds and 1-3 distances", "all distances"])
+@pytest.mark.parametrize("what", ["bonds and angles", "all distances"])
 def test_molecules_of_the_g2_set(what: str) -> None:
     """159 real geometries, flat ones and symmetric ones: none is refused, and what was asked for is held."""
     build = pytest.importorskip("ase.build")
@@ -355,8 +355,6 @@ def test_molecules_of_the_g2_set(what: str) -> None:
             if any(abs(atoms.get_angle(*t)) > 179.99 for t in angles) or not angles:
                 continue
             rows = [Distance(bonds), Angle(angles)]
-        elif what == "bonds and 1-3 distances":
-            rows = [Distance(sorted({*bonds, *((min(i, k), max(i, k)) for i, _, k in angles)}))]
         else:
             rows = [Distance(pairs_of(len(x)))]
         given = ConstraintSet(rows, x, atoms.get_masses())

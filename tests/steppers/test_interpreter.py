@@ -243,13 +243,6 @@ def test_steps_in_kernels_are_those_of_the_engine(stepper, name) -> None:
     assert not state.velocities[system.motion.fixed_atoms].any()
 
 
-@pytest.mark.parametrize("name", ["hydrogens", "periodic", "far"])
-def test_a_march_by_the_engine_is_the_same_to_the_last_bit(name) -> None:
-    for stepper in (Rattle(), Suzuki4()):
-        system, state = held_system(name, piecewise=True)
-        assert_same(stepper.march(system, state, 0.02, 5), one_by_one(stepper, system, state, 0.02, 5))
-
-
 def test_what_is_left_to_the_engine() -> None:
     def packed(*rows, x=SHAPE + 0.0, m=(16.0, 1.0, 1.0)):
         return System(Motion(ConstraintSet(rows, x, np.array(m)), x)).packed is not None
