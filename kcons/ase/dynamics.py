@@ -14,14 +14,7 @@ import numpy as np
 from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 
-from kcons.ase.binding import (
-    FORCES_ONLY,
-    Binding,
-    applied_forces,
-    bind,
-    company,
-    unchanged_on_failure,
-)
+from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind, company, unchanged_on_failure
 from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, differ, require_on_surface
@@ -330,8 +323,8 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time, self.nsteps = float(state.time), int(state.step)
         self._put(x, v)
         # Forces are asked for anew: nobody knows which calculator those of a file are of.
-        kept = replace(state.copied(), forces=None, origin=None)
-        self._state = replace(kept, positions=x, velocities=v, time=self.time, step=self.nsteps)
+        known: dict[str, Any] = {"positions": x, "velocities": v, "time": self.time, "step": self.nsteps}
+        self._state = replace(state.copied(), **known, forces=None, origin=None)
         self._cell = surroundings(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:

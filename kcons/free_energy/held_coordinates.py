@@ -465,13 +465,9 @@ def leaves_the_rest(
     if not np.abs(nearest_image(change, periods)).max() < _SAME:
         return False
     part, atoms = everything.subset(others)
-    before, after = (_volume(part, place[atoms]) for place in (x, there))
+    before, after = 0.0, 0.0
+    if part.n_rows:
+        root = np.sqrt(np.repeat(part.masses, 3))
+        slopes = (part.jacobian(place[atoms]).toarray() / root for place in (x, there))
+        before, after = (float(np.linalg.slogdet(a @ a.T)[1]) for a in slopes)  # minus infinity of dependent rows
     return bool(np.isfinite(before) and abs(after - before) < _SAME)
-
-
-def _volume(rows: ConstraintSet, x: FloatArray) -> float:
-    """ln det(A M^-1 A^T); minus infinity where rows depend on each other."""
-    if not rows.n_rows:
-        return 0.0
-    a = rows.jacobian(x).toarray() / np.sqrt(np.repeat(rows.masses, 3))
-    return float(np.linalg.slogdet(a @ a.T)[1])

@@ -282,6 +282,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=?, **TWO)", "slow", "ATOMS.calc", "3"),
     ('MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=3, **{**TWO, "fast_steps": 1})', "steps"),
     ('MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=3, bath="hot", **TWO)', "bath"),
+    ("MultipleTimeSteps([ATOMS], 0.1, fast=ATOMS.calc, slow=3, **TWO)", "atoms"),
     ("MultipleTimeSteps(ATOMS.copy(), 0.1, fast=ATOMS.calc, slow=3, auxiliary=2, **TWO)", "auxiliary"),
     ("ConstrainedDynamics(ATOMS.copy(), 0.1, time=nan)", "time"),
     ('ConstrainedDynamics(ATOMS.copy(), 0.1, constraints="hbonds")', "constraints"),

@@ -62,6 +62,13 @@ def test_squeezer_ends_where_it_is_published_to():
     np.testing.assert_allclose(-found.multipliers[-1].reshape(2, 3).T.ravel(), MULTIPLIERS, rtol=2e-6, atol=0)
 
 
+@pytest.mark.parametrize("seed", [3, 4, 9])
+def test_far_starts_are_reached_by_parts_of_steps(seed):
+    body = squeezer()[0]["body"]
+    q, v = body.project(START + 0.3 * np.random.default_rng(seed).normal(size=7), np.zeros(7))
+    assert np.abs(body.residuals(q, v)).max() < 1e-14
+
+
 # -- closed forms ------------------------------------------------------------------------------------
 
 
@@ -131,8 +138,7 @@ def test_no_time_and_no_times():
 # -- the same motion in other coordinates ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau"])
-def test_a_linear_change_of_coordinates_changes_nothing(method):
+def test_a_linear_change_of_coordinates_changes_nothing():
     """M = T^T D T, g(T y): the same steps, projections in the metric of M included, to rounding."""
     rng = np.random.default_rng(5)
     T, D = rng.normal(size=(3, 3)) + 2 * np.eye(3), np.array([1.0, 3.0, 0.5])
@@ -158,13 +164,10 @@ def test_a_linear_change_of_coordinates_changes_nothing(method):
         curvature=lambda y, w: bend(T @ y, T @ w),
     )
     x, v = plain.project([0.9, 0.2, 0.4], [0.3, 0.5, -0.4])
-    # Radau solves its equations only to the tolerance: there it has to be small.
-    options = steps_of(0.05) if method == "DOP853" else {"rtol": 1e-11, "atol": 1e-12}
-    one = plain.solve(x, v, (0, 2), method=method, **options)
-    other = full.solve(np.linalg.solve(T, x), np.linalg.solve(T, v), (0, 2), method=method, **options)
-    close = 1e-12 if method == "DOP853" else 1e-8
-    np.testing.assert_allclose(other.q[-1] @ T.T, one.q[-1], rtol=0, atol=close)
-    np.testing.assert_allclose(other.multipliers[-1], one.multipliers[-1], rtol=0, atol=100 * close)
+    one = plain.solve(x, v, (0, 2), **steps_of(0.05))
+    other = full.solve(np.linalg.solve(T, x), np.linalg.solve(T, v), (0, 2), **steps_of(0.05))
+    np.testing.assert_allclose(other.q[-1] @ T.T, one.q[-1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other.multipliers[-1], one.multipliers[-1], rtol=0, atol=1e-10)
     start = [x + np.array([0.1, -0.2, 0.1]), v + np.array([0.2, 0.0, 0.3])]
     there, speed = plain.project(*start)
     here, pace = full.project(*(np.linalg.solve(T, part) for part in start))
@@ -260,23 +263,16 @@ def test_positions_that_cannot_be_met():
 
 
 def test_trial_steps_may_go_too_far():
-    """A force with an edge that the motion never reaches, and one that it does."""
-
-    def force(q, v, t):
-        with np.errstate(all="ignore"):
-            return -0.5 / np.sqrt(q)  # x = sqrt(1 - 2 t^2...) reaches 0 with infinite force
-
-    body = Multibody([1.0], force)
-    with pytest.raises(NonFiniteError, match="force is not finite at q"):
-        body.solve([1.0], [-1.0], (0, 10), first_step=1.5)
+    """Past an edge of the force that the motion never reaches; where it does, that is told."""
 
     def wall(q, v, t):
-        with np.errstate(all="ignore"):
-            return 1e-3 / np.where(q > 0, q, np.nan) ** 2
+        return 1e-3 / np.where(q > 0, q, np.nan) ** 2
 
     found = Multibody([1.0], wall).solve([1.0], [-1.0], (0, 2.5), first_step=1.5)
     energy = 0.5 * found.v[:, 0] ** 2 + 1e-3 / found.q[:, 0]
     np.testing.assert_allclose(energy, energy[0], rtol=1e-6)
+    with pytest.raises(NonFiniteError, match="force is not finite at q"):
+        Multibody([1.0], lambda q, v, t: -0.5 / np.sqrt(np.where(q > 0, q, np.nan))).solve([1.0], [-1.0], (0, 10))
 
 
 def test_what_ends_a_run_is_told_not_what_was_got_over():
@@ -408,9 +404,3 @@ def test_what_functions_get_cannot_be_changed_and_what_they_return_may_be_used_a
     again = Multibody(np.eye(2), greedy, curve, reused).motion(Q, V)
     fresh = Multibody(np.eye(2), greedy, curve, gradient).motion(Q, V)
     np.testing.assert_array_equal(again[0], fresh[0])
-
-
-def test_large_numbers_are_finite():
-    """Whose squares are not."""
-    body = Multibody([1e200], lambda q, v, t: np.array([3e200]))
-    assert body.motion([0.0], [0.0])[0] == 3.0

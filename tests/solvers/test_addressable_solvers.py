@@ -6,14 +6,12 @@ import numba
 import numpy as np
 import pytest
 
-from kcons import ConstraintSet, Motion
+from kcons import ConstraintSet
 from kcons.constraints import Angle, Dihedral, Distance, Sphere
-from kcons.errors import ConvergenceError
 from kcons.solvers.addressable_solvers import pack_solver_tables, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.mixed_rows import SparseRows
-from kcons.steppers.packed_system import packed_rows
 
 X = np.array([[0.0, 0, 0], [1.5, 0, 0], [2.0, 1.4, 0], [3.5, 1.4, 0.5], [0.3, 0.2, 4.0], [1.0, 1.0, 5.0]])
 MASSES = np.array([12.0, 14.0, 1.0, 16.0, 2.0, 3.0])
@@ -21,9 +19,9 @@ CHAIN = [Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2]]), Dihedral([[0, 1
 ALONE = [Sphere([4, 5], [0.0, 0, 0])]
 
 
-def solvers(*, cell=None, inverse_masses=1 / MASSES) -> list[SparseRows | SingleRows]:
+def solvers(cell=None) -> list[SparseRows | SingleRows]:
     held = ConstraintSet([*CHAIN, *ALONE], X, MASSES, cell=cell)
-    return [SparseRows(held, np.arange(5), inverse_masses), SingleRows(held, np.arange(5, 7), inverse_masses)]
+    return [SparseRows(held, np.arange(5), 1 / MASSES), SingleRows(held, np.arange(5, 7), 1 / MASSES)]
 
 
 def tables_of(given, lattice=None):
@@ -39,7 +37,7 @@ def test_the_same_as_from_python(which, cell) -> None:
     new, v, y = X + 0.02 * rng.normal(size=X.shape), *rng.normal(size=(2, *X.shape))
     shift = 0.0 if cell is None or 1 in which else rng.integers(-1, 2, X.shape) @ cell
     x_ref, new = X + shift, new + shift
-    chosen = [solvers(cell=cell)[k] for k in which]
+    chosen = [solvers(cell)[k] for k in which]
     lattice = ConstraintSet([*CHAIN], X, MASSES, cell=cell).lattice
     tables = tables_of(chosen, lattice)
     place, speed, tangent = new.copy(), v.copy(), y.copy()
@@ -76,52 +74,3 @@ def test_kernels_are_compiled_for_their_own_solver_only() -> None:
     tables_of([solver])
     for kernel in solver.kernels[:3]:
         assert isinstance(kernel, numba.core.registry.CPUDispatcher) and len(kernel.signatures) == 1
-
-
-# -- long chains, whose kernel writes at once -------------------------------------------------------
-
-
-TRIANGLE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])
-
-
-def engine(chains=(100,), triangles: int = 0, stars: int = 0, ions: int = 0):
-    """Helices of so many bonds, then molecules, then free atoms: the engine, where they are, and the packed rows."""
-    rng = np.random.default_rng(5)
-    shapes = []
-    for number, n in enumerate(chains):
-        k = np.arange(n + 1)
-        helix = np.stack([np.cos(k), np.sin(k), 0.3 * k], axis=1) + 0.7 * number
-        shapes.append((helix, np.stack([k[:-1], k[1:]], axis=1)))
-    shapes += [(TRIANGLE + rng.normal(size=3), np.array([[0, 1], [0, 2], [1, 2]]))] * triangles
-    shapes += [(rng.normal(size=(4, 3)), np.array([[0, 1], [0, 2], [0, 3]])) for _ in range(stars)]
-    first = np.cumsum([0, *(len(where) for where, _ in shapes)])
-    x = np.concatenate([*(where for where, _ in shapes), rng.normal(size=(ions, 3))])
-    masses = [[16.0, 1.0, 1.0] if len(where) == 3 else np.linspace(1.0, 14.0, len(where)) for where, _ in shapes]
-    pairs = np.concatenate([rows + begin for (_, rows), begin in zip(shapes, first, strict=False)])
-    motion = Motion(ConstraintSet(Distance(pairs), x, np.concatenate([*masses, np.full(ions, 23.0)])), x)
-    packed = packed_rows(motion)
-    assert packed is not None and packed.called[-1].name == "Chains"
-    set_lattice(packed.tables, None)
-    return motion, x, packed  # tables are good as long as their solvers
-
-
-@pytest.mark.parametrize(
-    "options", [{}, {"triangles": 11}, {"triangles": 11, "stars": 3}, {"stars": 2, "ions": 300}, {"chains": [200, 7]}]
-)
-def test_nothing_changes_where_a_chain_has_no_solution(options) -> None:
-    """Also not what was solved before it."""
-    motion, x, packed = engine(**options)
-    rng = np.random.default_rng(4)
-    bad = 203 if "chains" in options else 50  # of the last chain
-    for wrong in (40.0, np.nan):
-        ends, v = x + 0.01 * rng.normal(size=x.shape), rng.normal(size=x.shape)
-        ends[bad] += wrong
-        there, speed = ends.copy(), v.copy()
-        assert packed_positions(there, x, speed, 10.0, packed.tables) == -1
-        assert np.array_equal(there, ends, equal_nan=True) and np.array_equal(speed, v)
-    with pytest.raises(ConvergenceError):
-        motion.project_positions(np.where(np.isnan(ends), 99.0, ends), x)
-    v[bad] = np.nan
-    speed = v.copy()
-    assert not packed_tangents(x, speed, packed.tables)
-    assert np.array_equal(speed, v, equal_nan=True)

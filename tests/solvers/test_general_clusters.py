@@ -13,8 +13,6 @@ from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rank_revealing import rank
 from kcons.solvers.tolerances import MANY_ITERATIONS
 
-WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
-
 
 def solver_of(rows, x, masses=None, labels=None) -> tuple[GeneralClusters, ConstraintSet]:
     whole = ConstraintSet(rows, x, np.ones(len(x)) if masses is None else masses)

@@ -19,30 +19,23 @@ from kcons.topology.topology import (
     whole_numbers,
 )
 
-
-@pytest.mark.parametrize(
-    ("name", "residue", "element"),
-    [
-        ("CA", "ALA", "C"), ("HG", "SER", "H"), ("HG21", "ILE", "H"), ("1HB", "ALA", "H"), ("NE", "ARG", "N"),
-        ("CD1", "LEU", "C"), ("OW", "SOL", "O"), ("MW", "SOL", ""), ("EPW", "WAT", ""), ("CL1", "LIG", "Cl"),
-        ("SE", "MSE", "Se"), ("FE", "HEM", "Fe"), ("NA", "HEM", "N"), ("SD", "MET", "S"), ("D1", "DOD", "H"),
-    ],
-)  # fmt: skip
-def test_elements_of_atoms_in_molecules(name, residue, element):
-    names = np.array([name, "XX1", "XX2"])
-    assert elements_of(names, np.zeros(3, int), np.array([residue]), None)[0] == element
+IN_MOLECULES = [
+    ("CA", "ALA", "C"), ("HG", "SER", "H"), ("HG21", "ILE", "H"), ("1HB", "ALA", "H"), ("NE", "ARG", "N"),
+    ("CD1", "LEU", "C"), ("OW", "SOL", "O"), ("MW", "SOL", ""), ("EPW", "WAT", ""), ("CL1", "LIG", "Cl"),
+    ("SE", "MSE", "Se"), ("FE", "HEM", "Fe"), ("NA", "HEM", "N"), ("SD", "MET", "S"), ("D1", "DOD", "H"),
+]  # fmt: skip
+ALONE = [
+    ("CA", "CA", "Ca"), ("NA", "NA", "Na"), ("NA+", "NA+", "Na"), ("SOD", "SOD", "Na"), ("CLA", "CLA", "Cl"),
+    ("CL", "CL-", "Cl"), ("CA", "GLY", "C"), ("OW", "SOL", "O"), ("O", "HOH", "O"), ("ZN", "ZN", "Zn"), ("K", "K", "K"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "residue", "element"),
-    [
-        ("CA", "CA", "Ca"), ("NA", "NA", "Na"), ("NA+", "NA+", "Na"), ("SOD", "SOD", "Na"), ("CLA", "CLA", "Cl"),
-        ("CL", "CL-", "Cl"), ("CA", "GLY", "C"), ("OW", "SOL", "O"), ("O", "HOH", "O"), ("ZN", "ZN", "Zn"),
-        ("K", "K", "K"),
-    ],
-)  # fmt: skip
-def test_elements_of_single_atoms(name, residue, element):
-    assert elements_of(np.array([name]), np.zeros(1, int), np.array([residue]), None)[0] == element
+@pytest.mark.parametrize("others", [(), ("XX1", "XX2")], ids=["alone", "in a molecule"])
+def test_elements_of_atoms(others):
+    for name, residue, element in IN_MOLECULES if others else ALONE:
+        names = np.array([name, *others])
+        found = elements_of(names, np.zeros(len(names), int), np.array([residue]), None)
+        assert found[0] == element, (name, residue)
 
 
 def test_masses_that_were_read_decide():

@@ -1,7 +1,7 @@
 """Windows as an input file describes them, in TOML.
 
 A table of the file is a dataclass below, a key one of its fields. What may be given is said by the annotation,
-`Annotated[type, rule]`, as for arguments. A key without a default has to be there.
+its type or `Annotated[type, rule]`, as for arguments. A key without a default has to be there.
 """
 
 from __future__ import annotations
@@ -11,18 +11,19 @@ import sys
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
-from functools import partial
+from functools import partial, reduce
 from itertools import product
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
-from typing import Annotated, Any, Literal, TypeAlias
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, FixedAtoms
-from kcons.constraints.arguments import ANGLE, Count, Positive, Rule, rules_of, whole_number
+from kcons.constraints.arguments import ANGLE, Count, Positive, rules_of, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, did_you_mean
 from kcons.free_energy.profiles.pulls import MIN_PULLS
@@ -44,67 +45,55 @@ FAMILIES: dict[str, tuple[int, Callable[[ArrayLike], Constraint]]] = {
 _RANGES = {"distance": (0.0, math.inf), "angle": (0.0, 180.0)}
 
 
-def _is(words: str, test: Callable[[Any], bool]) -> Rule:
-    """A rule for a value of TOML, in words and as a test."""
-
-    def rule(value: Any, item: str) -> Any:
-        if not test(value):
-            raise InputError(f"{item} is {short(value)}; give {words}", item=item.split()[0])
-        return value
-
-    return rule
+#: What values of TOML are called, one and several.
+_WORDS: dict[Any, tuple[str, ...]] = {str: ("a text",), dict: ("a table",), bool: ("true or false",)}
+_WORDS |= {float: ("a number", "numbers"), int: ("a whole number", "whole numbers")}
 
 
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+def _kinds(hint: Any) -> list[Any]:
+    """The types that an annotation names, but None; of a number with a rule, which says more, a number."""
+    if get_origin(hint) in (Union, UnionType):
+        return [kind for part in get_args(hint) for kind in _kinds(part)]
+    return [] if hint is NoneType else [float] if get_origin(hint) in (Annotated, Literal) else [hint]
 
 
-def _whole(value: Any) -> bool:
-    return isinstance(value, int) and _number(value)
+def _is(value: Any, kind: Any) -> bool:
+    if get_origin(kind) is list:
+        return isinstance(value, list) and bool(value) and all(_is(each, *get_args(kind)) for each in value)
+    if isinstance(value, bool) or kind is not float:
+        return isinstance(value, kind) and isinstance(value, bool) == (kind is bool)
+    return isinstance(value, int | float) and abs(value) <= sys.float_info.max
 
 
-def _list(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and bool(value) and all(map(test, value))
-
-
-_NUMBERS, _ATOMS = _list(_number), _list(_whole)
-Text: TypeAlias = Annotated[str, _is("a text", lambda v: isinstance(v, str))]
-Table: TypeAlias = Annotated[dict, _is("a table", lambda v: isinstance(v, dict))]
-Truth: TypeAlias = Annotated[bool, _is("true or false", lambda v: isinstance(v, bool))]
-Number: TypeAlias = Annotated[float, _is("a number", _number)]
-Numbers: TypeAlias = Annotated[list, _is("numbers", _NUMBERS)]
-NumberOrNumbers: TypeAlias = Annotated[Any, _is("a number, or numbers", lambda v: _number(v) or _NUMBERS(v))]
-Atoms: TypeAlias = Annotated[list, _is("whole numbers", _ATOMS)]
-Pairs: TypeAlias = Annotated[list, _is("pairs of whole numbers", _list(lambda pair: _ATOMS(pair) and len(pair) == 2))]
-#: Of which `Settings` and `Windows` say more.
-Single: TypeAlias = Annotated[Any, _is("one value", lambda v: not isinstance(v, dict | list))]
+def _words(kind: Any, many: int = 0) -> str:
+    return "lists of " * many + _words(get_args(kind)[0], 1) if get_origin(kind) is list else _WORDS[kind][many]
 
 
 @dataclass(kw_only=True)
 class Structure:
-    file: Text
+    file: str
     count_from: Literal[0, 1] = 0
 
 
 @dataclass(kw_only=True)
 class Forces:
-    calculator: Text | None = None
-    settings: Table | None = None
-    system: Text | None = None
-    platform: Text | None = None
+    calculator: str | None = None
+    settings: dict | None = None
+    system: str | None = None
+    platform: str | None = None
 
 
 @dataclass(kw_only=True)
 class Coordinate:
-    name: Text | None = None
-    distance: Atoms | None = None
-    difference: Atoms | None = None
-    angle: Atoms | None = None
-    dihedral: Atoms | None = None
-    begin: Number | None = field(default=None, metadata={"key": "from"})
-    to: Number | None = None
+    name: str | None = None
+    distance: list[int] | None = None
+    difference: list[int] | None = None
+    angle: list[int] | None = None
+    dihedral: list[int] | None = None
+    begin: float | None = field(default=None, metadata={"key": "from"})
+    to: float | None = None
     windows: Count | None = None
-    values: Numbers | None = None
+    values: list[float] | None = None
 
     def __post_init__(self) -> None:
         families = [family for family in FAMILIES if getattr(self, family) is not None]
@@ -144,9 +133,9 @@ class Coordinate:
 
 @dataclass(kw_only=True)
 class HeldRows:
-    constrain: Text | None = None
-    fixed: Atoms | None = None
-    distances: Pairs | None = None
+    constrain: str | None = None
+    fixed: list[int] | None = None
+    distances: list[list[int]] | None = None
 
     def rows(self, atoms: Any, first: int) -> list[Constraint]:
         from kcons.ase import constraints_of
@@ -167,15 +156,15 @@ class Improve:
 
 @dataclass(kw_only=True)
 class Pulls:
-    begin: NumberOrNumbers | None = field(default=None, metadata={"key": "from"})
-    to: NumberOrNumbers | None = None
+    begin: float | list[float] | None = field(default=None, metadata={"key": "from"})
+    to: float | list[float] | None = None
     count: Annotated[int, partial(whole_number, least=MIN_PULLS)] = 20
     steps: Count = 20_000
 
 
 #: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
-_OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "rng": Single}
-_SAMPLING = {each.name: Single for each in fields(Settings)} | _OF_WINDOWS
+_OF_WINDOWS = {"both_sides": bool, "approach": float | list[float], "rng": int}
+_SAMPLING = get_type_hints(Settings, include_extras=True) | _OF_WINDOWS
 #: Tables of a file.
 _TABLES: dict[str, Any] = {
     "structure": Structure,
@@ -294,15 +283,19 @@ def _read(kind: Any, name: str, entry: Any) -> Any:
     if not isinstance(entry, dict):
         raise InputError(f"{name} is {short(entry)}; write [{name}] and its keys below", item=name)
     own = {each.metadata.get("key", each.name): each for each in fields(kind)}
-    rules = rules_of(kind)
+    hints, rules = get_type_hints(kind, include_extras=True), rules_of(kind)
+    given: dict[str, Any] = {}
     for key, value in entry.items():
         _refuse_unknown(key, own, f"[{name}]")
-        for rule in rules[own[key].name].rules:
-            rule(value, f"{key} of [{name}]")
+        field_name, item = own[key].name, f"{key} of [{name}]"
+        kinds = _kinds(hints[field_name])
+        if not any(_is(value, each) for each in kinds):
+            raise InputError(f"{item} is {short(value)}; give {', or '.join(map(_words, kinds))}", item=key)
+        given[field_name] = reduce(lambda value, rule: rule(value, item), rules[field_name].rules, value)
     for key, each in own.items():
-        if key not in entry and each.default is MISSING:
+        if each.name not in given and each.default is MISSING:
             raise InputError(f"[{name}] has no {key}; write {key} = ...", item=key)
-    return kind(**{own[key].name: value for key, value in entry.items()})
+    return kind(**given)
 
 
 def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:

@@ -33,7 +33,7 @@ MUTANTS = {
         ),
     ],
     "free_energy/held_coordinates.py": [
-        ("if left[worst, 0] < «DEPENDENT→-1.0»:", "free_energy/refusals::refusals"),
+        ("if «dependent→False»:", "free_energy/refusals::refusals"),
         ("{*pair} not in joined« and bonded.issuperset(pair)→»", "ase_windows::torsions_over_atoms_that_form_no_bonds"),
     ],
     "constraints/target.py": [

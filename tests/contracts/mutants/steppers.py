@@ -6,10 +6,10 @@ MUTANTS = {
             "«np.copyto(velocities, saved[1])→pass»\n            if isinstance(error",
             "motion::velocities_are_put_back_when_a_later_solver_fails",
         ),
-        ("«0.5 * (reference_time + time)→reference_time»", "flights::flights_are_those_of_dense_algebra"),
+        ("«0.5 * (reference_time + time)→reference_time»", "schemes::flights_are_those_of_dense_algebra"),
     ],
     "steppers/interpreter.py": [
-        ("=self.at(row.«begin→end»)", "flights::flights_are_those_of_dense_algebra"),
+        ("=self.at(row.«begin→end»)", "schemes::flights_are_those_of_dense_algebra"),
         (
             "if «held.lattice is not cell or given.lattice is not cell→False»:",
             "interpreter::a_cell_that_the_force_function_changes",
@@ -24,12 +24,12 @@ MUTANTS = {
         ),
         ("self.time + «(end * self.dt + self.left_over)→end * self.dt»", "interpreter::times_within_a_step_are_exact"),
         ("(«start, float(np.abs(push).max(initial=0.0)), →0.0, »", "coming_to_rest::a_damped_pendulum_comes_to_rest"),
-        ("change <= «2→1e8» * _EPS * size", "coming_to_rest::settled_velocities_are_those_of_the_implicit_equation"),
+        ("change <= «2→1e8» * EPS * size", "coming_to_rest::settled_velocities_are_those_of_the_implicit_equation"),
     ],
     "solvers/sparse/mixed_rows.py": [
         (
             "time = «0.5 * (time + load_double(parameters, 1)→load_double(parameters, 0»)",
-            "flights::flights_are_those_of_dense_algebra",
+            "schemes::flights_are_those_of_dense_algebra",
         ),
     ],
     "solvers/general_clusters.py": [

@@ -161,9 +161,6 @@ def test_exponential_by_blocks(name):
     allowed = 1e-13 * np.linalg.cond(form.T) * abs(wanted).max()
     assert abs(form.propagator(t) - wanted).max() < allowed
     assert np.linalg.cond(form.T) < 1e4
-    # (13): T exp(Jt) T^-1.
-    literal = form.T @ scipy.linalg.expm(form.J * t) @ np.linalg.inv(form.T)
-    assert abs(form.propagator(t) - literal).max() < 10 * allowed
 
 
 def test_structures_that_rounding_allows():
@@ -281,12 +278,6 @@ def test_what_is_said_is_so():
 
 
 def test_what_cannot_be_told():
-    # An oscillator in a skew basis: rounding has put the eigenvalues off the axis, to one side or the other.
-    X = np.random.default_rng(3).normal(size=(4, 4))
-    A = X @ np.kron(np.diag([1.0, 3.0]), R) @ np.linalg.inv(X)
-    assert left_axis_right(A)[1] < 4
-    assert str(classify(A)) == "center whose stability cannot be told"
-    assert classify(np.kron(np.diag([1.0, 3.0]), R)).stability is Stability.STABLE
     # A change in the last digit moves the eigenvalues of a block of size 6 by some 1e-2.
     A = in_skew_basis(np.random.default_rng(0), [jordan_block(-1 / 1024, 6)])
     assert classify(A).stability is Stability.UNKNOWN

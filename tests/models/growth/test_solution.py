@@ -128,7 +128,7 @@ def test_tolerances_of_each_species_and_none() -> None:
         ({"t_eval": [0.5, 2.0]}, "t_eval is one-dimensional and within t_span"),
         ({"x0": None}, "either as x0 or as log_x0"),
         ({"log_x0": np.zeros(2)}, "either as x0 or as log_x0"),
-        ({"x0": [0.5, 0.3, 0.2]}, "the start has shape"),
+        ({"x0": [0.5, 0.3, 0.2]}, "the start has populations of shape"),
         ({"x0": [1.0, -1.0]}, "population 1 is -1"),
         ({"x0": None, "log_x0": [0.0, np.nan]}, "log_x0 is not finite"),
     ],

@@ -1,4 +1,4 @@
-"""Rows that kernels call by address: families, Numba's functions, Python's, and what these raise."""
+"""Rows that kernels call by address, alone and coupled: families, Numba's functions, Python's, and what these raise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kcons.errors import InputError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.single_rows import SingleRows
-from kcons.solvers.sparse.mixed_rows import SparseRows
+from kcons.solvers.sparse.mixed_rows import SparseRows, miss
 
 FUNCTIONS = [name for name in CASES if CASES[name]().kind == RowKind.FUNCTION]
 VELOCITIES = [name for name in CASES if CASES[name]().kind == RowKind.VELOCITY]
@@ -103,6 +103,40 @@ def test_kernels_agree_with_the_dense_solver(solver, name, where):
     assert np.all(np.abs(whole.value(found[0][0], TIME + 0.01)) <= 2 * whole.tolerance(x, TIME + 0.01))
 
 
+@pytest.mark.parametrize("damage", ["nan", "flipped", "coincident"])
+def test_failure_changes_nothing(damage):
+    x, rng = scattered(1), np.random.default_rng(5)
+    solver, _, whole = both(COUPLED, x)
+    new, v, y = x + 0.01 * rng.normal(size=x.shape), *rng.normal(size=(2, *x.shape))
+    if damage == "nan":
+        new[7, 2] = np.nan
+    elif damage == "flipped":
+        new[:5] = -x[:5]
+    else:
+        x[6] = x[7]
+    kept, speeds = new.copy(), v.copy()
+    outcome = solver.positions(Request(new, x, velocities=v, inv_dt=500.0))
+    assert not outcome.converged
+    named = set(whole.row_atoms(int(solver.rows[outcome.worst_row])))
+    assert (named <= {6, 7}) == (damage != "flipped")
+    np.testing.assert_array_equal(new, kept)
+    np.testing.assert_array_equal(v, speeds)
+    y[3, 1] = np.nan
+    kept = y.copy()
+    assert not solver.tangents(Request(y, x)).converged
+    np.testing.assert_array_equal(y, kept)
+
+
+def test_a_molecule_turned_through_a_point_is_no_solution_though_its_rows_hold():
+    """Lengths and angles are those of the mirror image: only gradients say that the step was half a turn."""
+    x = scattered(1)
+    solver, _, whole = both(COUPLED[:2], x)
+    turned = -x
+    assert np.all(np.abs(whole.value(turned)) <= whole.tolerance(turned))
+    assert not solver.positions(Request(turned, x)).converged
+    np.testing.assert_array_equal(turned, -x)
+
+
 @pytest.mark.parametrize("flight", [0.0, 0.1, -0.1], ids=["no flight", "flight", "backwards"])
 @pytest.mark.parametrize("name", VELOCITIES)
 def test_rows_of_velocities_agree_with_the_dense_solver(name, flight):
@@ -129,31 +163,19 @@ def test_rows_of_velocities_agree_with_the_dense_solver(name, flight):
     assert (np.abs(pushes[~whole.holonomic]) > 0).all() == (flight != 0)
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["gradient", "differences"])
-def test_gradients_are_found_once_for_a_place(known):
+def test_gradients_are_found_once_for_a_place():
     """A step asks where it begins, at each iteration, and twice where it ends: three gradients."""
     values, slopes = [], []
-
-    def quartic(r):
-        values.append(r)
-        return float(np.sum(r**4))
-
-    def slope(r):
-        slopes.append(r.tobytes())
-        return 4.0 * r**3
-
+    quartic = lambda r: values.append(r) or float(np.sum(r**4))  # noqa: E731
+    slope = lambda r: slopes.append(r.tobytes()) or 4.0 * r**3  # noqa: E731
     x = np.array([[1.0, 0.2, 0.5]])
-    motion = Motion(ConstraintSet(Custom([0], quartic, slope if known else None), x, [1.0]), x)
+    motion = Motion(ConstraintSet(Custom([0], quartic, slope), x, [1.0]), x)
     system = System(motion, None)
     state = run(system, State(x, motion.project_velocities(x, [[0.2, 1.0, 0.5]])), 0.003, 2)
     values.clear()
     slopes.clear()
     run(system, state, 0.003, 10)
-    if known:
-        assert len(slopes) == len(set(slopes)) and len(slopes) <= 31
-        assert len(values) <= len(slopes) + 2 * 10
-    else:
-        assert len(values) <= 31 * 13 + 2 * 10
+    assert len(slopes) == len(set(slopes)) and len(slopes) <= 31 and len(values) <= len(slopes) + 2 * 10
     assert all(not r.flags.writeable and r.shape == (1, 3) for r in values)
 
 
@@ -273,3 +295,72 @@ def test_rows_that_elimination_takes_for_dependent_go_to_the_dense_solver():
         ConstraintSet([square(weights), square(weights + np.array([[1e-6, 0, 0], [0, 0, 0]]))], x, MASSES), x
     )
     assert motion.rank == 2 and isinstance(motion.plan.solvers[0], GeneralClusters)
+
+
+# -- rows of mixed kinds ----------------------------------------------------------------------------
+
+
+def test_dependent_rows_are_dropped():
+    """Three sides of a triangle leave nothing for its angle; of many, rounding leaves something to most."""
+    rng, n = np.random.default_rng(7), 12
+    x, masses = rng.normal(size=(3 * n, 3)), rng.uniform(1, 16, 3 * n)
+    corners = np.arange(3 * n).reshape(n, 3)
+    sides = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    given = ConstraintSet([Distance(sides), Angle(corners)], x, masses)
+    solver = SparseRows(given, np.arange(4 * n), 1 / masses)
+    assert solver.rank(x, None) == 3 * n
+    y = rng.normal(size=x.shape)
+    assert solver.tangents(Request(y, x)).converged
+    # As far as the worst of these triangles is from a line.
+    rows = given.jacobian(x).toarray() / np.sqrt(np.repeat(masses, 3))
+    s = np.linalg.svd(rows / np.linalg.norm(rows, axis=1)[:, None], compute_uv=False)
+    assert np.abs(given.jacobian(x) @ y.ravel()).max() <= 1e-14 * s[0] / s[3 * n - 1]
+
+
+@pytest.mark.parametrize(("apart", "converged"), [(0.0, True), (3e-14, True), (1e-12, False)])
+def test_dependent_rows_may_miss_by_some_roundings(apart, converged):
+    """The last of three rows of one angle wants another value by this much; more than the sum of roundings fails."""
+    x = np.array([[1.0, 0.1, 0.0], [0.0, 0.0, 0.0], [0.2, 0.9, 0.3]])
+    angle = Angle([[0, 1, 2]])
+    target = float(ConstraintSet(angle, x, np.ones(3)).target(0.0)[0])
+    rows = [Distance([[0, 1]]), Angle([[0, 1, 2]], target), Angle([[2, 1, 0]], target * (1 + apart))]
+    whole = ConstraintSet(rows, x, np.ones(3))
+    eliminate_last = np.array([False, False, True])
+    moved = x + 0.01 * np.random.default_rng(0).normal(size=x.shape)
+    before = moved.copy()
+    outcome = SparseRows(whole, np.arange(3), np.ones(3), eliminate_last).positions(Request(moved, x))
+    assert outcome.converged == converged
+    if converged:
+        assert np.all(np.abs(whole.value(moved)) <= 4 * np.sqrt(3) * whole.tolerance(moved))
+    else:
+        np.testing.assert_array_equal(moved, before)
+
+
+@pytest.mark.parametrize("seed", [12, 22, 166, 1459])
+def test_a_dihedral_that_turns_over_has_no_solution_far_away(seed):
+    """Bent to the other side it is off by pi; hundreds of displacements away it is flat, and would be right again."""
+    rng = np.random.default_rng(seed)
+    legs = rng.normal(size=(3, 3)) * 10 ** rng.uniform(-1.5, 0.3, (3, 1))
+    side = np.cross(legs[1], rng.normal(size=3))
+    side *= 0.01 * np.linalg.norm(legs[2]) / np.linalg.norm(side)
+    legs[2] = legs[1] + side
+    x = np.vstack([np.zeros(3), np.cumsum(legs, axis=0)])
+    x_new = x.copy()
+    x_new[3] -= 2 * side
+    inv_mass = 10 ** rng.uniform(0, 1, 4)
+    held = ConstraintSet([Distance([[0, 1]]), Dihedral([[0, 1, 2, 3]])], x, 1 / inv_mass)
+    rows = np.arange(2)
+    for solver in (SparseRows(held, rows, inv_mass), GeneralClusters(held, rows, 0 * rows, inv_mass)):
+        changed = x_new.copy()
+        assert not solver.positions(Request(changed, x)).converged
+        assert np.array_equal(changed, x_new)
+
+
+def test_rows_with_a_period_miss_by_the_shorter_way():
+    turn = 2 * np.pi
+    assert miss(3.1, -3.1, turn) == pytest.approx(2 * np.pi - 6.2)
+    # More than a quarter of a turn is nothing to go round for.
+    assert miss(-1.0, 1.9, turn) == pytest.approx(2.9)
+    assert miss(1.0, -1.9, turn) == pytest.approx(-2.9)
+    assert miss(-1.0, 2.4, turn) == pytest.approx(3.4 - 2 * np.pi)
+    assert miss(3.1, 0.1, 0.0) == pytest.approx(-3.0)
