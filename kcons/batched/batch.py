@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -124,7 +123,8 @@ class Batch:
         self._is_position = self._joined(lambda each: each.constraint_set.holonomic, torch.bool)
         self._holonomic = bool(self._is_position.all())
         self._set_lattices()
-        self._groups = self._grouped(True)
+        self._known: dict[bool, list[Group]] = {}
+        self._groups(True)
 
     def _joined(self, of: Any, dtype: torch.dtype | None = None, starts: Any = None) -> Tensor:
         """Numbers of each system, one after another; those of atoms or rows from where these of a system begin."""
@@ -136,19 +136,18 @@ class Batch:
     def _inverse(self, masses: Tensor) -> Tensor:
         return torch.where(self._free, 1.0 / torch.where(self._free, masses, 1.0), 0.0)
 
-    def _grouped(self, velocity_rows: bool) -> list[Group]:
-        parts: dict[Any, list[Any]] = {}
-        for motion, numbers in self._numbers.items():
-            for pattern, kind in kinds_of(motion, velocity_rows).items():
-                where = np.stack([numbers, self.atom_starts[numbers], self.row_starts[numbers]], axis=1)
-                parts.setdefault(pattern, []).append((kind, where))
-        own = [self._inverse_masses], [self.targets, self._still]
-        return [Group(pattern, each, own, self.compiled) for pattern, each in parts.items()]
-
-    @cached_property
-    def _position_groups(self) -> list[Group]:
-        """Without rows of velocities."""
-        return self._groups if self._holonomic else self._grouped(False)
+    def _groups(self, velocity_rows: bool) -> list[Group]:
+        """All clusters, with or without rows of velocities."""
+        key = velocity_rows or self._holonomic
+        if key not in self._known:
+            parts: dict[Any, list[Any]] = {}
+            for motion, numbers in self._numbers.items():
+                for pattern, kind in kinds_of(motion, velocity_rows).items():
+                    where = np.stack([numbers, self.atom_starts[numbers], self.row_starts[numbers]], axis=1)
+                    parts.setdefault(pattern, []).append((kind, where))
+            own = [self._inverse_masses], [self.targets, self._still]
+            self._known[key] = [Group(pattern, each, own, self.compiled) for pattern, each in parts.items()]
+        return self._known[key]
 
     # -- cells ----------------------------------------------------------------------------------------
 
@@ -228,8 +227,7 @@ class Batch:
             if getattr(self, item)._version:  # numbers that follow from them are kept
                 raise InputError(f"{item} of a Batch were written to; give other ones as {item}= of a call", item=item)
         t, t_start = (torch.full((), each, dtype=self.dtype, device=self.device) for each in (time, start))
-        groups = self._groups if flight or not of_positions else self._position_groups
-        return Task(self, groups, of_positions, flight != 0, t, t_start)
+        return Task(self, self._groups(flight != 0 or not of_positions), of_positions, flight != 0, t, t_start)
 
     def _with_fixed(self, y: Tensor, rows: Tensor) -> Tensor:
         """With what the rows of fixed atoms say of these."""
@@ -341,7 +339,7 @@ class Batch:
         """
         calls, self._calls = self._calls, 0
         limit = max(ACCEPTED, ROUNDINGS * torch.finfo(self.dtype).eps)
-        groups = [*self._groups, *(self._position_groups if self._position_groups is not self._groups else [])]
+        groups = [group for known in self._known.values() for group in known]
         worst = [(group, group.worst) for group in groups]
         for group, off in worst:
             if bool((off <= limit).all()):

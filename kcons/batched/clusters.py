@@ -11,7 +11,7 @@ import operator
 from collections.abc import Callable
 from functools import reduce
 from itertools import accumulate
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -80,8 +80,8 @@ class Problem(NamedTuple):
         return self._replace(x=self.start, images=self.start_images, flies=False, t=self.t_start)
 
 
-class Clusters:
-    """Equations of the clusters of one pattern.
+class Lanes:
+    """Equations of the clusters of one pattern. Vectors are lists with a tensor for each number.
 
     Vectors of rows have shape (rank, n) or (n_rows, n), those of coordinates, all x before y and z, (3 n_atoms, n).
     `unpacked` makes vectors of tensors, `packed` tensors of vectors. Matrices are vectors of entries, the diagonal
@@ -91,15 +91,7 @@ class Clusters:
     """
 
     #: Whether rows that are computed alike are computed at once.
-    together: ClassVar[bool]
-    unpacked: Any
-    packed: Any
-    take: Any
-    summed: Any
-    subtract: Any
-    joined: Any
-    table: Any
-    columns: Any
+    together = False
 
     def __init__(self, pattern: Pattern) -> None:
         self.pattern, rows, n = pattern, pattern.rows, pattern.n_atoms
@@ -201,6 +193,36 @@ class Clusters:
         return of.held - torch.func.jvp(lambda t: self.packed(self.evaluate(of._replace(t=t), u)[0], of.x), *along)[1]
 
     # -- vectors --------------------------------------------------------------------------------------
+
+    def table(self, numbers: list[int]) -> Table:
+        return numbers
+
+    def columns(self, rows: Any) -> Any:
+        return rows[0]
+
+    def unpacked(self, packed: Tensor) -> Vector:
+        return list(packed.unbind(0))
+
+    def packed(self, vector: Vector, like: Tensor) -> Tensor:
+        lane = like[0]
+        return torch.stack([each.expand_as(lane) if isinstance(each, Tensor) else lane * 0 + each for each in vector])
+
+    def joined(self, values: list[Any], slopes: list[list[Any]], like: Tensor) -> tuple[Vector, Slope]:
+        x, y, z = ([each for some in slopes for each in some[c::3]] for c in range(3))
+        return values, (x, y, z)
+
+    def take(self, vector: Vector, numbers: Table) -> Vector:
+        return [vector[k] for k in numbers]
+
+    def summed(self, terms: Vector, numbers: Table, count: int) -> Vector:
+        found: dict[int, Any] = {}
+        for k, term in zip(numbers, terms, strict=True):
+            found[k] = found[k] + term if k in found else term
+        return [found.get(k, 0.0) for k in range(count)]
+
+    def subtract(self, vector: Vector, numbers: Table, terms: Vector) -> None:
+        for k, term in zip(numbers, terms, strict=True):
+            vector[k] = vector[k] - term
 
     def spread(self, slope: Slope, lam: Vector) -> Vector:
         """A^T lambda of the first rows, as many as have one."""
@@ -346,44 +368,8 @@ def _dot(one: Vector, other: Vector) -> Any:
     return sum((a * b).sum() for a, b in zip(one, other, strict=True))
 
 
-class Lanes(Clusters):
-    """Clusters with a tensor for each number."""
-
-    together = False
-
-    def table(self, numbers: list[int]) -> Table:
-        return numbers
-
-    def columns(self, rows: list[Any]) -> Any:
-        return rows[0]
-
-    def unpacked(self, packed: Tensor) -> Vector:
-        return list(packed.unbind(0))
-
-    def packed(self, vector: Vector, like: Tensor) -> Tensor:
-        lane = like[0]
-        return torch.stack([each.expand_as(lane) if isinstance(each, Tensor) else lane * 0 + each for each in vector])
-
-    def joined(self, values: list[Any], slopes: list[list[Any]], like: Tensor) -> tuple[Vector, Slope]:
-        x, y, z = ([each for some in slopes for each in some[c::3]] for c in range(3))
-        return values, (x, y, z)
-
-    def take(self, vector: Vector, numbers: Table) -> Vector:
-        return [vector[k] for k in numbers]
-
-    def summed(self, terms: Vector, numbers: Table, count: int) -> Vector:
-        found: dict[int, Any] = {}
-        for k, term in zip(numbers, terms, strict=True):
-            found[k] = found[k] + term if k in found else term
-        return [found.get(k, 0.0) for k in range(count)]
-
-    def subtract(self, vector: Vector, numbers: Table, terms: Vector) -> None:
-        for k, term in zip(numbers, terms, strict=True):
-            vector[k] = vector[k] - term
-
-
-class Levels(Clusters):
-    """Clusters whose numbers are all in one tensor."""
+class Levels(Lanes):
+    """The same with vectors that are tensors."""
 
     together = True
 
@@ -394,7 +380,7 @@ class Levels(Clusters):
     def table(self, numbers: list[Any]) -> Table:
         return torch.tensor(numbers, dtype=torch.long, device=self.device)
 
-    def columns(self, rows: list[Any]) -> Any:
+    def columns(self, rows: Any) -> Any:
         return self.table(rows).movedim(0, -1)
 
     def unpacked(self, packed: Tensor) -> Vector:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcons.batched.clusters import Clusters, Lanes, Levels, Pattern, Row
+from kcons.batched.clusters import Lanes, Levels, Pattern, Row
 from kcons.batched.row_functions import row_function
 from kcons.constraints.arguments import FloatArray, IntArray
 from kcons.errors import UnsupportedError
@@ -77,9 +77,9 @@ def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
 
 
 @lru_cache(512)
-def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Clusters:
+def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Lanes:
     """The equations of a pattern; of small ones compiled where that is asked for."""
-    made: Clusters = Lanes(pattern) if pattern.small else Levels(pattern, device)
+    made = Lanes(pattern) if pattern.small else Levels(pattern, device)
     if compiled and pattern.small:
         for name in ("newton", "tangent", "adjoint"):
             setattr(made, name, torch.compile(getattr(made, name), dynamic=True))

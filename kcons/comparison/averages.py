@@ -253,7 +253,7 @@ def compare_averages(
         **described(system, reference),
         "what": "deviation of the temperature of the configurations",
         "error_unit": "",
-        "per": f"until it is known to {100 * GOAL:g} %",
+        "per": f"until the temperature is known to {100 * GOAL:g} %",
         "budget": budget,
         "margin": COST_SCATTER,
     }

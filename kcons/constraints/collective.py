@@ -12,7 +12,7 @@ import numpy as np
 from numpy import sqrt
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import FloatArray, atom_array, whole_number
+from kcons.constraints.arguments import FloatArray, atom_array, refuse_other, whole_number
 from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import Target
@@ -164,6 +164,9 @@ class RadiusOfGyration(MassWeighted):
     def __init__(self, atoms: ArrayLike, target: Target = None, *, mass_weighted: bool = True) -> None:
         self.mass_weighted = bool(mass_weighted)
         super().__init__(atoms, target)
+
+    def _settle(self) -> None:
+        refuse_other(self.mass_weighted, bool, "RadiusOfGyration: mass_weighted", "True or False")
 
     def weights(self) -> FloatArray:
         return super().weights() if self.mass_weighted else _shares(np.ones(self.atoms.shape))

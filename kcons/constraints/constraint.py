@@ -33,6 +33,7 @@ from kcons.constraints.arguments import (
     check_range,
     checked,
     read_only,
+    rules_of,
     without_units,
 )
 from kcons.constraints.compilation import has_a_file, njit
@@ -385,7 +386,12 @@ class Constraint:
             name: read_only(array[rows]) for name, array in data.items() if isinstance(array, np.ndarray)
         }
         if isinstance(self.target, MovingTarget):
-            own["target"] = _selected(self.target, rows, self.n_rows, self.period)
+            target, n, period = self.target, self.n_rows, self.period
+            own["target"] = MovingTarget(
+                value=lambda t: target.at(t, n)[rows],
+                rate=lambda t: target.rate_at(t, n, period)[rows],
+                acceleration=lambda t: target.acceleration_at(t, n, period)[rows],
+            )
         return self.changed(**own)
 
     def renumbered(self, new_index: IntArray) -> Self:
@@ -442,9 +448,14 @@ class Constraint:
 
     @classmethod
     def _rebuilt(cls, data: Mapping[str, Any]) -> Self:
-        item = object.__new__(cls)
+        item, rules = object.__new__(cls), rules_of(cls.__init__)
         for name in cls.shared:
             setattr(item, name, data[name])
+        for name in cls.per_row.keys() & rules.keys():
+            for rule in rules[name].rules:  # of directions too, which have length 1 where they are written
+                taken = rule(data[name], f"{cls.family}: {name}")
+                if np.abs(taken - np.asarray(data[name])).max(initial=0.0) > 1e-10:
+                    raise InputError(f"{cls.family} cannot be read: {name} has vectors not of length 1", item=name)
         Constraint.__init__(item, data["atoms"], data["target"], **{name: data[name] for name in cls.per_row})
         return item
 
@@ -456,14 +467,6 @@ class Constraint:
 @functools.cache
 def _compiled(row: Callable[[Any, Any, Any, Any], None]) -> Any:
     return njit(cache=has_a_file(row), error_model="numpy")(row)
-
-
-def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float | None) -> MovingTarget:
-    return MovingTarget(
-        value=lambda t: target.at(t, n_rows)[rows],
-        rate=lambda t: target.rate_at(t, n_rows, period)[rows],
-        acceleration=lambda t: target.acceleration_at(t, n_rows, period)[rows],
-    )
 
 
 def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:

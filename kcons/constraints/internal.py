@@ -34,7 +34,7 @@ class Internal(Constraint, base=True):
     @property
     def pairs(self) -> IntArray:
         """The pairs of each row, shape (n_rows, n_pairs, 2): neighbors in its list of atoms."""
-        return np.stack([self.atoms[:, :-1], self.atoms[:, 1:]], axis=-1)
+        return self.linked
 
     def coincident(self, k: int, r: FloatArray) -> str:
         """What is said of two atoms of row `k` at one point; nothing where there are none."""

@@ -41,9 +41,6 @@ class Surface(Constraint, base=True):
     row_width = 1
     positive = "radius"
 
-    def __init__(self, atoms: ArrayLike, target: Target, **data: ArrayLike) -> None:
-        Constraint.__init__(self, atom_column(atoms, self.family), target, **data)
-
 
 class Sphere(Surface):
     """Distance from a point, q = |r - c|.
@@ -135,18 +132,10 @@ class Torus(Surface):
         atoms: ArrayLike,
         center: Lengths,
         axis: Directions,
-        major_radius: Lengths,
+        major_radius: PositiveLengths,
         minor_radius: Target = None,
     ) -> None:
         super().__init__(atoms, minor_radius, center=center, axis=axis, major_radius=major_radius)
-
-    def _settle(self) -> None:
-        self.refuse(
-            ~(self.major_radius > 0),
-            0,
-            lambda k: f"major_radius {self.major_radius[k]:g} is not positive",
-            "major_radius",
-        )
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
@@ -275,7 +264,7 @@ class Plane(LinearRows):
         if offset is not None and point is not None:
             raise InputError("Plane: give either offset or point, not both", item="point")
         n = np.asarray(normal)
-        super().__init__(atom_column(atoms, self.family), offset, coefficients=n if n.ndim == 1 else n[:, None])
+        super().__init__(atoms, offset, coefficients=n if n.ndim == 1 else n[:, None])
         if point is not None:
             self.target = _held(self, point)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,8 +34,8 @@ def _column(field: str) -> property:
     return property(column)
 
 
-class Series:
-    """Samples of held coordinates; see `Sample` for what they are.
+class Series(list[Sample]):
+    """Samples of held coordinates; see `Sample` for what they are. A slice is a series of some of them.
 
     Parameters
     ----------
@@ -58,29 +59,21 @@ class Series:
     """
 
     def __init__(self, names: Sequence[str], periods: ArrayLike = 0.0, isokinetic_degrees_of_freedom: int = 0) -> None:
+        super().__init__()
         self.names = tuple(names)
         self.isokinetic_degrees_of_freedom = isokinetic_degrees_of_freedom
         self.periods: FloatArray = np.broadcast_to(np.asarray(periods, dtype=np.float64), (len(self.names),)).copy()
-        self._samples: list[Sample] = []
-
-    def append(self, sample: Sample) -> None:
-        """Add a sample."""
-        self._samples.append(sample)
-
-    def __len__(self) -> int:
-        return len(self._samples)
 
     def __repr__(self) -> str:
         return f"<Series: {len(self)} samples of {', '.join(self.names)}>"
 
-    def __iter__(self) -> Iterator[Sample]:
-        return iter(self._samples)
-
-    def __getitem__(self, samples: slice) -> Series:
-        """A series of some of the samples."""
-        part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom)
-        part._samples = self._samples[samples]
-        return part
+    def __getitem__(self, samples: Any) -> Any:
+        found = super().__getitem__(samples)
+        if isinstance(samples, slice):
+            part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom)
+            part += found
+            return part
+        return found
 
     time, value, multiplier, kinetic, log_det_z, gradient, off, turned, mean_kinetic = map(_column, Sample._fields)
 
@@ -103,7 +96,7 @@ class Series:
 
     def work_of(self, force: FloatArray) -> FloatArray:
         """The work of any force along the coordinates, shape (n, d), up to each sample, shape (n,)."""
-        if not self._samples:
+        if not self:
             return np.zeros(0)
         moved = nearest_image(np.diff(self.value, axis=0), self.periods)
         return np.concatenate([[0.0], np.cumsum(np.sum((force[1:] + force[:-1]) / 2 * moved, axis=1))])
@@ -134,7 +127,7 @@ class Series:
             series = cls(names, data["periods"], int(data["isokinetic_degrees_of_freedom"]))
             shapes = {name: (-1,) if name in _NUMBERS else (-1, len(series.names)) for name in Sample._fields}
             columns = [data[name].reshape(shape) for name, shape in shapes.items()]
-            series._samples = [Sample(*row) for row in zip(*columns, strict=True)]
+            series += map(Sample._make, zip(*columns, strict=True))
         except FileNotFoundError:
             raise
         except Exception as error:  # a damaged archive raises whatever its bytes lead to

@@ -167,7 +167,6 @@ def test_errors_take_one_line(folder, capsys, name, more, words):
 
 
 def test_advice_is_of_the_command(folder, tmp_path, capsys):
-    """What remarks and errors tell to do can be done with files and options."""
     bare, few = tmp_path / "t.xyz", files.topology(tmp_path / "few.gro", N - 1, files.water(N - 1, 1)[0])
     atoms = "".join(f"{'OHH'[k % 3]} {k}.0 0.0 0.0\n" for k in range(3 * N))
     bare.write_text(f"{3 * N}\n\n{atoms}")
@@ -201,7 +200,6 @@ def test_hydrogens_without_a_bond_are_a_gap(tmp_path, capsys):
 
 
 def test_temperatures_of_configurations(folder, capsys, monkeypatch):
-    """Asked for with forces: among the remarks, on the page and in the file."""
     from kcons.comparison import trajectory_temperatures
     from kcons.thermostats import Estimate, SplitTemperatures
 

@@ -124,7 +124,6 @@ def test_proteins(name, atoms, rows):
 
 
 def test_hydrogens_are_added_and_do_not_depend_on_the_platforms_of_the_machine(bare, monkeypatch):
-    """OpenMM would take its fastest, of whatever precision."""
     seen, add = [], app.Modeller.addHydrogens
 
     def recorded(self, *args, platform=None, **options):

@@ -64,7 +64,6 @@ def test_what_the_table_is_of_stands_beside_it():
 
 
 def test_the_error_is_that_of_the_trajectory():
-    """By hand, against the reference."""
     system = chain()
     dt = system.time_steps[1]
     run = METHODS["rattle"].start(system, dt)

@@ -57,7 +57,7 @@ ROWS = (
 
 def test_the_cheapest_that_is_as_good_as_the_usual():
     found = rank(made(*ROWS))
-    assert (found.limit, found.limit_is) == (1e-3, "what kcons rattle makes at 2 fs")
+    assert (found.limit, found.limit_is) == (1e-3, "that of kcons rattle at 2 fs")
     assert list(found.table.method) == ["rattle", "blanes", "peer"]
     assert list(found.table.setting) == [2.0, 4.0, 2.0]
     assert list(found.table.place) == [1, 2, 3] and list(found.table.times) == [1.0, 2.1, 2.5]

@@ -224,7 +224,6 @@ def test_free_particles_stay_on_their_great_circles():
 
 
 def test_a_spherical_pendulum_meets_the_one_in_spherical_angles():
-    """45-digit solution."""
     case = json.loads((Path(__file__).parents[1] / "reference/data/A02_spherical_pendulum_generic.json").read_text())
     x, v = (np.array(case["initial"][key], dtype=float)[0] for key in ("positions", "velocities"))
     (gravity,) = (force["g"] for force in case["forces"] if force["type"] == "uniform_acceleration")

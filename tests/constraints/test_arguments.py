@@ -35,16 +35,7 @@ from kcons.constraints.arguments import (
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion, minimize
-from kcons.steppers import (
-    BlanesMoan6,
-    BlanesMoan6a,
-    Geodesic,
-    Rattle,
-    State,
-    Suzuki4,
-    System,
-    run,
-)
+from kcons.steppers import BlanesMoan6, BlanesMoan6a, Geodesic, Rattle, State, Suzuki4, System, run
 from kcons.thermostats import CellSystem, ForceGroups, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 
 X = np.array([[0.9, 0.0, -0.4], [1.5, 0.0, 0.1], [2.0, 0.3, -0.2]])

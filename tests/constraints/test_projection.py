@@ -190,10 +190,6 @@ def test_least_squares_where_there_is_no_solution(p: Problem) -> None:
     residual = b - p.A @ shortest
     np.testing.assert_allclose(p.A.T @ residual, 0.0, atol=1e-10)
     np.testing.assert_allclose(p.A @ other, p.A @ shortest, atol=1e-10)
-    assert np.linalg.norm(shortest) <= np.linalg.norm(other) + 1e-12
-    for _ in range(5):
-        off = shortest + p.rng.normal(size=p.A.shape[1])
-        assert np.linalg.norm(b - p.A @ off) >= np.linalg.norm(residual) - 1e-12
 
 
 @PROPERTY

@@ -41,7 +41,7 @@ def test_bad_targets_are_named(make, message):
 HUGE = {
     "Distance": lambda t: Distance([0, 1], t),
     "center": lambda t: held.Sphere(0, [t, 1.0, 1.0], None),
-    "major radius": lambda t: held.Torus(0, [1.0, 1.0, 1.0], [0, 0, 1.0], t, 1.0),
+    "major radius": lambda t: held.Torus(0, [1.0, 1.0, 1.0], [0, 0, 1.0], abs(t), 1.0),
     "point": lambda t: held.Line(0, [t, 0, 0], [0, 0, 1.0]),
     "coefficients": lambda t: held.LinearCombination([0, 1], [[t, 0, 0], [-t, 0, 0]]),
     "LinearRelation": lambda t: held.LinearRelation(0, [1, 2], [0.5, 0.5], [[t, 0, 0]]),

@@ -92,7 +92,6 @@ def test_universe_to_openmm_and_back(villin, held):
 
 
 def test_residues_in_another_order_than_in_the_universe(villin):
-    """A group may have its residues in any order; the atoms of each are still together."""
     group = sum(residue.atoms for residue in villin.residues[[7, 2, 5]])
     made = to_openmm(group, quietly(constraints_of, group, "hbonds"))
     assert [atom.name for atom in made.topology.atoms()] == group.names.tolist()

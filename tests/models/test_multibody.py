@@ -62,6 +62,13 @@ def test_squeezer_ends_where_it_is_published_to():
     np.testing.assert_allclose(-found.multipliers[-1].reshape(2, 3).T.ravel(), MULTIPLIERS, rtol=2e-6, atol=0)
 
 
+@pytest.mark.parametrize("seed", [3, 4, 9])
+def test_far_starts_are_reached_by_parts_of_steps(seed):
+    body = squeezer()[0]["body"]
+    q, v = body.project(START + 0.3 * np.random.default_rng(seed).normal(size=7), np.zeros(7))
+    assert np.abs(body.residuals(q, v)).max() < 1e-14
+
+
 # -- closed forms ------------------------------------------------------------------------------------
 
 

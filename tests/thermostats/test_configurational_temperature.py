@@ -9,9 +9,10 @@ import fluids as fluid
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from thermostat_systems import dumbbells, quartic, system, waves
+from thermostat_systems import dumbbells, system, waves
 
-from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Distance, FixedAtoms, Formula, Plane, Sphere
 from kcons.errors import InputError
 from kcons.steppers import State, System, run
 from kcons.thermostats import (
@@ -28,12 +29,9 @@ from kcons.thermostats import (
 from kcons.thermostats.configurational_temperature import temperature
 
 
-def test_what_does_not_change_is_no_distance_or_an_infinite_one_away():
+def test_estimates():
     still = mean(np.ones(40))
     assert (still.off(1.0), still.off(2.0), still.off(0.5)) == (0.0, -math.inf, math.inf)
-
-
-def test_estimates():
     assert Estimate(1.1, 0.05).off(1.0) == pytest.approx(2.0)
     assert Estimate(1.1, 0.03).off(1.0, 0.04) == pytest.approx(2.0)
     rng = np.random.default_rng(0)
@@ -92,6 +90,14 @@ KT = 0.6
 COPIES = 250
 
 
+def repeated(held: System, x, times: int, **options) -> TemperatureSplit:
+    """The same configuration so many times."""
+    split = TemperatureSplit(held, **options)
+    for _ in range(times):
+        split.add(x)
+    return split
+
+
 def curvatures(split: TemperatureSplit) -> list[tuple[float, float]]:
     """Means and errors of the second derivatives of all clusters, by kind."""
     return [mean(column) for column in np.array(split._series)[:, 1].T]
@@ -104,10 +110,7 @@ def test_a_dumbbell_on_springs():
     """U = k x^2/2 of both atoms: m_a + m_b on 2k; the turn has no slope with equal masses, and a curvature of 0."""
     k, m, d = 3.0, 2.0, 1.4
     x = np.array([[0.3, -0.2, 0.1], [0.3, -0.2, 0.1 + d]])
-    held = system([Distance([[0, 1]])], x, [m, m], lambda x, t: -k * x)
-    split = TemperatureSplit(held)
-    for _ in range(40):
-        split.add(x)
+    split = repeated(system([Distance([[0, 1]])], x, [m, m], lambda x, t: -k * x), x, 40)
     above, below = (np.array(split._series)[:, row] for row in (0, 1))
     center = x.mean(axis=0)
     assert above[:, 0] == pytest.approx((2 * k) ** 2 * (center @ center) / (2 * m), rel=1e-12)
@@ -128,10 +131,7 @@ def test_a_cluster_alone_has_no_temperature_of_shifts_and_turns():
         pull = (np.linalg.norm(x[2] - x[0]) - 1.5) * (x[2] - x[0])
         return np.array([pull, 0 * pull, -pull]) + 1e-16 * np.random.default_rng(0).standard_normal((3, 3))
 
-    split = TemperatureSplit(system([Distance([[0, 1], [1, 2]])], x, [1.0, 2.0, 3.0], spring))
-    for _ in range(40):
-        split.add(x)
-    found = split.result()
+    found = repeated(system([Distance([[0, 1], [1, 2]])], x, [1.0, 2.0, 3.0], spring), x, 40).result()
     assert found.shift is None and found.turn is None and found.internal is not None
     assert [words.split()[2] for words in found.left_out] == ["shifts", "turns"]
 
@@ -141,9 +141,7 @@ def test_curvatures_of_a_fluid():
     chosen = fluid.dumbbells(8)
     forces, kt = chosen.forces, chosen.thermal_energy
     x = forces.metropolis(chosen.positions, kt, 500, 10, 1, chosen.shift, chosen.turn)[1]
-    split = TemperatureSplit(chosen.system(), rng=3)
-    for _ in range(1000):
-        split.add(x)
+    split = repeated(chosen.system(), x, 1000, rng=3)
     centers = x.reshape(8, 2, 3).mean(axis=1, keepdims=True)
 
     def loads(arms, moved=0.0):
@@ -190,8 +188,6 @@ def bent(centers: np.ndarray, turns: np.ndarray, angle: np.ndarray, masses: np.n
 
 
 def rotations(vectors: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_rotvec(vectors).as_matrix()
 
 
@@ -246,60 +242,38 @@ def test_against_metropolis(flexible):
 # -- what has no shifts or turns --------------------------------------------------------------------
 
 
-def test_single_atoms_do_not_turn():
-    x = np.arange(12.0).reshape(4, 3)
-    split = TemperatureSplit(system([], x, np.ones(4), quartic))
-    for _ in range(32):
-        split.add(0.1 * x)
-    found = split.result()
-    assert found.turn is None and found.internal is None and found.shifts == 12 and found.turns == 0
-    assert found.left_out == ("single atoms only: nothing turns",)
-
-
-TIED = {
-    "sphere": (Sphere([0], [0, 0, 0], 1.0), "tied to a place"),
-    "plane": (Plane([0], [0, 0, 1.0]), "tied to a place"),
-    "fixed": (FixedAtoms([0]), "tied to a place"),
+#: Two dumbbells, the first of which has an end held; a pair at one height; atoms.
+BONDS, ENDS = Distance([[0, 1], [2, 3]]), np.array([[1.0, 0, 0], [1.3, 0.9, 0.2], [4.0, 0, 0], [4.5, 0.8, -0.1]])
+PLACE = "tied to a place"
+#: Rows, positions, degrees of freedom of shifts and turns, whether other motions are left, and what is said.
+NOT_FREE = {
+    "sphere": ([Sphere([0], [0, 0, 0], 1.0), BONDS], ENDS, (3, 2), True, [PLACE]),
+    "plane": ([Plane([0], [0, 0, 1.0]), BONDS], ENDS, (3, 2), True, [PLACE]),
+    "fixed": ([FixedAtoms([0]), BONDS], ENDS, (3, 2), True, [PLACE, "1 fixed atoms have no temperature"]),
+    "height": (
+        [Formula("z1 - z2", [0, 1])],
+        np.array([[0.0, 0, 0], [1.0, 0.3, 0]]),
+        (3, 0),
+        True,
+        ["tied to a direct"],
+    ),
+    "atoms": ([], 0.1 * np.arange(12.0).reshape(4, 3), (12, 0), False, ["single atoms only: nothing turns"]),
 }
 
 
-@pytest.mark.parametrize("name", TIED)
-def test_what_is_tied_to_space_is_left_out(name):
-    """A dumbbell with one end held: it neither shifts nor turns, and its motion is internal; the other is free."""
-    item, text = TIED[name]
-    x = np.array([[1.0, 0, 0], [1.3, 0.9, 0.2], [4.0, 0, 0], [4.5, 0.8, -0.1]])
-    held = system([item, Distance([[0, 1], [2, 3]])], x, [1.0, 2.0, 1.0, 2.0], waves)
-    split = TemperatureSplit(held)
-    for _ in range(128):
-        split.add(x)
-    found = split.result()
-    assert (found.shifts, found.turns) == (3, 2)
-    assert found.internal is not None
-    assert any(text in note for note in found.left_out)
-    if name == "fixed":
-        assert "1 fixed atoms have no temperature" in found.left_out
-
-
-def test_a_direction_in_space():
-    """Two atoms at the same height: they shift, and do not turn."""
-    from kcons.constraints import Formula
-
-    x = np.array([[0.0, 0, 0], [1.0, 0.3, 0.0]])
-    held = system([Formula("z1 - z2", [0, 1])], x, [1.0, 2.0], waves)
-    split = TemperatureSplit(held)
-    for _ in range(32):
-        split.add(x)
-    found = split.result()
-    assert found.shifts == 3 and found.turns == 0 and found.turn is None and found.internal is not None
-    assert any("tied to a direction" in note for note in found.left_out)
+@pytest.mark.parametrize("name", NOT_FREE)
+def test_what_does_not_shift_or_turn_is_said(name):
+    """Its motion is internal."""
+    rows, x, counts, internal, notes = NOT_FREE[name]
+    found = repeated(system(rows, x, np.resize([1.0, 2.0], len(x)), waves), x, 128).result()
+    assert (found.shifts, found.turns) == counts
+    assert (found.internal is not None) is internal and (found.turn is None) is (counts[1] == 0)
+    assert len(found.left_out) == len(notes)
+    assert all(note in told for note, told in zip(notes, found.left_out, strict=True))
 
 
 def test_molecules_across_the_border_of_a_box():
     """A molecule in two pieces is the same molecule."""
-    from kcons import ConstraintSet
-    from kcons.motion import Motion
-    from kcons.steppers import System
-
     box = 6.0
     whole = np.array([[5.8, 1.0, 1.0], [6.5, 1.5, 1.0], [3.0, 3.0, 3.0], [3.6, 3.6, 3.1]])
     broken = np.mod(whole, box)
@@ -310,9 +284,7 @@ def test_molecules_across_the_border_of_a_box():
     found = []
     for x in (whole, broken):
         held = ConstraintSet([Distance([[0, 1], [2, 3]])], x, np.array([1.0, 2, 1, 2]), cell=[box] * 3)
-        split = TemperatureSplit(System(Motion(held, x), force), displacement=1e-3)
-        split.add(x)
-        found.append(np.array(split._series))
+        found.append(np.array(repeated(System(Motion(held, x), force), x, 1, displacement=1e-3)._series))
     assert found[1] == pytest.approx(found[0], rel=1e-6)
 
 

@@ -117,7 +117,6 @@ def test_the_bath_leaves_the_uniform_distribution():
 
 
 TWO = {"slow": 1, "fast": 4}
-KINDS = ["split", "axes", "cluster", "global"]
 
 
 def gentle(x, t):
@@ -228,17 +227,32 @@ X = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [3.0, 1.2, 0], [6.0, 0.5, 0
 MASSES = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
 
 
-def freedom(rows, kind="split", x=X, masses=MASSES):
-    held = system(rows, x, masses)
-    return SphereLayout.of(held, x, kind).freedom.tolist()
+BONDS = Distance([[0, 1], [2, 3]])
 
 
 @pytest.mark.parametrize(
-    ("kind", "wanted"),
-    [("split", [3, 2, 3, 2, 3]), ("axes", [1, 1, 1, 2] * 2 + [1, 1, 1]), ("cluster", [5, 5, 3]), ("global", [13])],
+    ("rows", "kind", "wanted"),
+    [
+        ([BONDS], "split", [3, 2, 3, 2, 3]),
+        ([BONDS], "axes", [1, 1, 1, 2] * 2 + [1, 1, 1]),
+        ([BONDS], "cluster", [5, 5, 3]),
+        ([BONDS], "global", [13]),
+        ([Plane([0], [0, 0, 1.0]), Distance([[0, 1]])], "split", [4, 3, 3, 3]),
+        ([Sphere([2], [3.0, 0, 1.0], 1.0)], "axes", [2] + [1] * 12),
+        ([FixedAtoms([0]), BONDS], "split", [2, 3, 2, 3]),
+        ([BONDS, CenterOfMass([0, 1, 2, 3])], "split", [3 * 4 - 2 - 3, 3]),
+        ([Distance([[0, 1], [2, 3], [1, 2]])], "split", [3, 6, 3]),
+        ([LinearRelation(0, [1], [1.0], None)], "split", [3, 3, 3, 3]),  # held whole about its center
+    ],
+    ids=["split", "axes", "cluster", "global", "plane", "sphere", "fixed", "joined", "one chain", "center only"],
 )
-def test_two_dumbbells_and_a_free_atom(kind, wanted):
-    assert freedom([Distance([[0, 1], [2, 3]])], kind) == wanted
+def test_degrees_of_freedom_by_sphere(rows, kind, wanted):
+    """A cluster that is tied to space has one sphere; fixed atoms have none, and tie."""
+    held = system(rows, X, MASSES)
+    layout = SphereLayout.of(held, X, kind)
+    assert layout.freedom.tolist() == wanted
+    fixed = held.motion.fixed_atoms
+    assert np.flatnonzero(layout.cluster < 0).tolist() == fixed.tolist() and not layout.masses[fixed].any()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -259,32 +273,8 @@ def test_dependent_rows_count_by_rank():
     assert sorted(layout.freedom.tolist()) == [3] * 20 + [6, 7]
 
 
-def test_a_cluster_that_is_tied_to_space_has_one_sphere():
-    assert freedom([Plane([0], [0, 0, 1.0]), Distance([[0, 1]])]) == [4, 3, 3, 3]
-    assert freedom([Sphere([2], [3.0, 0, 1.0], 1.0)], "axes") == [2] + [1] * 12
-
-
-def test_fixed_atoms_have_none_and_tie():
-    rows = [FixedAtoms([0]), Distance([[0, 1], [2, 3]])]
-    held = system(rows, X, MASSES)
-    layout = SphereLayout.of(held, X, "split")
-    assert layout.freedom.tolist() == [2, 3, 2, 3]
-    assert layout.cluster[0] == -1 and layout.masses[0] == 0
-
-
-def test_rows_that_join_clusters_make_them_one():
-    joined = [Distance([[0, 1], [2, 3]]), CenterOfMass([0, 1, 2, 3])]
-    assert freedom(joined) == [3 * 4 - 2 - 3, 3]
-    assert freedom([Distance([[0, 1], [2, 3], [1, 2]])]) == [3, 6, 3]
-
-
-def test_the_motion_about_the_center_may_be_held_whole():
-    """Without a degree of freedom about it a cluster has the sphere of its center only."""
-    assert freedom([LinearRelation(0, [1], [1.0], None)]) == [3, 3, 3, 3]
-
-
 def test_radii_and_the_sphere_without_one():
-    held = system([Distance([[0, 1], [2, 3]])], X, MASSES)
+    held = system([BONDS], X, MASSES)
     layout = SphereLayout.of(held, X, "split")
     np.testing.assert_allclose(layout.squares(0.5, 2), 0.5 * np.array([4, 3, 4, 3, 4]))
     axes = SphereLayout.of(held, X, "axes")

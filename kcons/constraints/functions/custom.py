@@ -16,7 +16,6 @@ from kcons.constraints.arguments import (
     Duration,
     FloatArray,
     as_float_array,
-    atom_column,
     check_call,
     positive,
     read_only_view,
@@ -297,7 +296,7 @@ class ImplicitSurface(Custom):
         time_step: Duration = 0.02,
     ) -> None:
         given: dict[str, Any] = {"time_dependent": time_dependent, "length": length, "time_step": time_step}
-        super().__init__(atom_column(atoms, self.family), function, gradient, target, **given)
+        super().__init__(atoms, function, gradient, target, **given)
 
     @property
     def kind(self) -> RowKind:  # type: ignore[override]

@@ -123,12 +123,19 @@ def find_images(
         if item.relative and item.n_rows
     ]
     n_atoms = len(x)
-    _accept_small_pieces(tables, n_atoms, half_width)
+    bonds = [table for table in tables if table.held]
+    if any(table.unsure.any() for table in bonds):
+        # Lengths as found are right in pieces whose links, laid end to end, are shorter than half the cell.
+        pairs = np.concatenate([table.item.atoms for table in bonds])
+        piece, _ = connected(pairs, n_atoms)
+        reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([table.lengths[:, 0] for table in bonds]))
+        for table in bonds:
+            table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
     if all(t.held and not (t.whole.any() or t.unsure.any()) for t in tables):
         return given, None
     ties = [item for item in ties if item.holds_length and not item.moving and item.n_rows]
     others = [_Links(item.changed(whole=None, cell_offsets=None), 0, *place) for item in ties]
-    held = [t for t in [*tables, *others] if t.held]
+    held = [*bonds, *others]
     keys = np.concatenate([np.zeros(0, np.int64), *(t.short(n_atoms) for t in held)])
     for table in tables:
         table.sort_rows(keys, n_atoms)
@@ -291,18 +298,6 @@ class _Links:
         if offsets is None and not self.whole.any():
             return self.item
         return self.item.changed(whole=self.whole, cell_offsets=offsets)
-
-
-def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: float) -> None:
-    """Lengths as found are right in pieces whose links, laid end to end, are shorter than half the cell."""
-    held = [table for table in tables if table.held]
-    if not any(table.unsure.any() for table in held):
-        return
-    pairs = np.concatenate([table.item.atoms for table in held])
-    piece, _ = connected(pairs, n_atoms)
-    reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([t.lengths[:, 0] for t in held]))
-    for table in held:
-        table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
 
 
 def _tree(

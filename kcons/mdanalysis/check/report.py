@@ -55,10 +55,10 @@ def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **optio
 def _units(result: CheckResult) -> Table:
     """One line for lengths, one for angles."""
     headers = ["unit", "rows", "largest", "rms", "rms of\nrounding", "mean", "largest mean\nof a row"]
-    headers.append("drift of rms\na ns")
+    headers.append("drift of rms\nper ns")
     rates = any(unit.rate_rms is not None for unit in result.units)
     if rates:
-        headers += ["largest |Av|\na ps", "rms |Av|\na ps"]
+        headers += ["largest |Av|\nper ps", "rms |Av|\nper ps"]
     rows = []
     for unit in result.units:
         drift = ""

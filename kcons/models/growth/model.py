@@ -256,32 +256,24 @@ class Mixture:
         """g_eq = -c kT ln sum exp(-mu0/kT)."""
         return -total * self.kT * self._log_w
 
-    def excess(self, p: Populations, total: float, level: float = 0.0) -> Any:
-        """g - g_eq less `level`, a number a state, to the round-off of the potentials about their mean.
+    def excess(self, p: Populations, total: float) -> Any:
+        """g - g_eq, a number a state, to the round-off of the potentials about their mean.
 
         g_eq is taken at the actual sum X of the populations, near `total`. The terms of
-        kT [sum (x_eq h(ln x/x_eq) - a x) - c h(ln X/c) + a (X - c)], h(u) = u e^u - e^u + 1, a = level/(c kT)
-        are never negative for level = 0, so that nothing cancels near equilibrium; x_eq and c are those of `total`. Far
-        from it, the part of each population in `level` is taken from its own term, with ln x/x_eq and X - c to twice
-        the precision.
+        kT [sum x_eq h(ln x/x_eq) - c h(ln X/c)], h(u) = u e^u - e^u + 1, are never negative, so that nothing cancels
+        near equilibrium; x_eq and c are those of `total`.
         """
         if p.x.ndim == 2:
             states = zip(p.x.T, p.log_x.T, strict=True)
-            return np.array([self.excess(Populations(p.time, *state), total, level) for state in states])
+            return np.array([self.excess(Populations(p.time, *state), total) for state in states])
         log_eq = self.equilibrium(total)
-        a = level / (total * self.kT)
         # A trial step of an integrator may overflow; it is then rejected.
         with np.errstate(all="ignore"):
-            u = p.log_x - log_eq
-            part = u - p.log_x
-            rest = (p.log_x - (u - part)) - (log_eq + part)  # what rounding took from u (Knuth)
-            near = np.abs(u) < NEAR
-            x_eq = np.exp(log_eq)
-            small = np.where(near, u + rest, 0.0)
+            u, x_eq = p.log_x - log_eq, np.exp(log_eq)
+            small = np.where(np.abs(u) < NEAR, u, 0.0)
             series = np.polyval(_SERIES, small) * small * small
-            terms = np.where(near, x_eq * series - a * p.x, p.x * ((u - a) + rest) - (p.x - x_eq))
+            terms = np.where(np.abs(u) < NEAR, x_eq * series, p.x * u - (p.x - x_eq))
             if not (np.all(np.isfinite(terms)) and np.all(np.isfinite(p.x))):
                 return math.nan
-            more = math.fsum([*p.x, -total])
-            over = (1.0 + more / total) * np.log1p(more / total) - more / total
-            return self.kT * math.fsum([*terms, -total * over, a * more])
+            more = math.fsum([*p.x, -total]) / total
+            return self.kT * math.fsum([*terms, total * more, -total * (1.0 + more) * np.log1p(more)])

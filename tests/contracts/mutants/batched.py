@@ -5,11 +5,11 @@ MUTANTS = {
         ("torch.where(d > «0→-9e99», 0.0, torch.inf)", "batched/batch::a_bond_that_has_turned_is_no_solution"),
         ("_each(operator.«neg→pos», self.spread(slope, a)", "batched/gradients::derivatives_are_those_of_the_solution"),
         ("start=of.start «+→-» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
-        ("d, rest), «rest.T→0 * rest.T»])", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
-        ("[which] * s[beside], alpha=«-1→1»)", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
+        ("(d @ d.mT, «lam→2 * lam».T", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
+        ("(0, numbers, terms, alpha=«-1→1»)", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
     ],
     "batched/groups.py": [
-        ("if «not item.n_rows→False»:", "batched/batch::constraints_of_no_rows_hold_nothing"),
+        ("if «not n→False»:", "batched/batch::constraints_of_no_rows_hold_nothing"),
         ("sums = «-→+»torch.round(", "batched/against_the_engine::rows_take_the_images_that_the_engine_takes"),
     ],
     "batched/row_functions.py": [

@@ -45,6 +45,7 @@ MUTANTS = {
             "multibody::one_place_against_the_theory multibody::a_linear_change_of_coordinates_changes_nothing",
         ),
         ("left[rank - 1] > «DEPENDENT * left[0]→0.0»", "multibody::a_crossing_of_two_ways_is_passed_straight_on"),
+        ("range(«8→1»))", "multibody::far_starts_are_reached_by_parts_of_steps"),
         ("for _ in range(«ITERATIONS→1»):", "multibody::a_start_off_the_constraints_is_refused_and_can_be_mended"),
     ],
     "models/integration.py": [

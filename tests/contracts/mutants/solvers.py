@@ -8,9 +8,9 @@ MUTANTS = {
             "compilation::damaged_files_are_made_anew",
         ),
     ],
-    "constraints/functions/expressions.py": [
-        ("    undefined = «undefined_part(tree, _PI)→None»", "expressions::formulas_without_bound_are_refused_at_once"),
-        ("lambda _, x: «next(some)→-np.ones(40)»", "expressions::shifts_are_found_out"),
+    "constraints/functions/formula.py": [
+        ("    undefined = «undefined_part(tree, _PI)→None»", "formula::formulas_without_bound_are_refused_at_once"),
+        ("lambda _, x: «next(some)→-np.ones(40)»", "formula::shifts_are_found_out"),
     ],
     "constraints/constraint.py": [
         (", v, time + step) «+→- 0 *»", "constraint_set::acceleration_target_is_the_second_derivative_along_any_curve"),

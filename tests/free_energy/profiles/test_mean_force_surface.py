@@ -89,7 +89,6 @@ def test_a_grid_without_noise_gives_the_surface(name):
 
 
 def test_minima():
-    """Found where they are, and within their errors."""
     from scipy.optimize import minimize
 
     surface = fitted("wells", 60, 0.4, 0)

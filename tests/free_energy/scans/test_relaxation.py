@@ -62,7 +62,6 @@ def test_forces_that_are_no_gradient_are_told():
 
 
 def test_undefined_internal_coordinates_are_told():
-    """Two atoms in one place."""
     atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 1.0)])
     internals = Internals(atoms.numbers, x)
     met = x.copy()

@@ -21,7 +21,6 @@ RING = np.radians(np.arange(-180, 180, 30))
 
 
 def test_a_torsion_has_its_profile():
-    """Bonds and angles relax to where they cost nothing, the dihedral stays where it is held."""
     atoms = chain(4, threefold)
     before = atoms.positions.copy()
     found = scan(atoms, TURN, RING, fmax=1e-3)
@@ -139,7 +138,6 @@ def test_one_failed_point_does_not_stop_the_others():
 
 
 def test_a_failed_point_is_leapt_over():
-    """What lies behind it is reached from before it."""
     atoms = chain(4, threefold, lambda phi: RuntimeError("no") if 1.2 < phi[0] < 1.3 else None, turns=[1.0])
     found = scan(atoms, TURN, [1.0, 1.25, 1.5, 1.6])
     assert set(found.failed) == {(1,)} and np.isfinite(found.energies[2:]).all()

@@ -212,7 +212,6 @@ def test_pulls_by_long_steps(tmp_path):
 
 
 def test_pulls_that_fail_are_told_of(tmp_path):
-    """And those that did not are kept."""
     names = tuple(f"pull--0.5-to-0.5-{k:04d}" for k in range(3))
     with pytest.raises(InputError, match=r"3 of 14 pulls failed; pull--0.5-to-0.5-000.: RuntimeError.* are kept"):
         made(tmp_path, fails=names).pull(-0.5, 0.5, 7)

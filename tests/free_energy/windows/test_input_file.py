@@ -96,7 +96,6 @@ def test_a_difference_of_distances(folder):
 
 
 def test_pulls(folder):
-    """By default from the first window to the last; of two coordinates, see `test_a_difference_of_distances`."""
     assert read(folder).pulls is None
     found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8\nsteps = 300\n")
     assert found.pulls["start"] == pytest.approx([-np.pi / 3])

@@ -68,7 +68,6 @@ def test_a_torsion_held_as_a_collective_variable(bonds):
 
 
 def test_the_same_coordinate_held_in_three_ways(tmp_path):
-    """By the System, as a collective variable, and by `hold`: one multiplier at one configuration."""
     pair, angle = [8, 14], [6, 8, 14]
     x = np.array(PDB.positions.value_in_unit(unit.nanometer))
     found = {}

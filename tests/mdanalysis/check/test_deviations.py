@@ -66,7 +66,6 @@ def test_xtc_is_told_to_far_better_than_single_precision_would_allow(tmp_path):
 
 
 def test_rows_of_all_kinds(water):
-    """Angles, dihedrals, collective and linear rows, against plain formulas."""
     x = files.dcd_frames(water["dcd"])
 
     def near(d):
