@@ -44,14 +44,14 @@ class InputError(KconsError, ValueError):
     Attributes
     ----------
     item : str
-        The argument or array that is wrong.
+        The argument or array that is wrong, without the name of what takes it: of ``"Sphere: center"`` the center.
     atoms : tuple of int
         The atoms concerned, if any.
     """
 
     def __init__(self, message: str, *, item: str = "", atoms: Iterable[int] = ()) -> None:
         super().__init__(message)
-        self.item = item
+        self.item = item.rpartition(": ")[2]
         self.atoms = tuple(int(a) for a in atoms)
 
 

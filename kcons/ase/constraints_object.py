@@ -72,8 +72,8 @@ class Constraints(FixConstraint):
     """
 
     def __init__(self, constraints: Constraint | Iterable[Constraint | Mapping[str, Any]] = ()) -> None:
-        self.constraints = listed(constraints)
         self._binding: Binding | None = None
+        self.constraints = listed(constraints)
         #: Whether the engine is this object's; copies share one while all are in its cell.
         self._own = False
         #: The atoms that the positions known of belong to; one object may be on several.
@@ -87,7 +87,7 @@ class Constraints(FixConstraint):
 
     @constraints.setter
     def constraints(self, rows: tuple[Constraint, ...]) -> None:
-        self.__dict__["constraints"] = rows
+        self.__dict__["constraints"], self._binding = rows, None
         fixed = any(item.fixes_atoms and item.n_rows for item in rows)
         self.__class__ = ConstraintsWithFixedAtoms if fixed else Constraints  # type: ignore[assignment]
 
@@ -110,20 +110,15 @@ class Constraints(FixConstraint):
             self._last = ref(atoms)
             self._forget(atoms)
         bound = self._binding
-        # Rows can be given anew.
-        if bound is None or bound.given is not self.__dict__["constraints"] or not bound.fits(atoms):
-            bound = self._bind(atoms)
+        if bound is None or not bound.fits(atoms):
+            _refuse_moving(self.constraints)
+            bound = bind(self.constraints, atoms)
+            self._forget(atoms)
+            self.constraints, self._binding, self._own = bound.given, bound, True
         elif bound.periodic:
             bound = self._in_cell(atoms, atoms.cell.array)
         if len(atoms.constraints) > 1:
             check_company(atoms.constraints, self, bound)
-        return bound
-
-    def _bind(self, atoms: Atoms) -> Binding:
-        _refuse_moving(self.constraints)
-        bound = bind(self.constraints, atoms)
-        self._forget(atoms)
-        self.constraints, self._binding, self._own = bound.given, bound, True
         return bound
 
     def _in_cell(self, atoms: Atoms, cell: FloatArray) -> Binding:
@@ -131,9 +126,8 @@ class Constraints(FixConstraint):
         bound = self._binding
         assert bound is not None
         if not self._own and cell.tobytes() != bound.cell and bound.periodic:
-            bound = bind(self.constraints, atoms)
-            bound.given = self.constraints
-            self._binding, self._own = bound, True
+            bound = self._binding = bind(self.constraints, atoms)
+            self._own = True
         bound.follow_cell(atoms, cell)
         return bound
 
@@ -276,11 +270,20 @@ class Constraints(FixConstraint):
         IndexError
             If no row is left; ASE then drops the object.
         """
-        kept = _within(self.constraints, np.arange(len(atoms))[ind], len(atoms))
-        if not kept:
+        if not self._keep(np.arange(len(atoms))[ind], len(atoms)):
             raise IndexError("no constraint lies within the slice")
-        self.constraints = kept
-        self._binding = None
+
+    def _keep(self, atoms: IntArray, n_atoms: int) -> bool:
+        """Keep the rows all of whose atoms are among `atoms`, of n_atoms, renumbered in their order; whether any is."""
+        new_index = np.full(n_atoms, -1, dtype=np.int64)
+        new_index[atoms] = np.arange(len(atoms))
+        kept = []
+        for item in self.constraints:
+            inside = np.flatnonzero((new_index[item.atoms] >= 0).all(axis=1))
+            if len(inside):
+                kept.append((item if len(inside) == item.n_rows else item.select(inside)).renumbered(new_index))
+        self.constraints = tuple(kept)
+        return bool(kept)
 
     def repeat(self, m: Any, n: int) -> Constraints:
         """Hold the fixed atoms of all replicas of a cell of `n` atoms, `m` times along each axis; returns this object.
@@ -298,7 +301,6 @@ class Constraints(FixConstraint):
                 )
         copies = int(np.prod(np.broadcast_to(m, 3)))
         self.constraints = (FixedAtoms((self.touched + n * np.arange(copies)[:, None]).ravel()),)
-        self._binding = None
         return self
 
     # -- copies and files -----------------------------------------------------------------------
@@ -331,7 +333,11 @@ class Constraints(FixConstraint):
         except InputError as error:
             warnings.warn(f"constraints are left out of the file: {error}", stacklevel=3)
             raise AttributeError(f"todict: {error}") from None
-        return lambda: _as_data(self, rows)
+        data, bound = {"name": REGISTERED_NAME, "kwargs": {"constraints": rows}}, self._binding
+        # ASE counts rows as they are given, also those that depend on others.
+        if bound is None or bound.motion.rank == sum(item.n_rows for item in self.constraints):
+            data = file_form(self.constraints) or data
+        return lambda: data
 
     def __repr__(self) -> str:
         converted = self._binding.motion.conversions if self._binding is not None else ()
@@ -413,26 +419,13 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
 
     def delete_atoms(self, indices: Any, natoms: int) -> Constraints | None:
         """Keep the rows whose atoms all stay, renumbered; None if there are none."""
-        kept = _within(self.constraints, np.delete(np.arange(natoms), indices), natoms)
-        self.constraints, self._binding = kept, None
-        return self if kept else None
-
-
-def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    bound = held._binding
-    # ASE counts rows as they are given, also those that depend on others.
-    if bound is None or bound.motion.rank == sum(item.n_rows for item in held.constraints):
-        form = file_form(held.constraints)
-        if form is not None:
-            return form
-    return {"name": REGISTERED_NAME, "kwargs": {"constraints": rows}}
+        return self if self._keep(np.delete(np.arange(natoms), indices), natoms) else None
 
 
 def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
     """Constraints, those that are given as plain data made anew."""
-    given: Iterable[Any] = (constraints,)
-    if isinstance(constraints, Iterable) and not isinstance(constraints, str):
-        given = constraints
+    several = isinstance(constraints, Iterable) and not isinstance(constraints, str)
+    given: Any = constraints if several else (constraints,)
     result = tuple(families.from_dict(item) if isinstance(item, Mapping) else item for item in given)
     for item in result:
         if not isinstance(item, Constraint):
@@ -443,18 +436,6 @@ def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -
                 item="constraints",
             )
     return result
-
-
-def _within(constraints: Iterable[Constraint], atoms: IntArray, n_atoms: int) -> tuple[Constraint, ...]:
-    """Rows all of whose atoms are among `atoms`, of n_atoms, with these renumbered in their order."""
-    new_index = np.full(n_atoms, -1, dtype=np.int64)
-    new_index[atoms] = np.arange(len(atoms))
-    kept = []
-    for item in constraints:
-        inside = np.flatnonzero((new_index[item.atoms] >= 0).all(axis=1))
-        if len(inside):
-            kept.append((item if len(inside) == item.n_rows else item.select(inside)).renumbered(new_index))
-    return tuple(kept)
 
 
 def _refuse_moving(given: Iterable[Constraint]) -> None:
@@ -603,11 +584,7 @@ def attach(atoms: Atoms) -> Constraints:
     return held
 
 
-def _register() -> None:
-    """Add the name to `ase.constraints`, so that ASE's readers make this object again."""
-    if REGISTERED_NAME not in ase.constraints.__all__:
-        ase.constraints.__all__.append(REGISTERED_NAME)
-    setattr(ase.constraints, REGISTERED_NAME, Constraints)
-
-
-_register()
+# So that ASE's readers make this object again.
+if REGISTERED_NAME not in ase.constraints.__all__:
+    ase.constraints.__all__.append(REGISTERED_NAME)
+setattr(ase.constraints, REGISTERED_NAME, Constraints)

@@ -14,17 +14,10 @@ import numpy as np
 from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 
-from kcons.ase.binding import (
-    FORCES_ONLY,
-    Binding,
-    applied_forces,
-    bind,
-    company,
-    unchanged_on_failure,
-)
+from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind, company, unchanged_on_failure
 from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.logger import ConstraintLogger
-from kcons.ase.respect import START_TOLERANCE, require_on_surface
+from kcons.ase.respect import START_TOLERANCE, differ, require_on_surface
 from kcons.ase.topology import kinetic_energy_of, require_atoms
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
@@ -288,14 +281,12 @@ class ConstrainedDynamics(MolecularDynamics):
                 last = replace(last, thermostat=self._thermostat_after_change(last))
             self._state, self._asked = last, asked
         cell = surroundings(atoms)
-        same = last is not None and cell == self._cell
-        if last is not None and same:
-            if equal_pairs(x, last.positions, p, self._momenta):
-                if last.time != self.time:
-                    require_on_surface(system.motion.constraint_set, x, self.time)
-                    last = replace(last, time=self.time, time_remainder=0.0)
-                return last if last.step == self.nsteps else replace(last, step=self.nsteps)
-            same = bool((last.positions == x).all())
+        same = last is not None and cell == self._cell and not differ(x, last.positions)
+        if last is not None and same and not differ(p, self._momenta):
+            if last.time != self.time:
+                require_on_surface(system.motion.constraint_set, x, self.time)
+                last = replace(last, time=self.time, time_remainder=0.0)
+            return last if last.step == self.nsteps else replace(last, step=self.nsteps)
         v = np.divide(p, self._masses, out=np.zeros_like(p), where=self._masses != 0.0)
         require_on_surface(system.motion.constraint_set, x, self.time)
         state = system.initial_state(x, v, time=self.time, project=True)
@@ -332,8 +323,8 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time, self.nsteps = float(state.time), int(state.step)
         self._put(x, v)
         # Forces are asked for anew: nobody knows which calculator those of a file are of.
-        kept = replace(state.copied(), forces=None, origin=None)
-        self._state = replace(kept, positions=x, velocities=v, time=self.time, step=self.nsteps)
+        known: dict[str, Any] = {"positions": x, "velocities": v, "time": self.time, "step": self.nsteps}
+        self._state = replace(state.copied(), **known, forces=None, origin=None)
         self._cell = surroundings(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
@@ -403,16 +394,6 @@ def _rows(atoms: Atoms) -> list[Constraint]:
         if isinstance(item, Constraints):
             item.engine(atoms)  # settles targets that are open
     return translated(atoms, holding)
-
-
-@njit(cache=True, nogil=True)
-def equal_pairs(x, x0, p, p0):  # type: ignore[no-untyped-def]
-    """Whether x == x0 and p == p0."""
-    a, a0, b, b0 = x.ravel(), x0.ravel(), p.ravel(), p0.ravel()
-    other = 0
-    for i in range(a.size):
-        other |= (a[i] != a0[i]) | (b[i] != b0[i])
-    return other == 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -107,12 +107,10 @@ class AcceptedPositions:
             good = worst is None
             if good:
                 self.know(x, cell)
-            elif not scaled and self._cell is None:
-                require_on_surface(motion.constraint_set, x)
-            elif not scaled and self.between_steps:
-                require_on_surface(motion.constraint_set, x, why=_EDITED)
             elif not scaled:
-                require_on_surface(motion.constraint_set, x, why=_MOVED_WITHIN_A_STEP, by_class=True)
+                by_class = self._cell is not None and not self.between_steps
+                why = _MOVED_WITHIN_A_STEP if by_class else _OFF_AT_START if self._cell is None else _EDITED
+                require_on_surface(motion.constraint_set, x, why=why, by_class=by_class)
         self.between_steps = False
         return good
 

@@ -52,7 +52,6 @@ class ThermostattedDynamics(ConstrainedDynamics):
         barostat: Barostat | None = None,
         **kwargs: Any,
     ) -> None:
-        require_atoms(atoms)
         self._make = make
         if barostat is not None:
             require_barostat(barostat)
@@ -74,16 +73,12 @@ class ThermostattedDynamics(ConstrainedDynamics):
         if not isinstance(self.stepper, Isokinetic | NoseHooverChain):
             return
         state = self._start(self._systems())
-        arrays = self.atoms.arrays
-        momenta = arrays["momenta"].copy()
         try:
             begun = self.stepper.start(self._systems(), state)
         finally:  # forces were asked for elsewhere too
-            arrays["positions"][...], arrays["momenta"][...] = state.positions, momenta
+            self.atoms.arrays["positions"][...] = state.positions
         if begun.velocities is not state.velocities:
             begun = replace(begun, velocities=self._put(state.positions, begun.velocities))
-        else:
-            self._momenta = momenta
         self._state = begun
 
     def _made(self, motion: Motion) -> System:
@@ -368,6 +363,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         difference: bool = False,
         **kwargs: Any,
     ) -> None:
+        require_atoms(atoms)
         kinds: dict[str, Callable[..., Any]] = {"langevin": LangevinRespa, "spheres": IsokineticSpheres}
         kind = kinds.pop(bath)
         options = {name: kwargs.pop(name) for name in signature(kind).parameters if name in kwargs}

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kcons.constraints import Constraint, CustomVelocity, ImplicitSurface
-from kcons.constraints.functions.straight_line import Operand, Tape, differentiated, function_of
+from kcons.constraints.functions.straight_line import Tape, differentiated, function_of
 from kcons.errors import UnsupportedError
 
 _OPERATORS: dict[str, Callable[..., Any]] = {
@@ -30,20 +30,14 @@ _NAMES = {"rint": "round", "arcsin": "asin", "arccos": "acos", "arctan": "atan",
 
 def run(tape: Tape, r: Sequence[Any], p: Sequence[Any], t: Any) -> list[Any]:
     """Results of a tape at places, parameters and a time, tensors of any one shape."""
-    known = {"r": r, "p": p, "k": (made := [])}
 
-    def value(operand: Operand) -> Any:
-        if not isinstance(operand, tuple):
-            return operand
-        return t if operand[0] == "t" else known[operand[0]][operand[1]]
+    def perform(name: str, *given: Any) -> Any:
+        if name in _OPERATORS:  # which take plain numbers too
+            return _OPERATORS[name](*given)
+        tensors = (each if isinstance(each, Tensor) else r[-1] * 0 + each for each in given)
+        return getattr(torch, _NAMES.get(name, name))(*tensors)
 
-    for name, operands in tape.steps:
-        given = [value(each) for each in operands]
-        if name not in _OPERATORS:  # which take plain numbers too
-            given = [each if isinstance(each, Tensor) else r[-1] * 0 + each for each in given]
-        made.append(_OPERATORS.get(name) or getattr(torch, _NAMES.get(name, name)))
-        made[-1] = made[-1](*given)
-    return [value(each) for each in tape.results]
+    return tape.run(r, p, t, perform)
 
 
 class RowFunction(NamedTuple):

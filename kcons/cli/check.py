@@ -6,7 +6,6 @@ import argparse
 import io
 import sys
 from pathlib import Path
-from typing import Any
 
 from kcons.cli.terminal import Command, Option, rendered, say_written, show
 from kcons.constraints.arguments import positive
@@ -44,12 +43,19 @@ def _check(chosen: argparse.Namespace) -> int:
         say_written(report.write(folder, path, found))
         return EXIT["incomplete"]
     failed = ""
-    if chosen.forces is not None:
+    none = "no temperatures of the configurations:"
+    if chosen.forces is not None and result.violated:
+        result.remarks.append(f"{none} frames are off the constraints; say what the run held")
+    elif chosen.forces is not None:
+        from kcons.comparison import trajectory_temperatures
+
+        where, held = (path, chosen.topology), {"constrain": chosen.constrain, "select": chosen.select}
         try:
-            result.remarks += _temperatures(chosen, result)
+            kelvin = trajectory_temperatures.along(*where, chosen.forces, result.frames, **held)
+            result.remarks += trajectory_temperatures.sentences(kelvin, chosen.temperature)
         except KconsError as error:  # the check itself is done, and is worth its time
             failed = " ".join(str(error).split())
-            result.remarks.append(f"no temperatures of the configurations: {failed}")
+            result.remarks.append(f"{none} {failed}")
             print(f"kcons: {failed}", file=sys.stderr)
     summary, units, rows, verdict = report.page(result)
     picture = io.BytesIO()
@@ -59,16 +65,6 @@ def _check(chosen: argparse.Namespace) -> int:
     show(summary, units, rows, verdict)
     say_written(written)
     return 2 if failed else EXIT[result.status]
-
-
-def _temperatures(chosen: argparse.Namespace, result: Any) -> list[str]:
-    from kcons.comparison import trajectory_temperatures
-
-    if result.violated:
-        return ["no temperatures of the configurations: frames are off the constraints; say what the run held"]
-    held = {"constrain": chosen.constrain, "select": chosen.select}
-    found = trajectory_temperatures.along(chosen.trajectory, chosen.topology, chosen.forces, result.frames, **held)
-    return trajectory_temperatures.sentences(found, chosen.temperature)
 
 
 COMMANDS = (

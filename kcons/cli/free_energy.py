@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,12 +32,13 @@ def _scan(chosen: argparse.Namespace) -> int:
     from kcons.comparison.progress import Watcher
     from kcons.constraints import FixedAtoms
     from kcons.free_energy import scan
-    from kcons.free_energy.windows.input_file import counted, read_structure
+    from kcons.free_energy.windows.input_file import coordinate_of, counted, read_structure
 
+    first = chosen.count_from
     coordinates, values = _grid(chosen)
     atoms = read_structure(chosen.structure)
-    held: list[Any] = [FixedAtoms(counted(chosen.fix, chosen.count_from))] if chosen.fix else []
-    held += [_made(f, numbers, chosen) for f in FAMILIES for numbers in getattr(chosen, f"hold_{f}") or ()]
+    held: list[Any] = [FixedAtoms(counted(chosen.fix, first))] if chosen.fix else []
+    held += [coordinate_of(f, four, first) for f in FAMILIES for four in getattr(chosen, f"hold_{f}") or ()]
     if chosen.constrain is not None:
         held += constraints_of(atoms, chosen.constrain, guess_bonds=True)
     atoms.calc = _calculator(chosen.calculator, chosen.settings)
@@ -54,14 +54,10 @@ def _scan(chosen: argparse.Namespace) -> int:
     return INCOMPLETE if found.failed else 0
 
 
-def _made(family: str, atoms: Sequence[int], chosen: argparse.Namespace) -> Any:
-    from kcons.free_energy.windows.input_file import FAMILIES, counted
-
-    return FAMILIES[family]([counted(atoms, chosen.count_from)])
-
-
 def _grid(chosen: argparse.Namespace) -> tuple[list[Any], list[Any]]:
     import numpy as np
+
+    from kcons.free_energy.windows.input_file import Coordinate
 
     if not chosen.coordinates:
         raise InputError(
@@ -75,11 +71,9 @@ def _grid(chosen: argparse.Namespace) -> tuple[list[Any], list[Any]]:
     for (family, atoms), low, high, n in zip(chosen.coordinates, *each, strict=True):
         if n < 0 or (n == 0 and low != high):
             raise InputError(f"--steps is {n}; give a positive number", item="steps")
-        axis = np.linspace(low, high, int(n) + 1)
-        if family == "angle" and (min(low, high) <= 0 or max(low, high) >= 180):
-            raise InputError(f"--angle from {low:g} to {high:g}: angles are between 0 and 180 degrees", item="angle")
-        coordinates.append(_made(family, atoms, chosen))
-        values.append(np.radians(axis) if family in ("angle", "dihedral") else axis)
+        made = Coordinate(**{family: atoms}, values=np.linspace(low, high, int(n) + 1).tolist())
+        coordinates.append(made.constraint(chosen.count_from))
+        values.append(made.places())
     return coordinates, values
 
 
@@ -140,7 +134,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
     slow = replace(given.settings, pull=given.pull_steps)
     pulls = Windows(given.sampler, folder / "pulls", slow, **how) if given.pulls else None
     watcher = Watcher(shown=True)
-    with windows.taken(), watcher, watcher.piece("windows", 1.0):
+    with windows.taken(), watcher, watcher.piece(f"{len(given.targets)} windows in {folder}", 1.0):
         for each in filter(None, (windows, pulls)):
             each.progress = lambda done, total: watcher.advance(done / total)
         found = windows.run(given.targets)

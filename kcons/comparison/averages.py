@@ -231,7 +231,10 @@ def compare_averages(
         raise InputError(f"{system.name} has no temperature: compare its trajectories instead", item="criterion")
     chosen, watching, seed = choose_samplers(methods, cheap is not None), watcher or Watcher(), seed_from(rng)
     if cheap is not None:
-        _same_atoms(system, cheap)
+        if system.masses.shape != cheap.masses.shape or not np.allclose(system.masses, cheap.masses, rtol=1e-2):
+            raise InputError("expensive and cheap forces are of different atoms; give two of a file", item="fast")
+        if system.motion.rank != cheap.motion.rank:
+            raise InputError("expensive and cheap forces come with different constraints", item="fast")
     unit, inner = system.units.time_unit, inner_step(system)
     for step in steps or ():
         if not (math.isfinite(step) and step > 0):
@@ -250,7 +253,7 @@ def compare_averages(
         **described(system, reference),
         "what": "deviation of the temperature of the configurations",
         "error_unit": "",
-        "per": f"until it is known to {100 * GOAL:g} %",
+        "per": f"until the temperature is known to {100 * GOAL:g} %",
         "budget": budget,
         "margin": COST_SCATTER,
     }
@@ -264,14 +267,6 @@ def compare_averages(
         return found
 
     return table_of(run_pending(chosen, runs, about, done, keep, ALL_COLUMNS), about, ALL_COLUMNS)
-
-
-def _same_atoms(expensive: TestSystem, cheap: TestSystem) -> None:
-    heavy, light = expensive.masses, cheap.masses
-    if len(heavy) != len(light) or not np.allclose(heavy, light, rtol=1e-2):
-        raise InputError("expensive and cheap forces are of different atoms; give two of the same file", item="fast")
-    if expensive.motion.rank != cheap.motion.rank:
-        raise InputError("expensive and cheap forces come with different constraints", item="fast")
 
 
 def _refuse(system: TestSystem, step: float, friction: float) -> None:

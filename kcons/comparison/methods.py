@@ -125,7 +125,8 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
         if system is not None and system.openmm is not None and system.openmm.home:
             usual = [m for m in usual if m.engine == "OpenMM" and m.refusal(system) is None]
         elif system is not None:
-            able = [m for m in usual if m.name in guests(system) and m.refusal(system) is None]
+            guests = GUESTS[2:] if system.openmm is not None and system.openmm.surfaces else GUESTS[:2]
+            able = [m for m in usual if m.name in guests and m.refusal(system) is None]
             usual = [m for m in usual if m.engine != "OpenMM" or m in able]
         return usual
     groups = {"all": list(METHODS.values())} | {e.lower(): [m for m in usual if m.engine == e] for e in ENGINES}
@@ -149,11 +150,6 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
 #: Methods of OpenMM that also run, unless methods are named, with test systems whose forces are not OpenMM's: with
 #: distances, and with surfaces.
 GUESTS = ("openmm-verlet", "openmm-kcons-rattle", "openmm-held-rattle")
-
-
-def guests(system: TestSystem) -> tuple[str, ...]:
-    """Those of `GUESTS` that run a test system."""
-    return GUESTS[2:] if system.openmm is not None and system.openmm.surfaces else GUESTS[:2]
 
 
 def _step(dt: float) -> str:

@@ -182,8 +182,8 @@ def _usual(done: pd.DataFrame, about: Mapping[str, Any]) -> tuple[float, str]:
             row = rows.iloc[min(1, len(rows) - 1)]
             if about["time"] == "fs":
                 row = rows.loc[(np.log(rows.setting.astype(float) / USUAL_STEP)).abs().idxmin()]
-            return float(row.error), f"what {row.title} makes at {shown_setting(row, about)}"
-    return float(done.error.median()), "what half of the rows make"
+            return float(row.error), f"that of {row.title} at {shown_setting(row, about)}"
+    return float(done.error.median()), "the median of all runs"
 
 
 def shown_setting(row: Any, about: Mapping[str, Any]) -> str:

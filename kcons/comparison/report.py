@@ -114,7 +114,7 @@ def sentence(table: pd.DataFrame, found: Ranking | None) -> str:
     ties = found.table[found.table.place == 1].iloc[1:]
     if len(ties):
         named = ", ".join(ties.title[:3]) + (f" and {len(ties) - 3} more" if len(ties) > 3 else "")
-        words += f"; no dearer within the scatter of {100 * found.scatter:.0f} %: {named}"
+        words += f"; equally cheap within {100 * found.scatter:.0f} %: {named}"
     return words + "."
 
 
@@ -140,16 +140,14 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
     ]
     if len(ranked) > PLACES:
         lines.append(f"... and {len(ranked) - PLACES} more")
-    same = f"{100 * found.scatter:.0f} %"
-    how = ", to which times repeat" if found.cost == "seconds" and about.get("margin") is not None else ""
-    how = ", to which such costs are known" if "what" in about else how
     lines.append(f"Measured on {about['title']}.")
-    lines.append(f"cost: {COSTS[found.cost]} {_per(about)}; =: equal within {same}{how}.")
+    same = f"Costs that differ by less than {100 * found.scatter:.0f} % are equal (=)"
+    lines.append(f"cost: {COSTS[found.cost]} {_per(about)}. {same}.")
     return "\n".join(lines)
 
 
 def _per(about: dict[str, Any]) -> str:
-    return str(about.get("per") or f"a {about['long_time']}")
+    return str(about.get("per") or f"per {about['long_time']}")
 
 
 def _notes(table: pd.DataFrame) -> dict[str, str]:

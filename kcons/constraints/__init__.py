@@ -8,7 +8,6 @@
 - `surface`, `collective`: surfaces, groups
 - `functions`: functions of one's own
 - `velocity`: rows linear in the velocities
-- `contradictions`: targets that exclude each other
 - `periodic`: which images rows mean
 - `constraint_set`: many constraints as one sigma, A and b, in their cell
 - `projection`: the theory, dense and literal

@@ -59,10 +59,8 @@ def as_float_array(values: ArrayLike | Any, item: str) -> FloatArray:
     refuse_units(values, item)
     parts = values if isinstance(values, list | tuple) else (values,)
     if any(isinstance(part, np.ma.MaskedArray) for part in parts):
-        raise InputError(
-            f"{item} is a masked array; give plain numbers (array.filled(...)), and leave out what is masked",
-            item=item,
-        )
+        remedy = "give plain numbers (array.filled(...)), and leave out what is masked"
+        raise InputError(f"{item} is a masked array; {remedy}", item=item)
     try:
         array = np.asarray(values)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -74,7 +72,7 @@ def as_float_array(values: ArrayLike | Any, item: str) -> FloatArray:
     return np.asarray(array, dtype=np.float64)
 
 
-def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray:
+def as_array(values: ArrayLike, shape: tuple[int, ...], item: str) -> FloatArray:
     """`values` themselves if the kernels can take them, or a float64 copy of that shape."""
     if type(values) is np.ndarray and values.dtype is _FLOAT and values.shape == shape and values.flags.carray:
         return values
@@ -102,9 +100,7 @@ def check_range(values: FloatArray, say: str, item: str, atoms: IntArray | None 
         row, *others = np.argwhere(~good)[0] if values.ndim else (0,)
         value = float(values[(row, *others)] if values.ndim else values)
         said = f"{value:g}, of which the square overflows; choose other units" if math.isfinite(value) else "not finite"
-        raise InputError(
-            f"{say.format(row=row)} is {said}", item=item, atoms=() if atoms is None else atoms[row].tolist()
-        )
+        raise InputError(f"{say.format(row=row)} is {said}", item=item, atoms=() if atoms is None else atoms[row])
 
 
 def read_only_view(array: FloatArray) -> FloatArray:
@@ -142,36 +138,33 @@ def atom_column(atoms: Any, item: str) -> NDArray[Any]:
 
 
 def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") -> IntArray:
-    """Different atoms, a row of them for each row, shape (n, width); `item` is at fault where they are none."""
+    """Different atoms, a row of them for each row, shape (n, width); `item` is at fault where they are none.
+
+    Of rows of one atom a list of atoms is taken, too.
+    """
     table = atom_array(atoms, name, item)
     if table.size == 0:
         return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
     if not np.issubdtype(table.dtype, np.integer):
         remedy = "; of a mask give np.flatnonzero(mask)" if table.dtype == bool else ""
         raise InputError(f"{name}: atom indices must be integers, not {table.dtype}{remedy}", item=item)
-    table = np.atleast_2d(table.astype(np.int64))
+    table = table.astype(np.int64)
+    table = table.reshape(-1, 1) if width == 1 and table.ndim < 2 else np.atleast_2d(table)
     if table.ndim != 2:
         raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item=item)
     if width is not None and table.shape[1] != width:
-        raise InputError(
-            f"{name}: a row has {width} atom{'s' if width > 1 else ''}, but atoms has shape {np.shape(atoms)}",
-            item=item,
-        )
+        wanted = f"a row has {width} atom{'s' if width > 1 else ''}"
+        raise InputError(f"{name}: {wanted}, but atoms has shape {np.shape(atoms)}", item=item)
     if table.min() < 0:
         row, slot = np.argwhere(table < 0)[0]
-        raise InputError(
-            f"{name}: row {row} has the negative atom index {table[row, slot]}; count atoms from 0",
-            item=item,
-            atoms=table[row],
-        )
-    if table.shape[1] > 1:
-        ordered = np.sort(table, axis=1)
-        repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
-        if repeated.any():
-            row = int(np.argmax(repeated))
-            raise InputError(
-                f"{name}: row {row} names an atom twice: {tuple(table[row].tolist())}", item=item, atoms=table[row]
-            )
+        words = f"row {row} has the negative atom index {table[row, slot]}; count atoms from 0"
+        raise InputError(f"{name}: {words}", item=item, atoms=table[row])
+    ordered = np.sort(table, axis=1)
+    repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+    if repeated.any():
+        row = int(np.argmax(repeated))
+        words = f"row {row} names an atom twice: {tuple(table[row].tolist())}"
+        raise InputError(f"{name}: {words}", item=item, atoms=table[row])
     return table
 
 
@@ -199,9 +192,7 @@ def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str =
     `item` is what it is called in messages, `hint` ends their sentence.
     """
     if not callable(function) and (needed or function is not None):
-        raise InputError(
-            f"{item} is {function!r:.120}; give a function of {', '.join(arguments)}", item=item.rpartition(": ")[2]
-        )
+        raise InputError(f"{item} is {function!r:.120}; give a function of {', '.join(arguments)}", item=item)
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # no function, or one that does not say what it takes
@@ -209,10 +200,8 @@ def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str =
     try:
         signature.bind(*arguments)
     except TypeError:
-        raise InputError(
-            f"{item} takes {signature}, but is called with ({', '.join(arguments)}){hint}",
-            item=item.rpartition(": ")[2],
-        ) from None
+        called = f"{item} takes {signature}, but is called with ({', '.join(arguments)}){hint}"
+        raise InputError(called, item=item) from None
 
 
 def finite_number(value: Any, item: str) -> float:
@@ -222,7 +211,7 @@ def finite_number(value: Any, item: str) -> float:
     refuse_units(value, item)
     found = _float(value)
     if not math.isfinite(found):
-        raise InputError(f"{item} is {_value_text(value)}; give a finite number", item=item.rpartition(": ")[2])
+        raise InputError(f"{item} is {_value_text(value)}; give a finite number", item=item)
     return found
 
 
@@ -246,21 +235,18 @@ def all_positive(values: ArrayLike, item: str) -> FloatArray:
     """Numbers above zero, infinite ones included, as an array of any shape."""
     array = as_float_array(values, item)
     if not np.all(array > 0):
-        raise InputError(
-            f"{item} {array[~(array > 0)].flat[0]:g} is not positive; give numbers above zero",
-            item=item.rpartition(": ")[2],
-        )
+        raise InputError(f"{item} {array[~(array > 0)].flat[0]:g} is not positive; give numbers above zero", item=item)
     return array
 
 
 def unit(vectors: ArrayLike, item: str) -> FloatArray:
     """Vectors of length 1 along the given ones, shape (..., 3)."""
-    array, name = as_float_array(vectors, item), item.rpartition(": ")[2]
+    array = as_float_array(vectors, item)
     if array.ndim == 0 or array.shape[-1] != 3:
-        raise InputError(f"{item} must be vectors of three numbers; its shape is {array.shape}", item=name)
+        raise InputError(f"{item} must be vectors of three numbers; its shape is {array.shape}", item=item)
     length = np.sqrt(np.einsum("...i,...i->...", array, array))
     if not np.all(np.isfinite(length) & (length > 0)):
-        raise InputError(f"{item} has a vector that is zero or not finite; give a direction", item=name)
+        raise InputError(f"{item} has a vector that is zero or not finite; give a direction", item=item)
     return array / length[..., None]
 
 
@@ -281,7 +267,7 @@ def _number_rule(good: Callable[[float], bool], words: str) -> Callable[[Any, st
     def rule(value: Any, item: str) -> float:
         number = math.nan if isinstance(value, bool) else _float(value)
         if not (math.isfinite(number) and good(number)):
-            raise InputError(f"{item} is {_value_text(value)}; give a {words}", item=item.rpartition(": ")[2])
+            raise InputError(f"{item} is {_value_text(value)}; give a {words}", item=item)
         return number
 
     return rule
@@ -404,11 +390,9 @@ def quantity_text(values: Any) -> str:
 def refuse_units(values: Any, item: str) -> None:
     """Refuse Quantities where nobody knows which units the other numbers are in."""
     if has_units(values):
-        raise InputError(
-            f"{item} has units ({quantity_text(values)}), and only kcons.openmm knows what the other numbers are in; "
-            "give plain numbers in the units of the run (nm and ps in OpenMM)",
-            item=item,
-        )
+        unknown = "and only kcons.openmm knows what the other numbers are in"
+        remedy = "give plain numbers in the units of the run (nm and ps in OpenMM)"
+        raise InputError(f"{item} has units ({quantity_text(values)}), {unknown}; {remedy}", item=item)
 
 
 # -- arguments looked at by what their annotations say ----------------------------------------------

@@ -5,15 +5,15 @@ They depend on the masses, which the constraint set supplies.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy import sqrt
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import FloatArray, atom_array, whole_number
-from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.arguments import FloatArray, atom_array, refuse_other, whole_number
+from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import Target
 from kcons.errors import InputError
@@ -41,13 +41,11 @@ class MassWeighted(Constraint, base=True):
     def parameters(self) -> FloatArray:
         return np.hstack([np.full((self.n_rows, 1), float(self.width)), self.weights()])
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
         with np.errstate(invalid="ignore"):
-            weightless = np.asarray(np.isnan(self.weights()).any(axis=1))
-        self.refuse(
-            weightless, first_row, lambda k: "all atoms of a group have mass 0; give one of them a mass", "masses"
-        )
-        super().check(r, time, first_row)
+            weightless = np.isnan(self.weights()).any(axis=1)
+        yield weightless, lambda k: "all atoms of a group have mass 0; give one of them a mass", "masses"
+        yield from super().faults(r, time)
 
 
 class CenterOfMass(MassWeighted, LinearRows):
@@ -166,6 +164,9 @@ class RadiusOfGyration(MassWeighted):
     def __init__(self, atoms: ArrayLike, target: Target = None, *, mass_weighted: bool = True) -> None:
         self.mass_weighted = bool(mass_weighted)
         super().__init__(atoms, target)
+
+    def _settle(self) -> None:
+        refuse_other(self.mass_weighted, bool, "RadiusOfGyration: mass_weighted", "True or False")
 
     def weights(self) -> FloatArray:
         return super().weights() if self.mass_weighted else _shares(np.ones(self.atoms.shape))

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +33,7 @@ from kcons.constraints.arguments import (
     check_range,
     checked,
     read_only,
+    rules_of,
     without_units,
 )
 from kcons.constraints.compilation import has_a_file, njit
@@ -40,6 +41,8 @@ from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.errors import ConstraintError, InputError, SingularGeometryError, UnsupportedError
 
 IntArray = NDArray[np.int64]
+#: Rows that are marked, what is said of row k, and the argument at fault, if one is.
+Fault: TypeAlias = tuple[Any, ...]
 #: A step along which derivatives are imaginary parts: its square vanishes beside 1, and a power of two does not round.
 _COMPLEX_STEP = 2.0**-100
 
@@ -301,22 +304,18 @@ class Constraint:
 
         `first_row` is the number of this object's first row in its set, for messages.
         """
+        for bad, say, *item in self.faults(r, time):
+            self.refuse(bad, first_row, say, *item)
+
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
+        """What `check` refuses."""
         with np.errstate(all="ignore"):
             value, slope = self.value_and_gradient(r, time)
             size = np.sqrt(np.einsum("kai,kai->k", slope, slope))
-        bad = ~(np.isfinite(value) & np.isfinite(size) & (size > 0))
-        self.refuse(bad, first_row, lambda k: self.undefined(k, r[k], time))
+        yield ~(np.isfinite(value) & np.isfinite(size) & (size > 0)), lambda k: self.undefined(k, r[k], time)
         if self.positive and self.target is not None:
-            length = self.target_at(time)
-            self.refuse(
-                ~(length > 0),
-                first_row,
-                lambda k: (
-                    f"{self.positive} {length[k]:g} is not positive; give a length greater than zero, or None to hold "
-                    "the present one"
-                ),
-                self.positive,
-            )
+            length, remedy = self.target_at(time), "give a length greater than zero, or None to hold the present one"
+            yield ~(length > 0), lambda k: f"{self.positive} {length[k]:g} is not positive; {remedy}", self.positive
 
     def undefined(self, k: int, r: FloatArray, time: float) -> str:
         """What is said of row `k`, which has no gradient at `r`, shape (width, 3)."""
@@ -387,7 +386,12 @@ class Constraint:
             name: read_only(array[rows]) for name, array in data.items() if isinstance(array, np.ndarray)
         }
         if isinstance(self.target, MovingTarget):
-            own["target"] = _selected(self.target, rows, self.n_rows, self.period)
+            target, n, period = self.target, self.n_rows, self.period
+            own["target"] = MovingTarget(
+                value=lambda t: target.at(t, n)[rows],
+                rate=lambda t: target.rate_at(t, n, period)[rows],
+                acceleration=lambda t: target.acceleration_at(t, n, period)[rows],
+            )
         return self.changed(**own)
 
     def renumbered(self, new_index: IntArray) -> Self:
@@ -444,9 +448,14 @@ class Constraint:
 
     @classmethod
     def _rebuilt(cls, data: Mapping[str, Any]) -> Self:
-        item = object.__new__(cls)
+        item, rules = object.__new__(cls), rules_of(cls.__init__)
         for name in cls.shared:
             setattr(item, name, data[name])
+        for name in cls.per_row.keys() & rules.keys():
+            for rule in rules[name].rules:  # of directions too, which have length 1 where they are written
+                taken = rule(data[name], f"{cls.family}: {name}")
+                if np.abs(taken - np.asarray(data[name])).max(initial=0.0) > 1e-10:
+                    raise InputError(f"{cls.family} cannot be read: {name} has vectors not of length 1", item=name)
         Constraint.__init__(item, data["atoms"], data["target"], **{name: data[name] for name in cls.per_row})
         return item
 
@@ -458,14 +467,6 @@ class Constraint:
 @functools.cache
 def _compiled(row: Callable[[Any, Any, Any, Any], None]) -> Any:
     return njit(cache=has_a_file(row), error_model="numpy")(row)
-
-
-def _selected(target: MovingTarget, rows: IntArray, n_rows: int, period: float | None) -> MovingTarget:
-    return MovingTarget(
-        value=lambda t: target.at(t, n_rows)[rows],
-        rate=lambda t: target.rate_at(t, n_rows, period)[rows],
-        acceleration=lambda t: target.acceleration_at(t, n_rows, period)[rows],
-    )
 
 
 def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:

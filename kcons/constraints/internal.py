@@ -5,7 +5,7 @@ All depend on differences of positions alone, so minimum images apply in periodi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy import arctan2, sqrt
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import ANGLE, as_float_array, atom_array, read_only
-from kcons.constraints.constraint import Constraint, IntArray, RowKind
+from kcons.constraints.constraint import Constraint, Fault, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, norm
 from kcons.errors import InputError
@@ -26,7 +26,28 @@ COLLINEAR = 1e-7
 MOST_TURNED = 6 * np.pi
 
 
-class Distance(Constraint):
+class Internal(Constraint, base=True):
+    """Rows whose gradient is undefined where two atoms of a pair lie at one point."""
+
+    translation_invariant = True
+
+    @property
+    def pairs(self) -> IntArray:
+        """The pairs of each row, shape (n_rows, n_pairs, 2): neighbors in its list of atoms."""
+        return self.linked
+
+    def coincident(self, k: int, r: FloatArray) -> str:
+        """What is said of two atoms of row `k` at one point; nothing where there are none."""
+        for i, j in self.pairs[k]:
+            if norm(r[self.atoms[k] == i] - r[self.atoms[k] == j]) == 0:
+                return f"atoms {i} and {j} coincide: gradient undefined; move them apart"
+        return ""
+
+    def undefined(self, k: int, r: FloatArray, time: float) -> str:
+        return self.coincident(k, r) or super().undefined(k, r, time)
+
+
+class Distance(Internal):
     """Length of the vector between two atoms, q = |r_0 - r_1|.
 
     Parameters
@@ -47,20 +68,10 @@ class Distance(Constraint):
     positive = "target"
     row_width = 2
     reversible = True
-    translation_invariant = True
     kind = RowKind.DISTANCE
 
     def __init__(self, pairs: ArrayLike, target: Target = None) -> None:
         super().__init__(pairs, target)
-
-    @property
-    def pairs(self) -> IntArray:
-        """The one pair of each row, shape (n_rows, 1, 2)."""
-        return self.atoms[:, None]
-
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        _refuse_coincident(self, r, first_row, [(0, 1)])
-        super().check(r, time, first_row)
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
@@ -71,7 +82,7 @@ class Distance(Constraint):
         out[4], out[5], out[6] = -x, -y, -z
 
 
-class DistanceDifference(Constraint):
+class DistanceDifference(Internal):
     """Difference of two distances, or any sum of distances with weights, q = sum_k w_k |r_i - r_j| over pairs (i, j).
 
     The coordinate of a proton that goes from one atom to another, |D - H| - |H - A|; ``bondcombos`` of ASE's
@@ -94,7 +105,6 @@ class DistanceDifference(Constraint):
     array([-0.5])
     """
 
-    translation_invariant = True
     singular = "its gradient vanishes: its atoms lie on a line; bend them, or hold a distance"
     shared = ("slots", "weights")
     #: Which atoms of a row are the pairs, and the weight of each pair.
@@ -179,11 +189,10 @@ class DistanceDifference(Constraint):
             row += [i, j, w]
         return np.tile(row, (self.n_rows, 1))
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        _refuse_coincident(self, r, first_row, self.slots)
-        super().check(r, time, first_row)
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
+        yield from super().faults(r, time)
         size = np.linalg.norm(self.gradient(r, time), axis=(1, 2))
-        self.refuse(size < COLLINEAR * np.abs(self.weights).max(), first_row, lambda k: self.singular)
+        yield size < COLLINEAR * np.abs(self.weights).max(), lambda k: self.singular
 
 
 def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], list[tuple[int, int]]]:
@@ -222,7 +231,7 @@ def angle_between(ux: Any, uy: Any, uz: Any, wx: Any, wy: Any, wz: Any) -> tuple
     return value, fu * ax, fu * ay, fu * az, fw * bx, fw * by, fw * bz
 
 
-class Angle(Constraint):
+class Angle(Internal):
     """Angle at the middle atom, q = atan2(|u x w|, u.w), u = r_0 - r_1, w = r_2 - r_1, in radian.
 
     Its gradient stays of order one up to 180 degrees, where that of cos q vanishes (2.449 for unit arms).
@@ -238,7 +247,6 @@ class Angle(Constraint):
     row_width = 3
     reversible = True
     held = ANGLE
-    translation_invariant = True
     kind = RowKind.ANGLE
 
     def __init__(self, triples: ArrayLike, target: Target = None) -> None:
@@ -253,33 +261,28 @@ class Angle(Constraint):
         out[4], out[5], out[6] = -ax - bx, -ay - by, -az - bz
         out[7], out[8], out[9] = bx, by, bz
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        _refuse_coincident(self, r, first_row, [(0, 1), (1, 2)])
-        self._refuse_straight(self.measure(r, time), "is", first_row)
-        if self.target is None:
-            return
-        target = self.target_at(time)
-        self.refuse(
-            (target < -COLLINEAR) | (target > np.pi + COLLINEAR),
-            first_row,
-            lambda k: f"target {target[k]:g} is no angle between 0 and pi; targets are in radian",
-            "target",
-        )
-        self._refuse_straight(target, "has the target", first_row)
+    def undefined(self, k: int, r: FloatArray, time: float) -> str:
+        return self.coincident(k, r) or self._straight(self.measure(r[None], time)[0])
 
-    def _refuse_straight(self, angle: FloatArray, verb: str, first_row: int) -> None:
-        degrees = np.degrees(angle)
-        self.refuse(
-            np.sin(angle) < COLLINEAR,
-            first_row,
-            lambda k: (
-                f"angle constraint singular at {degrees[k]:.0f} deg, use a linear constraint (LinearRelation with the "
-                f"end atoms as bases at 180 deg), or distances: it {verb} {degrees[k]:.9g} deg"
-            ),
+    @staticmethod
+    def _straight(angle: Any, verb: str = "is") -> str:
+        return (
+            f"angle constraint singular at {np.degrees(angle):.0f} deg, use a linear constraint (LinearRelation with "
+            f"the end atoms as bases at 180 deg), or distances: it {verb} {np.degrees(angle):.9g} deg"
         )
 
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
+        yield from super().faults(r, time)
+        angle = self.measure(r, time)
+        yield np.sin(angle) < COLLINEAR, lambda k: self._straight(angle[k])
+        if self.target is not None:
+            target, words = self.target_at(time), "is no angle between 0 and pi; targets are in radian"
+            outside = (target < -COLLINEAR) | (target > np.pi + COLLINEAR)
+            yield outside, lambda k: f"target {target[k]:g} {words}", "target"
+            yield np.sin(target) < COLLINEAR, lambda k: self._straight(target[k], "has the target")
 
-class Dihedral(Constraint):
+
+class Dihedral(Internal):
     """Dihedral angle of four atoms in radian, IUPAC sign, smooth through +-180 degrees.
 
     Parameters
@@ -297,7 +300,6 @@ class Dihedral(Constraint):
     row_width = 4
     reversible = True
     held = ANGLE
-    translation_invariant = True
     period = 2 * np.pi
 
     def __init__(self, quads: ArrayLike, target: Target = None) -> None:
@@ -325,36 +327,18 @@ class Dihedral(Constraint):
         out[7], out[8], out[9] = -tx - gb * bx, -ty - gb * by, -tz - gb * bz
         out[10], out[11], out[12] = gb * bx, gb * by, gb * bz
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        _refuse_coincident(self, r, first_row, [(0, 1), (1, 2), (2, 3)])
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
         if self.target is not None and not self.moving:
             target = self.target_at(time)
-            self.refuse(
-                np.abs(target) > MOST_TURNED,
-                first_row,
-                lambda k: f"target {target[k]:g} is over three turns, and in radian; give np.radians({target[k]:g})",
-                "target",
-            )
+            words = "is over three turns, and in radian; give np.radians"
+            yield np.abs(target) > MOST_TURNED, lambda k: f"target {target[k]:g} {words}({target[k]:g})", "target"
         legs = np.diff(r, axis=1)
         sizes = norm(cross(legs[:, :-1], legs[:, 1:])), norm(legs)
-        for first in (0, 1):
-            self.refuse(
-                sizes[0][:, first] < COLLINEAR * sizes[1][:, first] * sizes[1][:, first + 1],
-                first_row,
-                lambda k, first=first: (  # type: ignore[misc]
-                    f"dihedral constraint singular: atoms {', '.join(map(str, self.atoms[k, first : first + 3]))} are "
-                    "collinear; bend them, or hold a dihedral of other atoms"
-                ),
-            )
+        straight = sizes[0] <= COLLINEAR * sizes[1][:, :-1] * sizes[1][:, 1:]
+        yield straight.any(axis=1), lambda k: self._straight(k, r[k], int(np.argmax(straight[k])))
 
-
-def _refuse_coincident(item: Constraint, r: FloatArray, first_row: int, slots: Sequence[tuple[int, int]]) -> None:
-    """Two atoms at one point leave a direction undefined."""
-    for i, j in slots:
-        item.refuse(
-            norm(r[:, i] - r[:, j]) == 0,
-            first_row,
-            lambda k, i=i, j=j: (  # type: ignore[misc]
-                f"atoms {item.atoms[k, i]} and {item.atoms[k, j]} coincide: gradient undefined; move them apart"
-            ),
+    def _straight(self, k: int, r: FloatArray, first: int) -> str:
+        atoms = ", ".join(map(str, self.atoms[k, first : first + 3]))
+        return self.coincident(k, r) or (
+            f"dihedral constraint singular: atoms {atoms} are collinear; bend them, or hold a dihedral of other atoms"
         )

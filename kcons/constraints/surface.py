@@ -7,7 +7,7 @@ taken from the positions as they are: surfaces are not repeated in periodic cell
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,7 +25,7 @@ from kcons.constraints.arguments import (
     read_only,
     unit,
 )
-from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import Target
 from kcons.errors import InputError
@@ -40,9 +40,6 @@ class Surface(Constraint, base=True):
 
     row_width = 1
     positive = "radius"
-
-    def __init__(self, atoms: ArrayLike, target: Target, **data: ArrayLike) -> None:
-        Constraint.__init__(self, atom_column(atoms, self.family), target, **data)
 
 
 class Sphere(Surface):
@@ -135,18 +132,10 @@ class Torus(Surface):
         atoms: ArrayLike,
         center: Lengths,
         axis: Directions,
-        major_radius: Lengths,
+        major_radius: PositiveLengths,
         minor_radius: Target = None,
     ) -> None:
         super().__init__(atoms, minor_radius, center=center, axis=axis, major_radius=major_radius)
-
-    def _settle(self) -> None:
-        self.refuse(
-            ~(self.major_radius > 0),
-            0,
-            lambda k: f"major_radius {self.major_radius[k]:g} is not positive",
-            "major_radius",
-        )
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
@@ -244,17 +233,11 @@ class Ellipsoid(Surface):
         logs = np.log(np.where(finite, self.inverse_axes, 1.0)).sum(axis=1)
         return np.asarray(np.exp(-logs / finite.sum(axis=1)))
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        super().check(r, time, first_row)
-        if self.target is None:
-            return
-        target = self.target_at(time)
-        self.refuse(
-            ~(target > -self.scale()),
-            first_row,
-            lambda k: f"target {target[k]:g} lies beyond the center of the ellipsoid; use 0 for its surface",
-            "target",
-        )
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
+        yield from super().faults(r, time)
+        if self.target is not None:
+            target, words = self.target_at(time), "lies beyond the center of the ellipsoid; use 0 for its surface"
+            yield ~(target > -self.scale()), lambda k: f"target {target[k]:g} {words}", "target"
 
 
 class Plane(LinearRows):
@@ -281,7 +264,7 @@ class Plane(LinearRows):
         if offset is not None and point is not None:
             raise InputError("Plane: give either offset or point, not both", item="point")
         n = np.asarray(normal)
-        super().__init__(atom_column(atoms, self.family), offset, coefficients=n if n.ndim == 1 else n[:, None])
+        super().__init__(atoms, offset, coefficients=n if n.ndim == 1 else n[:, None])
         if point is not None:
             self.target = _held(self, point)
 

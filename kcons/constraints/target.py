@@ -40,12 +40,9 @@ class MovingTarget:
     time_step: float = 0.02
 
     def __post_init__(self) -> None:
-        for name, function in (
-            ("", self.value),
-            ("rate of the ", self.rate),
-            ("acceleration of the ", self.acceleration),
-        ):
-            check_call(f"the {name}target", function, ("t",))
+        for name in ("value", "rate", "acceleration"):
+            of = "" if name == "value" else f"{name} of the "
+            check_call(f"the {of}target", getattr(self, name), ("t",))
         positive(self.time_step, "the time_step of the target")
 
     def at(self, time: float, rows: int) -> FloatArray:

@@ -6,7 +6,7 @@ a . acceleration = d target/dt - v . da/dt (notes, eqs. 82 and 92).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy import sqrt
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import SPEED, Directions, FloatArray, PositiveLengths, atom_array, unit
-from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.target import Target
 from kcons.constraints.vectors import dot, norm
 from kcons.errors import InputError
@@ -102,6 +102,7 @@ class KnifeEdge(VelocityRows):
 
     row_width = 2
     translation_invariant = True
+    singular = "the blade is normal to its plane, so its direction is undefined; move the atoms"
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"normal": _VECTOR, "contact": ()}
     normal: FloatArray
 
@@ -133,13 +134,9 @@ class KnifeEdge(VelocityRows):
         out[1], out[2], out[3] = f * lx, f * ly, f * lz
         out[4], out[5], out[6] = g * lx, g * ly, g * lz
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
         d = r[:, 1] - r[:, 0]
-        self.refuse(
-            ~(norm(np.cross(d, self.normal)) > 1e-7 * norm(d)),
-            first_row,
-            lambda k: "the blade is normal to its plane, so its direction is undefined; move the atoms",
-        )
+        yield ~(norm(np.cross(d, self.normal)) > 1e-7 * norm(d)), lambda k: self.singular
 
 
 class Rolling(VelocityRows):
@@ -170,6 +167,7 @@ class Rolling(VelocityRows):
 
     row_width = 2
     translation_invariant = True
+    singular = "the rim atom lies on the axle of the wheel, so its direction is undefined; move the atoms"
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"radius": (), "heading": _VECTOR, "normal": _VECTOR}
     heading: FloatArray
     normal: FloatArray
@@ -207,13 +205,9 @@ class Rolling(VelocityRows):
         out[1], out[2], out[3] = p[1] + x, p[2] + y, p[3] + z
         out[4], out[5], out[6] = -x, -y, -z
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
         s = r[:, 1] - r[:, 0]
-        self.refuse(
-            ~(np.hypot(dot(s, self.normal), dot(s, self.heading)) > 1e-7 * norm(s)),
-            first_row,
-            lambda k: "the rim atom lies on the axle of the wheel, so its direction is undefined; move the atoms",
-        )
+        yield ~(np.hypot(dot(s, self.normal), dot(s, self.heading)) > 1e-7 * norm(s)), lambda k: self.singular
 
 
 def _pairs(first: ArrayLike, second: ArrayLike, family: str) -> ArrayLike:

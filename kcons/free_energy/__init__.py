@@ -1,9 +1,8 @@
 """Free energies along held coordinates, and relaxed scans.
 
-- `torsion_force`: torsions turned as rigid groups
-- `held_coordinates`, `series`: multipliers and Z by name, and samples of them
+- `held_coordinates`: multipliers and Z by name; torsions turned as rigid groups
 - `averages`: means of correlated samples with weights
-- `mean_forces`: the mean force of one window
+- `series`: samples of held coordinates, and the mean force of one window
 - `profiles`: free energies from mean forces, and where to sample next
 - `windows`: recording in runs of ASE and OpenMM, and many windows by any executor
 - `scans`: relaxed scans
@@ -17,19 +16,15 @@ from kcons.errors import with_extra
 #: Public names by the module that has them, which is imported when one is asked for.
 _NAMES = {
     "held_coordinates": ("HeldCoordinates", "Sample"),
-    "series": ("Recorder", "Series"),
-    "mean_forces": ("MeanForce", "mean_force"),
-    "windows.window": ("Settings", "Window"),
+    "series": ("MeanForce", "Recorder", "Series", "mean_force"),
     "windows.ase_windows": ("AseRecorder", "AseWindows"),
     "windows.openmm_windows": ("HeldCoordinatesReporter", "OpenMMWindows"),
-    "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
+    "windows.driver": ("FreeEnergy", "Settings", "Window", "WindowResult", "Windows"),
     "windows.input_file": ("InputFile", "read_input"),
     "averages": ("Mean", "weighted_mean"),
-    "profiles.profile": ("Profile", "integrate", "plot_profile"),
-    "profiles.mean_force_surface": ("Surface", "fit_surface"),
+    "profiles.profile": ("Profile", "Surface", "fit_surface", "integrate", "plot_profile"),
     "profiles.pulls": ("Pulled", "pull_free_energy"),
-    "scans.relaxed_scan": ("scan",),
-    "scans.scan_result": ("Scan",),
+    "scans.relaxed_scan": ("Scan", "scan"),
     "scans.system_calculator": ("SystemCalculator",),
 }
 

@@ -79,8 +79,24 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
     UserWarning
         Fewer than 10 independent samples; a quantity that never changes, whose error is then 0.
     """
-    series, factors = _checked(values, weights)
+    series = finite(values, "values")
+    series = series[:, None] if series.ndim == 1 else series
+    if series.ndim != 2 or len(series) < MIN_SAMPLES or not series.shape[1]:
+        raise InputError(
+            f"values of shape {series.shape} are too few for an error; give (n, d) with n of {MIN_SAMPLES} or more",
+            item="values",
+        )
     n = len(series)
+    factors = np.ones(n) if weights is None else finite(weights, "weights")
+    if factors.shape != (n,) or (factors < 0).any() or not factors.any():
+        raise InputError(f"weights must have shape {(n,)}, not be negative, and one be positive", item="weights")
+    factors = factors / factors.max()
+    if factors.sum() <= 1 + 1e-12:
+        raise InputError(
+            f"sample {int(np.argmax(factors))} has all of the weight, and one sample has no error; sample longer",
+            item="weights",
+        )
+    factors /= factors.mean()
     value = factors @ series / n
     # What the ratio sum w f/sum w fluctuates by, sample by sample: its mean is 0.
     fluctuation = factors[:, None] * (series - value)
@@ -130,26 +146,3 @@ def agreement(one: FloatArray, other: FloatArray, covariance: FloatArray) -> flo
         return 0.0
     count = int(known.sum())
     return float(chi2.sf((parts[known] ** 2 / sizes[known]).sum(), count)) if count else 1.0
-
-
-def _checked(values: ArrayLike, weights: ArrayLike | None) -> tuple[FloatArray, FloatArray]:
-    """Values (n, d) and weights (n,) whose mean is about 1."""
-    series = finite(values, "values")
-    series = series[:, None] if series.ndim == 1 else series
-    if series.ndim != 2 or len(series) < MIN_SAMPLES or not series.shape[1]:
-        raise InputError(
-            f"values of shape {series.shape} are too few for an error; give (n, d) with n of {MIN_SAMPLES} or more",
-            item="values",
-        )
-    factors = np.ones(len(series)) if weights is None else finite(weights, "weights")
-    if factors.shape != (len(series),):
-        raise InputError(f"weights must have shape {(len(series),)}, not {factors.shape}", item="weights")
-    if (factors < 0).any() or not factors.any():
-        raise InputError("weights must not be negative, and one of them must be positive", item="weights")
-    factors = factors / factors.max()
-    if factors.sum() <= (1 + 1e-12) * factors.max():
-        raise InputError(
-            f"sample {int(np.argmax(factors))} has all of the weight, and one sample has no error; sample longer",
-            item="weights",
-        )
-    return series, factors / factors.mean()

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints.arguments import as_array
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet, rows_like
+from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray, nearest_image
+from kcons.constraints.vectors import cross, dot, norm
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
-from kcons.free_energy.torsion_force import RigidTurn, leaves_the_rest, rigid_turn
 from kcons.motion.motion import Motion
 
 #: A coordinate of which the other constraints leave less than this share of its Z depends on them.
@@ -235,12 +239,11 @@ class HeldCoordinates:
             item, atom = _ITEMS[which], int(self.atoms[first])
             raise NonFiniteError(f"{item} of atom {atom} are not finite at time {times[k]:g}", item=item, atom=atom)
         gathered = self._gathered(here)
-        metric = self._at(gathered, time)
-        along, respond = metric.directions, metric.respond
+        log_det_z, respond, shares, along, of_rows = self._at(gathered, time)
         pairs = [along[:, s] + sign * along[:, j] for s in range(d) for j in range(s) for sign in (1, -1)]
         fields = np.stack([speed.reshape(n, -1), *along.swapaxes(0, 1), *pairs], axis=1)
         if self._averages:
-            fields = np.concatenate([fields, metric.fields], axis=1)
+            fields = np.concatenate([fields, of_rows], axis=1)
         bent, traces = self._curvatures(gathered, fields, time)
         rest, driven = np.zeros((n, len(order))), -bent[:, 0]
         if rows.moving:
@@ -259,8 +262,8 @@ class HeldCoordinates:
         for k, turn in enumerate(self._turns):
             if turn is not None:
                 turned[:, k] = turn.force(whole[0], whole[2])
-        gradient = self._change_of_z(bent[:, 1 : 1 + d * d] @ metric.shares.swapaxes(1, 2))
-        columns = (value, moving, moving - still, metric.log_det_z.tolist(), gradient, off.tolist(), turned, mean)
+        gradient = self._change_of_z(bent[:, 1 : 1 + d * d] @ shares.swapaxes(1, 2))
+        columns = (value, moving, moving - still, log_det_z.tolist(), gradient, off.tolist(), turned, mean)
         return [Sample(*each) for each in zip(times, *columns, strict=True)]
 
     # -- pieces, on the atoms of the clusters ---------------------------------------------------
@@ -277,8 +280,13 @@ class HeldCoordinates:
         self._rows.lattice = self._source.lattice
         return [np.stack([self._rows.gather(item, y) for y in x]) for item in self._rows.constraints]
 
-    def _at(self, gathered: Sequence[FloatArray], time: float) -> _Metric:
-        """Z and all that follows from the gradients; raises where a coordinate depends on other constraints."""
+    def _at(self, gathered: Sequence[FloatArray], time: float) -> tuple[FloatArray, ...]:
+        """Z and all that follows from the gradients; raises where a coordinate depends on other constraints.
+
+        Of n configurations, d coordinates among r rows on a atoms: ln det Z; rows of (A M^-1 A^T)^-1, (n, d, r); the
+        share of each row in a coordinate's gradient that the others have answered, (n, d, r); directions, (n, d, 3 a);
+        fields, whose squares are what the rows take from M^-1, (n, r, 3 a).
+        """
         d, n = len(self), len(gathered[0])
         table = np.zeros((n, len(self._order), len(self.atoms), 3))
         for k, (item, r) in enumerate(zip(self._rows.constraints, gathered, strict=True)):
@@ -303,7 +311,7 @@ class HeldCoordinates:
         if left[worst, 0] < DEPENDENT:
             self._refuse(np.flatnonzero(np.abs(mixture[worst, :, 0]) > 0.1).tolist())
         log_det_z = np.log(left).sum(axis=1) + 2 * np.log(own).sum(axis=1)
-        return _Metric(log_det_z, respond, z @ respond, respond @ weighed, root @ weighed)
+        return log_det_z, respond, z @ respond, respond @ weighed, root @ weighed
 
     def _refuse(self, dependent: list[int]) -> None:
         if dependent:
@@ -345,21 +353,6 @@ class HeldCoordinates:
         return result
 
 
-class _Metric(NamedTuple):
-    """At n configurations, for d coordinates among r rows on a atoms.
-
-    `respond` (n, d, r), rows of (A M^-1 A^T)^-1; `shares` (n, d, r), of each row in a coordinate's gradient that the
-    other rows have answered; `directions` (n, d, 3 a); `fields` (n, r, 3 a), whose squares are what the rows take from
-    M^-1.
-    """
-
-    log_det_z: FloatArray
-    respond: FloatArray
-    shares: FloatArray
-    directions: FloatArray
-    fields: FloatArray
-
-
 def _root(product: FloatArray) -> tuple[FloatArray, FloatArray]:
     """W with W^T W the (pseudo)inverse of matrices with a diagonal of 1; how much of each row depends on others."""
     with suppress(np.linalg.LinAlgError):
@@ -370,3 +363,111 @@ def _root(product: FloatArray) -> tuple[FloatArray, FloatArray]:
     known = sizes > _NONE * sizes[:, -1:]
     inverse = np.where(known, 1 / np.sqrt(np.where(known, sizes, 1.0)), 0.0)
     return (axes * inverse[:, None]).swapaxes(1, 2), (axes**2 * ~known[:, None]).sum(axis=2)
+
+
+#: A trial turn in radian, what it may change of other rows, and by which factor a bond may change before it is broken.
+_TRIAL, _SAME, _BROKEN = 0.3, 1e-8, 1.5
+
+
+class RigidTurn(NamedTuple):
+    """All atoms beyond the middle bond of a torsion, turned about it.
+
+    Such a turn changes no bond and no angle, and has no divergence, so that dF/dphi is the weighted mean of the torque
+    against it (Ciccotti, Lelievre and Vanden-Eijnden, Commun. Pure Appl. Math. 61, 371, 2008, for any such field).
+    """
+
+    #: Two atoms: a turn about the line from the first to the second by a positive angle makes the torsion larger.
+    axis: IntArray
+    #: The atoms that move.
+    group: IntArray
+    #: Those of the group, to the axis and of the axis, shape (b, 2), and their lengths.
+    bonds: IntArray
+    lengths: FloatArray
+
+    def turned(self, x: FloatArray, angle: float) -> FloatArray:
+        """Positions with the group turned, shape (n_atoms, 3)."""
+        e = self._direction(x)
+        r = x[self.group] - x[self.axis[1]]
+        result = x.copy()
+        result[self.group] += np.sin(angle) * cross(e, r) + (1 - np.cos(angle)) * (np.outer(r @ e, e) - r)
+        return result
+
+    def force(self, x: FloatArray, f: FloatArray) -> FloatArray:
+        """dU/dphi of the turn, of one or several configurations; NaN where a bond of the group is broken, by a box for
+        example."""
+        i, j = self.bonds.T
+        broken = (((x[..., i, :] - x[..., j, :]) ** 2).sum(axis=-1) > (_BROKEN * self.lengths) ** 2).any(axis=-1)
+        arms = x[..., self.group, :] - x[..., self.axis[1:], :]
+        torque = cross(arms, f[..., self.group, :]).sum(axis=-2)
+        return np.where(broken, np.nan, -dot(self._direction(x), torque))
+
+    def _direction(self, x: FloatArray) -> FloatArray:
+        e: FloatArray = x[..., self.axis[1], :] - x[..., self.axis[0], :]
+        return e / norm(e)[..., None]
+
+
+def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray) -> None:
+    """Warn of torsions over atoms that are not bonded: most often the atoms are in another order than the chain.
+
+    Not of improper torsions, where one atom is bonded to the three others, nor of atoms without any bond.
+    """
+    joined, bonded = {frozenset(pair) for pair in bonds.tolist()}, set(bonds.ravel().tolist())
+    for name, item in coordinates.items():
+        for four in item.atoms.tolist() if item.family == "Dihedral" else ():
+            if any(all({hub, other} in joined for other in four if other != hub) for hub in four):
+                continue
+            gaps = [pair for pair in pairwise(four) if {*pair} not in joined and bonded.issuperset(pair)]
+            if gaps:
+                said = ", ".join(f"{a}-{b}" for a, b in gaps) + (" are no bonds" if len(gaps) > 1 else " is no bond")
+                warnings.warn(
+                    f"{name} is a torsion over the atoms {', '.join(map(str, four))}, counted from 0, and {said}; give "
+                    "the atoms in the order in which they are bonded, unless this is what you mean",
+                    UserWarning,
+                    stacklevel=4,
+                )
+
+
+def rigid_turn(
+    coordinate: Constraint, bonds: IntArray, x: FloatArray, lattice: FloatArray | None = None
+) -> RigidTurn | None:
+    """The smaller group of one torsion; None of another coordinate, or where the middle bond is missing or in a ring.
+
+    Bonds have their lengths in the lattice, also where a box has cut them.
+    """
+    if coordinate.family != "Dihedral":
+        return None
+    i, j, k, m = coordinate.atoms[0].tolist()
+    middle = ((bonds == [j, k]) | (bonds == [k, j])).all(axis=1)
+    if not middle.any():
+        return None
+    a, b = bonds[~middle].T
+    part = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(x), len(x))), directed=False)[1]
+    if part[j] == part[k] or part[i] != part[j] or part[m] != part[k]:
+        return None
+    beyond = [(np.flatnonzero(part == part[near]), far, near) for near, far in ((k, j), (j, k))]
+    atoms, far, near = min(beyond, key=lambda side: len(side[0]))
+    own = bonds[middle | (part[bonds[:, 0]] == part[near])]
+    lengths = np.linalg.norm(minimum_image(x[own[:, 0]] - x[own[:, 1]], lattice), axis=1)
+    return RigidTurn(np.array([far, near]), atoms[atoms != near], own, lengths)
+
+
+def leaves_the_rest(
+    turn: RigidTurn, row: int, everything: ConstraintSet, others: IntArray, x: FloatArray, time: float = 0.0
+) -> bool:
+    """Whether a turn changes its coordinate by its angle, no other row of the set, and not det(A M^-1 A^T) of `others`.
+
+    `row` is that of the coordinate in the set, `others` the other rows of the clusters of the coordinates.
+    """
+    there = turn.turned(x, _TRIAL)
+    change = everything.measure(there, time) - everything.measure(x, time)
+    change[row] -= _TRIAL
+    periods = np.concatenate([np.full(c.n_rows, c.period or 0.0) for c in everything.constraints])
+    if not np.abs(nearest_image(change, periods)).max() < _SAME:
+        return False
+    part, atoms = everything.subset(others)
+    before, after = 0.0, 0.0
+    if part.n_rows:
+        root = np.sqrt(np.repeat(part.masses, 3))
+        slopes = (part.jacobian(place[atoms]).toarray() / root for place in (x, there))
+        before, after = (float(np.linalg.slogdet(a @ a.T)[1]) for a in slopes)  # minus infinity of dependent rows
+    return bool(np.isfinite(before) and abs(after - before) < _SAME)

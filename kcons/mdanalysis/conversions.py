@@ -215,12 +215,12 @@ def _of_openmm(
     topology: Any, positions: unit.Quantity, system: openmm.System | None, velocities: unit.Quantity | None, part: Any
 ) -> tuple[Snapshot, list[Constraint]]:
     """A snapshot, and what a System and a part hold, in angstrom."""
+    from kcons.openmm.quantities import held_pairs
     from kcons.openmm.topology import snapshot_of as snapshot_of_topology
 
     rows: list[Constraint] = []
     if system is not None and system.getNumConstraints():
-        held = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-        rows.append(Distance([(i, j) for i, j, _ in held], [length._value for _, _, length in held]))
+        rows.append(Distance(*held_pairs(system)))
     if part is not None:
         rows += part.motion.constraint_set.constraints
     snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)

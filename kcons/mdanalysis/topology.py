@@ -135,7 +135,9 @@ def snapshot_of(universe: Any) -> Snapshot:
     _refuse_alternates(group, described)
     cell = None
     if step.dimensions is not None and np.all(step.dimensions[:3] > NARROWEST):
-        cell = _cell(step)
+        sizes = as_written(np.asarray(step.dimensions))
+        # In double precision; right angles are right.
+        cell = np.diag(sizes[:3]) if np.all(sizes[3:] == 90.0) else triclinic_vectors(sizes, dtype=np.float64)
     velocities = as_written(group.velocities) if step.has_velocities and velocities_known(whole.trajectory) else None
     return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, host_of(whole), group.indices)
 
@@ -184,7 +186,8 @@ def topology_of(universe: Any) -> Topology:
     names = _texts(group, "names" if hasattr(group, "names") else "types")
     residue_names = _texts(heads, "resnames")
     masses = np.asarray(group.masses, dtype=np.float64) if hasattr(group, "masses") else np.zeros(n)
-    measured = hasattr(group, "masses") and not _masses_guessed(whole)
+    attributes = whole._topology.attrs
+    measured = hasattr(group, "masses") and not all(a.is_guessed for a in attributes if a.attrname == "masses")
     elements = np.char.capitalize(np.char.strip(_texts(group, "elements")))
     heavy = elements == "D"
     elements = np.where(heavy, "H", elements)
@@ -195,9 +198,14 @@ def topology_of(universe: Any) -> Topology:
     if hasattr(group, "masses") and not measured:
         # Masses that somebody set later are theirs.
         mended = guessed_masses(masses, names, np.where(heavy, "D", elements))
-        masses = np.where(masses == _first_guess(group), mended, masses)
+        # What MDAnalysis gives by elements or types, whatever the atoms are.
+        kinds = _texts(group, "elements" if hasattr(group, "elements") else "types").tolist()
+        guess = [float(tables.masses.get(k, tables.masses.get(k.upper(), 0.0))) for k in kinds]
+        masses = np.where(masses == guess, mended, masses)
     chains = _texts(heads, "chainIDs" if hasattr(group, "chainIDs") else "segids")
-    bonds = _bonds(whole)
+    # Without the objects that MDAnalysis makes of them.
+    pairs = next((a.values for a in attributes if a.attrname == "bonds"), ())
+    bonds = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     if n != len(whole.atoms) or not np.array_equal(group.indices, np.arange(n)):
         new = np.full(len(whole.atoms), -1, dtype=np.int64)
         new[group.indices] = np.arange(n)
@@ -215,31 +223,6 @@ def topology_of(universe: Any) -> Topology:
         charges=np.asarray(group.charges, dtype=np.float64) if hasattr(group, "charges") else None,
         residues_known=bool((np.char.strip(residue_names) != "").any()),
     )
-
-
-def _cell(step: Any) -> NDArray[np.float64]:
-    """Lattice vectors in double precision; right angles are right."""
-    sizes = as_written(np.asarray(step.dimensions))
-    if np.all(sizes[3:] == 90.0):
-        return np.diag(sizes[:3])
-    return np.asarray(triclinic_vectors(sizes, dtype=np.float64), dtype=np.float64)
-
-
-def _bonds(whole: Any) -> IntArray:
-    """All bonds of a Universe, without the objects that MDAnalysis makes of them."""
-    values = next((a.values for a in whole._topology.attrs if a.attrname == "bonds"), ())
-    return np.array(values, dtype=np.int64).reshape(-1, 2)
-
-
-def _masses_guessed(whole: Any) -> bool:
-    """Whether masses did not come with the topology."""
-    return all(a.is_guessed for a in whole._topology.attrs if a.attrname == "masses")
-
-
-def _first_guess(group: Any) -> FloatArray:
-    """Masses that MDAnalysis gives by elements or types, whatever the atoms are."""
-    kinds = _texts(group, "elements" if hasattr(group, "elements") else "types").tolist()
-    return np.array([tables.masses.get(k, tables.masses.get(k.upper(), 0.0)) for k in kinds], dtype=np.float64)
 
 
 def _texts(group: Any, name: str) -> NDArray[np.str_]:

@@ -149,7 +149,9 @@ def called(
     It can read arrays among its arguments and not change them.
     """
     value = as_float_array(function(*(read_only_view(a) if isinstance(a, np.ndarray) else a for a in arguments)), item)
-    if value.shape != shape and not (scalar and value.shape == ()):
+    if value.shape == shape:
+        return read_only_view(value)
+    if not scalar or value.shape:
         raise InputError(f"{item} returned shape {value.shape}, not {shape}", item=item)
     return np.broadcast_to(value, shape)
 

@@ -27,7 +27,7 @@ from scipy.linalg import lapack
 from kcons.constraints.arguments import FloatArray, IntArray, as_float_array, check_call, positive, read_only_view
 from kcons.constraints.target import WRONG, first_derivative_4, second_derivative
 from kcons.errors import ConstraintError, ConvergenceError, InputError, NonFiniteError, SingularGeometryError
-from kcons.models.integration import check_derivative, check_run, integrate
+from kcons.models.integration import called, check_derivative, check_run, integrate
 
 #: Rows of G, of unit length, depend on others where no more than this part of them is left beside these.
 DEPENDENT = 1e-10
@@ -216,21 +216,20 @@ class Multibody:
             t_span, t_eval, method, options | {"rtol": rtol, "atol": atol}, 2 * np.size(q)
         )
         q, v = self._state(q, v)
-        n, rank = len(q), len(self._start(q, v, t0).rows)
-        place = self._placed(q, t0, rank)
+        place = self._start(q, v, t0)
+        n, rank = len(q), len(place.rows)
 
         def project(t: float, y: FloatArray) -> FloatArray:
             nonlocal place
-            place = self._placed(read_only_view(y[:n]), t, rank)
+            place = self._placed(y[:n], t, rank)
             return np.concatenate([place.q, self._tangent(place, y[n:])])
 
         def slope(t: float, y: FloatArray) -> FloatArray:
-            q, v = read_only_view(y[:n]), read_only_view(y[n:])
+            q, v = y[:n], y[n:]
             here = place if place.t == t and np.array_equal(place.q, q) else self._place(q, t, rank)
             return np.concatenate([v, here.solve(self._called("force", (n,), q, v, t), self._b(q, v))])
 
         start = project(t0, np.concatenate([q, v]))
-        self._motion(place, read_only_view(start[n:]))  # what is wrong at the start is told at once
         options |= {"t_eval": wanted, "rtol": rtol, "atol": atol}
         ode = integrate(slope, (t0, t1), start, solver, project, **options)
         if ode.status < 0:
@@ -241,7 +240,7 @@ class Multibody:
         q, v = np.split(np.reshape(ode.y, (2 * n, -1)).T, 2, axis=1)
         a, multipliers = np.zeros((len(q), n)), np.zeros((len(q), self.m or 0))
         for k, (t, x, w) in enumerate(zip(ode.t, q, v, strict=True)):
-            a[k], multipliers[k] = self._motion(self._place(read_only_view(x), t, rank), read_only_view(w))
+            a[k], multipliers[k] = self._motion(self._place(x, t, rank), w)
         return MultibodySolution(np.asarray(ode.t), q, v, a, multipliers, ode.nfev)
 
     def _place(self, q: FloatArray, t: float, rank: int | None) -> _Place:
@@ -298,7 +297,7 @@ class Multibody:
                 break
             step = place.solve(np.zeros(len(q)), -g)
             for part in PARTS if off > accepted else PARTS[:1]:
-                moved = read_only_view(place.q + part * step)
+                moved = place.q + part * step
                 there = self._g(moved)
                 left = _largest(there / place.size)
                 if left < (1.0 - 0.5 * part) * off:
@@ -326,14 +325,9 @@ class Multibody:
 
     # -- what the user gave: called, differenced where derivatives are missing, and checked ----------------
 
-    def _called(self, name: str, shape: tuple[int, ...] | None, *arguments: Any) -> FloatArray:
-        """What a function of the user returned, of that shape, by default (m,), and finite; a copy."""
-        array = np.array(as_float_array(getattr(self, name)(*arguments), name))
-        if shape is None:
-            array = np.atleast_1d(array)
-            shape = (array.size,) if self.m is None else (self.m,)
-        if array.shape != shape:
-            raise InputError(f"{name} returned shape {array.shape}; it must return {shape}", item=name)
+    def _called(self, name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
+        """What a function of the user returned, of that shape and finite; a copy."""
+        array = np.array(called(name, getattr(self, name), shape, *arguments, scalar=shape == (1,)))
         if not np.isfinite(array).all():
             entry = np.argwhere(~np.isfinite(array))[0].tolist()
             raise NonFiniteError(
@@ -347,7 +341,7 @@ class Multibody:
         return self.mass if isinstance(self.mass, np.ndarray) else self._called("mass", (len(q), len(q)), q)
 
     def _g(self, q: FloatArray) -> FloatArray:
-        return self._called("constraints", None, q) if self.m else np.zeros(0)
+        return self._called("constraints", (self.m,), q) if self.m else np.zeros(0)
 
     def _G(self, q: FloatArray) -> FloatArray:
         if self.m and self.jacobian is not None:
@@ -361,7 +355,7 @@ class Multibody:
     def _b(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """What G a must be, shape (m,)."""
         if self.m and self.curvature is not None:
-            return -self._called("curvature", None, q, v)
+            return -self._called("curvature", (self.m,), q, v)
         speed = _largest(v) / self.length
         if not self.m or speed == 0.0:
             return np.zeros(self.m or 0)
@@ -371,7 +365,7 @@ class Multibody:
 
     def _state(self, q: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """A state as arrays, after all functions were seen to fit it."""
-        place, speed = (read_only_view(as_float_array(given, item)) for item, given in (("q", q), ("v", v)))
+        place, speed = (np.array(as_float_array(given, item)) for item, given in (("q", q), ("v", v)))
         n = place.size if callable(self.mass) else len(self.mass)
         for item, array in (("q", place), ("v", speed)):
             if array.shape != (n,) or n == 0 or not np.isfinite(array).all():
@@ -387,8 +381,7 @@ class Multibody:
             _check_symmetric(self._M(q))
         if self.constraints is None:
             return
-        self.m = None
-        self.m = len(self._called("constraints", None, q))
+        self.m = as_float_array(self.constraints(read_only_view(q)), "constraints").size
         along = self.length * np.random.default_rng(0).normal(size=len(q))
         bare = copy(self)
         bare.jacobian = bare.curvature = None

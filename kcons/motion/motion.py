@@ -360,17 +360,8 @@ class Motion:
             check_out(out, self._shape)
         self.cell()
         start = as_array(x, self._shape, "positions")
-        pairs: Bonds | None = None
-        nearest_only = False
-        if callable(bonds):
-            pairs = bonds
-        elif bonds is not None:
-            table = check_pairs(bonds, self.n_atoms)
-            nearest_only = not len(table)
-
-            def pairs() -> IntArray:
-                return table
-
+        table = None if bonds is None or callable(bonds) else check_pairs(bonds, self.n_atoms)
+        pairs: Bonds | None = bonds if callable(bonds) else None if table is None else lambda: table
         search = FarStart(self._solve, time)
 
         def nearest(y: FloatArray) -> FloatArray:
@@ -382,23 +373,20 @@ class Motion:
             return result
 
         result = restored(self.constraint_set, self.plan, start, time, pairs, nearest)
-        if search.left > LEFT_OVER and nearest_only:
+        if search.left > LEFT_OVER and table is not None and not len(table):
             warnings.warn(
                 f"these positions fulfil all rows, but are not the nearest that do: {search.left:.1g} of the way from "
                 "the start leads along the rows, and the search has done what it may. Start nearer to the rows, or "
                 "bring targets there in several parts",
                 stacklevel=2,
             )
-        if out is None:
-            return result
-        np.copyto(out, result)
-        return out
+        return _in(out, result)
 
     # -- accelerations, forces ------------------------------------------------------------------
 
     def acceleration(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected)."""
-        return self._accelerated(x, v, f, time)[0]
+        return self._accelerated(x, v, f, time, None)
 
     def multipliers(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """lambda of z = A^T lambda, shape (n_rows,) (notes eqs. 103-104).
@@ -419,7 +407,9 @@ class Motion:
         """`acceleration` and `multipliers` of one solve."""
         time = finite_number(time, "time")
         mu = np.zeros(self._local.n_rows)
-        a, local_a, local_x, force = self._accelerated(x, v, f, time, mu)
+        a = self._accelerated(x, v, f, time, mu)
+        here, force = as_array(x, self._shape, "positions"), as_array(f, self._shape, "forces")
+        local_x, local_a = (here, a) if self._atoms is None else (here[self._atoms], a[self._atoms])
         lam = self.plan.least_norm(local_x, -mu, time)
         if len(self.plan.pinned):
             # What the fixed atoms' rows supply: M a - f less the other rows' forces.
@@ -431,15 +421,8 @@ class Motion:
             lam[self.plan.pinned_rows] = reaction.ravel()
         return a, lam
 
-    def _accelerated(
-        self,
-        x: ArrayLike,
-        v: ArrayLike,
-        f: ArrayLike,
-        time: float,
-        mu: FloatArray | None = None,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Accelerations, those of local atoms, local positions, forces; `mu` receives the solvers' multipliers."""
+    def _accelerated(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float, mu: FloatArray | None) -> FloatArray:
+        """Accelerations; `mu` receives the solvers' multipliers."""
         time = finite_number(time, "time")
         here = as_array(x, self._shape, "positions")
         speed = as_array(v, self._shape, "velocities")
@@ -456,7 +439,7 @@ class Motion:
         self._solve.tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:
             a[self._atoms] = local_a
-        return a, local_a, local_x, force
+        return a
 
     def project_forces(
         self, x: ArrayLike, f: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None

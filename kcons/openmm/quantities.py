@@ -13,7 +13,7 @@ from openmm import unit
 
 from kcons.constraints import FixedAtoms
 from kcons.constraints.arguments import has_units, quantity_text
-from kcons.constraints.constraint import Constraint
+from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -88,6 +88,13 @@ def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
 def masses_of(system: openmm.System) -> FloatArray:
     """Masses in dalton, shape (n_particles,)."""
     return np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
+
+
+def held_pairs(system: openmm.System) -> tuple[IntArray, FloatArray]:
+    """Pairs of particles, shape (n, 2), and lengths in nm, (n,), of the constraints of a System."""
+    known = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    pairs = np.array([pair for *pair, _ in known], dtype=np.int64).reshape(-1, 2)
+    return pairs, np.array([length._value for *_, length in known], dtype=float)
 
 
 def held_without_mass(system: openmm.System) -> list[int]:

@@ -13,7 +13,7 @@ from openmm import app, unit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.quantities import array, masses_of
+from kcons.openmm.quantities import array, held_pairs, masses_of
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import (
@@ -174,7 +174,7 @@ def bonds_of(system: openmm.System, x: FloatArray) -> IntArray:
     Springs of which most are off their lengths at `x` by more than a quarter make no structure, and more than two an
     atom are a network, not bonds (diamond has two): none counts then.
     """
-    pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
+    pairs = held_pairs(system)[0].tolist()
     for force in system.getForces():
         if isinstance(force, openmm.HarmonicBondForce) and force.getNumBonds():
             springs = [force.getBondParameters(k) for k in range(force.getNumBonds())]

@@ -13,9 +13,8 @@ from kcons.constraints.constraint import IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import connected, spanning_tree
 from kcons.constraints.target import FloatArray
+from kcons.solvers.small_clusters import LARGEST
 
-#: Largest cluster, in rows, that goes through the lanes.
-LANES_ROWS = 6
 #: Fewer clusters alike than this are left to the sparse solver, which takes all shapes in one call.
 LANES_CLUSTERS = 8
 
@@ -72,6 +71,16 @@ def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray) -> IntArray:
     return labels
 
 
+def atom_labels(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: FloatArray) -> IntArray:
+    """Cluster of each atom, by those of the rows; -1 for atoms that belong to none, and for fixed ones."""
+    incidence = constraint_set.incidence
+    found = np.full(constraint_set.n_atoms, -1, dtype=np.int64)
+    of_entry = np.repeat(labels, np.diff(incidence.indptr))
+    found[incidence.indices[of_entry >= 0]] = of_entry[of_entry >= 0]
+    found[inverse_masses == 0] = -1
+    return found
+
+
 def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: FloatArray) -> Iterator[Shape]:
     """Sort the clusters by the shape of their graph; vectorized over clusters."""
     n_clusters = int(labels.max(initial=-1)) + 1
@@ -86,20 +95,16 @@ def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: Fl
 
     distances_only, compiled = only(kinds == RowKind.DISTANCE), only(kinds != RowKind.INTERPRETED)
 
-    # Atoms that move belong to one cluster each.
-    atom_label = np.full(constraint_set.n_atoms, -1, dtype=np.int64)
+    atom_label, movable = atom_labels(constraint_set, labels, inverse_masses), inverse_masses > 0
     incidence = constraint_set.incidence
     entry_label = np.repeat(labels, np.diff(incidence.indptr))
-    atom_label[incidence.indices[entry_label >= 0]] = entry_label[entry_label >= 0]
-    movable = inverse_masses > 0
-    atom_label[~movable] = -1
     n_atoms = np.bincount(atom_label[atom_label >= 0], minlength=n_clusters)
     anchored = np.zeros(n_clusters, dtype=bool)
     to_fixed = ~movable[incidence.indices] & (entry_label >= 0)
     anchored[entry_label[to_fixed]] = True
 
     tree = distances_only & ((n_rows == n_atoms - 1) | ((n_rows == n_atoms) & anchored))
-    small = distances_only & ~anchored & (n_rows <= LANES_ROWS)
+    small = distances_only & ~anchored & (n_rows <= LARGEST)
     left_over = np.zeros(n_clusters, dtype=bool)
     if small.any():
         for shape, members in _small_shapes(pairs, labels, small, inverse_masses, tree):

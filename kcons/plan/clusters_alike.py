@@ -10,6 +10,10 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import BoolArray
 
+#: Rows with more couplings than the fewest that a row has, by so many times and so many, wait for a later level: what
+#: they would fill in costs more than the levels that they save.
+MORE_TIMES, MORE = 1.2, 20
+
 
 class Alike(NamedTuple):
     """Clusters with equal rows: their atoms, shape (n, n_atoms), and their rows in the set, shape (n, n_rows)."""
@@ -68,13 +72,16 @@ def elimination(atoms: Sequence[Sequence[int]], last: set[int]) -> Order:
     left, order, levels = set(range(len(atoms))), list[int](), [0]
     while left:
         beside: set[int] = set()
-        for k in sorted(left, key=lambda k: (len(coupled[k]), k)):
-            if k not in beside and not (k in last and coupled[k] - last):
+        ready = [(len(coupled[k]), k) for k in left if not (k in last and coupled[k] - last)]
+        most = MORE_TIMES * min(ready)[0] + MORE
+        for count, k in sorted(ready):
+            if k not in beside and count <= most:
                 order.append(k)
                 beside |= coupled[k]
         for k in order[levels[-1] :]:
             for other in coupled[k]:
-                coupled[other] = (coupled[other] | coupled[k]) - {other, k}
+                coupled[other] |= coupled[k]
+                coupled[other] -= {other, k}
         left.difference_update(order[levels[-1] :])
         levels.append(len(order))
     place = np.argsort(order)

@@ -126,7 +126,9 @@ class _Stack:
         """Blocks that are singular at second order at `x`, shape (n_blocks,)."""
         unit, _, curvature = self.dense(x)
         doubtful: BoolArray = np.asarray(np.isfinite(unit).all(axis=(1, 2)))
-        doubtful[doubtful] = _deficient(unit[doubtful])
+        if unit.shape[1] <= unit.shape[2]:  # dependent rows
+            squares = np.linalg.eigvalsh(unit[doubtful] @ unit[doubtful].transpose(0, 2, 1))
+            doubtful[doubtful] = squares[:, 0] <= LOST**2 * squares[:, -1]
         if doubtful.any() and not doubtful.all():
             doubtful[doubtful] = self.chosen(doubtful).suspects(x)
         elif doubtful.any():
@@ -206,16 +208,8 @@ class _Stack:
         return result
 
 
-def _deficient(unit: FloatArray) -> BoolArray:
-    """Which blocks have dependent rows, shape (n_blocks,)."""
-    if unit.shape[1] > unit.shape[2]:
-        return np.ones(len(unit), bool)
-    squares = np.linalg.eigvalsh(unit @ unit.transpose(0, 2, 1))
-    return np.asarray(squares[:, 0] <= LOST**2 * squares[:, -1])
-
-
 def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> Iterator[_Stack]:
-    """All blocks small enough for dense algebra, by shape; tests larger ones on the way."""
+    """All blocks small enough for dense algebra, by shape; refuses larger ones whose rank is higher nearby."""
     rows: IntArray | None = None
     pinned = fixed_atoms(constraint_set)
     for accept in _LEVELS:
@@ -242,14 +236,10 @@ def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -
         if len(rows) == 0:
             return
     for k in np.flatnonzero(large).tolist():
-        _check_large(LocalRows(constraint_set, members[starts[k] : starts[k + 1]], positions, time))
-
-
-def _check_large(block: LocalRows) -> None:
-    """Refuse a block too large for dense algebra whose rank is lower here than at positions nearby."""
-    here, nearby = (_sparse_rank(block, x) for x in (block.x, block.nearby(np.random.default_rng(20090131))))
-    if here < nearby:
-        raise _unresolved(block, here, nearby)
+        block = LocalRows(constraint_set, members[starts[k] : starts[k + 1]], positions, time)
+        here, nearby = (_sparse_rank(block, x) for x in (block.x, block.nearby(np.random.default_rng(20090131))))
+        if here < nearby:
+            raise _unresolved(block, here, nearby)
 
 
 def _sparse_rank(block: LocalRows, x: FloatArray) -> int:
@@ -322,12 +312,10 @@ class LocalRows:
         unit, norms, curvature = _Stack(self.part, self.time, *every, np.flatnonzero(self.pinned)).dense(x)
         return unit[0], norms[0], lambda v: curvature(v[None])[0]
 
-    def decomposed(
-        self, x: FloatArray, rows: IntArray | slice = slice(None)
-    ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
-        """u, s and v^T of these rows (all by default), all singular vectors, and their rank."""
-        u, s, vt = np.linalg.svd(self.linear(x)[0][rows], full_matrices=True)
-        return u, s, vt, int(np.sum(s > LOST * s[0]))
+    def decomposed(self, x: FloatArray, rows: IntArray | slice = slice(None)) -> tuple[FloatArray, int]:
+        """v^T of these rows (all by default), with all singular vectors, and their rank."""
+        _, s, vt = np.linalg.svd(self.linear(x)[0][rows], full_matrices=True)
+        return vt, int(np.sum(s > LOST * s[0]))
 
     def singular(self, x: FloatArray, rows: IntArray | None = None) -> bool:
         """Whether these rows (all by default) are singular at second order at `x`."""
@@ -367,7 +355,7 @@ class LocalRows:
         best, rigid = -1, np.eye(n, dtype=bool)
         for _ in range(3):
             x = self.nearby(rng)
-            _, _, vt, rank = self.decomposed(x)
+            vt, rank = self.decomposed(x)
             if rank <= best:
                 continue
             best = rank
@@ -447,7 +435,7 @@ def find_flat_bodies(block: LocalRows) -> list[FlatBody]:
     x = block.unwrapped(block.x)
     groups = [atoms for atoms in _cliques(rigid) if block.singular(block.x, block.inside(atoms))]
     if not groups:
-        raise _unresolved(block, block.decomposed(block.x)[3], generic)
+        raise _unresolved(block, block.decomposed(block.x)[1], generic)
     bodies = _without_repeats(block, [_body(block, atoms, x) for atoms in groups])
     _check_result(block, bodies, generic)
     return [body.renumbered(block.atoms, block.rows) for body in bodies]
@@ -549,13 +537,13 @@ def _without_repeats(block: LocalRows, bodies: list[FlatBody]) -> list[FlatBody]
     """Leave out base distances that other bodies hold already (two planar groups with a common edge)."""
     if len(bodies) < 2:
         return bodies
-    rank = _rebuilt(block, bodies).decomposed(block.x)[3]
+    rank = _rebuilt(block, bodies).decomposed(block.x)[1]
     for b in range(len(bodies)):
         for k in reversed(range(len(bodies[b].pairs))):
             body = bodies[b]
             fewer = replace(body, pairs=np.delete(body.pairs, k, axis=0), lengths=np.delete(body.lengths, k))
             trial = [*bodies[:b], fewer, *bodies[b + 1 :]]
-            if _rebuilt(block, trial).decomposed(block.x)[3] == rank:
+            if _rebuilt(block, trial).decomposed(block.x)[1] == rank:
                 bodies = trial
     return bodies
 
@@ -572,12 +560,12 @@ def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> Non
     distances between them resist the fold at second order.
     """
     new = _rebuilt(block, bodies)
-    _, _, vt, rank = new.decomposed(block.x)
+    vt, rank = new.decomposed(block.x)
     apart = np.abs(block.linear(block.x)[0] @ vt[rank:].T).max(initial=0.0)
     both = new.part.replaced([*new.part.constraints, *block.part.constraints], block.x, block.time)
     together = LocalRows(both, np.arange(both.n_rows), block.x, block.time, pinned=block.pinned)
     if apart > 1e-4 or new.singular(block.x) or together.singular(block.x):
-        raise _unresolved(block, block.decomposed(block.x)[3], generic)
+        raise _unresolved(block, block.decomposed(block.x)[1], generic)
 
 
 def with_flat_bodies(
@@ -620,7 +608,7 @@ def _listed(atoms: IntArray) -> str:
 
 def _refused(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray, why: str) -> SingularGeometryError:
     """The error for a flat group that cannot be converted."""
-    linearized = 3 * int(np.sum(~block.pinned[atoms])) - block.decomposed(block.x, inside)[3]
+    linearized = 3 * int(np.sum(~block.pinned[atoms])) - block.decomposed(block.x, inside)[1]
     _, _, shape, freedom, remedy = _GROUPS[affine_dimension(x[atoms]) - 1]
     named = block.atoms[atoms]
     return SingularGeometryError(

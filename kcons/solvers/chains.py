@@ -596,8 +596,6 @@ class Chains(AddressableSolver):
         path = np.array(atoms, dtype=np.int64)
         inverse = np.array(inv_mass, dtype=np.float64)
         sizes = np.diff(bounds)
-        if (sizes < 2).any():
-            raise ValueError("a chain has at least two atoms")
         long, short = np.flatnonzero(sizes > SHORT), np.flatnonzero(sizes <= SHORT)
         # Chains of similar length share a strip.
         short = short[np.argsort(-sizes[short], kind="stable")]

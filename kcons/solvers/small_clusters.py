@@ -333,8 +333,6 @@ class SmallClusters(AddressableSolver):
     ) -> None:
         local = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         members = np.array(atoms, dtype=np.int64)
-        if not 1 <= len(local) <= LARGEST or members.shape[1] > len(local) + 1:
-            raise ValueError(f"a small cluster holds 1 to {LARGEST} connected distances")
         self._made_of = rows, atoms, pairs, lengths, inv_mass
         self.rows = np.array(rows, dtype=np.int64).reshape(-1)
         self.kernels = Kernels(_kernel(len(local), None), _kernel(len(local), ()))

@@ -18,6 +18,7 @@ from numpy import empty, ndarray
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError
+from kcons.solvers.tolerances import EPS, MAX_ITERATIONS
 from kcons.steppers.compiled_operations import (
     ENGINE,
     FAR,
@@ -32,8 +33,6 @@ from kcons.steppers.program import Program, Row
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Listed, explained, stays
 
-_MAX_ITERATIONS = 50
-_EPS = float(np.finfo(float).eps)
 _FLOAT = np.dtype(np.float64)
 _EMPTY = np.empty(0)
 _compiled, _tangents = cache(kernel), cache(tangents)
@@ -43,8 +42,7 @@ class Interpreted(Listed):
     """Base of the steppers whose steps the interpreter makes."""
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` where the stepper may not be used."""
-        raise NotImplementedError
+        """Raise `UnsupportedError` where the stepper may not be used: unless a stepper says otherwise, nowhere."""
 
     def program(self, system: System | None) -> Program:
         """A step as the interpreter goes through it; without a System, of forces of positions and time only."""
@@ -396,7 +394,7 @@ class Interpreter:
         half_kick = (row.length * self.dt) * system.inverse_masses
         start = float(np.abs(drifted).max(initial=0.0))
         v, change = drifted, math.inf
-        for _ in range(_MAX_ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             forces = system.forces(positions, v, now, self.number)
             push = half_kick * forces
             following = system.motion.project_velocities(self.x, drifted + push, time=now)
@@ -404,17 +402,17 @@ class Interpreter:
             v = following
             # Where the system comes to rest, v is the small difference of what it had and the kick: these are rounded.
             size = max(start, float(np.abs(push).max(initial=0.0)), float(np.abs(v).max(initial=0.0)))
-            if change <= 2 * _EPS * size or (change >= last and change <= 1e-13 * size):
+            if change <= 2 * EPS * size or (change >= last and change <= 1e-13 * size):
                 self.forces, self.known = system.forces(positions, v, now, self.number), True
                 np.copyto(self.v, v)
                 check_finite(self.v, "velocity", self.number)
                 return
         raise ConvergenceError(
             f"velocity-dependent forces do not settle: the velocities still change by {change:.3g} "
-            f"after {_MAX_ITERATIONS} iterations; time step too large",
+            f"after {MAX_ITERATIONS} iterations; time step too large",
             residual=change / max(size, float(np.finfo(float).tiny)),
-            tolerance=2 * _EPS,
-            iterations=_MAX_ITERATIONS,
+            tolerance=2 * EPS,
+            iterations=MAX_ITERATIONS,
         )
 
     # -- the end --------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ with its solver, behind one array of numbers.
 from __future__ import annotations
 
 from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +44,18 @@ class PackedSystem:
     Parameters
     ----------
     motion : Motion
-    found : PackedRows
-        From `packed_rows`.
+    called : list of AddressableSolver
+        Whom the kernels call by what stands in the tables; kept as long as these.
+    tables : ndarray of float64
+        From `pack_solver_tables`.
     more : tuple of ndarray
         What is behind the rows, see `System`.
     """
 
-    def __init__(self, motion: Motion, found: PackedRows, more: tuple[NDArray[Any], ...]) -> None:
-        self.motion, self._more = motion, more
-        self._tables, self._called = found
+    def __init__(
+        self, motion: Motion, called: list[AddressableSolver], tables: FloatArray, more: tuple[NDArray[Any], ...]
+    ) -> None:
+        self.motion, self.called, self._tables, self._more = motion, called, tables, more
         self._cell, self._sources = motion.cell, motion.sources
         self._lattice = motion.lattice
         #: Those that the engine was told of last; -1: of none.
@@ -60,13 +63,7 @@ class PackedSystem:
         set_lattice(self._tables, self._lattice)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self).of, (self.motion, *self._more)  # addresses are of no use elsewhere
-
-    @classmethod
-    def of(cls, motion: Motion, *more: NDArray[Any]) -> PackedSystem | None:
-        """For the rows of `motion`, or None if they are too many, move, or hold what no kernel knows."""
-        found = packed_rows(motion, *more)
-        return None if found is None else cls(motion, found, more)
+        return packed_system, (self.motion, *self._more)  # addresses are of no use elsewhere
 
     @property
     def tables(self) -> FloatArray:
@@ -79,7 +76,7 @@ class PackedSystem:
 
     def refuse(self) -> None:
         """Raise what a Python function among the rows has raised, where a kernel reports that it could not go on."""
-        for solver in self._called:
+        for solver in self.called:
             solver.refuse()
 
     def took(self, iterations: float) -> None:
@@ -87,11 +84,6 @@ class PackedSystem:
         self.iterations = iterations
         if iterations >= 0:
             self.motion.took(int(iterations))
-
-
-def tables_without_rows(*more: NDArray[Any]) -> FloatArray:
-    """The tables where all rows are left to the engine."""
-    return pack_solver_tables((), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), *more)
 
 
 def spheres_of(motion: Motion) -> FloatArray | None:
@@ -118,15 +110,8 @@ def spheres_of(motion: Motion) -> FloatArray | None:
     return found
 
 
-class PackedRows(NamedTuple):
-    """The tables of all rows, and whom the kernels call by what stands there: to be kept as long as these."""
-
-    tables: FloatArray
-    called: list[AddressableSolver]
-
-
-def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
-    """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
+def packed_system(motion: Motion, *more: NDArray[Any]) -> PackedSystem | None:
+    """All rows, and `more`; None where there are rows that move, that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
     if held.moving or plan.between_fixed_atoms is not None or any(plan.whole):
         return None
@@ -169,7 +154,8 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
         called.append(copy(triangles))
     if chains is not None:
         called.append(chains.renumbered(held.touched) if compact else copy(chains))
-    return PackedRows(pack_solver_tables(called, pinned, plan.pinned_targets(None), *more), called)
+    tables = pack_solver_tables(called, pinned, plan.pinned_targets(None), *more)
+    return PackedSystem(motion, called, tables, more)
 
 
 def _solver_like(

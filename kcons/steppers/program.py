@@ -17,17 +17,6 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.solvers.addressable_solvers import address_of
 from kcons.steppers import compiled_operations as kernel
-from kcons.steppers.compiled_operations import (
-    ADDRESS,
-    CALL,
-    COUNT,
-    FUNCTION,
-    ITERATIONS,
-    PAIRS,
-    PYTHON,
-    ROOM,
-    WIDTH,
-)
 from kcons.steppers.operations import Fly, Kick, Operation
 
 #: Operations that show positions to a force function, after which they are not written to again.
@@ -88,12 +77,14 @@ class Program:
     def numbers(self) -> FloatArray:
         """What a room begins with, of which the kernel reads the rows."""
         if self._numbers is None:
-            self._numbers = np.zeros(ROOM + WIDTH * len(self.rows))
-            self._numbers[PAIRS], self._numbers[ITERATIONS], self._numbers[COUNT] = self.pairs, -1.0, len(self.rows)
-            for line, row in zip(self._numbers[ROOM:].reshape(-1, WIDTH), self.rows, strict=True):
-                line[:ADDRESS] = row.verb, row.here, row.there, row.length, row.kick, row.group
-                if row.verb in (CALL, kernel.CIRCLE):
-                    line[ADDRESS] = address_of(row.function, FUNCTION if row.verb == CALL else kernel.CIRCLES)
+            begin, lines = np.zeros(kernel.ROOM), np.zeros((len(self.rows), kernel.WIDTH))
+            begin[kernel.PAIRS], begin[kernel.ITERATIONS], begin[kernel.COUNT] = self.pairs, -1.0, len(self.rows)
+            for line, row in zip(lines, self.rows, strict=True):
+                line[: kernel.ADDRESS] = row.verb, row.here, row.there, row.length, row.kick, row.group
+                if row.verb in (kernel.CALL, kernel.CIRCLE):
+                    kind = kernel.FUNCTION if row.verb == kernel.CALL else kernel.CIRCLES
+                    line[kernel.ADDRESS] = address_of(row.function, kind)
+            self._numbers = np.append(begin, lines)
         return self._numbers
 
     def __getstate__(self) -> dict[str, Any]:
@@ -123,7 +114,7 @@ def _rows(operations: Sequence[Operation], functions: Mapping[str, Any], groups:
                 yield Row(verb, what, here, there, *passed, 0, operation, kernel.fly_circles)
                 here, time, kick = there, end, Kick(0.0)
         else:
-            what = CALL if verb in functions else kernel.PROJECT if verb == "project" else PYTHON
+            what = kernel.CALL if verb in functions else kernel.PROJECT if verb == "project" else kernel.PYTHON
             group = groups.get(kick.group if kick.fraction else operation.group, 0)
             times = (operation.fraction, kick.fraction, group, time, time, met[verb])
             yield Row(verb, what, here, here, *times, operation, functions.get(verb))

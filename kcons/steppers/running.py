@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, TypeAlias, overload
+from typing import Any, TypeAlias, TypedDict, Unpack, overload
 
 import numpy as np
 
@@ -49,33 +49,20 @@ class Trajectory:
         return np.array([state.velocities for state in self.frames])
 
 
+class _Options(TypedDict, total=False):
+    stepper: Stepper | None
+    observers: Iterable[Observer]
+    every: int
+    check_every: int | None
+
+
 @overload
 def run(
-    system: System,
-    state: State,
-    dt: float,
-    steps: int,
-    *,
-    stepper: Stepper | None = ...,
-    observers: Iterable[Observer] = ...,
-    every: int = ...,
-    check_every: int | None = ...,
-    record: None = None,
+    system: System, state: State, dt: float, steps: int, *, record: None = None, **options: Unpack[_Options]
 ) -> State: ...
-
-
 @overload
 def run(
-    system: System,
-    state: State,
-    dt: float,
-    steps: int,
-    *,
-    stepper: Stepper | None = ...,
-    observers: Iterable[Observer] = ...,
-    every: int = ...,
-    check_every: int | None = ...,
-    record: int,
+    system: System, state: State, dt: float, steps: int, *, record: int, **options: Unpack[_Options]
 ) -> Trajectory: ...
 
 

@@ -120,9 +120,6 @@ class Splitting(Interpreted):
             self._by_form[form] = Program(listed)
         return self._by_form[form]
 
-    def check(self, system: System) -> None:
-        """Raise `UnsupportedError` where the stepper may not be used: here, nowhere."""
-
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         if (state is not system.last or state.forces is None) and (self.kick_first or system.velocity_dependent):
             state = system.with_forces(state)

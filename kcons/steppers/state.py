@@ -28,11 +28,12 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import CertificateError, InputError, OverdeterminedError
-from kcons.motion.certificate import Schedule
+from kcons.motion.certificate import Schedule, off_row
 from kcons.motion.motion import Motion
+from kcons.solvers.addressable_solvers import pack_solver_tables
 from kcons.steppers.compiled_operations import beyond, check_finite
 from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
-from kcons.steppers.packed_system import PackedSystem, spheres_of, tables_without_rows
+from kcons.steppers.packed_system import PackedSystem, packed_system, spheres_of
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -284,8 +285,8 @@ class System:
         held = self.motion.constraint_set
         miss = np.abs(held.value(x, time))
         allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
-        if not np.all(miss <= allowed):
-            row = int(np.argmax(miss / allowed))
+        row = off_row(miss, allowed)
+        if row >= 0:
             raise InputError(
                 f"initial positions are off row {held.row_name(row)} by {miss[row]:.6g}; "
                 "pass project=True to System.initial_state to bring them onto the constraints, or correct them",
@@ -339,9 +340,8 @@ class System:
             if not project:
                 raise
             x = motion.restore_positions(x, time=time)
-        remainder = None
-        local = x
-        if self.is_far(x):
+        remainder, local, free = None, x, self._free_of_origin
+        if free is not None and beyond(x, free, self.anchor, self.far):
             shift = x[self.anchor].copy()
             local = motion.restore_positions(x - shift, time=time)
             remainder = local - (x - shift)
@@ -496,12 +496,12 @@ class System:
     @cached_property
     def packed(self) -> PackedSystem | None:
         """What compiled steps know of the system; None where its rows are left to the engine."""
-        return PackedSystem.of(self.motion, *self._more_tables)
+        return packed_system(self.motion, *self._more_tables)
 
     @cached_property
     def tables_without_rows(self) -> FloatArray:
         """What they know then."""
-        return tables_without_rows(*self._more_tables)
+        return pack_solver_tables((), np.zeros(0, dtype=np.int64), np.zeros((0, 3)), *self._more_tables)
 
     @cached_property
     def great_circles(self) -> FloatArray | None:
@@ -531,8 +531,3 @@ class System:
             return x, None
         shift = x[self.anchor]
         return (x - shift) + state.remainder, shift
-
-    def is_far(self, x: FloatArray) -> bool:
-        """Whether what is held is so far from the origin that the rounding of its positions would show."""
-        atoms = self._free_of_origin
-        return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))

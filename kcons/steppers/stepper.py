@@ -13,6 +13,7 @@ from kcons.constraints.arguments import Positive, checked
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, InputError, KconsError, ReversibilityError, UnsupportedError
+from kcons.motion.certificate import off_row
 from kcons.steppers.operations import Operation
 from kcons.steppers.state import KICK_ROUNDING, State, System
 
@@ -116,9 +117,8 @@ def explained(error: ConvergenceError, system: System, state: State, dt: float, 
     held = system.motion.constraint_set
     miss = np.abs(held.value(state.positions, state.time))
     allowed = np.maximum(1e-6 * held.scale, 4 * held.tolerance(state.positions, state.time))
-    off = np.flatnonzero(~(miss <= allowed))
-    if len(off):
-        row = int(off[np.argmax(miss[off])])
+    row = off_row(miss, allowed)
+    if row >= 0:
         cause = (
             f"the state before it was already off row {held.row_name(row)} by {miss[row]:.3g}; "
             "start from System.initial_state(..., project=True)"
@@ -218,7 +218,13 @@ class ReversibilityCheck(Listed):
             message = f"step {after.step} cannot be taken back: {error}"
             raise retold(error, message, ReversibilityError, after.step) from error
         acceleration = max((_largest(f * system.inverse_masses) for f in forces() if f is not None), default=0.0)
-        off = _missed(state, after, back, dt, acceleration)
+        # Relative; a speed of zero both before and after leaves nothing to compare with.
+        speed, kick = max(_largest(state.velocities), _largest(after.velocities)), abs(dt) * acceleration
+        length = max(extent(state.positions), speed * abs(dt))
+        rounding = 8 * float(np.spacing(_largest(state.positions)))
+        moved = np.maximum(np.abs(back.positions - state.positions) - rounding, 0.0)
+        turned = np.maximum(np.abs(back.velocities - state.velocities) - KICK_ROUNDING * kick, 0.0)
+        off = np.maximum(moved / (length or 1.0), turned / (speed or 1.0))
         residual = float(off.max(initial=0.0))
         if not residual <= self.tolerance:
             atom = int(np.argmax(off.max(axis=1)))
@@ -230,18 +236,6 @@ class ReversibilityCheck(Listed):
                 atoms=[atom],
                 step=after.step,
             )
-
-
-def _missed(state: State, after: State, back: State, dt: float, acceleration: float) -> FloatArray:
-    """How far a step that was taken back misses its start, relative as in `ReversibilityCheck`, shape (n_atoms, 3)."""
-    speed = max(_largest(state.velocities), _largest(after.velocities))
-    length = max(extent(state.positions), speed * abs(dt))
-    rounding = 8 * float(np.spacing(_largest(state.positions)))
-    kick = abs(dt) * acceleration
-    moved = np.maximum(np.abs(back.positions - state.positions) - rounding, 0.0)
-    turned = np.maximum(np.abs(back.velocities - state.velocities) - KICK_ROUNDING * kick, 0.0)
-    # A speed of zero both before and after leaves nothing to compare with.
-    return np.asarray(np.maximum(moved / (length or 1.0), turned / (speed or 1.0)))
 
 
 def _largest(values: np.ndarray) -> float:

@@ -54,7 +54,7 @@ FLAT = 2e-3
 LARGE = 50
 #: Among how many atoms nearby three are looked for, and what volume of three unit vectors is enough.
 _NEAR, _ENOUGH = 12, 0.2
-_TRIPLES = np.array(list(combinations(range(_NEAR + 4), 3)))
+_TRIPLES, _OF_FOUR = (np.array(list(combinations(range(n), 3))) for n in (_NEAR + 4, 4))
 #: Waters whose plane is told by less than this are none: |u x w| over the square of the longer arm.
 _LINE = 1e-3
 #: Bases are the first atoms that are this close to the best.
@@ -324,7 +324,10 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray]) -> list[Constraint
             np.put_along_axis(others, bases, False, axis=1)
             rest, named = y[others].reshape(len(these), n - d - 1, d), atoms[these][others].reshape(len(these), -1)
             if d == 3:
-                seen = _best_triples(rest, corners)
+                # For each atom the three bases that are farthest from being seen in one plane.
+                sight = corners[:, None] - rest[:, :, None]
+                sight = sight / np.linalg.norm(sight, axis=3, keepdims=True)
+                seen = _OF_FOUR[_farthest(np.abs(np.linalg.det(sight[:, :, _OF_FOUR])))]
                 number = np.arange(len(these))[:, None, None]
                 at, places = own[number, seen], corners[number, seen]
                 hold(
@@ -413,20 +416,9 @@ def _three(x: FloatArray, atom: int, choices: Iterator[IntArray]) -> IntArray:
     return best
 
 
-def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:
-    """For each atom the three of four bases that are farthest from being seen in one plane."""
-    triples = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
-    sight = corners[:, None] - rest[:, :, None]
-    sight = sight / np.linalg.norm(sight, axis=3, keepdims=True)
-    volume = np.abs(np.linalg.det(sight[:, :, triples]))
-    # The first that is as good as the best, so that rounding does not choose.
-    best = np.argmax(volume >= _AS_GOOD * volume.max(axis=2, keepdims=True), axis=2)
-    return triples[best]
-
-
 def _farthest(distance: FloatArray) -> IntArray:
-    """The first atom as far as the farthest, up to rounding: the same choice whatever the unit of length."""
-    return np.argmax(distance >= _AS_GOOD * distance.max(axis=1, keepdims=True), axis=1).astype(np.int64)
+    """The first of the last axis as far as the farthest, up to rounding: the same choice whatever the unit."""
+    return np.argmax(distance >= _AS_GOOD * distance.max(axis=-1, keepdims=True), axis=-1).astype(np.int64)
 
 
 def body_numbers(n_atoms: int, groups: Sequence[IntArray]) -> Iterator[IntArray]:

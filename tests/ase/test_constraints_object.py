@@ -17,21 +17,6 @@ from kcons.errors import InfeasibleError, InputError
 # -- dynamics and optimization ----------------------------------------------------------------------
 
 
-def test_velocity_verlet_goes_back_and_does_not_stand_still():
-    atoms, held = rigid(2)
-    before = atoms.get_positions(), atoms.get_momenta()
-    dyn = VelocityVerlet(atoms, 1 * units.fs)
-    dyn.run(50)
-    dyn.dt = -1 * units.fs
-    dyn.run(50)
-    assert np.abs(atoms.positions - before[0]).max() <= 1e-11
-    assert np.abs(atoms.get_momenta() - before[1]).max() <= 1e-11
-    dyn.dt = 0.0  # ASE divides by the time step
-    with np.errstate(all="ignore"), pytest.raises(InputError, match="not finite"):
-        dyn.run(1)
-    assert off(atoms, held) <= 1e-13
-
-
 def test_float32_forces():
     class Single(EMT):
         def get_forces(self, atoms=None):

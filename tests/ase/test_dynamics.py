@@ -1,4 +1,4 @@
-"""ConstrainedDynamics is right: orders, conserved quantities, moving and velocity rows, boxes."""
+"""ConstrainedDynamics as one of ASE's classes: files, observers, changes by others between steps, time steps."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import pytest
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
-from ase.calculators.tip3p import TIP3P
-from ase.constraints import FixAtoms, FixBondLengths, FixCartesian, Hookean
+from ase.constraints import FixAtoms, FixBondLengths, FixCartesian
 from ase.io import read
 from ase.io.trajectory import Trajectory
-from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, Field, off, rigid, slip, state, water
 
 from kcons.ase import (
@@ -30,22 +28,6 @@ from kcons.ase import (
 from kcons.constraints import Distance
 from kcons.errors import InputError, KconsError
 from kcons.steppers import Rattle
-
-# -- right ------------------------------------------------------------------------------------------
-
-
-def test_follows_velocity_verlet():
-    """With rigid water and a spring of ASE."""
-    ours, held = rigid()
-    ours.set_constraint([held, Hookean(a1=0, a2=3, rt=2.0, k=1.0)])
-    theirs = ours.copy()
-    theirs.calc = TIP3P(rc=6.0)
-    ConstrainedDynamics(ours, FS).run(50)
-    VelocityVerlet(theirs, FS).run(50)
-    assert np.abs(ours.positions - theirs.positions).max() <= 1e-9
-    assert np.abs(ours.get_velocities() - theirs.get_velocities()).max() <= 1e-9
-    assert off(ours, held) <= 1e-13
-
 
 # -- ASE's conventions ------------------------------------------------------------------------------
 
@@ -121,52 +103,31 @@ def test_momenta_set_past_the_constraints_are_projected():
     assert off(atoms, held) <= 1e-13 and slip(atoms, held) <= 1e-14
 
 
-def _index(items):
-    items["atoms"].index = np.array([7])
+#: Changes of fixed atoms, fixed components, held lengths and ours, and atoms that are at rest afterwards.
+CHANGES = {
+    "index": (lambda a, c, d, ours: setattr(a, "index", np.array([7])), [7]),
+    "index in place": (lambda a, c, d, ours: a.index.__setitem__(0, 7), [7]),
+    "mask": (lambda a, c, d, ours: c.mask.__setitem__(slice(None), True), [8]),
+    "lengths": (lambda a, c, d, ours: vars(d).update(pairs=np.array([[1, 2], [3, 5]]), bondlengths=None), []),
+    "rows": (lambda a, c, d, ours: setattr(ours, "constraints", (*ours.constraints, Distance([3, 5]))), []),
+}
 
 
-def _index_in_place(items):
-    items["atoms"].index[0] = 7
-
-
-def _mask(items):
-    items["components"].mask[:] = True, True, True
-
-
-def _lengths(items):
-    items["lengths"].pairs = np.array([[1, 2], [3, 5]])
-    items["lengths"].bondlengths = None
-
-
-def _rows(items):
-    items["kcons"].constraints = (*items["kcons"].constraints, Distance([1, 2]))
-
-
-@pytest.mark.parametrize(
-    ("change", "rest"),
-    [(_index, [7]), (_index_in_place, [7]), (_mask, [8]), (_lengths, []), (_rows, [])],
-    ids=lambda v: getattr(v, "__name__", ""),
-)
-def test_what_constraints_hold_changed_between_steps_is_taken(change, rest):
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_constraints_hold_changed_between_steps_is_taken(name):
     """The objects on the atoms are the same: dynamics go on as new ones would, which see them so from the start."""
-    atoms = molecule("CH3CH2OH")
+    atoms, (change, rest) = molecule("CH3CH2OH"), CHANGES[name]
     atoms.calc = EMT()
-    items = {
-        "atoms": FixAtoms([6]),
-        "components": FixCartesian([8], (True, False, False)),
-        "lengths": FixBondLengths([[1, 2]]),
-    }
-    atoms.set_constraint(list(items.values()))
-    if change is _rows:
-        atoms.set_constraint(list(items.values())[:2])
-    items["kcons"] = constrain(atoms, Distance([0, 4]))
+    items = [FixAtoms([6]), FixCartesian([8], (True, False, False)), FixBondLengths([[1, 2]])]
+    atoms.set_constraint(items)
+    items.append(constrain(atoms, Distance([0, 4])))
     draw_velocities(atoms, 300, rng=1)
     dyn = ConstrainedDynamics(atoms, FS)
     dyn.run(2)
     engine = dyn.motion
     dyn.run(1)
     assert dyn.motion is engine
-    change(items)
+    change(*items)
     again, before = atoms.copy(), atoms.get_positions()
     again.calc = EMT()
     dyn.run(2)
@@ -199,31 +160,18 @@ def test_masses_of_free_atoms_changed_between_steps_are_taken(change):
         np.testing.assert_array_equal(one, two)
 
 
-@pytest.mark.parametrize(
-    "made",
-    [
-        lambda atoms: ConstrainedDynamics(atoms, FS),
-        lambda atoms: ConstrainedLangevin(atoms, FS, 300, 0.01 / FS, rng=1),
-        lambda atoms: ConstrainedMonteCarlo(atoms, 0.1 * FS, 300, 3, rng=1),
-    ],
-    ids=["constant energy", "langevin", "monte carlo"],
-)
-def test_another_calculator_gives_other_forces(made):
-    """At once: a step begins with forces, and a proposal with an energy, that are known from before."""
+def test_another_calculator_gives_another_energy():
+    """At once: a proposal begins with an energy that is known from before."""
     atoms, _ = water()
-    atoms.calc = Field(0.05)
-    dyn = made(atoms)
+    dyn = ConstrainedMonteCarlo(atoms, 0.1 * FS, 300, 3, rng=1)
     dyn.run(2)
     before = dyn.state.copied()
     atoms.calc = Field(5.0)
     dyn.run(1)
     again, _ = water()
     again.positions, again.calc = before.positions, Field(5.0)
-    other = made(again)
-    thermostat = before.thermostat if before.thermostat is None else before.thermostat.copy()
-    if isinstance(dyn, ConstrainedMonteCarlo):
-        thermostat[0] = np.nan  # the energy
-    other._resume(replace(before, forces=None, thermostat=thermostat))
+    before.thermostat[0] = np.nan  # the energy
+    other = ConstrainedMonteCarlo(again, 0.1 * FS, 300, 3, rng=1, state=before)
     other.run(1)
     for one, two in zip(state(atoms), state(again), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-12)

@@ -10,11 +10,7 @@ import pytest
 from ase import Atoms
 from ase.build import molecule
 
-from kcons.ase import (
-    constrain,
-    constraints_of,
-    repartition_hydrogen_mass,
-)
+from kcons.ase import constrain, constraints_of, repartition_hydrogen_mass
 from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, repair_elements, snapshot_of, velocities_of
 from kcons.errors import InputError
 

@@ -3,12 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import ase.io
 import numpy as np
@@ -16,8 +10,6 @@ import pytest
 from ase.build import molecule
 
 from kcons.cli import main
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -90,26 +82,6 @@ def test_points_that_fail_are_told_by_the_exit_status(run, capsys):
     assert "failed: Distance(2, 3) = 3.5: InfeasibleError" in capsys.readouterr().out
 
 
-def test_a_scan_outlives_being_killed(run, tmp_path):
-    """No relaxation that was done is lost, and the end is the same to the last bit."""
-    words = ["peroxide.xyz", "--dihedral", "2", "0", "1", "3", "--steps", "8", *EMT]
-    command = [sys.executable, "-m", "kcons", "scan", *words, "--out", "cut"]
-    process = subprocess.Popen(
-        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    while not (tmp_path / "cut" / "relaxations" / "00003.npz").exists():
-        assert process.poll() is None, "it ended before it could be killed"
-        time.sleep(0.002)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    done = {path: path.read_bytes() for path in (tmp_path / "cut" / "relaxations").glob("*.npz")}
-    assert run(*words, "--out", "cut") == 0 and run(*words, "--out", "whole") == 0
-    assert all(path.read_bytes() == content for path, content in done.items())
-    assert len(list((tmp_path / "cut" / "relaxations").glob("*.npz"))) > len(done)
-    for name in ("scan.json", "scan.extxyz"):
-        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-
-
 def test_a_system_of_openmm(run, tmp_path, capsys):
     openmm = pytest.importorskip("openmm")
     system = openmm.System()
@@ -143,10 +115,15 @@ TURN = ("--dihedral", 2, 0, 1, 3)
     ("words", "said"),
     [
         (("none.xyz", *TURN), "there is no file none.xyz"),
+        (("bad.xyz", *TURN), "ASE cannot read bad.xyz"),
         (("peroxide.xyz",), "name what is scanned: --dihedral"),
+        (("peroxide.xyz", "--distance", 0, 1, "--from", 0, "--to", 1), "there is no distance of 0 to hold"),
         (("peroxide.xyz", "--distance", 0, 1), "give --from: only dihedrals have a range by themselves"),
         (("peroxide.xyz", "--difference", 0, 2, 2, 1, "--to", 1), "give --from: only dihedrals have a range by"),
-        (("peroxide.xyz", "--angle", 0, 1, 2, "--from", 60, "--to", 190), "angles are between 0 and 180 degrees"),
+        (
+            ("peroxide.xyz", "--angle", 0, 1, 2, "--from", 60, "--to", 190),
+            "there is no angle of 184",
+        ),
         (("peroxide.xyz", *TURN, "--to", 1, 2), "--to has 2 numbers for 1 coordinates"),
         (("peroxide.xyz", *TURN, "--steps", 0), "--steps is 0; give a positive number"),
         (("peroxide.xyz", *TURN, "--count-from", 1), "there is no atom 0; atoms are counted from 1"),
@@ -157,24 +134,11 @@ TURN = ("--dihedral", 2, 0, 1, 3)
         (("peroxide.xyz", *TURN, "--calculator", "ase.calculators.emt:None"), "no calculator 'ase.calculators.emt:N"),
         (("peroxide.xyz", *TURN, "--calculator", "none.xml"), "there is no file none.xml"),
         (("peroxide.xyz", *TURN, "--fmax", 0), "fmax is 0.0; give a positive number"),
-        (("peroxide.xyz", *TURN, "--hold-dihedral", *TURN[1:]), "depends on what else is held"),
+        (("peroxide.xyz", *TURN, "--hold-dihedral", *TURN[1:]), "dihedral_2_0_1_3 depends on the other constraints"),
     ],
 )
-def test_wrong_use(run, capsys, words, said):
+def test_wrong_use(run, tmp_path, capsys, words, said):
+    (tmp_path / "bad.xyz").write_text("three\n")
     extra = () if "--calculator" in words else ("--calculator", "ase.calculators.emt:EMT")
     assert run(*words, *extra) == 2
     assert said in capsys.readouterr().err
-
-
-def test_a_file_that_ase_cannot_read(run, tmp_path, capsys):
-    (tmp_path / "bad.xyz").write_text("three\n")
-    assert run("bad.xyz", *TURN) == 2
-    assert "ASE cannot read bad.xyz" in capsys.readouterr().err
-
-
-def test_results_of_others_are_not_overwritten(run, tmp_path, capsys):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "scan.csv").write_text("precious")
-    assert run("peroxide.xyz", *TURN, "--steps", 2, "--out", "out", *EMT) == 2
-    assert "out has other files called scan.csv; give another folder (--out)" in capsys.readouterr().err
-    assert [path.read_text() for path in (tmp_path / "out").iterdir()] == ["precious"]

@@ -140,8 +140,8 @@ def test_the_cheapest_that_is_right_is_named():
     assert list(found.table.place) == [1, 1, 3]  # costs are known to a third
     words = text(rows, found)
     assert words.startswith(
-        "Use two at 2 fs, 5/ps: the least processor time until it is known to 1 %, 4.00 s, for a deviation of the "
-        "temperature of the configurations of at most 0.01 (two standard errors included); no dearer"
+        "Use two at 2 fs, 5/ps: the least processor time until the temperature is known to 1 %, 4.00 s, for a "
+        "deviation of the temperature of the configurations of at most 0.01 (two standard errors included); equally "
     )
     none = rank(made(row("three", 0.02, 1.0)), "temperature")
     assert "the least is 0.02, by three at 2 fs, 5/ps. Longer runs (--budget)" in text(rows, none)

@@ -64,7 +64,6 @@ def test_what_the_table_is_of_stands_beside_it():
 
 
 def test_the_error_is_that_of_the_trajectory():
-    """By hand, against the reference."""
     system = chain()
     dt = system.time_steps[1]
     run = METHODS["rattle"].start(system, dt)
@@ -198,41 +197,6 @@ def test_short_runs_are_timed_in_rounds_and_long_ones_once():
     assert (table()[table().method == "rattle"].rounds >= 2).all()
     once = compare(chain(), ["rattle"], rounds=0)
     assert (once.rounds == 0).all() and once.attrs["margin"] is None
-
-
-def test_the_median_of_the_rounds_is_the_time_of_a_step(monkeypatch):
-    """With a clock that counts: a pass takes 1 s, then 3 s, then 2 s, and so on."""
-    given = iter(np.tile([1.0, 3.0, 2.0], 1000))
-    now = [0.0]
-
-    def clock():
-        return now[0]
-
-    class Ticking(Slow):
-        seconds = 0.0
-
-        def advance(self, steps=1):
-            super().advance(steps)
-            if steps > 1:
-                now[0] += next(given)
-
-        def rewind(self):
-            pass
-
-    system = chain()
-    rows = [measure.measure(system, METHODS["rattle"], system.time_steps[0], system.reference(), 10.0)]
-    method = add_method("ticking", Ticking)
-    try:
-        rows[0] |= {"method": method.name}
-        timing = measure.Rounds(system, 3, 10.0, 30.0, measure.Watcher())
-        timing.clock = clock
-        monkeypatch.setattr(measure, "MORE_SECONDS", 0.0)
-        margin = timing.time(rows)
-    finally:
-        del METHODS["ticking"]
-    assert rows[0]["rounds"] == 3 and rows[0]["step_seconds"] == pytest.approx(2.0 / rows[0]["steps"])
-    # The median of the odd rounds is 1.5, that of the even one 3.
-    assert margin == pytest.approx(1.0)
 
 
 def test_steps_that_cost_unevenly_are_timed_again_and_told():

@@ -79,8 +79,6 @@ def test_a_method_of_ones_own_is_compared(registry):
 
 
 def test_a_method_that_gives_states_is_compared(registry):
-    """As many steps as of the stepper that makes them, the same errors, and timed from the start again."""
-
     def start(system, dt):
         run = on_arrays(lambda dt: Rattle(), system, dt)
 

@@ -27,7 +27,7 @@ def test_the_text_has_at_most_thirty_lines():
     shown = text(table(), found, "\n".join(f"line {k}" for k in range(14)), "Forces are too expensive.")
     assert len(shown.splitlines()) + 1 <= 30  # and one that says what was written
     assert shown.splitlines()[0].startswith("Use ") and "In Python:" in shown
-    assert "... and" in shown and "=: equal within" in shown
+    assert "... and" in shown and "are equal (=)" in shown
     assert max(len(line) for line in shown.splitlines()[3:]) <= 100
 
 
@@ -35,7 +35,7 @@ def test_the_sentence_names_ties_and_no_winner_within_the_scatter():
     found = rank(table())
     tied = found.table.assign(place=1)
     words = sentence(table(), type(found)(**{**vars(found), "table": tied}))
-    assert "no dearer within the scatter of" in words and "more" in words
+    assert "; equally cheap within" in words and "more" in words
     none = rank(table(), limit=1e-30)
     assert sentence(table(), none).startswith("No method makes an error of at most 1e-30")
     nothing = table()[table().method == "verlet"]

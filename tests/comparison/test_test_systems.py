@@ -15,12 +15,10 @@ import numpy as np
 import pytest
 from ase import Atoms, units
 from ase.calculators.calculator import CalculationFailed, Calculator
-from scipy.spatial.transform import Rotation
 from small_test_systems import SMALL, end, small
 
 from kcons.comparison import Potential, add_system, compare, test_systems
-from kcons.comparison.test_systems import chain, rotor, sphere, water
-from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
+from kcons.comparison.test_systems import chain, sphere, water
 from kcons.comparison.test_systems.potential import of_calculator
 from kcons.comparison.test_systems.system import converged, thermal_velocities
 from kcons.errors import CalculatorError, InputError
@@ -152,28 +150,6 @@ def test_a_calculator_that_fails_is_told_of():
         potential.forces(np.zeros((2, 3)))
 
 
-@pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
-def test_openmm_forces_are_in_the_units_of_the_system():
-    """Two charges far apart without periodicity: Coulomb's law and Lennard-Jones by hand."""
-    import openmm
-
-    system, force = openmm.System(), openmm.NonbondedForce()
-    for q in (0.4, -0.4):
-        system.addParticle(1.0)
-        force.addParticle(q, 0.3, 0.5)
-    system.addForce(force)
-    pair, r = OpenMMEngine(lambda: system).potential(), 4.0
-    x = np.array([[0.0, 0, 0], [r, 0, 0]])
-    epsilon, s6 = 0.5 * units.kJ / units.mol, (3.0 / r) ** 6
-    coulomb = -0.16 * units.Hartree * units.Bohr / r
-    assert pair.energy(x) == pytest.approx(coulomb + 4 * epsilon * (s6**2 - s6), rel=1e-6)
-    pull = coulomb / r + 4 * epsilon * (12 * s6**2 - 6 * s6) / r
-    assert pair.forces(x)[1, 0] == pytest.approx(pull, rel=1e-6)
-    box = test_systems.build("water", 27, forces="openmm")
-    assert box.potential.name.startswith("PME, OpenMM")
-    assert np.abs(box.potential.forces(box.positions).sum(axis=0)).max() < 1e-2
-
-
 # -- what is built ----------------------------------------------------------------------------------
 
 
@@ -248,7 +224,6 @@ def test_free_particles_stay_on_their_great_circles():
 
 
 def test_a_spherical_pendulum_meets_the_one_in_spherical_angles():
-    """45-digit solution."""
     case = json.loads((Path(__file__).parents[1] / "reference/data/A02_spherical_pendulum_generic.json").read_text())
     x, v = (np.array(case["initial"][key], dtype=float)[0] for key in ("positions", "velocities"))
     (gravity,) = (force["g"] for force in case["forces"] if force["type"] == "uniform_acceleration")
@@ -257,16 +232,3 @@ def test_a_spherical_pendulum_meets_the_one_in_spherical_angles():
     for time, wanted in list(zip(case["times"], case["reference"]["positions"], strict=True))[1:4]:
         found = sphere.swing(x - point, v, -gravity[2], time)
         np.testing.assert_allclose(found + point, np.array(wanted, dtype=float)[0], atol=1e-11 * np.exp(0.3 * time))
-
-
-def test_a_symmetric_top_precesses_evenly():
-    """Four equal masses in a square: about its axis and about L, the body turns at two constant rates."""
-    x = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
-    omega, drift = np.array([0.5, 0.0, 0.8]), np.array([0.1, 0.2, 0.3])
-    about = np.array([2.0, 2.0, 4.0]) * omega / 2.0  # rate of precession L/I1, and what is left of the spin
-    own = np.array([0.0, 0.0, omega[2] - about[2]])
-    for time in (0.7, 5.0):
-        turn = Rotation.from_rotvec(about * time) * Rotation.from_rotvec(own * time)
-        found = rotor.flight(x, np.cross(omega, x) + drift, np.ones(4), time)
-        np.testing.assert_allclose(found.positions, turn.apply(x) + time * drift, atol=1e-12)
-        assert found.error < 1e-11

@@ -12,7 +12,7 @@ from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
 from openmm import unit
 
 from kcons import Motion
-from kcons.constraints import Constraint, Distance, MovingTarget, Sphere, from_dict
+from kcons.constraints import Constraint, Distance, MovingTarget, Sphere, Torus, from_dict
 from kcons.constraints.constraint import FAMILIES, constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
@@ -146,14 +146,18 @@ def test_plain_data_that_does_not_fit():
         from_dict({**data, "center": [[0.0, 0.0]]})
     with pytest.raises(InputError, match="center of row 1 is not finite"):
         from_dict({**data, "center": [[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]]})
+    data = Torus(0, [0.0, 0.0, 0.0], [0.0, 3.0, 4.0], 2.0).todict()
+    with pytest.raises(InputError, match="axis has vectors not of length 1"):
+        from_dict({**data, "axis": [[0.0, 3.0, 4.0]]})
+    with pytest.raises(InputError, match="Torus: major_radius -2 is not positive"):
+        from_dict({**data, "major_radius": [-2.0]})
 
 
-@pytest.mark.parametrize("given", [None, 3, "ab", [Distance([[0, 1]]), None]])
-def test_what_are_no_constraints(given):
-    with pytest.raises(InputError, match=r"held has .* is no kcons constraint"):
-        constraints_in(given, "held")
+def test_one_constraint_or_several():
     row = Distance([[0, 1]])
     assert constraints_in(row, "held") == [row] == constraints_in(iter([row]), "held")
+    with pytest.raises(InputError, match=r"held has None, which is no kcons constraint"):
+        constraints_in([row, None], "held")
 
 
 @pytest.mark.parametrize("name", CASES)

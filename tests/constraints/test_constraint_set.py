@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 from copy import copy, deepcopy
+from unittest import mock
 
 import numpy as np
 import pytest
 from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
+from hypothesis import given
+from hypothesis import strategies as st
 
-from kcons.constraints import Angle, Distance, FixedAtoms, LinearCombination, Plane, Sphere
+from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, LinearCombination, Plane, Sphere, constraint_set
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import InputError
+from kcons.errors import ContradictionError, InfeasibleError, InputError
 from kcons.motion import Motion
 from kcons.steppers import System
-
-TRICLINIC = np.array([[10.0, 0.0, 0.0], [3.0, 9.0, 0.0], [-2.0, 1.0, 8.0]])
 
 
 def everything(x):
@@ -99,60 +101,21 @@ def test_tolerance_knows_what_double_precision_can_reach():
     assert near.tolerance(far)[0] == pytest.approx(reach, rel=1e-12)
 
 
-# -- cells ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("cell", [np.diag([9.0, 8.0, 10.0]), TRICLINIC], ids=["orthorhombic", "triclinic"])
-def test_wrapped_atoms_give_the_rows_of_whole_molecules(cell):
-    rng = np.random.default_rng(0)
-    whole = 0.3 * scattered(0) + [4.0, 4.0, 4.0]
-    wrapped = whole + rng.integers(-2, 3, size=(N_ATOMS, 3)) @ cell
-    v = rng.normal(size=(N_ATOMS, 3))
-    names = [name for name, make in CASES.items() if make().translation_invariant]
-    assert {"Distance", "Angle", "Dihedral", "LinearRelation", "RadiusOfGyration", "Custom", "KnifeEdge"} <= set(names)
-    for name in names:
-        free = ConstraintSet([CASES[name]()], whole, MASSES, time=TIME)
-        periodic = ConstraintSet([CASES[name]()], wrapped, MASSES, cell=cell, time=TIME)
-        assert np.allclose(periodic.target(TIME), free.target(TIME), rtol=1e-12, atol=1e-12), name
-        assert np.allclose(periodic.value(wrapped, TIME), free.value(whole, TIME), atol=1e-12), name
-        assert np.allclose(periodic.jacobian(wrapped, TIME).toarray(), free.jacobian(whole, TIME).toarray(), atol=1e-12)
-        assert np.allclose(
-            periodic.acceleration_target(wrapped, v, TIME),
-            free.acceleration_target(whole, v, TIME),
-            rtol=1e-8,
-            atol=1e-9,
-        ), name
-
-
-def test_only_periodic_directions_are_wrapped():
-    x = np.array([[0.2, 0.2, 0.2], [0.2, 0.2, 9.8]])
-    assert ConstraintSet([Distance([[0, 1]])], x, np.ones(2), cell=[10.0] * 3).target() == pytest.approx([0.4])
-    slab = ConstraintSet([Distance([[0, 1]], 3.0)], x, np.ones(2), cell=[10.0] * 3, pbc=[True, True, False])
-    assert slab.measure(x) == pytest.approx([9.6])
-    flat = np.diag([10.0, 10.0, 0.0])
-    assert ConstraintSet([Distance([[0, 1]], 3.0)], x, np.ones(2), cell=flat, pbc=[1, 1, 0]).half_width == 5.0
-
-
 # -- bad input --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_positions_of_constrained_atoms_must_be_finite(number):
-    x = scattered(0)
-    x[3, 1] = number
-    with pytest.raises(InputError, match="position of atom 3 is not finite") as caught:
-        ConstraintSet([Distance([[0, 1], [2, 3]])], x, MASSES)
-    assert caught.value.atoms == (3,)
-    ConstraintSet([Distance([[0, 1]])], x, MASSES)  # other atoms are not looked at
-
-
-@pytest.mark.parametrize("mass", [0.0, -1.0, np.nan, np.inf])
-def test_masses_of_constrained_atoms_must_be_positive(mass):
-    m = MASSES.copy()
-    m[3] = mass
-    with pytest.raises(InputError, match=f"atom 3 has mass {mass:g}; constrained atoms need positive mass") as caught:
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+def test_positions_and_masses_of_constrained_atoms(bad):
+    x, m = scattered(0), MASSES.copy()
+    m[3], x[3, 1] = bad, bad
+    with pytest.raises(InputError, match=f"atom 3 has mass {bad:g}; constrained atoms need positive mass") as caught:
         ConstraintSet([Distance([[0, 1], [2, 3]])], scattered(0), m)
     assert caught.value.atoms == (3,)
+    if not np.isfinite(bad):
+        with pytest.raises(InputError, match="position of atom 3 is not finite") as caught:
+            ConstraintSet([Distance([[0, 1], [2, 3]])], x, MASSES)
+        assert caught.value.atoms == (3,)
+    ConstraintSet([Distance([[0, 1]])], x, m)  # other atoms are not looked at
 
 
 def test_arrays_of_the_wrong_shape_are_named_later_too():
@@ -161,15 +124,6 @@ def test_arrays_of_the_wrong_shape_are_named_later_too():
         held.value(np.zeros((7, 3)))
     with pytest.raises(InputError, match=r"velocities must have shape \(8, 3\)"):
         held.acceleration_target(scattered(0), np.zeros((7, 3)))
-
-
-def test_nothing_held():
-    x = scattered(0)
-    for rows in ([], [Distance([])]):
-        held = ConstraintSet(rows, x, MASSES)
-        assert held.n_rows == 0 and not held.moving
-        assert held.value(x).shape == held.target().shape == held.acceleration_target(x, x).shape == (0,)
-        assert held.jacobian(x).shape == (0, 24)
 
 
 def test_what_was_given_may_be_changed_afterwards():
@@ -192,3 +146,78 @@ def test_masses_cannot_be_changed(made):
     for masses in (motion.masses, motion.constraint_set.masses, System(motion).masses):
         with pytest.raises(ValueError, match="read-only"):
             masses[0] = 5.0
+
+
+# -- targets that exclude each other ------------------------------------------------------------------
+
+
+def test_one_pair_at_two_lengths():
+    x = scattered(0)
+    with pytest.raises(
+        ContradictionError, match=r"constraints #0 and #1 on atoms \(0, 1\) have different targets 1.0, 1.001"
+    ) as caught:
+        ConstraintSet([Distance([[0, 1], [1, 0]], [1.0, 1.001])], x, MASSES)
+    assert isinstance(caught.value, ValueError)
+    assert (caught.value.rows, caught.value.atoms) == ((0, 1), (0, 1))
+
+
+def test_across_objects_and_against_an_initial_length():
+    x = np.array([[0.0, 0, 0], [1.5, 0, 0], [0, 2.0, 0]])
+    with pytest.raises(ContradictionError, match=r"#1 and #2 on atoms \(0, 1\) have different targets 1.5, 1.2"):
+        ConstraintSet([Distance([[1, 2], [0, 1]]), Distance([[1, 0]], 1.2)], x, np.ones(3))
+
+
+def test_the_same_length_twice_is_accepted():
+    x = scattered(0)
+    held = ConstraintSet([Distance([[0, 1], [1, 0], [0, 1]])], x, MASSES)
+    assert held.n_rows == 3
+    ConstraintSet([Distance([[0, 1], [1, 0]], [1.0, 1.0 + 1e-12])], x, MASSES)
+
+
+def test_angles_and_dihedrals_at_two_values():
+    x = scattered(0)
+    with pytest.raises(ContradictionError, match=r"atoms \(0, 1, 2\) have different targets 1.0, 1.1"):
+        ConstraintSet([Angle([[0, 1, 2], [2, 1, 0]], [1.0, 1.1])], x, MASSES)
+    with pytest.raises(ContradictionError, match=r"atoms \(0, 1, 2, 3\) have different targets 1.0, 1.1"):
+        ConstraintSet([Dihedral([[0, 1, 2, 3], [3, 2, 1, 0]], [1.0, 1.1])], x, MASSES)
+    # Other vertices, other axes and other images are no contradiction.
+    ConstraintSet([Angle([[0, 1, 2], [0, 2, 1]], [1.0, 1.1])], x, MASSES)
+    ConstraintSet([Dihedral([[0, 1, 2, 3], [3, 2, 1, 0], [0, 2, 1, 3]], [1.0, 1.0 + 2 * np.pi, 1.1])], x, MASSES)
+
+
+def test_triangle_inequality():
+    x = scattered(0)
+    with pytest.raises(
+        InfeasibleError, match=r"infeasible: residual cannot go below 0.333333 \(sum of squares\).*\(0, 1, 2\)"
+    ) as caught:
+        ConstraintSet([Distance([[5, 6], [0, 1], [1, 2], [0, 2]], [9.0, 1.0, 1.0, 3.0])], x, MASSES)
+    assert isinstance(caught.value, RuntimeError)
+    assert caught.value.residual == pytest.approx(1 / 3, rel=1e-14)
+    assert (caught.value.row, caught.value.atoms) == (3, (0, 1, 2))
+
+
+def test_flat_triangles_pass():
+    ConstraintSet([Distance([[0, 1], [1, 2], [0, 2]], [0.1, 0.2, 0.1 + 0.2])], scattered(0), MASSES)
+    x = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [1.6, 1.7, 1.8]])
+    ConstraintSet([Distance([[0, 1], [1, 2], [0, 2]])], x, np.ones(3))
+
+
+@given(
+    lengths=st.dictionaries(st.sampled_from(list(itertools.combinations(range(8), 2))), st.floats(0.3, 3), min_size=3),
+    chunk=st.sampled_from([20, 2_000_000]),
+)
+def test_what_cannot_close_is_refused_in_any_graph(lengths, chunk):
+    """Also where few triangles are looked at together."""
+    triangles = [
+        sorted(lengths[pair] for pair in itertools.combinations(three, 2))
+        for three in itertools.combinations(range(8), 3)
+        if set(itertools.combinations(three, 2)) <= set(lengths)
+    ]
+    infeasible = any(a + b < c * (1 - 1e-10) for a, b, c in triangles)
+    with mock.patch.object(constraint_set, "_CHUNK", chunk):
+        try:
+            ConstraintSet([Distance(list(lengths), list(lengths.values()))], scattered(0), MASSES)
+        except InfeasibleError:
+            assert infeasible
+        else:
+            assert not infeasible

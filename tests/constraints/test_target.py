@@ -20,31 +20,28 @@ def test_derivatives_given_or_differenced(given):
         assert target.acceleration_at(time, 2) == pytest.approx([-np.sin(time)] * 2, abs=1e-11)
 
 
-def test_an_acceleration_without_its_rate_is_refused():
-    with pytest.raises(InputError, match="also needs its rate"):
-        MovingTarget(np.sin, acceleration=np.sin).rate_at(0.0, 1)
+MOVED = MovingTarget(lambda t: [1.0, 2.0, 3.0])
+BAD = [
+    (lambda: as_target([1.0, 2.0], 3), r"target has shape \(2,\); give one number or 3"),
+    (lambda: as_target(np.zeros((2, 2)), 3), r"target has shape \(2, 2\)"),
+    (lambda: as_target([1.0, np.nan, 2.0], 3), "the target of row 1 is not finite"),
+    (lambda: as_target([[1.0], [1.0, 2.0]], 3), "target is no array of numbers"),
+    (lambda: MovingTarget(lambda t: np.nan).at(2.0, 1), "target of row 0 at t = 2 is not finite"),
+    (lambda: MOVED.at(2.0, 2), r"target at t = 2 has shape \(3,\); give one number or 2"),
+    (lambda: MovingTarget(np.sin, acceleration=np.sin).rate_at(0.0, 1), "also needs its rate"),
+]
 
 
-@pytest.mark.parametrize(
-    ("target", "message"),
-    [
-        ([1.0, 2.0], r"target has shape \(2,\); give one number or 3"),
-        (np.zeros((2, 2)), r"target has shape \(2, 2\)"),
-        ([1.0, np.nan, 2.0], "the target of row 1 is not finite"),
-        (np.inf, "the target of row 0 is not finite"),
-        ("one", "target is no array of numbers"),
-        ([[1.0], [1.0, 2.0]], "target is no array of numbers"),
-    ],
-)
-def test_bad_targets_are_named(target, message):
+@pytest.mark.parametrize(("make", "message"), BAD)
+def test_bad_targets_are_named(make, message):
     with pytest.raises(InputError, match=message):
-        as_target(target, 3)
+        make()
 
 
 HUGE = {
     "Distance": lambda t: Distance([0, 1], t),
     "center": lambda t: held.Sphere(0, [t, 1.0, 1.0], None),
-    "major radius": lambda t: held.Torus(0, [1.0, 1.0, 1.0], [0, 0, 1.0], t, 1.0),
+    "major radius": lambda t: held.Torus(0, [1.0, 1.0, 1.0], [0, 0, 1.0], abs(t), 1.0),
     "point": lambda t: held.Line(0, [t, 0, 0], [0, 0, 1.0]),
     "coefficients": lambda t: held.LinearCombination([0, 1], [[t, 0, 0], [-t, 0, 0]]),
     "LinearRelation": lambda t: held.LinearRelation(0, [1, 2], [0.5, 0.5], [[t, 0, 0]]),
@@ -70,13 +67,6 @@ def test_a_moving_target_is_refused_when_it_becomes_too_large():
     with pytest.raises(InputError, match=r"target of row 0 at t = 1 is 1e\+160, of which the square overflows"):
         motion.project_positions(new, x, time=1.0, out=new)
     np.testing.assert_array_equal(new, kept)
-
-
-def test_bad_values_of_a_function_are_named():
-    with pytest.raises(InputError, match="target of row 0 at t = 2 is not finite"):
-        MovingTarget(lambda t: np.nan).at(2.0, 1)
-    with pytest.raises(InputError, match=r"target at t = 2 has shape \(3,\); give one number or 2"):
-        MovingTarget(lambda t: [1.0, 2.0, 3.0]).at(2.0, 2)
 
 
 def test_derivatives_that_contradict_a_moving_target_are_refused():
@@ -114,12 +104,6 @@ def test_a_target_that_jumps_by_its_period_does_not_move_faster_there():
         held = ConstraintSet(item, x, np.ones(4))
         assert held.velocity_target(x) == pytest.approx([1.0], rel=1e-11)
         assert held.acceleration_target(x, 0 * x) == pytest.approx([1.0], rel=1e-9)
-
-
-@pytest.mark.parametrize("time_step", [0.0, np.nan, -0.02])
-def test_steps_of_differences_are_positive(time_step):
-    with pytest.raises(InputError, match=r"the time_step of the target is .*; give a positive number"):
-        MovingTarget(np.cos, time_step=time_step)
 
 
 def test_a_target_too_fast_for_its_differences_is_refused():

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from carried_systems import context_of, free, pull, start, state_of
+from carried_systems import start
+from openmm_systems import context_of, field, particles, state_of
 
 from kcons.constraints import Distance
 from kcons.errors import InputError
@@ -15,7 +16,7 @@ from kcons.openmm.callback_rows import hold
 
 def pair(x, cutoff=1.0):
     """Two particles in a cube of 2 nm, their distance held."""
-    system = free([12.0, 12.0])
+    system = particles([12.0, 12.0])
     nonbonded = openmm.NonbondedForce()
     nonbonded.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
     nonbonded.setCutoffDistance(cutoff)
@@ -51,7 +52,7 @@ def test_a_box_too_small_stops_the_step():
 @pytest.mark.usefixtures("without_device")
 def test_multipliers_of_a_hanging_weight():
     """The rod of a weight at rest pulls with m g."""
-    part = hold(system := free([0.0, 2.0], pull(-19.6, 2)), Distance([[0, 1]]), [[0, 0, 0], [0, 0, -0.5]])
+    part = hold(system := particles([0.0, 2.0], field("19.6*z", 2)), Distance([[0, 1]]), [[0, 0, 0], [0, 0, -0.5]])
     context = context_of(system, ProjectedIntegrator(0.001, parts=[part]))
     context.setPositions([[0, 0, 0], [0, 0, -0.5]])
     assert part.multipliers(context)[0] == pytest.approx(-19.6, abs=1e-12)

@@ -79,7 +79,6 @@ def test_a_series_that_never_changes_is_warned_of():
 
 
 def test_windows_that_agree_do_so_with_the_right_probability():
-    """p values of means that are the same are uniform; of means that are not, they vanish."""
     rng = np.random.default_rng(8)
     roots = [np.array([[1.0, 0.0], [0.9, 0.3]]), np.array([[0.5, 0.2], [0.0, 0.4]])]
     covariances = [root @ root.T for root in roots]

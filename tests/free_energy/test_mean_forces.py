@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import Distance, FixedAtoms, Formula, Plane
+from kcons.constraints import Distance, FixedAtoms, Plane
 from kcons.free_energy import HeldCoordinates, Sample, Series, mean_force, weighted_mean
-from kcons.free_energy.mean_forces import _quietest, local_mean_force
+from kcons.free_energy.series import _quietest, local_mean_force
 
 KT = 0.8
 SAMPLES = 1000
@@ -60,17 +60,6 @@ def test_a_length_in_a_plane(mass):
     np.testing.assert_allclose(series.gradient, 0, atol=1e-12)
     assert result.raw == pytest.approx(result.force, rel=1e-12)
     assert "r = 1.7: dF/dq = " in str(result)
-
-
-def test_a_squared_length_has_a_gradient_term():
-    """F = U(sqrt(s)) - kT ln P: dF/ds = U'/(2 r) in a plane, the term being kT/(2 s)."""
-    r = 1.7
-    square = Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2", [[0, 1]], target=None)
-    series = series_of({"s": square}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.array([1.0, 2.0]), ring(r), spring)
-    result = mean_force(series, KT)
-    assert abs(result.force[0] - (0.7**3 + 1) / (2 * r)) < 3 * result.error[0] < 0.03
-    np.testing.assert_allclose(series.gradient, 1 / (2 * r * r), rtol=1e-12)
-    assert result.raw[0] < result.force[0] - 5 * result.error[0]
 
 
 def trimer(n: int = SAMPLES):
@@ -145,35 +134,6 @@ def test_one_end_to_end_length_beside_two_bonds(sphere):
         known = series_of(coordinates, [Distance([[0, 1], [1, 2]])], masses, shape[None], pull, kT=given, known=True)
         known.isokinetic_degrees_of_freedom = 6 if sphere else 0
         np.testing.assert_allclose(local_mean_force(known, KT), [[exact]], rtol=0, atol=1e-8)
-
-
-def test_two_coordinates_with_z_off_the_diagonal():
-    """r and s = r^2 + x in a plane with a fixed center: P of both in closed form."""
-    rng = np.random.default_rng(4)
-    r, s, mass = 1.4, 2.5, 2.0
-    masses = np.array([1.0, mass])
-    x = s - r * r
-    signs = rng.choice([-1, 1], 64)
-    points = np.zeros((64, 2, 3))
-    points[:, 1, 0], points[:, 1, 1] = x, signs * np.sqrt(r * r - x * x)
-    coordinates = {
-        "r": Distance([[0, 1]]),
-        "s": Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2 + x2", [[0, 1]], target=None),
-    }
-    series = series_of(coordinates, [FixedAtoms([0]), Plane([1], (0, 0, 1))], masses, points, spring)
-
-    def free_energy(r, s):
-        """P(r, s) dr ds = 2 |d(x, y)/d(r, s)| e^(-U/kT); the Jacobian is r/|y|."""
-        x = s - r * r
-        return (r - 1) ** 4 / 4 + r - KT * np.log(r / np.sqrt(r * r - x * x))
-
-    h = 1e-6
-    exact = [
-        (free_energy(r + h, s) - free_energy(r - h, s)) / (2 * h),
-        (free_energy(r, s + h) - free_energy(r, s - h)) / (2 * h),
-    ]
-    # Nothing is left to move: every sample has it exactly.
-    np.testing.assert_allclose(local_mean_force(series, KT), np.tile(exact, (64, 1)), rtol=0, atol=1e-8)
 
 
 def test_of_two_estimates_the_mixture_that_fluctuates_least():

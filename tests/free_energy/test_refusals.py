@@ -34,7 +34,7 @@ from kcons.free_energy import (
     scan,
     weighted_mean,
 )
-from kcons.free_energy.scans.scan_result import Grid
+from kcons.free_energy.scans.relaxed_scan import Grid
 
 TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
 CALCULATOR = partial(LennardJones, sigma=1.0, epsilon=0.02, rc=6.0)
@@ -243,10 +243,10 @@ SCANS = [
     (lambda: scanned(None, [0.1]), None, "coordinates has None"),
     (lambda: scan(Atoms("C4", STRAIGHT.positions), TURN, [0.1]), "calculator", "no calculator"),
     (lambda: scan(STRAIGHT, TURN, [0.1]), None, "collinear; bend them, or hold a", SingularGeometryError),
-    (lambda: scanned(LENGTH, [1.2], held=LENGTH), None, r"Distance\(0, 1\) depends on what else is h", ConstraintError),
-    (lambda: scanned(LONG[2], [2.2], held=LONG[:2]), None, r"Distance\(0, 2\) depends", ConstraintError),
-    (lambda: scanned(LENGTH, [1.2], held=FixedAtoms([0, 1])), None, r"Distance\(0, 1\) depends", ConstraintError),
-    (lambda: scanned([LENGTH, Distance([[1, 0]])], [[1.2], [1.2]]), None, r"Distance\(1, 0\) depends", ConstraintError),
+    (lambda: scanned(LENGTH, [1.2], held=LENGTH), None, "distance_0_1 depends on the other", ConstraintError),
+    (lambda: scanned(LONG[2], [2.2], held=LONG[:2]), None, "distance_0_2 depends", ConstraintError),
+    (lambda: scanned(LENGTH, [1.2], held=FixedAtoms([0, 1])), None, "distance_0_1 depends", ConstraintError),
+    (lambda: scanned([LENGTH, Distance([[1, 0]])], [[1.2], [1.2]]), "distance_0_1", "are the same row 0"),
     (lambda: scanned(Distance([[0, 9]]), [1.2]), None, "atom 9"),
     (lambda: scanned(LENGTH, [-1.0, 1.2]), None, "length greater than zero"),
     (lambda: scanned(Angle([[0, 1, 2]]), [120.0]), None, "no angle between 0 and pi"),

@@ -8,7 +8,7 @@ import pytest
 from kcons import ConstraintSet
 from kcons.constraints import Angle, Dihedral, Distance
 from kcons.free_energy import HeldCoordinates
-from kcons.free_energy.torsion_force import leaves_the_rest, rigid_turn
+from kcons.free_energy.held_coordinates import leaves_the_rest, rigid_turn
 
 #: A chain of five atoms with a branch at the third.
 X = np.array([[0.0, 0.1, 0.2], [1.1, 0.0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9], [3.1, 0.4, 1.9], [1.0, 2.1, -0.4]])

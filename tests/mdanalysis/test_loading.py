@@ -112,7 +112,6 @@ def test_restarts_of_amber(tmp_path, x, name):
 
 
 def test_topologies_of_gromacs_and_amber_have_one_ending(tmp_path):
-    """A topology of GROMACS that stands by itself is read; one that includes others names what is missing."""
     atoms = "".join(f"{k + 1} {name} 1 SOL {name} 1 0.0 {mass}\n" for k, (name, mass) in enumerate(WATER))
     molecule = f"[ moleculetype ]\nSOL 2\n[ atoms ]\n{atoms}[ bonds ]\n1 2 1\n1 3 1\n"
     path = tmp_path / "w.top"

@@ -11,13 +11,7 @@ import pytest
 from scipy.special import ellipj, ellipk
 
 from kcons.constraints import projection
-from kcons.errors import (
-    ConstraintError,
-    ConvergenceError,
-    InputError,
-    NonFiniteError,
-    SingularGeometryError,
-)
+from kcons.errors import ConstraintError, ConvergenceError, InputError, NonFiniteError, SingularGeometryError
 from kcons.models import Multibody
 
 #: Steps of one size: no error is too large for it.
@@ -68,7 +62,19 @@ def test_squeezer_ends_where_it_is_published_to():
     np.testing.assert_allclose(-found.multipliers[-1].reshape(2, 3).T.ravel(), MULTIPLIERS, rtol=2e-6, atol=0)
 
 
+@pytest.mark.parametrize("seed", [3, 4, 9])
+def test_far_starts_are_reached_by_parts_of_steps(seed):
+    body = squeezer()[0]["body"]
+    q, v = body.project(START + 0.3 * np.random.default_rng(seed).normal(size=7), np.zeros(7))
+    assert np.abs(body.residuals(q, v)).max() < 1e-14
+
+
 # -- closed forms ------------------------------------------------------------------------------------
+
+
+def none(q, v, t):
+    return np.zeros(len(q))
+
 
 LENGTH, GRAVITY, SWING = 0.5, 9.8, 2.0
 
@@ -110,26 +116,15 @@ def test_coordinates_without_mass():
     np.testing.assert_allclose(found.multipliers, pull, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("method", "rtol"), [("DOP853", 1e-9), ("RK45", 1e-8), ("RK23", 1e-5), ("Radau", 1e-7), ("BDF", 1e-6)]
-)
-def test_every_method_stays_on_the_constraints(method, rtol):
-    body = pendulum()
-    found = body.solve(*hung(SWING), (0, 1), method=method, rtol=rtol, atol=0.1 * rtol)
-    assert np.abs(found.q[-1, 2] - swinging(1.0)[0]) < 1e3 * rtol
-    # Where projected velocities differ from those of the method, its next step starts from them.
-    g, slip = np.abs([body.residuals(q, v) for q, v in zip(found.q, found.v, strict=True)]).max(axis=(0, 2))
-    assert g < 1e-15 and slip < 1e-14
-
-
-def test_between_steps_as_well_and_backwards():
+def test_at_steps_and_between_and_backwards():
     body = pendulum()
     times = np.linspace(1, 0, 40)
-    there = body.solve(*hung(SWING), (0, 1), rtol=1e-11, atol=1e-12)
+    there = body.solve(*hung(SWING), (0, 1), method="BDF", rtol=1e-10, atol=1e-11)
     back = body.solve(there.q[-1], there.v[-1], (1, 0), times, rtol=1e-11, atol=1e-12)
     np.testing.assert_array_equal(back.t, times)
-    np.testing.assert_allclose(back.q[:, 2], swinging(times)[0], rtol=0, atol=1e-8)
-    assert max(np.abs(body.residuals(q, v)).max() for q, v in zip(back.q, back.v, strict=True)) < 1e-14
+    np.testing.assert_allclose(back.q[:, 2], swinging(times)[0], rtol=0, atol=1e-6)
+    for found in (there, back):
+        assert max(np.abs(body.residuals(q, v)).max() for q, v in zip(found.q, found.v, strict=True)) < 1e-14
 
 
 def test_no_time_and_no_times():
@@ -143,8 +138,7 @@ def test_no_time_and_no_times():
 # -- the same motion in other coordinates ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau"])
-def test_a_linear_change_of_coordinates_changes_nothing(method):
+def test_a_linear_change_of_coordinates_changes_nothing():
     """M = T^T D T, g(T y): the same steps, projections in the metric of M included, to rounding."""
     rng = np.random.default_rng(5)
     T, D = rng.normal(size=(3, 3)) + 2 * np.eye(3), np.array([1.0, 3.0, 0.5])
@@ -170,13 +164,10 @@ def test_a_linear_change_of_coordinates_changes_nothing(method):
         curvature=lambda y, w: bend(T @ y, T @ w),
     )
     x, v = plain.project([0.9, 0.2, 0.4], [0.3, 0.5, -0.4])
-    # Radau solves its equations only to the tolerance: there it has to be small.
-    options = steps_of(0.05) if method == "DOP853" else {"rtol": 1e-11, "atol": 1e-12}
-    one = plain.solve(x, v, (0, 2), method=method, **options)
-    other = full.solve(np.linalg.solve(T, x), np.linalg.solve(T, v), (0, 2), method=method, **options)
-    close = 1e-12 if method == "DOP853" else 1e-8
-    np.testing.assert_allclose(other.q[-1] @ T.T, one.q[-1], rtol=0, atol=close)
-    np.testing.assert_allclose(other.multipliers[-1], one.multipliers[-1], rtol=0, atol=100 * close)
+    one = plain.solve(x, v, (0, 2), **steps_of(0.05))
+    other = full.solve(np.linalg.solve(T, x), np.linalg.solve(T, v), (0, 2), **steps_of(0.05))
+    np.testing.assert_allclose(other.q[-1] @ T.T, one.q[-1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other.multipliers[-1], one.multipliers[-1], rtol=0, atol=1e-10)
     start = [x + np.array([0.1, -0.2, 0.1]), v + np.array([0.2, 0.0, 0.3])]
     there, speed = plain.project(*start)
     here, pace = full.project(*(np.linalg.solve(T, part) for part in start))
@@ -249,7 +240,7 @@ def test_no_mass_where_something_moves():
 
 def test_a_crossing_of_two_ways_is_passed_straight_on():
     """Where the planes z = 0 and z = x y touch, rows depend: the step that ends there is made shorter."""
-    body = Multibody(np.ones(3), lambda q, v, t: np.zeros(3), lambda q: np.array([q[2], q[2] - q[0] * q[1]]))
+    body = Multibody(np.ones(3), none, lambda q: np.array([q[2], q[2] - q[0] * q[1]]))
     found = body.solve([-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], (0, 3), **steps_of(0.25))
     np.testing.assert_allclose(found.q[-1], [2.0, 0.0, 0.0], rtol=0, atol=1e-12)
     assert len(found.t) > 13
@@ -259,41 +250,29 @@ def test_a_crossing_of_two_ways_is_passed_straight_on():
 
 
 def test_a_constraint_that_ends_on_the_way_is_told():
-    def until_zero(q):
-        return np.array([min(q[0], 0.0) ** 4 * q[1], q[2]])
-
-    body = Multibody(np.ones(3), lambda q, v, t: np.zeros(3), until_zero)
-    with pytest.raises(
-        SingularGeometryError, match=r"at t = 1.* only 1 constraints are independent, and 2 at the start"
-    ):
+    body = Multibody(np.ones(3), none, lambda q: np.array([min(q[0], 0.0) ** 4 * q[1], q[2]]))
+    with pytest.raises(SingularGeometryError, match=r"at t = 1.* only 1 constraints are independent, and 2 at the"):
         body.solve([-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], (0, 3))
 
 
 def test_positions_that_cannot_be_met():
-    body = Multibody([1.0, 1.0], lambda q, v, t: np.zeros(2), lambda q: np.array([q @ q + 1.0]))
+    body = Multibody([1.0, 1.0], none, lambda q: np.array([q @ q + 1.0]))
     with pytest.raises(ConvergenceError, match="constraint 0 stays off") as caught:
         body.project([1.0, 0.5], [0.0, 0.0])
     assert caught.value.row == 0 and caught.value.residual > 0.1
 
 
 def test_trial_steps_may_go_too_far():
-    """A force with an edge that the motion never reaches, and one that it does."""
-
-    def force(q, v, t):
-        with np.errstate(all="ignore"):
-            return -0.5 / np.sqrt(q)  # x = sqrt(1 - 2 t^2...) reaches 0 with infinite force
-
-    body = Multibody([1.0], force)
-    with pytest.raises(NonFiniteError, match="force is not finite at q"):
-        body.solve([1.0], [-1.0], (0, 10), first_step=1.5)
+    """Past an edge of the force that the motion never reaches; where it does, that is told."""
 
     def wall(q, v, t):
-        with np.errstate(all="ignore"):
-            return 1e-3 / np.where(q > 0, q, np.nan) ** 2
+        return 1e-3 / np.where(q > 0, q, np.nan) ** 2
 
     found = Multibody([1.0], wall).solve([1.0], [-1.0], (0, 2.5), first_step=1.5)
     energy = 0.5 * found.v[:, 0] ** 2 + 1e-3 / found.q[:, 0]
     np.testing.assert_allclose(energy, energy[0], rtol=1e-6)
+    with pytest.raises(NonFiniteError, match="force is not finite at q"):
+        Multibody([1.0], lambda q, v, t: -0.5 / np.sqrt(np.where(q > 0, q, np.nan))).solve([1.0], [-1.0], (0, 10))
 
 
 def test_what_ends_a_run_is_told_not_what_was_got_over():
@@ -308,29 +287,7 @@ def test_what_ends_a_run_is_told_not_what_was_got_over():
         Multibody([1.0], force).solve([0.0], [1.0], (0, 2))
 
 
-@pytest.mark.parametrize(
-    ("change", "item"),
-    [
-        ({"q": [0.0, 0.0]}, "q"),
-        ({"q": [0.0, -LENGTH, np.nan]}, "q"),
-        ({"v": [0.0, np.inf, 0.0]}, "v"),
-        ({"v": np.zeros((3, 1))}, "v"),
-        ({"rtol": np.nan}, "rtol"),
-    ],
-)
-def test_bad_arguments_are_named(change, item):
-    q, v = hung(0.0)
-    arguments = {"q": q, "v": v, "t_span": (0, 1)} | change
-    with pytest.raises(InputError) as caught:
-        pendulum().solve(**arguments)
-    assert caught.value.item == item
-
-
 # -- what a user gives -------------------------------------------------------------------------------
-
-
-def none(q, v, t):
-    return np.zeros(len(q))
 
 
 def curve(q):
@@ -406,29 +363,30 @@ def test_wrong_derivatives_are_refused(name, wrong, said):
         ("constraints", [lambda q: np.zeros((2, 2)), lambda q: ["a", "b"]]),
         ("jacobian", [lambda q: gradient(q).T[:1], lambda q: gradient(q)[:1]]),
         ("curvature", [lambda q, v: bend(q, v)[:1]]),
+        # Of a run.
+        ("q", [[0.0], [np.nan, 0.7]]),
+        ("v", [[0.0, np.inf], np.zeros((2, 1))]),
+        ("rtol", [np.nan]),
     ],
 )
 def test_what_cannot_be_is_named(item, values):
     for value in values:
+        given = {"mass": np.eye(2), "force": none, "constraints": curve, "q": Q, "v": V, "rtol": 1e-9} | {item: value}
+        run = {name: given.pop(name) for name in ("q", "v", "rtol")}
         with pytest.raises(InputError) as caught:
-            Multibody(**({"mass": np.eye(2), "force": none, "constraints": curve} | {item: value})).motion(Q, V)
+            Multibody(**given).solve(t_span=(0, 1), **run)
         assert caught.value.item == item
-
-
-def test_a_gradient_without_constraints_is_named():
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match="there is a jacobian without constraints"):
         Multibody(np.eye(2), none, jacobian=gradient)
-    assert caught.value.item == "jacobian"
 
 
-@pytest.mark.parametrize("name", ["mass", "force", "constraints", "jacobian", "curvature"])
-def test_functions_that_are_not_finite_are_named(name):
+def test_functions_that_are_not_finite_are_named():
     given = {"mass": lambda q: np.eye(2), "force": none, "constraints": curve, "jacobian": gradient, "curvature": bend}
-    right = given[name]
-    given[name] = lambda *arguments: right(*arguments) * np.nan
-    with pytest.raises(NonFiniteError, match=f"{name} is not finite at q") as caught:
-        Multibody(**given).motion(Q, V)
-    assert caught.value.item == name
+    for name, right in given.items():
+        wrong = lambda *arguments, right=right: right(*arguments) * np.nan  # noqa: E731
+        with pytest.raises(NonFiniteError, match=f"{name} is not finite at q") as caught:
+            Multibody(**(given | {name: wrong})).motion(Q, V)
+        assert caught.value.item == name
 
 
 def test_what_functions_get_cannot_be_changed_and_what_they_return_may_be_used_again():
@@ -446,9 +404,3 @@ def test_what_functions_get_cannot_be_changed_and_what_they_return_may_be_used_a
     again = Multibody(np.eye(2), greedy, curve, reused).motion(Q, V)
     fresh = Multibody(np.eye(2), greedy, curve, gradient).motion(Q, V)
     np.testing.assert_array_equal(again[0], fresh[0])
-
-
-def test_large_numbers_are_finite():
-    """Whose squares are not."""
-    body = Multibody([1e200], lambda q, v, t: np.array([3e200]))
-    assert body.motion([0.0], [0.0])[0] == 3.0

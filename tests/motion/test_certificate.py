@@ -21,9 +21,8 @@ V = np.array([[0.1, 0.5, 0.2], [-0.3, 0.1, 0.4], [0.2, 0.3, -0.5]])
 MASSES = np.array([1.0, 0.7, 2.0])
 
 
-def system(angle: bool = True) -> tuple[System, State]:
-    rows = [Distance([[0, 1], [1, 2]]), *([Angle([[0, 1, 2]])] if angle else [])]
-    motion = Motion(ConstraintSet(rows, X, MASSES), X)
+def system() -> tuple[System, State]:
+    motion = Motion(ConstraintSet([Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2]])], X, MASSES), X)
     return System(motion, lambda x, t: -0.3 * x), State(X, motion.project_velocities(X, V))
 
 
@@ -32,23 +31,13 @@ class Careless:
 
     def __init__(self, solver, what, good=0):
         self.solver, self.what, self.left = solver, what, good
-        self.rows, self.name = solver.rows, solver.name
 
     def __getattr__(self, name):
-        return getattr(self.solver, name)
-
-    def positions(self, *args):
-        return self._either("positions", args)
-
-    def tangents(self, *args):
-        return self._either("tangents", args)
-
-    def _either(self, name, args):
         if name == self.what:
             self.left -= 1
             if self.left < 0:
-                return Outcome(True, 0.0, 1, 0)
-        return getattr(self.solver, name)(*args)
+                return lambda *args: Outcome(True, 0.0, 1, 0)
+        return getattr(self.solver, name)
 
 
 @pytest.mark.parametrize(("what", "named"), [("positions", "sigma"), ("tangents", "A v - c")])

@@ -1,23 +1,66 @@
-"""The engine's public calls: what they change, what they leave alone, and what they refuse."""
+"""The engine's public calls: what they change, leave alone, refuse, say and report."""
 
 from __future__ import annotations
 
+import tracemalloc
+from itertools import combinations
+
 import numpy as np
 import pytest
-from motion_systems import TRIANGLE, WATER, steps, system
 
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import (
-    ContradictionError,
-    ConvergenceError,
-    InfeasibleError,
-    InputError,
-    KconsError,
-    SingularGeometryError,
-)
+from kcons.errors import ContradictionError, ConvergenceError, InputError, SingularGeometryError
 from kcons.motion import Motion
-from kcons.solvers.cluster_solver import Request
+from kcons.motion import report as reports
+from kcons.motion.report import worst_condition
+from kcons.motion.solver_sequence import Failures
+from kcons.solvers.cluster_solver import Outcome, Request
+
+WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
+TRIANGLE = list(combinations(range(3), 2))
+ZIGZAG = np.cumsum(np.tile([[0.8, 0.9, 0.1], [0.9, -0.8, 0.2]], (10, 1)), axis=0)
+ATOMS = 26
+
+
+def system(extra: int, seed: int = 0, moving: bool = False):
+    """Rows of every kind on scattered atoms among `extra` free ones; the constraint set, positions, and which atoms.
+
+    Water, lanes, a chain, an anchored bond, dependent, mixed and general rows.
+    """
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-4, 4, (ATOMS, 3))
+    x[:3] = WATER
+    x[5:14] = ZIGZAG[:9]
+    masses = rng.choice([1.0, 12.0, 16.0], ATOMS)
+    rows: list[held.Constraint] = [
+        held.Distance([(0, 1), (0, 2), (1, 2)]),
+        held.Distance([(3, 4)]),
+        held.Distance([(k, k + 1) for k in range(5, 13)]),
+        held.FixedAtoms([14]),
+        held.Distance([(14, 15)]),
+        held.Distance([(16, 17), (17, 18), (16, 17)]),
+        held.Angle([(16, 17, 18)]),
+        held.RadiusOfGyration([[19, 20, 21]]),
+        held.Sphere(22, [9.0, 9, 9]),
+    ]
+    if moving:
+        rows.append(held.Distance([(23, 24)], lambda t: 3.0 + 0.3 * np.sin(t)))
+        rows.append(held.LinearVelocity([[25]], [[1.0, 0.5, 0]], lambda t: np.cos(t)))
+    n = ATOMS + extra
+    numbers = rng.permutation(n)[:ATOMS]
+    whole = rng.uniform(-4, 4, (n, 3))
+    whole[numbers] = x
+    all_masses = np.full(n, 7.0)
+    all_masses[numbers] = masses
+    renumbered = [item.renumbered(numbers) for item in rows]
+    return ConstraintSet(renumbered, whole, all_masses), whole, numbers
+
+
+def steps(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return 0.03 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+
 
 # -- in place, pure, wrong arguments ----------------------------------------------------------------
 
@@ -208,34 +251,15 @@ def test_rescue_by_damped_newton(name: str, crowd: int) -> None:
     assert motion.report(y).iterations > 0
 
 
-# -- every failure has a remedy ---------------------------------------------------------------------
+# -- what has no solution ---------------------------------------------------------------------------
 
 
-def raised(call) -> KconsError:
-    with pytest.raises(KconsError) as caught:
-        call()
-    return caught.value
-
-
-def test_messages_say_what_to_do() -> None:
-    far = WATER + np.array([[0, 0, 0], [7.0, 0, 0], [0, 0, 0]])
-    motion = Motion(ConstraintSet(held.Distance(TRIANGLE), WATER, np.ones(3)), WATER)
-    error = raised(lambda: motion.project_positions(far, WATER))
-    assert isinstance(error, ConvergenceError) and "use a smaller time step" in str(error)
-    rows = [held.Distance([0, 1]), held.Plane([0, 1], [1.0, 0, 0], [0.0, 3.0])]
-    bent = WATER[1:]
-    twice = Motion(ConstraintSet(rows, bent, np.ones(2)), bent)
-    error = raised(lambda: twice.restore_positions(bent))
-    assert isinstance(error, InfeasibleError) and "Check its target" in str(error)
-    contrary = [held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.0), held.LinearVelocity([[0, 1]], np.eye(3)[[0, 1]], 0.0)]
-    contrary += [held.LinearVelocity([[1]], [[0, 1.0, 0]], 1.0)]
-    error = raised(
-        lambda: Motion(ConstraintSet(contrary, WATER, np.ones(3)), WATER).project_velocities(WATER, 0 * WATER)
-    )
-    assert isinstance(error, ConvergenceError) and "contradict" in str(error) and "Remove or change" in str(error)
-    between = [held.FixedAtoms([0, 1]), held.Distance([0, 1], 2.0)]
-    error = raised(lambda: Motion(ConstraintSet(between, WATER, np.ones(3)), WATER))
-    assert isinstance(error, ContradictionError) and "free one of its atoms" in str(error)
+def test_rows_of_velocities_that_contradict_each_other() -> None:
+    rows = [held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.0), held.LinearVelocity([[0, 1]], np.eye(3)[[0, 1]], 0.0)]
+    rows += [held.LinearVelocity([[1]], [[0, 1.0, 0]], 1.0)]
+    motion = Motion(ConstraintSet(rows, WATER, np.ones(3)), WATER)
+    with pytest.raises(ConvergenceError, match=r"contradict.*Remove or change"):
+        motion.project_velocities(WATER, 0 * WATER)
 
 
 def test_nothing_held() -> None:
@@ -291,3 +315,280 @@ def test_a_cell_that_moves_the_image_of_a_fixed_atom_is_refused(free, of_the_set
         motion.certify(x)
     motion.set_cell([10.0, 12, 11])
     motion.certify(motion.project_positions(x + 0.01, x))
+
+
+# -- what is said where a solve fails ---------------------------------------------------------------
+
+
+def test_curvature_that_is_undefined() -> None:
+    x = np.array([[1.0, 0, 0], [0.0, 0, 0], [0.0, 1.0, 0]])
+    motion = Motion(ConstraintSet(held.Angle([0, 1, 2]), x, np.ones(3)), x)
+    straight = np.array([[1.0, 0, 0], [0.0, 0, 0], [-1.0, 0.0, 0]])
+    with pytest.raises(SingularGeometryError) as caught:
+        motion.acceleration(straight, x, x)
+    assert caught.value.rows == (0,) and caught.value.atoms == (0, 1, 2)
+
+
+def chain(x: np.ndarray) -> Motion:
+    rows = [held.Distance([[0, 1], [1, 2], [2, 3]]), held.Dihedral([[0, 1, 2, 3]])]
+    return Motion(ConstraintSet(rows, x, np.ones(len(x))), x)
+
+
+def folded(degrees: float) -> np.ndarray:
+    """Four atoms whose last three are so far from one line, to the one side or to the other, and one elsewhere."""
+    bend = np.radians(degrees)
+    return np.array([[0, 1.0, 0], [0, 0, 0], [1.0, 0, 0], [1.0 + np.cos(bend), 0, np.sin(bend)], [5.0, 5, 5]])
+
+
+@pytest.mark.parametrize("numbers", [None, np.array([10, 11, 12, 13, 14])])
+@pytest.mark.parametrize(("before", "after", "named"), [(2.0, -2.0, True), (20.0, -20.0, True), (2.0, 20.0, False)])
+def test_a_dihedral_that_becomes_straight_is_named(numbers, before, after, named) -> None:
+    x = folded(before)
+    motion, request = chain(x), Request(folded(after), x)
+    told = Failures(motion.constraint_set, motion.plan, numbers)
+    error = told.positions(request, Outcome(False, 0.25, 7, 0), motion.plan.solvers[0])
+    assert isinstance(error, ConvergenceError) and "smaller time step" in str(error)
+    names = "1, 2, 3" if numbers is None else "11, 12, 13"
+    assert (f"Atoms {names} of row #3 Dihedral" in str(error)) == named
+    assert np.array_equal(request.changed, folded(after)) and np.array_equal(x, folded(before))
+
+
+# -- few constrained atoms among many free ones: the compact copy -----------------------------------
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_few_atoms_among_many_get_what_they_get_alone(moving: bool) -> None:
+    """The compact copy gives the numbers of the direct way, on the global atoms; all others stay."""
+    many, x, numbers = system(400, moving=moving)
+    alone = ConstraintSet(
+        [c.renumbered(np.argsort(numbers)[np.searchsorted(np.sort(numbers), np.arange(len(x))).clip(0, ATOMS - 1)])
+         for c in many.constraints],
+        x[numbers], many.masses[numbers],
+    )  # fmt: skip
+    big, small = Motion(many, x), Motion(alone, x[numbers])
+    assert big._atoms is not None and small._atoms is None
+    assert big.rank == small.rank
+    assert big.degrees_of_freedom - small.degrees_of_freedom == 3 * 400
+    move, v = steps(len(x), 1)
+    f = np.random.default_rng(5).normal(size=x.shape)
+    free = np.setdiff1d(np.arange(len(x)), numbers)
+    n = many.n_rows
+    for time in (0.0, 0.4) if moving else (0.0,):
+        vb, vs, lb, ls = v.copy(), v[numbers], np.empty(n), np.empty(n)
+        kw = {"time": time, "reference_time": 0.0, "dt": 0.1}
+        found = big.project_positions(x + move, x, velocities=vb, multipliers=lb, **kw)
+        expected = small.project_positions((x + move)[numbers], x[numbers], velocities=vs, multipliers=ls, **kw)
+        np.testing.assert_allclose(found[numbers], expected, rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(found[free], (x + move)[free])
+        np.testing.assert_allclose(vb[numbers], vs, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(vb[free], v[free])
+        np.testing.assert_allclose(lb, ls, rtol=0, atol=1e-12)
+        y, ys = found, expected
+        found = big.project_velocities(y, v, time=time, multipliers=lb)
+        expected = small.project_velocities(ys, v[numbers], time=time, multipliers=ls)
+        np.testing.assert_allclose(found[numbers], expected, rtol=0, atol=1e-13)
+        np.testing.assert_array_equal(found[free], v[free])
+        np.testing.assert_allclose(lb, ls, rtol=0, atol=1e-12)
+        for name in ("acceleration", "constraint_force"):
+            found = getattr(big, name)(y, v, f, time)
+            expected = getattr(small, name)(ys, v[numbers], f[numbers], time)
+            np.testing.assert_allclose(found[numbers], expected, rtol=0, atol=1e-11)
+            plain = f / many.masses[:, None] if name == "acceleration" else np.zeros_like(f)
+            np.testing.assert_array_equal(found[free], plain[free])
+        lam = big.multipliers(y, v, f, time)
+        np.testing.assert_allclose(lam, small.multipliers(ys, v[numbers], f[numbers], time), rtol=0, atol=1e-11)
+        found = big.project_forces(y, f, time=time)
+        np.testing.assert_allclose(found[numbers], small.project_forces(ys, f[numbers], time=time), rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(found[free], f[free])
+        off = x + 3 * move
+        found = big.restore_positions(off, time=time)
+        np.testing.assert_allclose(found[numbers], small.restore_positions(off[numbers], time=time), rtol=0, atol=1e-10)
+        np.testing.assert_array_equal(found[free], off[free])
+
+
+def test_memory_of_one_bond_does_not_depend_on_the_number_of_atoms() -> None:
+    """After set-up: neither a step's peak nor what is kept between steps."""
+
+    def used(n: int, traced: bool = True) -> tuple[int, int]:
+        x = np.zeros((n, 3))
+        x[n // 2] = [1.0, 0, 0]
+        whole = ConstraintSet(held.Distance([0, n // 2]), x, np.ones(n))
+        if traced:
+            tracemalloc.start()
+        motion = Motion(whole, x)
+        kept = tracemalloc.get_traced_memory()[0]
+        new, v = x + 0.0, np.zeros_like(x)
+        new[0] += [0.01, 0.02, 0.03]
+        motion.project_positions(new, x, velocities=v, dt=0.1, out=new)
+        motion.project_velocities(new, v, out=v)
+        tracemalloc.reset_peak()
+        before = tracemalloc.get_traced_memory()[0]
+        motion.project_positions(new, x, velocities=v, dt=0.1, out=new)
+        motion.project_velocities(new, v, out=v)
+        peak = tracemalloc.get_traced_memory()[1] - before
+        tracemalloc.stop()
+        return kept, peak
+
+    used(1000, traced=False)  # kernels are compiled, which takes four times as long where memory is watched
+    (kept_small, peak_small), (kept_large, peak_large) = used(1000), used(300_000)
+    assert peak_large <= peak_small + 2000
+    # The incidence of the set and the atoms it touches, but nothing by atom: 300,000 doubles are 2.4 MB.
+    assert kept_large <= kept_small + 20_000
+
+
+def test_errors_name_global_rows_and_atoms() -> None:
+    many, x, numbers = system(400)
+    motion = Motion(many, x)
+    bond = numbers[[3, 4]].tolist()
+    far = x.copy()
+    far[bond[0]] += [40.0, 0, 0]
+    with pytest.raises(ConvergenceError, match="smaller time step") as caught:
+        motion.project_positions(far, x)
+    assert list(caught.value.atoms) == bond
+    assert many.row_name(caught.value.row) in str(caught.value)
+    assert caught.value.cluster == motion.plan.labels[caught.value.row] >= 0
+    assert caught.value.residual > caught.value.tolerance
+    broken = x.copy()
+    broken[numbers[9]] = np.nan
+    for call in (
+        lambda: motion.project_positions(broken, x),
+        lambda: motion.project_positions(x, broken),
+        lambda: motion.project_velocities(x, broken),
+        lambda: motion.project_velocities(broken, x),
+        lambda: motion.project_forces(x, broken),
+        lambda: motion.restore_positions(broken),
+    ):
+        with pytest.raises(InputError, match=f"atom {numbers[9]} is not finite") as wrong:
+            call()
+        assert wrong.value.atoms == (numbers[9],)
+    same = x.copy()
+    same[bond[0]] = same[bond[1]]
+    with pytest.raises(SingularGeometryError, match=f"atoms {bond[0]} and {bond[1]} coincide.*move them") as single:
+        motion.project_velocities(same, x)
+    assert single.value.atoms == tuple(bond)
+    assert str(bond[0]) in str(motion.report(x))
+
+
+# -- the report, and condition numbers against singular values of the whole matrix ------------------
+
+
+TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+METHANE = np.vstack([np.zeros(3), 0.629 * TETRAHEDRON])
+
+
+def mixed_system(extra: int = 0) -> tuple[Motion, np.ndarray]:
+    """Water, methane by ten distances, an angle with its bonds, a radius of gyration; atoms from `extra` on."""
+    x = np.vstack([WATER, METHANE + 5, 1.1 * WATER - 5, WATER[:, ::-1] + 9])
+    rows = [
+        held.Distance(TRIANGLE),
+        held.Distance([(3 + i, 3 + j) for i, j in combinations(range(5), 2)]),
+        held.Distance([(8, 9), (8, 10)]),
+        held.Angle([(9, 8, 10)]),
+        held.RadiusOfGyration([[11, 12, 13]]),
+    ]
+    numbers = np.arange(len(x)) + extra
+    rows = [c.renumbered(numbers) for c in rows]
+    whole = np.vstack([np.arange(3.0 * extra).reshape(extra, 3) + 50, x])
+    masses = np.concatenate([np.ones(extra), [16.0, 1, 1], [12.0, 1, 1, 1, 1], [16.0, 1, 1], [3.0, 4, 5]])
+    return Motion(ConstraintSet(rows, whole, masses), whole), whole
+
+
+@pytest.mark.parametrize("extra", [0, 100])
+def test_report_says_it_all(extra: int) -> None:
+    motion, x = mixed_system(extra)
+    whole = motion.constraint_set
+    v = np.random.default_rng(0).normal(size=x.shape)
+    report = motion.report(x, v)
+    assert (report.rows, report.rank, report.degrees_of_freedom) == (17, 16, 3 * len(x) - 16)
+    assert [(k.solver, k.clusters, k.rows, k.rank) for k in report.kinds] == [
+        ("RigidTriangles", 1, 3, 3),
+        ("SparseDistances", 1, 10, 9),
+        ("SingleRows", 1, 1, 1),
+        ("SparseRows", 1, 3, 3),
+    ]
+    A = whole.jacobian(x).toarray()
+    for kind, rows in zip(report.kinds, (range(3), range(3, 13), [16], range(13, 16)), strict=True):
+        B = A[list(rows)] / np.sqrt(np.repeat(whole.masses, 3))
+        s = np.linalg.svd(B / np.linalg.norm(B, axis=1)[:, None], compute_uv=False)
+        assert kind.condition == pytest.approx(s[0] / s[s > 1e-9][-1], rel=1e-9)
+        assert whole.row_name(rows[0]) == kind.example
+    assert report.condition == max(k.condition for k in report.kinds)
+    unit = A / np.linalg.norm(A, axis=1)[:, None]
+    assert report.velocity_residual == pytest.approx(np.abs(unit @ v.ravel()).max(), rel=1e-12)
+    assert report.iterations == 0 and all(k.iterations == 0 for k in report.kinds)
+    text = str(report)
+    for kind in report.kinds:
+        assert kind.solver in text and kind.example in text and f"{kind.condition:.3g}" in text
+    assert "rows 17, rank 16" in text and "condition" in text and "iterations" in text
+    assert f"degrees of freedom {report.degrees_of_freedom}" in text
+
+
+def test_the_worst_row_is_named_and_the_condition_is_found_where_it_is_asked_for() -> None:
+    motion, x = mixed_system()
+    off = x.copy()
+    off[9] += 0.3
+    report = motion.report(off, condition=False)
+    assert report.worst_row in ("#13 Distance(8, 9)", "#15 Angle(9, 8, 10)")
+    assert report.residual == np.abs(motion.constraint_set.value(off)).max()
+    assert np.isnan([report.condition, report.velocity_residual, *(k.condition for k in report.kinds)]).all()
+    assert report.worst_row in str(report) and " - " in str(report) and "nan" not in str(report)
+
+
+# -- condition ------------------------------------------------------------------------------------------
+
+
+def dense(whole: ConstraintSet, x: np.ndarray, inverse_masses: np.ndarray, rows: np.ndarray) -> float:
+    B = whole.jacobian(x).toarray()[rows] * np.repeat(np.sqrt(inverse_masses), 3)
+    s = np.linalg.svd(B / np.linalg.norm(B, axis=1)[:, None], compute_uv=False)
+    return float(s[0] / s[s > 1e-9 * s[0]][-1])
+
+
+def straight_chain(n: int) -> tuple[ConstraintSet, np.ndarray]:
+    rng = np.random.default_rng(n)
+    k = np.arange(n)
+    x = np.stack([0.99 * k, 0.01 * (k % 2), 0.005 * rng.normal(size=n)], axis=1)
+    return ConstraintSet(held.Distance(np.stack([k[:-1], k[1:]], axis=1)), x, np.full(n, 7.0)), x
+
+
+@pytest.mark.parametrize("n", [2, 30, reports.DENSE_ROWS + 1, reports.DENSE_ROWS + 2, 900])
+def test_one_cluster(n: int) -> None:
+    """Straight-ish chains, whose condition grows with their length: the dense and the sparse way."""
+    whole, x = straight_chain(n)
+    w, rows = 1 / whole.masses, np.arange(n - 1)
+    found = worst_condition(whole.jacobian(x), w, rows, np.zeros(n - 1, int), deficiency=0)
+    assert found == pytest.approx(dense(whole, x, w, rows), rel=1e-6 if n - 1 <= reports.DENSE_ROWS else 1e-3)
+    assert found > min(0.2 * n, 50)
+
+
+def test_worst_of_many_clusters_of_several_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    x = np.concatenate([WATER + 5 * k + 0.3 * rng.normal(size=(3, 3)) for k in range(20)])
+    pairs = [(3 * k + i, 3 * k + j) for k in range(20) for i, j in list(combinations(range(3), 2))[: 2 + k % 2]]
+    order = rng.permutation(len(pairs))
+    pairs = np.array(pairs)[order]
+    whole = ConstraintSet(held.Distance(pairs), x, rng.uniform(1, 20, 60))
+    labels = pairs[:, 0] // 3
+    w = 1 / whole.masses
+    w[6] = 0.0  # a fixed atom
+    expected = max(dense(whole, x, w, np.flatnonzero(labels == k)) for k in range(20))
+    found = worst_condition(whole.jacobian(x), w, np.arange(len(pairs)), labels, deficiency=0)
+    assert found == pytest.approx(expected, rel=1e-9)
+    # Portions of one cluster each give the same.
+    monkeypatch.setattr(reports, "PORTION", 1)
+    again = worst_condition(whole.jacobian(x), w, np.arange(len(pairs)), labels, deficiency=0)
+    assert again == found
+    some = np.flatnonzero(labels == 3)
+    one = worst_condition(whole.jacobian(x), w, some, labels, deficiency=0)
+    assert one == pytest.approx(dense(whole, x, w, some), rel=1e-9)
+
+
+def test_out_of_reach_is_not_a_number() -> None:
+    n = reports.DENSE_DEPENDENT_ROWS + 3
+    whole, x = straight_chain(n)
+    labels = np.zeros(n - 1, int)
+    assert np.isnan(worst_condition(whole.jacobian(x), 1 / whole.masses, np.arange(n - 1), labels, deficiency=1))
+    # A gradient of zero has no direction.
+    two = ConstraintSet(held.Distance([0, 1]), WATER[:2], np.ones(2))
+    jacobian = two.jacobian(WATER[:2])
+    jacobian.data[:] = 0.0
+    assert np.isnan(worst_condition(jacobian, np.ones(2), np.arange(1), np.zeros(1, int), deficiency=0))

@@ -3,18 +3,11 @@
 import numpy as np
 import openmm
 import pytest
+from collective_cases import bond, with_variable
 from openmm import unit
-from openmm_systems import dumbbell, started, state_of
+from openmm_systems import dumbbell, particles, started, state_of
 
-from kcons.constraints import (
-    Angle,
-    CustomVelocity,
-    Distance,
-    FixedAtoms,
-    ImplicitSurface,
-    KnifeEdge,
-    Sphere,
-)
+from kcons.constraints import Angle, CustomVelocity, Distance, FixedAtoms, ImplicitSurface, KnifeEdge, Sphere
 from kcons.errors import InputError
 from kcons.openmm import (
     CarriedConstraints,
@@ -34,11 +27,8 @@ nm, ps, angstrom, kelvin = unit.nanometer, unit.picosecond, unit.angstrom, unit.
 X = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.15, 0.1, 0], [0.3, 0.1, 0.2]])
 
 
-def atoms(n=4):
-    system = openmm.System()
-    for k in range(n):
-        system.addParticle(12.0 + k)
-    return system
+def atoms():
+    return particles(range(12, 16))
 
 
 def sigma(constraints, time=0.0):
@@ -84,12 +74,7 @@ def test_functions_give_plain_numbers():
 def test_collective_variables_of_composite_units():
     """A product of two distances, and a spring's energy times a length: OpenMM does not tell their units."""
     system = atoms()
-    first, second = openmm.CustomBondForce("r"), openmm.CustomBondForce("50*r^2")
-    first.addBond(0, 1)
-    second.addBond(2, 3)
-    product = openmm.CustomCVForce("a*b")
-    product.addCollectiveVariable("a", first)
-    product.addCollectiveVariable("b", second)
+    product = with_variable("a*b", a=bond(0, 1), b=bond(2, 3, "50*r^2"))
     e = unit.kilojoule_per_mole
     rows = CollectiveRows(system, [Row(product, 2.0 * e * angstrom, rate=3 * e * angstrom / unit.nanosecond)])
     assert rows._targets == [pytest.approx(0.2)] and rows._rates == [pytest.approx(3e-4)]

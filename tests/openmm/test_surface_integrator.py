@@ -7,8 +7,9 @@ import copy
 import numpy as np
 import openmm
 import pytest
+from ensemble_runs import run
 from openmm import unit
-from openmm_systems import PLATFORMS, on_gpus
+from openmm_systems import field, on_gpus, particles
 from surface_cases import (
     CENTER,
     KINDS,
@@ -26,7 +27,7 @@ from surface_cases import (
 
 from kcons.constraints import Distance, Plane, Sphere, Torus
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
 from kcons.openmm import SCHEMES, SurfaceIntegrator
 
@@ -53,15 +54,6 @@ def test_refused(surfaces, error, words):
     assert openmm.XmlSerializer.serialize(system) == before
     with pytest.raises(InputError, match="give system="):
         SurfaceIntegrator(0.001, surfaces=Sphere([0], [0, 0, 0], 1.0), device=False)
-
-
-def test_a_particle_at_the_center_is_refused():
-    system = system_of([1.0], "0", 0)
-    integrator = SurfaceIntegrator(0.001, surfaces=Sphere([0], [1, 1, 1], 0.5), system=system, device=False)
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    context.setPositions([[1, 1, 1]])
-    with pytest.raises(SingularGeometryError, match="center of the sphere"):
-        integrator.step(1)
 
 
 # -- motion -----------------------------------------------------------------------------------------
@@ -93,54 +85,6 @@ def test_on_a_gpu_without_the_plugin(platform):
     assert across <= 1e-6
 
 
-def free_on_sphere(scheme, dt, radius=2.0, center=(0.0, 0.0, 0.0), speed=1.0, platform="Reference"):
-    """One particle without forces; turns by speed/radius in the xy plane."""
-    system = openmm.System()
-    system.addParticle(3.0)
-    surface, step = Sphere([0], center, radius), dt * unit.picosecond
-    integrator = SurfaceIntegrator(step, scheme, surfaces=surface, system=system, device=False)
-    start = np.array([[radius, 0.0, 0.0]]) + center
-    return integrator, started(system, integrator, start, [[0.0, speed, 0.0]], platform)
-
-
-@pytest.mark.parametrize("platform", PLATFORMS)
-def test_great_circles_at_any_time_step(platform):
-    for dt in (0.1, 3.0, 50.0):
-        integrator, context = free_on_sphere("geodesic", dt, platform=platform)
-        integrator.step(40)
-        angle = 40 * dt / 2
-        x, v = state_of(context)
-        assert x == pytest.approx(2 * np.array([[np.cos(angle), np.sin(angle), 0]]), abs=2e-16 * 40 * angle + 1e-14)
-        assert np.linalg.norm(v) == pytest.approx(1.0, abs=1e-13)
-
-
-def test_great_circles_leave_resting_and_free_particles_alone():
-    system = system_of(potential="0", springs=0)
-    integrator = SurfaceIntegrator(
-        0.1 * unit.picosecond, "geodesic", surfaces=Sphere([0, 1], [0, 0, 0], 1.0), system=system, device=False
-    )
-    x = np.array([[1.0, 0, 0], [0, 1.0, 0], [5.0, 0, 0]])
-    context = started(system, integrator, x, [[0, 0, 0], [0, 0, 0.5], [0.1, 0.2, 0.3]])
-    integrator.step(10)
-    there, v = state_of(context)
-    assert there[0] == pytest.approx([1, 0, 0], abs=1e-15)
-    assert there[1] == pytest.approx([0, np.cos(0.5), np.sin(0.5)], abs=1e-14)
-    assert there[2] == pytest.approx([5.1, 0.2, 0.3], abs=1e-14)
-    assert v[2] == pytest.approx([0.1, 0.2, 0.3], abs=1e-15)
-
-
-@pytest.mark.parametrize("scheme", ["rattle", "geodesic"])
-@pytest.mark.parametrize("far", [1e3, 1e6])
-@pytest.mark.filterwarnings("ignore:held particles are")
-def test_far_from_the_origin(far, scheme):
-    integrator, context = free_on_sphere(scheme, 0.05, center=(far, -far, far))
-    integrator.step(200)
-    x, v = state_of(context)
-    # As near as numbers of this size come; the velocity does not suffer.
-    assert abs(np.linalg.norm(x - [far, -far, far]) - 2) <= 4 * np.spacing(far)
-    assert abs(np.linalg.norm(v) - 1) <= 1e-12 + 200 * np.spacing(far)
-
-
 def test_a_curve_and_a_surface_that_moves():
     """Two surfaces for a particle, also one that a constraint of the System ties; a radius that grows."""
     system = system_of(potential="0.1*x*z", springs=0)
@@ -152,8 +96,7 @@ def test_a_curve_and_a_surface_that_moves():
     ]
     x = np.array([[1.0, 0, 0], [1.0, 0, 1.0], [0, 1.0, 0]])
     integrator = SurfaceIntegrator(0.01, surfaces=surfaces, system=system, positions=x, device=False)
-    context = started(system, integrator, x, [[0, 0.5, 0], [0.2, 0.3, 0.1], [0.3, 0, 0]])
-    integrator.step(100)
+    context = run(system, integrator, x, [[0, 0.5, 0], [0.2, 0.3, 0.1], [0.3, 0, 0]], 100)
     there, _ = state_of(context)
     assert np.linalg.norm(there[0]) == pytest.approx(1, abs=1e-14)
     assert there[0, 2] == pytest.approx(0, abs=1e-15)
@@ -221,17 +164,10 @@ def test_open_targets_are_those_of_the_start():
 
 def test_multipliers_know_which_forces_act():
     """Forces of a group that was left out entered them."""
-    system = openmm.System()
-    system.addParticle(10.0)
-    idle = openmm.CustomExternalForce("100*x")
-    idle.addParticle(0, [])
-    idle.setForceGroup(3)
-    system.addForce(idle)
+    system = particles([10.0], field("100*x", 1, group=3))
     integrator = SurfaceIntegrator(2e-3, surfaces=Sphere([0], [0, 0, 0], 2.0), system=system, device=False)
     integrator.setIntegrationForceGroups({0})
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    context.setPositions([[2, 0, 0]])
-    context.setVelocities([[0, 3, 0]])
+    context = started(system, integrator, [[2, 0, 0]], [[0, 3, 0]])
     assert integrator.multipliers(context) == pytest.approx([-45])
     np.testing.assert_allclose(integrator.constraint_forces(context), [[-45, 0, 0]], atol=1e-12)
 
@@ -241,6 +177,5 @@ def test_copies_hold_the_same_surfaces():
     integrator.step(20)
     other = copy.deepcopy(integrator)
     assert isinstance(other, SurfaceIntegrator)
-    there = started(context.getSystem(), other, POSITIONS, VELOCITIES)
-    other.step(20)
+    there = run(context.getSystem(), other, POSITIONS, VELOCITIES, 20)
     assert np.array_equal(state_of(there)[0], state_of(context)[0])

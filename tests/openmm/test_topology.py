@@ -4,6 +4,7 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
+from openmm_systems import pairs_force, particles
 
 from kcons.errors import InputError
 from kcons.openmm.topology import bonds_of, constraints_of, openmm_topology, reduced, snapshot_of
@@ -44,10 +45,8 @@ def test_what_does_not_fit_is_refused():
     topology, x = waters()
     with pytest.raises(InputError, match="the Topology has 6 atoms, but positions have shape"):
         snapshot_of(topology, x[:5])
-    system = openmm.System()
-    system.addParticle(1.0)
     with pytest.raises(InputError, match="the Topology has 6 atoms, the System 1 particles"):
-        snapshot_of(topology, x, system=system)
+        snapshot_of(topology, x, system=particles([1.0]))
 
 
 @pytest.mark.parametrize("call", [constraints_of, snapshot_of])
@@ -63,13 +62,11 @@ def test_what_is_no_topology_is_refused(call):
 def test_masses_and_box_of_the_system():
     topology, x = waters()
     topology.setPeriodicBoxVectors(None)
-    system = openmm.System()
     force = openmm.NonbondedForce()
     for k in range(6):
-        system.addParticle(10.0 + k)
         force.addParticle(0.1 * k, 0.3, 0.0)
     force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
-    system.addForce(force)
+    system = particles(range(10, 16), force)
     system.setDefaultPeriodicBoxVectors(*(np.eye(3) * 3.0))
     snapshot = snapshot_of(topology, x, system=system)
     assert snapshot.topology.masses.tolist() == [10.0, 11.0, 12.0, 13.0, 14.0, 15.0]
@@ -95,24 +92,13 @@ def test_the_same_lattice_with_short_vectors():
 
 def test_bonds_are_springs_at_their_lengths_and_constraints():
     x = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]])
-    system = openmm.System()
-    springs = openmm.HarmonicBondForce()
-    for _ in x:
-        system.addParticle(12.0)
-    springs.addBond(0, 1, 0.1, 1000.0)
-    springs.addBond(1, 2, 0.1, 1000.0)
-    system.addForce(springs)
-    system.addConstraint(2, 3, 0.1)
+    springs = pairs_force(openmm.HarmonicBondForce(), (0, 1, 0.1, 1000.0), (1, 2, 0.1, 1000.0))
+    system = particles([12.0] * 4, springs, held=[(2, 3)], x=x)
     assert sorted(map(tuple, bonds_of(system, x).tolist())) == [(0, 1), (1, 2), (2, 3)]
     assert bonds_of(system, 2.0 * x).tolist() == [[2, 3]]  # springs far off their lengths make no structure
 
 
 def test_a_network_of_springs_is_no_molecule():
     x = np.random.default_rng(4).uniform(size=(7, 3))
-    system, force = openmm.System(), openmm.HarmonicBondForce()
-    for i in range(7):
-        system.addParticle(12.0)
-        for j in range(i):
-            force.addBond(i, j, float(np.linalg.norm(x[i] - x[j])), 1000.0)
-    system.addForce(force)
-    assert len(bonds_of(system, x)) == 0
+    springs = [(i, j, float(np.linalg.norm(x[i] - x[j])), 1000.0) for i in range(7) for j in range(i)]
+    assert len(bonds_of(particles([12.0] * 7, pairs_force(openmm.HarmonicBondForce(), *springs)), x)) == 0

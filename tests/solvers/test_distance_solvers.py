@@ -5,13 +5,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Distance
+from kcons.errors import UnsupportedError
 from kcons.solvers.chains import SHORT, Chains
-from kcons.solvers.distance_clusters import resolved
-from kcons.solvers.kernels.lattices import NO_LATTICE, OPEN
+from kcons.solvers.cluster_solver import Request
 from kcons.solvers.rigid_triangles import PAIRS, RigidTriangles
 from kcons.solvers.small_clusters import SmallClusters
+from kcons.solvers.sparse import elimination
 from kcons.solvers.sparse.distances import SparseDistances
-from tests.systems.solver_calls import positions, tangents
+from kcons.solvers.sparse.elimination import make_pattern, make_triples
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 CELLS = [np.diag([19.0, 18.0, 20.0]), np.array([[19.0, 0, 0], [2.0, 18.0, 0], [-1.5, 2.5, 20.0]])]
@@ -131,15 +134,22 @@ class Clusters:
         place = np.argsort(self.rows)
         return np.asarray(values)[place[np.searchsorted(self.rows[place], solver.rows)]]
 
+    def by_row(self, values):
+        """Values by row number of the set; rows that a solver does not have would show as NaN."""
+        wanted = np.full(self.rows.max() + 1, np.nan)
+        wanted[self.rows] = values
+        return wanted
+
     def positions(self, x, solver=None, reference=None, lattice=None, velocities=None, multipliers=None):
-        solver = self.solver() if solver is None else solver
-        reference, lengths = self.x_ref if reference is None else reference, self.in_order(solver, self.lengths)
-        return positions(solver, x, reference, lengths, lattice, velocities, 500.0, multipliers)
+        solver, reference = solver or self.solver(), self.x_ref if reference is None else reference
+        request = Request(x, reference, self.by_row(self.lengths), lattice, velocities=velocities, inv_dt=500.0)
+        return solver.positions(request, multipliers)
 
     def tangents(self, y, solver=None, reference=None, rates=None, lattice=None, multipliers=None):
-        solver = self.solver() if solver is None else solver
-        rates = None if rates is None else self.in_order(solver, rates)
-        return tangents(solver, self.x_ref if reference is None else reference, y, rates, lattice, multipliers)
+        solver, reference = solver or self.solver(), self.x_ref if reference is None else reference
+        return solver.tangents(
+            Request(y, reference, None if rates is None else self.by_row(rates), lattice), multipliers
+        )
 
     def pulls(self):
         """Of each cluster its rows, its atoms, its pairs by local atoms, and M^-1 A^T at the reference."""
@@ -323,16 +333,6 @@ def test_a_third_side_that_turned_round_is_no_solution():
     np.testing.assert_array_equal(x, c.x_new)
 
 
-def test_triangles_that_cannot_be():
-    c = clusters("triangles-8")
-    c.lengths[9:12] = 1.0, 1.0, 3.0
-    outcome = c.positions(c.x_new.copy())
-    assert not outcome.converged and outcome.worst_row // 3 == 3
-    c.x_ref[c.atoms[5]] = [[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]
-    outcome = c.tangents(c.y.copy())
-    assert not outcome.converged and outcome.worst_row // 3 == 5
-
-
 # -- chains ---------------------------------------------------------------------------------------------------
 
 
@@ -356,34 +356,61 @@ def test_ten_thousand_bonds(shape, monkeypatch):
     assert np.abs(speed).max() <= 5e-15 * np.sqrt(3)
 
 
-def test_what_is_no_cluster_of_the_shape_is_refused():
-    with pytest.raises(ValueError, match="at least two"):
-        Chains([0], [0, 2, 3], [0, 1, 2], [1.0], [1.0, 1.0, 1.0])
-    pairs = [(k, k + 1) for k in range(7)]
-    with pytest.raises(ValueError, match="1 to 6"):
-        SmallClusters(np.arange(7), np.arange(8)[None], pairs, np.ones((1, 7)), np.ones(8))
-
-
-@pytest.mark.parametrize(("at", "miss", "expected"), [(0.0, 5e-15, True), (0.0, 1e-12, False), (1e4, 1e-12, True)])
-def test_lengths_are_resolved_as_far_as_positions_are(at, miss, expected):
-    x, pairs = np.array([[at, 0, 0], [at + 1.0, 0, 0]]), np.array([0, 1], dtype=np.uint32)
-    assert resolved(x, pairs, np.array([x[1, 0] - x[0, 0] + miss]), NO_LATTICE, OPEN) is expected
-
-
 # -- any connection -------------------------------------------------------------------------------------------
 
 
-def test_dependent_rows_are_dropped():
-    """Five points in space joined in all ten ways: nine rows are independent."""
-    pairs = np.array([(i, j) for i in range(5) for j in range(i)])
-    rng = np.random.default_rng(8)
-    x_ref = rng.normal(size=(5, 3))
-    lengths = np.linalg.norm(x_ref[pairs[:, 0]] - x_ref[pairs[:, 1]], axis=1)
-    solver = SparseDistances(np.arange(10), pairs, lengths, np.ones(5))
-    assert solver.rank(x_ref, None) == 9
-    x = x_ref + 0.01 * rng.normal(size=x_ref.shape)
-    assert positions(solver, x, x_ref, lengths[solver.rows]).converged
-    np.testing.assert_allclose(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1), lengths, rtol=1e-13)
-    y = rng.normal(size=x_ref.shape)
-    assert tangents(solver, x_ref, y).converged
-    assert np.abs(jacobian(x_ref, pairs) @ y.ravel()).max() <= 1e-13
+# -- order and pattern of the sparse elimination ----------------------------------------------------
+
+
+def pattern_of(pairs, n_atoms):
+    flat = np.asarray(pairs, dtype=np.int64)
+    return make_pattern(2 * np.arange(len(flat) + 1), flat.ravel(), n_atoms)
+
+
+def coupled(pairs):
+    """Row pairs that share an atom."""
+    sets = [set(pair) for pair in pairs]
+    return {(k, l) for k in range(len(pairs)) for l in range(len(pairs)) if k != l and sets[k] & sets[l]}
+
+
+TREES = {
+    "path": [(k, k + 1) for k in range(30)],
+    "comb": [(k, k + 1) for k in range(20)] + [(k, 21 + k) for k in range(21)],
+    "alkane": [e for k in range(8) for e in ((3 * k, 3 * k + 1), (3 * k, 3 * k + 2), (3 * k, 3 * k + 3))],
+    "star": [(0, k) for k in range(1, 7)],
+}
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_trees_have_no_fill(name):
+    pairs = TREES[name]
+    pattern = pattern_of(pairs, 50)
+    assert len(pattern.columns) == len(coupled(pairs)) // 2
+
+
+def test_rows_that_are_coupled_too_densely_are_refused_in_words(monkeypatch):
+    monkeypatch.setattr(elimination, "MOST_UPDATES", 1e3)
+    x = np.random.default_rng(1).normal(size=(31, 3))
+    held = ConstraintSet(Distance([(0, k) for k in range(1, 31)]), x, np.ones(31))
+    with pytest.raises(UnsupportedError, match=r"30 rows are coupled so densely .* one atom takes part in 30 rows"):
+        Motion(held, x)
+
+
+def test_few_rows_are_ordered_by_python_alike(monkeypatch) -> None:
+    """Bit for bit what is compiled finds."""
+    rng = np.random.default_rng(0)
+    assert elimination._minimum_degree.py_func is not elimination._minimum_degree
+    for _ in range(100):
+        n, n_atoms = int(rng.integers(1, 25)), int(rng.integers(2, 25))
+        members = [rng.choice(n_atoms, size=int(rng.integers(1, min(5, n_atoms + 1))), replace=False) for _ in range(n)]
+        row_start, row_atoms = np.cumsum([0, *map(len, members)]), np.concatenate(members)
+        eliminate_last = rng.random(n) < 0.2
+        found = []
+        for chosen in (lambda kernel, _: kernel, lambda kernel, _: kernel.py_func):
+            monkeypatch.setattr(elimination, "plain_if_small", chosen)
+            pattern = make_pattern(row_start, row_atoms, n_atoms, eliminate_last)
+            triples = make_triples(pattern.start, pattern.columns, row_start, row_atoms, np.ones(n_atoms))
+            found.append([*vars(pattern).values(), *triples])
+        for one, two in zip(*found, strict=True):
+            assert one.dtype == two.dtype
+            np.testing.assert_array_equal(one, two)

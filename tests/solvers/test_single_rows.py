@@ -1,69 +1,17 @@
-"""Functions that share no atom, one after the other, against the dense solver."""
+"""Functions that share no atom, one after the other and many at once."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from constraint_cases import CASES, MASSES, TIME, scattered
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import Custom, Dihedral, RowKind, Sphere
+from kcons.constraints import Custom, Cylinder, Dihedral, Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.errors import ConvergenceError
 from kcons.solvers.cluster_solver import Request
-from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.single_rows import SingleRows
-
-FUNCTIONS = [name for name in CASES if CASES[name]().kind == RowKind.FUNCTION]
-
-
-def both(item, x, cell=None, time=TIME):
-    whole = ConstraintSet(item, x, MASSES, cell=cell, time=time)
-    numbers = np.arange(whole.n_rows)
-    return SingleRows(whole, numbers, 1 / MASSES), GeneralClusters(whole, numbers, numbers, 1 / MASSES), whole
-
-
-@pytest.mark.parametrize("cell", [None, np.array([[40.0, 0, 0], [6, 36, 0], [-4, 8, 44]])], ids=["open", "triclinic"])
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_rows_agree_with_the_dense_solver(name, cell):
-    item = CASES[name]()
-    used = np.unique(item.atoms, return_counts=True)[1]
-    item = item.select([0]) if used.max() > 1 else item
-    x = scattered(1)
-    if cell is not None and item.translation_invariant:
-        x = x + np.random.default_rng(0).integers(-1, 2, (8, 3)) @ cell
-    fast, dense, whole = both(item, x, cell)
-    rng = np.random.default_rng(2)
-    new, y, w = x + 0.02 * rng.normal(size=x.shape), *rng.normal(size=(2, *x.shape))
-    wanted, rates = whole.target(TIME + 0.01), rng.normal(size=whole.n_rows)
-    found = []
-    for solver in (fast, dense):
-        positions, velocities, tangents, lam = new.copy(), w.copy(), y.copy(), np.empty((2, whole.n_rows))
-        request = Request(positions, x, wanted, whole.lattice, TIME + 0.01, TIME, velocities, 7.0)
-        assert solver.positions(request, lam[0]).converged
-        assert solver.tangents(Request(tangents, x, rates, whole.lattice, TIME), lam[1]).converged
-        found.append((positions, velocities, tangents, lam))
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, atol=2e-11 if "ithout" in name else 2e-12 if cell is not None else 2e-13)
-    assert np.all(np.abs(whole.value(found[0][0], TIME + 0.01)) <= 2 * whole.tolerance(x, TIME + 0.01))
-
-
-def test_failure_changes_nothing_and_names_the_row():
-    x = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
-    whole = ConstraintSet(Sphere([0, 1, 2], [0.0, 0, 0]), x, np.ones(3))
-    solver = SingleRows(whole, np.arange(3), np.ones(3))
-    new, v = x.copy(), np.ones_like(x)
-    new[1] = [3.0, -0.2, 0.0]  # out of reach along y
-    kept = new.copy()
-    outcome = solver.positions(Request(new, x, velocities=v, inv_dt=1.0))
-    assert not outcome.converged and outcome.worst_row == 1
-    assert np.array_equal(new, kept) and np.all(v == 1.0)
-    v[2, 0] = np.inf
-    kept = v.copy()
-    outcome = solver.tangents(Request(v, x))
-    assert not outcome.converged and outcome.worst_row == 2 and np.array_equal(v, kept)
-    motion = Motion(whole, x)
-    with pytest.raises(ConvergenceError, match=r"#1 Sphere\(1\)"):
-        motion.project_positions(new, x)
+from kcons.solvers.sparse import row_functions
+from kcons.solvers.sparse.row_functions import BLOCK, FEWEST, GivenRows
 
 
 def test_steps_that_overshoot_are_halved():
@@ -92,3 +40,91 @@ def test_a_dihedral_that_turns_over_has_no_solution_far_away(seed):
     kept = new.copy()
     assert not SingleRows(whole, np.arange(1), inverse_masses).positions(Request(new, x)).converged
     assert np.array_equal(new, kept)
+
+
+# -- many rows at once ------------------------------------------------------------------------------
+
+
+AXIS, OFF = np.array([0.0, 0.6, 0.8]), np.array([0.1, 0.0, 0.0])
+#: More than one block, of which the last one is not full.
+MANY = np.arange(BLOCK + FEWEST)
+
+
+def around(n: int) -> np.ndarray:
+    rng = np.random.default_rng(7)
+    turn = rng.uniform(0, 2 * np.pi, n)
+    return np.stack([np.cos(turn), np.sin(turn), rng.uniform(-0.4, 0.4, n)], axis=1) * rng.uniform(0.9, 1.1, (n, 1))
+
+
+#: Of these atoms, with parameters that all share or that each has for itself.
+ITEMS = {
+    "Sphere": lambda atoms, own: Sphere(atoms, OFF + own),
+    "Plane": lambda atoms, own: Plane(atoms, AXIS + own),
+    "Cylinder": lambda atoms, own: Cylinder(atoms, OFF + own, AXIS),
+    "Ellipsoid": lambda atoms, own: Ellipsoid(atoms, OFF + own, [1.0, 2.0, 3.0], target=None),
+    "Torus": lambda atoms, own: Torus(atoms, OFF + own, AXIS, 0.5),
+    "Formula": lambda atoms, own: Formula("z1 - a*sin(x1 + t)*y1**2", atoms, {"a": 0.5 + np.ravel(own[..., 0])}, None),
+}
+
+
+def owned(own: bool, n: int) -> np.ndarray:
+    return 0.01 * np.random.default_rng(3).normal(size=(n, 3)) if own else np.zeros(3)
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "own"])
+@pytest.mark.parametrize("name", ITEMS)
+def test_solutions_are_those_of_rows_called_one_by_one(name, own, monkeypatch):
+    """In two blocks, with targets of their own, the second one not full."""
+    n = len(MANY)
+    x = around(n)
+    whole = ConstraintSet(ITEMS[name](MANY, owned(own, n)), x, np.linspace(1.0, 2.0, n), time=0.3)
+    rng = np.random.default_rng(1)
+    new, y, rates = x + 0.01 * rng.normal(size=x.shape), rng.normal(size=x.shape), rng.normal(size=n)
+    found = []
+    for fewest in (FEWEST, 10**6):
+        monkeypatch.setattr(row_functions, "FEWEST", fewest)
+        solver = SingleRows(whole, MANY, 1 / whole.masses)
+        assert (solver._given.at_once(BLOCK)[:, 0] != 0).tolist() == [fewest == FEWEST] * 2
+        positions, velocities, tangents, lam = new.copy(), y.copy(), y.copy(), np.empty((2, n))
+        outcome = solver.positions(Request(positions, x, None, None, 0.3, 0.2, velocities, 7.0), lam[0])
+        assert outcome.converged and 0 < outcome.iterations <= 6
+        assert solver.tangents(Request(tangents, x, rates, None, 0.3), lam[1]).converged
+        found.append((positions, velocities, tangents, lam))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+    assert np.all(np.abs(whole.value(found[0][0], 0.3)) <= 2 * whole.tolerance(x, 0.3))
+
+
+@pytest.mark.parametrize(("n", "row"), [(3, 1), (len(MANY), 3), (len(MANY), BLOCK + 2)])
+def test_a_row_that_fails_is_named_and_changes_nothing(n, row):
+    x = around(n)
+    whole = ConstraintSet(Sphere(np.arange(n), [0.0, 0, 0]), x, np.ones(n))
+    solver = SingleRows(whole, np.arange(n), np.ones(n))
+    new, v = x + 0.001, np.ones_like(x)
+    new[row] = 3.0 * np.cross(x[row], [0.0, 0.0, 1.0])  # out of reach
+    kept = new.copy()
+    outcome = solver.positions(Request(new, x, velocities=v, inv_dt=1.0))
+    assert not outcome.converged and outcome.worst_row == row
+    assert np.array_equal(new, kept) and np.all(v == 1.0)
+    v[row, 1] = np.nan
+    kept, outcome = v.copy(), solver.tangents(Request(v, x))
+    assert not outcome.converged and outcome.worst_row == row and np.array_equal(v, kept, equal_nan=True)
+    with pytest.raises(ConvergenceError, match=rf"#{row} Sphere\({row}\)"):
+        Motion(whole, x).project_positions(new, x)
+
+
+def test_who_is_called_one_by_one():
+    """Few rows, those of several objects in one block, parameters at unequal distances, functions of Python."""
+    x = around(2 * BLOCK)
+
+    def taken(*items) -> list[bool]:
+        whole = ConstraintSet(items, x, np.ones(len(x)))
+        return (GivenRows(whole, np.arange(whole.n_rows), 10).at_once(BLOCK)[:, 0] != 0).tolist()
+
+    all_atoms = np.arange(2 * BLOCK)
+    assert taken(Sphere(all_atoms, [0, 0, 0])) == [True, True]
+    assert taken(Sphere(all_atoms[: FEWEST - 1], [0, 0, 0])) == [False]
+    assert taken(Sphere(all_atoms[: BLOCK + 4], [0, 0, 0]), Plane(all_atoms[BLOCK + 4 :], AXIS)) == [True, False]
+    assert taken(Sphere(all_atoms[:BLOCK], [0, 0, 0]), Plane(all_atoms[BLOCK:], AXIS)) == [True, True]
+    assert taken(Custom(all_atoms[:, None], lambda r: r[0] @ r[0], lambda r: 2 * r)) == [False, False]
+    assert taken() == []

@@ -6,27 +6,10 @@ import pickle
 
 import numpy as np
 import pytest
-from stepper_systems import (
-    PROJECTED,
-    SYMMETRIC,
-    growing_rod,
-    rotor,
-    skate,
-    spherical_pendulum,
-    system_of,
-)
+from stepper_systems import PROJECTED, SYMMETRIC, growing_rod, rotor, skate, spherical_pendulum
 
-from kcons.constraints import Angle, Distance
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
-from kcons.steppers import (
-    BlanesMoan4,
-    Geodesic,
-    Rattle,
-    ReversibilityCheck,
-    State,
-    System,
-    run,
-)
+from kcons.steppers import BlanesMoan4, Geodesic, Rattle, ReversibilityCheck, State, System, run
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, IsokineticSpheres, Langevin
 
 REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
@@ -40,20 +23,6 @@ def assert_untouched(state: State, before: list[np.ndarray | None]) -> None:
     for array, copy in zip((state.positions, state.velocities, state.forces), before, strict=True):
         assert (array is None) == (copy is None)
         assert array is None or np.array_equal(array, copy)
-
-
-def molecule(force=None) -> tuple[System, State]:
-    """A bent molecule and a free atom, tied by springs."""
-    rng = np.random.default_rng(4)
-    x = np.array([[1.0, 0.1, 0.0], [0.0, 0.0, 0.0], [-0.9, 0.3, 0.2], [0.4, 1.5, 0.3]])
-    system = system_of([Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2]])], x, [1.0, 3.0, 2.0, 1.5], force or springs)
-    return system, system.initial_state(x, 0.3 * rng.normal(size=(4, 3)), project=True)
-
-
-def springs(x: np.ndarray, t: float) -> np.ndarray:
-    """Between all pairs; independent of origin, orientation and order of the atoms."""
-    d = x[:, None] - x[None]
-    return -np.sum(d * (1 - 0.5 / (1 + np.sum(d**2, axis=-1, keepdims=True))), axis=1)
 
 
 # -- forces -----------------------------------------------------------------------------------------
@@ -97,35 +66,12 @@ def test_copies_leave_behind_what_was_found_for_a_system(stepper) -> None:
     )
 
 
-@REVERSIBLE
-def test_step_is_pure(stepper) -> None:
-    system, state = molecule()
-    state = system.with_forces(state)
-    before = copies(state)
-    first, second = (stepper.step(system, state, 0.05) for _ in range(2))
-    assert np.array_equal(first.positions, second.positions)
-    assert np.array_equal(first.velocities, second.velocities)
-    assert first.time == 0.05 and first.step == 1
-    assert_untouched(state, before)
-
-
-@REVERSIBLE
-def test_too_large_a_step_raises_and_changes_nothing(stepper) -> None:
-    system, state = rotor(omega=1.0)
-    state = State(state.positions, state.velocities, step=41)
-    before = copies(state)
-    with pytest.raises(ConvergenceError, match=r"step 42: time step too large \(dt = 100\)") as caught:
-        stepper.step(system, state, 100.0)
-    assert caught.value.step == 42 and caught.value.atoms == (0, 1)
-    assert_untouched(state, before)
-
-
 # -- time steps -------------------------------------------------------------------------------------
 
 
 @REVERSIBLE
 def test_steps_of_no_number_and_of_zero(stepper) -> None:
-    system, state = molecule()
+    system, state = rotor(force=lambda x, t: -x)
     before = copies(state)
     for dt in (np.nan, np.inf, -np.inf):
         with pytest.raises(InputError, match="time step"):
@@ -138,7 +84,7 @@ def test_steps_of_no_number_and_of_zero(stepper) -> None:
 
 
 @REVERSIBLE
-@pytest.mark.parametrize("make", [molecule, rotor, spherical_pendulum, growing_rod, skate], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("make", [rotor, spherical_pendulum, growing_rod, skate], ids=lambda f: f.__name__)
 def test_steps_are_taken_back(stepper, make) -> None:
     """One, and steps of any length by the same in reverse."""
     system, start = make()
@@ -154,30 +100,6 @@ def test_steps_are_taken_back(stepper, make) -> None:
 
 
 # -- invariance -------------------------------------------------------------------------------------
-
-
-@REVERSIBLE
-def test_order_of_atoms_orientation_place_and_moving_frame_do_not_matter(stepper) -> None:
-    system, start = molecule()
-    end = run(system, start, 0.02, 100, stepper=stepper)
-    new = np.array([2, 0, 3, 1])  # atom new[i] of the old order is atom i of the new one
-    place, x = np.argsort(new), start.positions[new]
-    rows = [Angle([place[[0, 1, 2]]]), Distance([place[[1, 2]], place[[0, 1]]])]
-    other = system_of(rows, x, system.masses[new], springs)
-    b = run(other, other.initial_state(x, start.velocities[new]), 0.02, 100, stepper=stepper)
-    assert np.abs(end.positions[new] - b.positions).max() <= 1e-12
-    assert np.abs(end.velocities[new] - b.velocities).max() <= 1e-12
-
-    turn, _ = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))
-    turn *= np.linalg.det(turn)
-    shift, drift = np.array([3.0, -2.0, 5.0]), np.array([0.3, -0.2, 0.1])
-    there = molecule()[0].initial_state(start.positions @ turn.T + shift, start.velocities @ turn.T)
-    b = run(molecule()[0], there, 0.02, 100, stepper=stepper)
-    assert np.abs(end.positions @ turn.T + shift - b.positions).max() <= 1e-12
-    assert np.abs(end.velocities @ turn.T - b.velocities).max() <= 1e-12
-
-    b = run(system, system.initial_state(start.positions, start.velocities + drift), 0.02, 100, stepper=stepper)
-    assert np.abs(end.positions + 2.0 * drift - b.positions).max() <= 1e-12
 
 
 def test_reprs_build_the_stepper_again() -> None:
@@ -221,13 +143,10 @@ def test_check_reports_a_step_that_cannot_be_taken_back() -> None:
     assert caught.value.atoms == (0, 1) and caught.value.step == 1
 
 
-def test_check_refuses_schemes_that_are_not_reversible_and_bad_tolerances() -> None:
+def test_check_refuses_schemes_that_are_not_reversible() -> None:
     for stepper in PROJECTED:
         with pytest.raises(UnsupportedError, match="use Rattle, Geodesic, a Composition or a RungeKuttaNystrom"):
             ReversibilityCheck(stepper)
-    for tolerance in (0.0, -1.0, np.nan):
-        with pytest.raises(InputError, match="tolerance"):
-            ReversibilityCheck(Rattle(), tolerance)
 
 
 def test_check_works_far_from_the_origin_and_at_rest() -> None:
@@ -235,13 +154,6 @@ def test_check_works_far_from_the_origin_and_at_rest() -> None:
     run(system, state, 0.05, 20, stepper=ReversibilityCheck(Geodesic(2)))
     system, state = rotor(omega=0.0)
     run(system, state, 0.05, 3, stepper=ReversibilityCheck(Rattle()))
-
-
-def test_observers_see_start_and_every_kth_step() -> None:
-    system, state = rotor()
-    seen: list[int] = []
-    run(system, state, 0.01, 10, observers=[lambda s: seen.append(s.step)], every=4)
-    assert seen == [0, 4, 8]
 
 
 IMPOSSIBLE = [{"time": np.nan}, {"time": -np.inf}, {"time": 1j}, {"time": "a"}, {"time_remainder": np.nan}]
@@ -280,6 +192,8 @@ def test_frames_are_states_of_the_run(stepper):
     alone = run(system, state, 0.01, 10, stepper=stepper)
     assert found.last.step == 10
     np.testing.assert_array_equal(found.last.positions, alone.positions)
+    for frame in found.frames[1:]:
+        np.testing.assert_array_equal(frame.positions, run(system, state, 0.01, frame.step, stepper=stepper).positions)
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
@@ -294,13 +208,6 @@ def test_frames_of_a_run_that_stops_are_kept(error):
     with pytest.raises(error) as raised:
         run(System(system.motion, forces), state, 0.01, 10, record=2)
     assert [frame.step for frame in raised.value.trajectory.frames] == [0, 2, 4, 6]
-
-
-def test_what_raises_at_the_first_state_has_a_trajectory_too() -> None:
-    def refuses(state: State) -> None:
-        raise KeyError("first")
-
-    system, state = rotor()
-    with pytest.raises(KeyError) as raised:
-        run(system, state, 0.01, 3, observers=[refuses], record=1)
+    with pytest.raises(ZeroDivisionError) as raised:
+        run(system, state, 0.01, 3, observers=[lambda s: 1 / 0], record=1)
     assert raised.value.trajectory.frames == []

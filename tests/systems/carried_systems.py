@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import openmm
 from openmm import app
-from openmm_systems import DATA, context_of, state_of
+from openmm_systems import DATA, context_of, particles, started, state_of
 
 from kcons.constraints import Dihedral, Distance
 from kcons.openmm import ProjectedIntegrator, hold
@@ -13,14 +12,6 @@ from kcons.openmm import ProjectedIntegrator, hold
 PEPTIDE_FILE = DATA / "alanine-dipeptide-implicit.pdb"
 PEPTIDE = app.PDBFile(str(PEPTIDE_FILE))
 PSI = [[6, 8, 14, 16]]
-
-
-def started(context, x, v=None):
-    """The Context, at these positions and velocities."""
-    context.setPositions(x)
-    if v is not None:
-        context.setVelocities(v)
-    return context
 
 
 def start(context, part, x, temperature=300, seed=1):
@@ -43,23 +34,6 @@ def peptide(rows=True, scheme="rattle", dt=0.001, platform="Reference", constrai
     return part, integrator, context
 
 
-def free(masses, force=None):
-    """Particles under a force on each, or none."""
-    system = openmm.System()
-    for m in masses:
-        system.addParticle(m)
-    if force is not None:
-        system.addForce(force)
-    return system
-
-
-def pull(strength, n):
-    force = openmm.CustomExternalForce(f"-{strength}*z")
-    for k in range(n):
-        force.addParticle(k, [])
-    return force
-
-
 def _longer(t):
     return 0.3 + 0.05 * t
 
@@ -67,14 +41,13 @@ def _longer(t):
 def driven():
     """Two particles, a distance that grows."""
     x = np.array([[0.0, 0, 0], [0.3, 0, 0]])
-    system = free([12.0, 12.0])
+    system = particles([12.0, 12.0])
     return system, hold(system, Distance([[0, 1]], _longer), x), x
 
 
 def begun(system, part, x):
     integrator = ProjectedIntegrator(0.01, parts=[part])
-    context = context_of(system, integrator)
-    context.setPositions(x)
+    context = started(system, integrator, x)
     integrator.applyVelocityConstraints(context)
     return integrator, context
 

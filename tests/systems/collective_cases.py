@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import openmm
 from openmm import app, unit
-from openmm_systems import DATA, started
+from openmm_systems import DATA, particles, started
 
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
@@ -42,11 +42,7 @@ def spring_forces(x, t=0.0):
 
 
 def chain_system():
-    system = openmm.System()
-    for mass in MASSES:
-        system.addParticle(mass)
-    system.addForce(springs())
-    return system
+    return particles(MASSES, springs())
 
 
 def energy_of(context, integrator):
@@ -70,8 +66,8 @@ def angle(i, j, k):
     return force
 
 
-def dihedral(*atoms):
-    force = openmm.CustomTorsionForce("theta")
+def dihedral(*atoms, expression="theta"):
+    force = openmm.CustomTorsionForce(expression)
     force.addTorsion(*atoms)
     return force
 

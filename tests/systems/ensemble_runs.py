@@ -3,7 +3,7 @@
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import alanine, context_of, masses_of, started, state_of
+from openmm_systems import alanine, masses_of, pairs_force, particles, started, state_of
 
 from kcons.constraints import Angle, Sphere
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold
@@ -21,8 +21,7 @@ def run(system, integrator, x, v, steps, platform="Reference"):
 
 def warm(system, integrator, x, seed):
     """A Context on the constraints, with velocities of 300 K."""
-    context = context_of(system, integrator)
-    context.setPositions(x)
+    context = started(system, integrator, x)
     integrator.applyConstraints(context)
     integrator.setVelocitiesToTemperature(context, 300, seed)
     return context
@@ -48,13 +47,8 @@ def in_calls_of_any_length(ensemble, start=alanine):
 
 def tied(masses, spring, x):
     """Particles, each tied to all others."""
-    system, springs = openmm.System(), openmm.CustomBondForce(spring)
-    for i, mass in enumerate(masses):
-        system.addParticle(mass)
-        for j in range(i):
-            springs.addBond(j, i)
-    system.addForce(springs)
-    return system, np.array(x)
+    pairs = ((j, i) for i in range(len(masses)) for j in range(i))
+    return particles(masses, pairs_force(openmm.CustomBondForce(spring), *pairs)), np.array(x)
 
 
 def two_parts():
@@ -62,9 +56,7 @@ def two_parts():
     places = [[0.1, 0, 0], [0.2, 0.1, 0], [0.3, 0, 0.05], [0.8, 0.1, 0], [0.8, 0.6, 0.1], [0.0, 0.6, 0.1]]
     system, x = tied(range(12, 18), "200*(r-0.5)^2", places)
     carried = hold(system, [Angle([(0, 1, 2)], 1.9), Sphere([5], [0, 0, 0], 0.6)], positions=x)
-    distance = openmm.CustomBondForce("r")
-    distance.addBond(3, 4)
-    rows = CollectiveRows(system, [Row(distance, 0.5)])
+    rows = CollectiveRows(system, [Row(pairs_force(openmm.CustomBondForce("r"), (3, 4)), 0.5)])
     return system, x, (carried, rows)
 
 

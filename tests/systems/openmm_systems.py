@@ -58,6 +58,36 @@ def started(system, integrator, x, v=None, platform="Reference"):
     return context
 
 
+def particles(masses, *forces, held=(), x=None):
+    """A System of particles under forces; `held` are pairs at their distances at x, or (i, j, length)."""
+    system = openmm.System()
+    for mass in masses:
+        system.addParticle(mass)
+    for force in forces:
+        system.addForce(force)
+    for i, j, *length in held:
+        system.addConstraint(i, j, length[0] if length else float(np.linalg.norm(np.subtract(x[i], x[j]))))
+    return system
+
+
+def field(expression, n, group=0, **parameters):
+    """A force on each of n particles, or on some, with global parameters."""
+    force = openmm.CustomExternalForce(expression)
+    for name, value in parameters.items():
+        force.addGlobalParameter(name, value)
+    for k in range(n) if isinstance(n, int) else n:
+        force.addParticle(k, [])
+    force.setForceGroup(group)
+    return force
+
+
+def pairs_force(force, *terms):
+    """A force of bonds, each of which has two particles and what else it needs."""
+    for i, j, *parameters in terms:
+        force.addBond(i, j, *parameters)
+    return force
+
+
 def state_of(context):
     state = context.getState(positions=True, velocities=True)
     return np.asarray(state.getPositions(asNumpy=True)._value), np.asarray(state.getVelocities(asNumpy=True)._value)
@@ -99,14 +129,8 @@ def residuals(system, context):
 
 def dumbbell(length=0.1, masses=(12.0, 1.0), stiffness=50.0):
     """One bond in an anharmonic field that turns it."""
-    system = openmm.System()
-    field = openmm.CustomExternalForce("k*(x^2+1.3*y^2+0.7*z^2)+c*x*y^3")
-    field.addGlobalParameter("k", stiffness)
-    field.addGlobalParameter("c", 10 * stiffness)
-    for m in masses:
-        field.addParticle(system.addParticle(m), [])
-    system.addForce(field)
-    system.addConstraint(0, 1, length)
+    turning = field("k*(x^2+1.3*y^2+0.7*z^2)+c*x*y^3", 2, k=stiffness, c=10 * stiffness)
+    system = particles(masses, turning, held=[(0, 1, length)])
     x = np.array([[0.3, 0.1, 0.2], [0.3 + length, 0.1, 0.2]])
     v = np.array([[0.1, 0.4, -0.3], [0.1, -0.9, 0.8]])
     return system, x, v
@@ -119,12 +143,7 @@ def hexagon(rows):
     pairs = sorted(
         ((i, j) for i in range(6) for j in range(i)), key=lambda ij: np.linalg.norm(x[ij[0]] - x[ij[1]]).round(6)
     )
-    system = openmm.System()
-    for _ in x:
-        system.addParticle(12.0)
-    for i, j in pairs[:rows]:
-        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
-    return system, x
+    return particles([12.0] * 6, held=pairs[:rows], x=x), x
 
 
 def water_box(n=27, spacing=0.31, exact=False):

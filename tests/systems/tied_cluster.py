@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 import openmm
-from openmm_systems import context_of
+from collective_cases import bond
+from openmm_systems import field, pairs_force, particles, started
 
 from kcons.constraints import Distance
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
@@ -21,16 +22,9 @@ EVERYTHING = {"positions": True, "velocities": True, "parameters": True, "integr
 
 def cluster(strength=200.0, bonded=False):
     """Eight particles tied by springs to one another and to a place; with `bonded`, one distance held by OpenMM."""
-    system, force, field = openmm.System(), openmm.HarmonicBondForce(), openmm.CustomExternalForce("50*(x^2+y^2+z^2)")
-    for i in range(8):
-        field.addParticle(system.addParticle(MASSES[i]), [])
-        for j in range(i):
-            force.addBond(i, j, 0.3, strength)
-    system.addForce(force)
-    system.addForce(field)
-    if bonded:
-        system.addConstraint(6, 7, float(np.linalg.norm(X[6] - X[7])))
-    return system
+    springs = [(i, j, 0.3, strength) for i in range(8) for j in range(i)]
+    forces = pairs_force(openmm.HarmonicBondForce(), *springs), field("50*(x^2+y^2+z^2)", 8)
+    return particles(MASSES, *forces, held=[(6, 7)] * bonded, x=X)
 
 
 @dataclass
@@ -55,23 +49,15 @@ def thermostatted(ensemble, **options):
 
 
 def begun(system, integrator, restore=None, part=None):
-    context = context_of(system, integrator)
-    context.setPositions(X)
-    context.setVelocities(0.3 * np.random.default_rng(1).normal(size=X.shape))
+    context = started(system, integrator, X, 0.3 * np.random.default_rng(1).normal(size=X.shape))
     if restore is not None:
         restore(context)
     return Made(integrator, context, part)
 
 
-def bond(i=0, j=7):
-    force = openmm.CustomBondForce("r")
-    force.addBond(i, j)
-    return force
-
-
 def row_at(target=0.30, strength=200.0, **options):
     system = cluster(strength)
-    rows = CollectiveRows(system, [Row(bond(), target)], positions=X)
+    rows = CollectiveRows(system, [Row(bond(0, 7), target)], positions=X)
     return begun(system, ProjectedIntegrator(0.002, parts=[rows], **options), rows.restore, rows)
 
 

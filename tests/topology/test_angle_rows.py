@@ -1,9 +1,9 @@
-"""All angles: the rows are independent, well-conditioned, and hold every angle, also those that are no rows."""
+"""All angles: the rows are independent, well-conditioned, and hold every angle, also those that are no rows; rings."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ from openmm import app
 from snapshots import held_rows, snapshot
 
 import kcons.openmm
-from kcons.constraints import Angle, Distance
+from kcons.constraints import Angle, Dihedral, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.topology.angle_rows import FLAT_CENTER, angle_rows
+from kcons.topology.angle_rows import LARGEST, angle_rows, ring_rows, ring_systems
 from kcons.topology.guessed_bonds import guess_bonds
-from kcons.topology.topology import bond_angles
+from kcons.topology.topology import bond_angles, sorted_pairs
 
 
 def singular_values(whole, x):
@@ -52,20 +52,6 @@ def star(directions, elements=None):
     e = e / np.linalg.norm(e, axis=1, keepdims=True)
     n = len(e)
     return snapshot(elements or ["C"] * (n + 1), np.vstack([np.zeros(3), 1.2 * e]), [(0, k + 1) for k in range(n)])
-
-
-def pyramid(improper):
-    """Three neighbors at equal angles, with this improper dihedral in degrees."""
-    # Unit vectors of elevation h below the plane; the dihedral of two about the third.
-    heights = np.linspace(0.0, 1.5, 20_001)
-    a, b, c = (
-        np.stack([np.cos(t) * np.cos(heights), np.sin(t) * np.cos(heights), -np.sin(heights)], axis=1)
-        for t in np.radians([0, 120, 240])
-    )
-    p, q = np.cross(a, b), np.cross(a, c)
-    found = np.degrees(np.arccos(np.einsum("ij,ij->i", p, q) / np.linalg.norm(p, axis=1) / np.linalg.norm(q, axis=1)))
-    k = int(np.argmin(np.abs(found - improper)))
-    return star([a[k], b[k], c[k]])
 
 
 #: Torsions of bonds: all that is left beside bonds and angles.
@@ -125,47 +111,26 @@ def test_a_flat_center_has_an_improper_dihedral():
     assert condition(every_angle(made), made.positions)[0] > 100
 
 
-@pytest.mark.parametrize(("away", "dihedrals"), [(-1.0, 1), (+1.0, 0)])
-def test_flat_is_an_improper_of_150_degrees(away, dihedrals):
-    triples, quads = angle_rows(made := pyramid(180 - FLAT_CENTER - away), made.topology.bonds, [])
-    assert (len(triples), len(quads)) == (3 - dihedrals, dihedrals)
-    # 353 degrees, as the documentation has it.
-    x = made.positions / 1.2
-    around = sum(np.degrees(np.arccos(x[i] @ x[j])) for i, j in combinations(range(1, 4), 2))
-    assert around == pytest.approx(353, abs=1.0)
+#: Directions of neighbors, and how many rows beside the bonds are independent: 2n - 3.
+STARS = {
+    "tetrahedron": [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]],
+    "five": [[1, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [0, 0.1, 1], [0.1, 0, -1]],
+    "four in a plane at no right angle: two impropers": [[1, 0, 0], [0.2, 1, 0], [-1, 0.3, 0], [0, -1, 0]],
+    # Straight angles hold an end by a linear row; these hold bonds once more, and are counted.
+    "square": [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]],
+    "T": [[1, 0, 0], [0, 1, 0], [-1, 0, 0]],
+    "octahedron": [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]],
+}
 
 
-@pytest.mark.parametrize(
-    ("directions", "rows"),
-    [
-        ([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], 5),
-        ([[1, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [0, 0.1, 1], [0.1, 0, -1]], 7),
-        # Four in a plane at no right angle: two impropers.
-        ([[1, 0, 0], [0.2, 1, 0], [-1, 0.3, 0], [0, -1, 0]], 5),
-    ],
-)
-def test_centers_of_four_and_five_have_two_n_minus_three_rows(directions, rows):
-    made = star(directions)
-    found = held_rows(made, "allangles")
-    assert found.constraint_set.n_rows == len(directions) + rows
-    assert condition(found.constraint_set, made.positions)[1] == found.constraint_set.n_rows
-    assert condition(found.constraint_set, made.positions)[0] < 15
-
-
-@pytest.mark.parametrize(
-    "directions",
-    [
-        [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]],
-        [[1, 0, 0], [0, 1, 0], [-1, 0, 0]],
-        [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    ],
-)
-def test_straight_angles_hold_an_end_by_a_linear_row(directions):
-    """T-shaped, square and octahedral: rigid; the linear rows hold bonds once more, and are counted."""
-    made = star(directions)
-    rows = held_rows(made, "allangles")
-    assert condition(rows.constraint_set, made.positions)[1] == 3 * len(directions) - 3
-    assert Motion(rows.constraint_set, made.positions).degrees_of_freedom == 6
+@pytest.mark.parametrize("name", STARS)
+def test_centers_have_two_n_minus_three_rows(name):
+    made = star(STARS[name])
+    held, n = held_rows(made, "allangles").constraint_set, len(STARS[name])
+    largest, rank = condition(held, made.positions)
+    assert rank == 3 * n - 3 and Motion(held, made.positions).degrees_of_freedom == 6
+    if name in list(STARS)[:3]:
+        assert rank == held.n_rows and largest < 15
 
 
 def test_of_six_angles_the_one_between_the_lightest_is_none_of_the_rows():
@@ -210,3 +175,113 @@ def test_selected_atoms_and_distances():
     assert {item.family for item in apart} == {"Distance", "Dihedral"}
     assert condition(apart.constraint_set, made.positions)[1] == 3 * len(made.positions) - 6 - 2
     assert condition(apart.constraint_set, made.positions)[0] < 50
+
+
+# -- rings ------------------------------------------------------------------------------------------
+
+
+NO_QUADS = np.zeros((0, 4), np.int64)
+
+
+def cycle(*atoms):
+    return list(pairwise([*atoms, atoms[0]]))
+
+
+def found(bonds, n):
+    """Labels of the bonds, and the sizes of the rings of each system."""
+    of_bond, systems = ring_systems(sorted_pairs(bonds), n)
+    return of_bond.tolist(), [sorted(len(ring) for ring in rings) for rings in systems]
+
+
+def ring(n, height, length=1.4):
+    """A regular ring in angstrom, its atoms at these heights."""
+    turn = 2 * np.pi * np.arange(n) / n
+    radius = length / (2 * np.sin(np.pi / n))
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), np.array(height, dtype=float)], axis=1)
+
+
+def rows_of_ring(x, *body):
+    """Of a ring of which some atoms are held rigid."""
+    n = len(x)
+    bonds = sorted_pairs(cycle(*range(n)))
+    made = snapshot(["C"] * n, x, bonds)
+    rigid = [np.array([body])] if body else []
+    return ring_rows(made, bonds, bond_angles(bonds, n), NO_QUADS, [np.arange(n)], rigid)
+
+
+def values_of_ring(x, triples, quads):
+    items = [Distance(sorted_pairs(cycle(*range(len(x))))), Angle(triples), Dihedral(quads)]
+    rows = ConstraintSet(items, x, np.full(len(x), 12.0)).jacobian(x).toarray()
+    return np.linalg.svd(rows / np.linalg.norm(rows, axis=1, keepdims=True), compute_uv=False)
+
+
+@pytest.mark.parametrize(
+    ("bonds", "n", "labels", "sizes"),
+    [
+        ([(0, 1), (1, 2), (1, 3)], 4, [-1, -1, -1], []),
+        ([*cycle(0, 1, 2), (2, 3)], 4, [0, 0, 0, -1], [[3]]),
+        # Two rings, joined by a bond, by an atom, by an edge, by a bridge.
+        ([*cycle(0, 1, 2), (2, 3), *cycle(3, 4, 5)], 6, [0, 0, 0, -1, 1, 1, 1], [[3], [3]]),
+        ([*cycle(0, 1, 2), *cycle(2, 3, 4, 5)], 6, [0, 0, 0, 1, 1, 1, 1], [[3], [4]]),
+        ([*cycle(0, 1, 2, 3, 4), *cycle(4, 0, 5, 6, 7, 8)], 9, [0] * 10, [[5, 6]]),
+        ([*cycle(0, 1, 2, 3, 4, 5), (0, 6), (6, 3)], 7, [0] * 8, [[5, 5]]),
+        (cycle(*range(LARGEST)), LARGEST, [0] * LARGEST, [[LARGEST]]),
+        (cycle(*range(LARGEST + 1)), LARGEST + 1, [-1] * (LARGEST + 1), []),
+    ],
+)
+def test_rings_that_share_a_bond_are_one_system(bonds, n, labels, sizes):
+    assert found(bonds, n) == (labels, sizes)
+
+
+CHAIR = 0.25 * np.array([1, -1, 1, -1, 1, -1])
+ENVELOPE = [0.5, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("height", "angles", "dihedrals"),
+    [
+        (np.zeros(3), 0, 0),
+        (np.zeros(4), 1, 1),
+        (np.zeros(5), 2, 2),
+        (np.zeros(6), 3, 3),
+        (0.1 * CHAIR, 3, 3),
+        (CHAIR, 6, 0),
+        (ENVELOPE, 4, 0),
+        ([0.3, -0.3, 0.3, -0.3], 2, 0),
+    ],
+)
+def test_a_ring_is_rigid_by_as_many_rows_as_it_needs(height, angles, dihedrals):
+    x = ring(len(height), height)
+    triples, quads = rows_of_ring(x)
+    assert (len(triples), len(quads)) == (angles, dihedrals)
+    s = values_of_ring(x, triples, quads)
+    assert len(s) == 3 * len(x) - 6  # all that a rigid body has
+    assert s[-1] > 0.01 * s[0]
+
+
+def test_rows_within_a_body_are_held_already():
+    x = ring(6, np.zeros(6))
+    triples, quads = rows_of_ring(x, *range(6))
+    assert len(triples) == len(quads) == 0
+    # Four of the six: two more atoms of two bonds, 6 of their rows are 3 bonds, 1 angle, 2 dihedrals.
+    triples, quads = rows_of_ring(x, *range(4))
+    assert not np.isin(triples, range(4)).all(axis=1).any()
+    assert (len(triples), len(quads)) == (1, 2)
+
+
+def test_a_large_system_keeps_what_it_has(monkeypatch):
+    monkeypatch.setattr("kcons.topology.angle_rows.LARGE_SYSTEM", 5)
+    triples, quads = rows_of_ring(ring(6, np.zeros(6)))
+    assert (len(triples), len(quads)) == (6, 0)
+
+
+def test_a_ring_across_the_faces_of_the_cell_is_the_same_ring():
+    x = ring(6, np.zeros(6))
+    bonds = sorted_pairs(cycle(*range(6)))
+    cell = 8.0 * np.eye(3)
+    rows = [
+        ring_rows(snapshot(["C"] * 6, y, bonds, cell=cell), bonds, bond_angles(bonds, 6), NO_QUADS, [np.arange(6)], [])
+        for y in (x + 4.0, np.mod(x, 8.0))
+    ]
+    for one, two in zip(*rows, strict=True):
+        np.testing.assert_array_equal(one, two)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import openmm
 import pytest
 from scipy.spatial.distance import pdist
 from snapshots import WATER, held_rows, rotations, snapshot
@@ -203,20 +202,6 @@ def sites():
         np.tile([0, 1, 2], (3, 1)),
         np.array([[0.128, 0.128, 0.0], [-0.34, -0.34, 0.64], [-0.34, -0.34, -0.64]]),
     )
-
-
-def test_place_of_sites_is_what_openmm_computes():
-    x = np.concatenate([WATER, np.zeros((3, 3))]) + RNG.normal(size=3)
-    system = openmm.System()
-    for mass in (16.0, 1.0, 1.0, 0.0, 0.0, 0.0):
-        system.addParticle(mass)
-    for site, (a, b, c) in zip((3, 4, 5), sites().coefficients, strict=True):
-        system.setVirtualSite(site, openmm.OutOfPlaneSite(0, 1, 2, a, b, c))
-    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
-    context.setPositions(x)
-    context.computeVirtualSites()
-    there = np.array(context.getState(positions=True).getPositions(asNumpy=True)._value)
-    np.testing.assert_allclose(sites().place(x), there, rtol=0, atol=1e-14)
 
 
 def test_spread_forces_do_the_same_work():

@@ -1,18 +1,24 @@
-"""Rows by name: what is held, in which order, and what is said where a topology does not do."""
+"""Rows by name: what is held, in which order, what is said where a topology does not do, and the options."""
 
 from __future__ import annotations
 
+import inspect
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 from snapshots import WATER, held_rows, snapshot
 
+import kcons.ase
+import kcons.mdanalysis
+import kcons.openmm
 from kcons.constraints import CenterOfMass
 from kcons.errors import InputError
 from kcons.motion import Motion
+from kcons.topology import Holding
+from kcons.topology.holding import Options
 
 # Ethanol, C C O H(O) and five H, and a water.
 ETHANOL = np.array(
@@ -144,10 +150,8 @@ def test_virtual_sites_are_no_degrees_of_freedom():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"constrain": "hbond"}, r"cannot constrain 'hbond' \(did you mean 'hbonds'\?"),
         ({"constrain": "none", "rigid_water": False}, "nothing is to be held"),
         ({"angles": "cosines"}, "choose .angles. or .distances."),
-        ({"water_geometry": (1.0, 190.0)}, "give a positive length"),
         ({"select": np.zeros(12, bool)}, "nothing to hold within the selection of 0 atoms"),
     ],
 )
@@ -201,3 +205,50 @@ def test_bodies_that_a_missing_cell_tears_are_refused(atom, shift, said, options
     with pytest.raises(InputError, match=said):
         held_rows(replace(made, positions=x), "none", **options)
     held_rows(replace(made, positions=x, cell=np.diag([shift, 40.0, 40.0]), pbc=np.full(3, True)), "none", **options)
+
+
+# -- the options, the same in every MD engine -------------------------------------------------------
+
+
+ENGINES = [kcons.ase.constraints_of, kcons.mdanalysis.constraints_of, kcons.openmm.constraints_of]
+
+
+def test_options_of_the_signature_are_those_of_the_object():
+    assert {field.name for field in fields(Holding)} == {"constrain", *Options.__annotations__}
+
+
+@pytest.mark.parametrize("function", ENGINES, ids=lambda f: f.__module__)
+def test_help_shows_every_option_with_its_default(function):
+    shown = inspect.signature(function).parameters
+    page = inspect.getdoc(function)
+    assert "**options" not in page
+    for field in fields(Holding):
+        assert shown[field.name].default == field.default
+        assert page.count(f"\n{field.name} : ") == 1
+    # The parameters of the function itself come first, what it returns and raises last.
+    assert page.index("rigid_water :") > page.index("Parameters\n")
+    assert page.index("guess_bonds :") < page.index("Returns\n") < page.index("Raises\n")
+
+
+def test_iterables_are_read_once():
+    holding = Holding("none", rigid_bodies=iter([[0, 1, 2]]), rigid_residues=iter(["HOH"]), rigid_water=False)
+    assert holding.bodies == holding.bodies == ([0, 1, 2],)
+    assert holding.residues == holding.residues == ("HOH",)
+    assert Holding("none", rigid_residues="HOH").residues == ("HOH",)
+
+
+def test_geometry_of_water():
+    assert Holding().geometry() == (None, 0.0)
+    assert Holding(water_geometry="TIP4P/2005").geometry() == ((0.9572, 104.52), 0.1546)
+    assert Holding(water_geometry=(1, 109)).geometry() == ((1.0, 109.0), 0.0)
+    with pytest.raises(InputError, match="give a positive length"):
+        Holding(water_geometry=(np.nan, 109)).geometry()
+    assert Holding(rigid_water=False).waters == frozenset()
+    assert "MINE" in Holding(water_names=[" mine "]).waters
+
+
+@pytest.mark.parametrize("on", [{"protein": "CenterOfMass"}, [("protein", None)], ["protein"], [1]])
+def test_own_rows_that_cannot_be_made(on):
+    with pytest.raises(InputError, match=r"on has .*give pairs .*CenterOfMass itself") as caught:
+        Holding(on=on)
+    assert caught.value.item == "on"

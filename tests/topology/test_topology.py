@@ -1,49 +1,41 @@
-"""What is read out of names and numbers: elements, residues, decimals; molecules made whole."""
+"""What is read out of names, numbers and distances: elements, residues, decimals, bonds; molecules made whole."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from snapshots import WATER, held_rows, snapshot
+from snapshots import WATER, held_rows, rotations, snapshot
 
-from kcons.constraints.periodic.one_piece import connected
 from kcons.errors import InputError
+from kcons.topology.guessed_bonds import guess_bonds
 from kcons.topology.topology import (
     Snapshot,
     as_written,
     elements_of,
     require_standard_form,
-    sorted_pairs,
     split_residues,
     whole_groups,
     whole_molecules,
     whole_numbers,
 )
 
-
-@pytest.mark.parametrize(
-    ("name", "residue", "element"),
-    [
-        ("CA", "ALA", "C"), ("HG", "SER", "H"), ("HG21", "ILE", "H"), ("1HB", "ALA", "H"), ("NE", "ARG", "N"),
-        ("CD1", "LEU", "C"), ("OW", "SOL", "O"), ("MW", "SOL", ""), ("EPW", "WAT", ""), ("CL1", "LIG", "Cl"),
-        ("SE", "MSE", "Se"), ("FE", "HEM", "Fe"), ("NA", "HEM", "N"), ("SD", "MET", "S"), ("D1", "DOD", "H"),
-    ],
-)  # fmt: skip
-def test_elements_of_atoms_in_molecules(name, residue, element):
-    names = np.array([name, "XX1", "XX2"])
-    assert elements_of(names, np.zeros(3, int), np.array([residue]), None)[0] == element
+IN_MOLECULES = [
+    ("CA", "ALA", "C"), ("HG", "SER", "H"), ("HG21", "ILE", "H"), ("1HB", "ALA", "H"), ("NE", "ARG", "N"),
+    ("CD1", "LEU", "C"), ("OW", "SOL", "O"), ("MW", "SOL", ""), ("EPW", "WAT", ""), ("CL1", "LIG", "Cl"),
+    ("SE", "MSE", "Se"), ("FE", "HEM", "Fe"), ("NA", "HEM", "N"), ("SD", "MET", "S"), ("D1", "DOD", "H"),
+]  # fmt: skip
+ALONE = [
+    ("CA", "CA", "Ca"), ("NA", "NA", "Na"), ("NA+", "NA+", "Na"), ("SOD", "SOD", "Na"), ("CLA", "CLA", "Cl"),
+    ("CL", "CL-", "Cl"), ("CA", "GLY", "C"), ("OW", "SOL", "O"), ("O", "HOH", "O"), ("ZN", "ZN", "Zn"), ("K", "K", "K"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "residue", "element"),
-    [
-        ("CA", "CA", "Ca"), ("NA", "NA", "Na"), ("NA+", "NA+", "Na"), ("SOD", "SOD", "Na"), ("CLA", "CLA", "Cl"),
-        ("CL", "CL-", "Cl"), ("CA", "GLY", "C"), ("OW", "SOL", "O"), ("O", "HOH", "O"), ("ZN", "ZN", "Zn"),
-        ("K", "K", "K"),
-    ],
-)  # fmt: skip
-def test_elements_of_single_atoms(name, residue, element):
-    assert elements_of(np.array([name]), np.zeros(1, int), np.array([residue]), None)[0] == element
+@pytest.mark.parametrize("others", [(), ("XX1", "XX2")], ids=["alone", "in a molecule"])
+def test_elements_of_atoms(others):
+    for name, residue, element in IN_MOLECULES if others else ALONE:
+        names = np.array([name, *others])
+        found = elements_of(names, np.zeros(len(names), int), np.array([residue]), None)
+        assert found[0] == element, (name, residue)
 
 
 def test_masses_that_were_read_decide():
@@ -95,12 +87,6 @@ def test_single_precision_gives_back_the_decimals_of_a_file():
     assert np.abs(as_written(x) - x).max() <= np.spacing(np.float32(90))
     y = rng.uniform(-90, 90, size=(5, 3))
     np.testing.assert_array_equal(as_written(y), y)
-
-
-def test_pairs_and_components():
-    assert sorted_pairs([(3, 1), (0, 2), (1, 3)]).tolist() == [[0, 2], [1, 3]]
-    number, count = connected(np.array([[1, 3]]), 5)
-    assert (number.tolist(), count) == ([0, 1, 2, 1, 3], 4)
 
 
 def test_units_and_numbers_of_atoms():
@@ -159,3 +145,65 @@ def test_atoms_of_endless_molecules_are_lined_up():
     chain = snapshot(["C"] * 8, x, [(i, (i + 1) % 8) for i in range(8)], cell=12.0 * np.eye(3))
     r = whole_groups(chain, np.array([[0, 7, 6], [3, 4, 5]]))
     np.testing.assert_allclose(r[:, 1:] - r[:, :1], [[[-1.5, 0, 0], [-3, 0, 0]], [[1.5, 0, 0], [3, 0, 0]]], atol=1e-12)
+
+
+# -- bonds by distance ------------------------------------------------------------------------------
+
+
+SHORT = [[0, 0, 0], [1.05, 0, 0], [2.2, 0, 0]]  # a hydrogen bond: 1.05 and 1.15 angstrom to two oxygens
+FAR = [[0, 0, 0], [2.0, 0, 0], [0, 1.95, 0]]
+
+
+@pytest.mark.parametrize(
+    ("elements", "x", "expected"),
+    [
+        ("O H H", WATER, [[0, 1], [0, 2]]),
+        ("O H O", SHORT, [[0, 1]]),  # a hydrogen keeps its nearest neighbor
+        ("H H", [[0, 0, 0], [0.74, 0, 0]], [[0, 1]]),
+        ("H H", [[0, 0, 0], [1.0, 0, 0]], []),
+        ("C Zn C", FAR, []),  # a metal, and 1.95 angstrom
+        ("C Zn C", [*FAR[:2], [0, 1.85, 0]], [[0, 2]]),
+    ],
+)
+def test_what_is_bonded(elements, x, expected):
+    x = np.array(x, dtype=float)
+    assert guess_bonds(snapshot(elements.split(), x)).tolist() == expected
+    assert guess_bonds(snapshot(elements.split(), x / 10, angstrom=0.1)).tolist() == expected
+
+
+def test_only_bonds_of_marked_atoms():
+    x = np.concatenate([WATER, WATER + 5.0])
+    marked = np.array([False] * 4 + [True, False])
+    assert guess_bonds(snapshot(["O", "H", "H"] * 2, x), marked).tolist() == [[3, 4]]
+    # The nearest neighbor of the hydrogen, which is not marked, may have its bonds already.
+    assert guess_bonds(snapshot(["O", "H", "O"], SHORT), np.array([False, False, True])).tolist() == []
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [np.diag([9.0, 8.0, 10.0]), np.array([[9.0, 0, 0], [3.0, 8.0, 0], [-2.0, 2.5, 7.0]]), np.diag([3.2, 3.4, 3.3])],
+    ids=["right-angled", "triclinic", "narrow"],
+)
+def test_bonds_across_the_cell_are_those_of_whole_molecules(cell):
+    volume = abs(np.linalg.det(cell))
+    count = max(1, int(volume / 60))
+    rng = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(-1, 3)[:count] / 3
+    x = ((grid + 0.05) @ cell)[:, None] + WATER @ rotations(count, 3)
+    wrapped = x.reshape(-1, 3) @ np.linalg.inv(cell)
+    wrapped = (wrapped - np.floor(wrapped)) @ cell
+    # Any image will do, also those outside of the cell.
+    wrapped += rng.integers(-2, 3, size=(3 * count, 3)) @ cell
+    bonds = guess_bonds(snapshot(["O", "H", "H"] * count, wrapped, cell=cell))
+    first = 3 * np.arange(count)
+    expected = np.concatenate([np.stack([first, first + k], 1) for k in (1, 2)])
+    assert sorted(map(tuple, bonds.tolist())) == sorted(map(tuple, expected.tolist()))
+
+
+def test_what_cannot_be_guessed_is_refused():
+    with pytest.raises(InputError, match="no elements"):
+        guess_bonds(snapshot(["", ""], [[0, 0, 0], [1, 0, 0]]))
+    with pytest.raises(InputError, match=r"C of MOL 1 \(atom 0\) and C of MOL 1 \(atom 1\) are 0.1 angstrom apart"):
+        guess_bonds(snapshot(["C", "C"], [[0, 0, 0], [0.1, 0, 0]]))
+    with pytest.raises(InputError, match="not finite"):
+        guess_bonds(snapshot(["C", "C"], [[0, 0, 0], [np.nan, 0, 0]]))

@@ -122,7 +122,8 @@ def plan(
             error.args = (f"{path}: {error}",)
             raise
     told = ("were guessed from distances", "no bond was guessed")
-    notes = tuple(str(w.message) for w in caught if any(words in str(w.message) for words in told))
+    said = (str(w.message).replace(", or pass guess_bonds=False to refuse", "") for w in caught)
+    notes = tuple(line for line in said if any(words in line for words in told))
     return _planned(path.name, rows, constrain, notes)
 
 

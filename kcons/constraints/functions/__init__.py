@@ -2,6 +2,5 @@
 
 - `custom`: functions in Python, or compiled by Numba
 - `straight_line`: functions of rows as lists of operations: for derivatives, and for engines in other languages
-- `expressions`: formulas read, and written as code
-- `formula`: rows that are formulas
+- `formula`: formulas read, written as code, and held
 """

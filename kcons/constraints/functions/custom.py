@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Annotated, Any, ClassVar, TypeAlias
 
@@ -16,12 +16,11 @@ from kcons.constraints.arguments import (
     Duration,
     FloatArray,
     as_float_array,
-    atom_column,
     check_call,
     positive,
     read_only_view,
 )
-from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.target import (
     FIRST_4,
     WRONG,
@@ -61,7 +60,7 @@ class PythonRows(Constraint, base=True):
     @property
     def called(self) -> tuple[Any, ...]:
         """The functions that kernels call where Numba has compiled all of them: value and gradient, or coefficients."""
-        raise NotImplementedError
+        return tuple(getattr(self, name) for name in self.functions)
 
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         """Gradient, or coefficients, of row `k` alone, shape (width, 3), at an `r` that cannot be changed."""
@@ -154,10 +153,6 @@ class Custom(PythonRows):
         self.function, self.gradient_function = function, gradient
         self.translation_invariant, self.period = bool(translation_invariant), period
 
-    @property
-    def called(self) -> tuple[Any, ...]:
-        return self.function, self.gradient_function
-
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         return self._values(r, time, 0)
 
@@ -216,8 +211,8 @@ class Custom(PythonRows):
         spread = np.sqrt(_contract(apart, apart) / max(self.width, 1))
         return np.where(spread > 0, spread, 1.0)
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        super().check(r, time, first_row)
+    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
+        yield from super().faults(r, time)
         if self.n_rows == 0:
             return
         # A wrong derivative would give wrong motion without any other sign.
@@ -232,9 +227,8 @@ class Custom(PythonRows):
         steps, start = (1e-3 * length, 0.5e-3 * length), np.zeros(self.n_rows)
         found, finer = (first_derivative_4(at, start, step, self.period) for step in steps)
         if self.gradient_function is None:
-            self.refuse(
+            yield (
                 ~(np.abs(finer - found) <= WRONG * size),
-                first_row,
                 lambda k: (
                     f"differences with steps of {1e-3 * length[k]:g} and half of that disagree about the "
                     f"gradient, {found[k]:.3g} and {finer[k]:.3g}: it vanishes, or the function varies faster. "
@@ -252,8 +246,7 @@ class Custom(PythonRows):
                 "varies (length=...)"
             )
 
-        wrong = ~(np.abs(_contract(slope, along) - found) <= WRONG * size)
-        self.refuse(wrong, first_row, worst, "gradient")
+        yield ~(np.abs(_contract(slope, along) - found) <= WRONG * size), worst, "gradient"
 
 
 class ImplicitSurface(Custom):
@@ -303,7 +296,7 @@ class ImplicitSurface(Custom):
         time_step: Duration = 0.02,
     ) -> None:
         given: dict[str, Any] = {"time_dependent": time_dependent, "length": length, "time_step": time_step}
-        super().__init__(atom_column(atoms, self.family), function, gradient, target, **given)
+        super().__init__(atoms, function, gradient, target, **given)
 
     @property
     def kind(self) -> RowKind:  # type: ignore[override]
@@ -369,10 +362,6 @@ class CustomVelocity(PythonRows, VelocityRows):
         super().__init__(atoms, target)
         self._take(time_dependent, length, time_step, coefficients=coefficients)
         self.coefficients, self.translation_invariant = coefficients, bool(translation_invariant)
-
-    @property
-    def called(self) -> tuple[Any, ...]:
-        return (self.coefficients,)
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         return np.zeros(self.n_rows)

@@ -1,30 +1,320 @@
-"""Rows that are formulas of the coordinates of their atoms, or of these and linear in the velocities."""
+"""Rows that are formulas of the coordinates of their atoms, or of these and linear in the velocities.
+
+What is written is checked, differentiated, and kept in a file. Formulas come from files of others, too: names are those
+of a list, and length and depth are bounded.
+
+Derivatives are taken backwards through the operations, which are written down once each; second ones are complex steps
+of the first. The file is a module of functions on plain numbers, or on arrays of one number a row. It lies where Numba
+can keep what it compiles of it, so that another process finds both.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import ast
+import hashlib
+import math
+import os
+import re
+import sys
+import tempfile
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import cache
 from keyword import iskeyword
+from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, ClassVar, Self
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import (
-    ANY,
-    MD_UNITS,
-    FloatArray,
-    as_float_array,
-    atom_array,
-    positive,
-    refuse_other,
-    without_units,
-)
+from kcons.constraints.arguments import ANY, MD_UNITS, FloatArray, as_float_array, positive, refuse_other, without_units
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.functions.expressions import FUNCTIONS, Code, code_of, undefined_part
+from kcons.constraints.functions.straight_line import Operand, Tape, differentiated
 from kcons.constraints.target import Target
-from kcons.errors import InputError
+from kcons.errors import InputError, UnsupportedError
 
 __all__ = ["Formula", "VelocityFormula"]
+
+#: Characters of a formula, and levels of its tree (a sum of n terms has n).
+MAX_LENGTH, MAX_DEPTH = 10_000, 200
+#: Functions of formulas: name -> the one of NumPy.
+FUNCTIONS: dict[str, Any] = {
+    **{name: getattr(np, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt")},
+    **{f"a{name[3:]}": getattr(np, name) for name in ("arcsin", "arccos", "arctan", "arctan2")},
+    "abs": np.abs,
+}
+#: What a sum that vanishes may be off by, beside its parts, at places where these are of order one.
+_SAME = 1e-9
+_COORDINATE = re.compile(r"[xyz]([1-9][0-9]{0,5})")
+_SPEED = re.compile(r"v[xyz]([1-9][0-9]{0,5})")
+_OPERATIONS: dict[type, Callable[[Any, Any], Any]]
+_OPERATIONS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power}
+_PI = {"pi": np.float64(np.pi)}
+
+
+def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tuple[ast.expr, set[int]]:
+    """The tree of a formula, which may have velocities or not, and the atoms in it."""
+    if len(formula) > MAX_LENGTH:
+        raise _too_large(formula, f"has {len(formula)} characters, and at most {MAX_LENGTH} are read")
+    try:
+        tree = ast.parse(formula.strip(), mode="eval").body
+    except (SyntaxError, ValueError) as error:  # of bytes that are no text, a ValueError
+        remedy = "; write what is held at zero, the left side less the right one" if "=" in formula else ""
+        what = error.msg if isinstance(error, SyntaxError) else error
+        raise InputError(f"Formula: {formula!r:.200} cannot be read: {what}{remedy}", item="formula") from None
+    except (RecursionError, MemoryError):
+        raise _too_large(formula, "is nested too deeply") from None
+    level: list[ast.AST] = [tree]
+    for _ in range(MAX_DEPTH):
+        level = [child for node in level for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
+    if level:
+        raise _too_large(formula, f"is nested in more than {MAX_DEPTH} levels")
+
+    def wrong(part: str, what: str, item: str) -> InputError:
+        return InputError(f"Formula: {part} in {formula!r} {what}", item=item)
+
+    found, called = set(), set()
+    for node in ast.walk(tree):  # what contains something comes before it
+        match node:
+            case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
+                called.add(node.func)
+                if name not in FUNCTIONS or len(args) != 1 + (name == "atan2"):
+                    known = f"{', '.join(sorted(FUNCTIONS))}, of one number each, atan2 of two"
+                    raise wrong(ast.unparse(node), f"is no function of formulas; these are {known}", name)
+            case ast.Name(id=name):
+                known_as = _COORDINATE.fullmatch(name) or _SPEED.fullmatch(name)
+                if known_as and (speeds or name[0] != "v"):
+                    found.add(int(known_as[1]))
+                elif known_as:
+                    held = "what is linear in velocities is held by VelocityFormula"
+                    raise wrong(repr(name), f"is a velocity; {held}", name)
+                elif name in FUNCTIONS and node not in called:
+                    raise wrong(name, f"is a function; write what it is of, as in {name}(x1)", name)
+                elif name not in (*FUNCTIONS, *parameters, "t", "pi"):
+                    places = "x1, y1, z1, x2, ..." + (", vx1, vy1, ..." if speeds else "")
+                    known = ", ".join([places, "t", "pi", *parameters])
+                    remedy = f"Give it as a parameter: parameters={{{name!r}: ...}}"
+                    raise wrong(repr(name), f"is not known; known are {known}. {remedy}", name)
+            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+                if not value <= sys.float_info.max:
+                    raise _too_large(formula, "has a number that is too large", "write it in other units")
+            case ast.BinOp(op=operation) if type(operation) in _OPERATIONS:
+                pass
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd()) | ast.operator() | ast.unaryop() | ast.expr_context():
+                pass
+            case _:
+                hint = "; a power is written **" if isinstance(node, ast.BinOp) else ""
+                allowed = f"use + - * / **, numbers, names and functions{hint}"
+                raise wrong(repr(ast.unparse(node)), f"is not allowed; {allowed}", "formula")
+    undefined = undefined_part(tree, _PI)
+    if undefined is not None:
+        raise InputError(f"Formula: {undefined} in {formula!r:.200}; give numbers with a finite value", item="formula")
+    return tree, found
+
+
+def _too_large(
+    formula: str,
+    what: str,
+    remedy: str = "shorten it, put parentheses around parts of a long sum, or use Custom, which takes a function",
+) -> InputError:
+    return InputError(f"Formula: {formula!r:.60} {what}; {remedy}", item="formula")
+
+
+def _value(tree: ast.expr, numbers: Mapping[str, Any], constant: Callable[[Any], Any] = np.float64) -> Any:
+    """The value of a tree, with numbers for names."""
+    match tree:
+        case ast.Constant(value=value):
+            return constant(value)
+        case ast.Name(id=name):
+            return numbers[name]
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return FUNCTIONS[name](*(_value(each, numbers, constant) for each in args))
+        case ast.BinOp(left=left, op=operation, right=right):
+            return _OPERATIONS[type(operation)](_value(left, numbers, constant), _value(right, numbers, constant))
+        case ast.UnaryOp(op=sign, operand=operand):
+            value = _value(operand, numbers, constant)
+            return -value if isinstance(sign, ast.USub) else value
+    raise AssertionError(ast.dump(tree))
+
+
+def undefined_part(tree: ast.expr, numbers: Mapping[str, float]) -> str | None:
+    """The smallest part of a tree, among those that have names of `numbers` only, without a finite value, in words."""
+    known: dict[ast.AST, bool] = {}
+    for node in reversed(list(ast.walk(tree))):  # parts before what they are parts of
+        function = isinstance(node, ast.Name) and node.id in FUNCTIONS
+        known[node] = function or all(known[part] for part in ast.iter_child_nodes(node))
+        if isinstance(node, ast.Name) and not function:
+            known[node] = node.id in numbers
+        if not isinstance(node, ast.expr) or function or not known[node]:
+            continue
+        with np.errstate(all="ignore"):
+            value = _value(node, numbers)
+            if not np.isfinite(value):
+                inside = node.args[:1] if isinstance(node, ast.Call) else []
+                of = "".join(f" where {ast.unparse(each)} = {_value(each, numbers):g}" for each in inside)
+                return f"{ast.unparse(node)} is {value}{of}"
+    return None
+
+
+class Code:
+    """What is computed of a formula with parameters of these names; with `speeds`, of one that is linear in velocities.
+
+    `row` and `rate` are those of a `Constraint`, `rate` None where the time is not in the formula; `width` are the
+    atoms a row, and `invariant` says whether a common shift of all of them changes nothing.
+    """
+
+    def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool = False) -> None:
+        tree, atoms = parsed(formula, parameters, speeds)
+        if not atoms:
+            raise InputError(
+                f"Formula: {formula!r} names no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of "
+                "the second",
+                item="formula",
+            )
+        width = max(atoms)
+        if len(atoms) < width:
+            raise InputError(
+                f"Formula: {formula!r} names atom {width} of a row and not atom "
+                f"{min({*range(1, width)} - atoms)}; number them from 1 on",
+                item="formula",
+            )
+        self.tree, self.width, n = tree, width, 3 * width
+        names = [f"{kind}{axis}{atom}" for kind in ["", "v"] for atom in range(1, width + 1) for axis in "xyz"]
+
+        def value(r: Any, p: Any, t: Any) -> Any:
+            known = {name: r[k] for k, name in enumerate(names)} | {name: p[k] for k, name in enumerate(parameters)}
+            return _value(tree, {**known, "t": t, "pi": math.pi}, float)
+
+        with np.errstate(all="ignore"):  # of constants
+            tape = differentiated(value, n + n * speeds)
+        found, *slopes, moves = (_text(each) for each in tape.results)
+        steep, slope = slopes[:n], slopes[n:] or slopes
+        self.invariant = _look(formula, tape, n, speeds, len(parameters)) and width > 1
+        ends = [f"{part} + 0.5*{bent}" for part, bent in zip(slope, steep, strict=True)] if speeds else slope
+        texts = [_function("row", tape, [found, *ends])]
+        if moves != "0.0":
+            texts.append(_function("rate", tape, [moves]))
+        module = _module("\n\n".join([f"# Written by kcons for {formula!r}.", "from numpy import *\n", *texts]))
+        self.row, self.rate = module.row, getattr(module, "rate", None)
+
+
+#: Each once.
+code_of = cache(Code)
+
+
+#: Operations of tapes, for real numbers and, to first order in imaginary parts, complex ones.
+_TEXT = {
+    **{name: f"{{}}{sign}{{}}" for sign, name in ((" + ", "add"), (" - ", "subtract"), ("*", "multiply"))},
+    **{"divide": "{}/{}", "power": "{}**{}", "negative": "-{}", "copysign": "copysign({}, {}.real)"},
+    "absolute": "copysign(1.0, {0}.real)*{0}",
+    "arctan2": "arctan2({0}.real, {1}.real) + ({1}*({0} - {0}.real) - {0}*({1} - {1}.real))/({0}*{0} + {1}*{1})",
+}
+
+
+def _text(operand: Operand) -> str:
+    if not isinstance(operand, tuple):
+        return repr(operand) if operand >= 0 else f"({operand!r})"
+    kind, k = operand
+    return {"t": "t", "k": f"_{k}"}.get(kind, f"{kind}[{k}]")
+
+
+def _function(name: str, tape: Tape, results: list[str]) -> str:
+    """Code that puts results of a tape out, with the steps that these need."""
+    needed, lines = " ".join(results), []
+    for k, (operation, operands) in reversed(list(enumerate(tape.steps))):
+        if re.search(rf"\b_{k}\b", needed):
+            texts = [_text(each) for each in operands]
+            if operation == "power" and isinstance(operands[1], float) and operands[1].is_integer():
+                texts[1] = str(int(operands[1])) if 0 < operands[1] < 1000 else texts[1]
+            lines.append(f"    _{k} = {_TEXT.get(operation, f'{operation}({{}})').format(*texts)}")
+            needed += lines[-1]
+    outs = [f"    out[{k}] = {each}" for k, each in enumerate(results)]
+    return "\n".join([f"def {name}(r, p, t, out):", *reversed(lines), *outs]) + "\n"
+
+
+def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bool:
+    """Whether common shifts change nothing, found out at random places; what is no row is refused.
+
+    At complex ones, where all functions are defined, and whatever the signs of what is in ``abs``.
+    """
+    rng = np.random.default_rng(0)
+    r, faster, p = (rng.normal(size=(size, 40, 2)) @ [1.0, 1.0j] for size in (2 * n, 2 * n, parameters + 1))
+    signs = rng.choice([-1.0, 1.0], (len(tape.steps), 40))
+
+    def looked(places: Any) -> Any:
+        some = iter(signs)
+        own: dict[str, Any] = {"absolute": lambda x: next(some) * x, "copysign": lambda _, x: next(some)}
+        own["arctan2"] = lambda a, b: np.arctan(a / b)
+        found = tape.run(places, p, p[-1], lambda name, *given: (own.get(name) or getattr(np, name))(*given))
+        return np.array([np.broadcast_to(each, 40) for each in found[:-1]])
+
+    with np.errstate(all="ignore"):
+        value, *slopes = looked(r)
+        steep, slope = np.array(slopes[:n]), np.array(slopes[n:] or slopes)
+        seen = np.isfinite(slopes).all(axis=0)
+        if seen.all() and not slope.any():
+            what = "velocities: it has none of them" if speeds else "positions: its gradient is zero"
+            raise InputError(
+                f"Formula: {formula!r} does not change with the {what}; write one that does", item="formula"
+            )
+        if speeds:
+            faster[:n] = r[:n]
+            bent, rest = looked(faster)[1 + n :] - slope, looked(np.concatenate([r[:n], 0 * r[n:]]))[0]
+            if not all(map(_vanishes, [rest, *bent], [value, *slope])):
+                left = "" if _vanishes(rest, value) else "; at rest it is not 0: what the sum is held at is the target"
+                raise InputError(
+                    f"VelocityFormula: {formula!r} is not a sum of velocities times functions of the positions and the "
+                    f"time{left}",
+                    item="formula",
+                )
+        return all(_vanishes(steep[k::3].sum(axis=0), *steep[k::3]) for k in range(3))
+
+
+def _vanishes(sums: Any, *parts: Any) -> bool:
+    """Whether a sum is nothing beside its parts, at all places that are seen."""
+    size = np.abs(parts).sum(axis=0)
+    seen = np.isfinite(sums) & np.isfinite(size)
+    return bool(seen.sum() > 5 and (np.abs(sums) <= _SAME * size)[seen].all())
+
+
+def _module(text: str) -> ModuleType:
+    """The module with this text, which is kept in a file: Numba keeps beside files what it compiles of them."""
+    own = text.encode()
+    try:
+        path = _folder() / f"formula_{hashlib.sha256(own).hexdigest()[:24]}.py"
+        if not path.is_file() or path.read_bytes() != own:
+            unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+            try:
+                unfinished.write_bytes(own)
+                os.replace(unfinished, path)
+            finally:
+                unfinished.unlink(missing_ok=True)
+    except OSError as error:
+        raise UnsupportedError(
+            f"the code of a formula cannot be written: {error}; set NUMBA_CACHE_DIR to a folder with space in it"
+        ) from error
+    # Numba looks for what it has kept by the names of modules.
+    module = sys.modules[f"kcons_{path.stem}"] = ModuleType(f"kcons_{path.stem}")
+    exec(compile(own, path, "exec"), module.__dict__)
+    return module
+
+
+def _folder() -> Path:
+    """Where code is kept: with Numba's own files, or where caches of the user are, or until the process ends."""
+    given = os.environ.get("NUMBA_CACHE_DIR") or getattr(numba.config, "CACHE_DIR", "")
+    caches = given or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    path = Path(caches) / "kcons-formulas"
+    with suppress(OSError):
+        path.mkdir(parents=True, exist_ok=True)
+    return path if os.access(path, os.W_OK) else Path(_passing())
+
+
+@cache
+def _passing() -> str:
+    return tempfile.mkdtemp(prefix="kcons-formulas-")
 
 
 class Formula(Constraint):
@@ -97,8 +387,7 @@ class Formula(Constraint):
             if not name.isidentifier() or iskeyword(name) or taken or (name[1:].isdigit() and name[0] in "xyz"):
                 raise InputError(f"Formula: {name!r} cannot be the name of a parameter; give another one", item=name)
         self.row_width = self.code().width
-        table = atom_array(atoms, self.family)
-        super().__init__(table.reshape(-1, 1) if self.row_width == 1 and table.ndim < 2 else table, target)
+        super().__init__(atoms, target)
         columns = []
         for name, value in given.items():
             plain, matters = without_units(value, f"Formula: {name}", ANY)

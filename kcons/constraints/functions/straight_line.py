@@ -30,6 +30,18 @@ class Tape(NamedTuple):
     steps: tuple[tuple[str, tuple[Operand, ...]], ...]
     results: tuple[Operand, ...]
 
+    def run(self, r: Any, p: Any, t: Any, perform: Callable[..., Any]) -> list[Any]:
+        """Results at places, parameters and a time; `perform` takes the name of an operation, and what it is of."""
+        made: list[Any] = []
+        known = {"r": r, "p": p, "t": [t], "k": made}
+
+        def value(operand: Operand) -> Any:
+            return known[operand[0]][operand[1]] if isinstance(operand, tuple) else operand
+
+        for name, operands in self.steps:
+            made.append(perform(name, *map(value, operands)))
+        return list(map(value, self.results))
+
 
 #: Steps so far, each once, with their numbers.
 _Steps: TypeAlias = dict[tuple[str, tuple[Operand, ...]], int]

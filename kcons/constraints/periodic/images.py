@@ -116,31 +116,42 @@ def find_images(
     given = [item.changed(whole=None, cell_offsets=None) for item in constraints]
     if lattice is None:
         return given, None
+    place = (x, lattice, half_width, time)
     tables = [
-        _Links(item, int(start), x, lattice, half_width, time)
+        _Links(item, int(start), *place)
         for item, start in zip(given, starts, strict=False)
         if item.relative and item.n_rows
     ]
     n_atoms = len(x)
-    _accept_small_pieces(tables, n_atoms, half_width)
+    bonds = [table for table in tables if table.held]
+    if any(table.unsure.any() for table in bonds):
+        # Lengths as found are right in pieces whose links, laid end to end, are shorter than half the cell.
+        pairs = np.concatenate([table.item.atoms for table in bonds])
+        piece, _ = connected(pairs, n_atoms)
+        reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([table.lengths[:, 0] for table in bonds]))
+        for table in bonds:
+            table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
     if all(t.held and not (t.whole.any() or t.unsure.any()) for t in tables):
         return given, None
     ties = [item for item in ties if item.holds_length and not item.moving and item.n_rows]
-    others = [_Links(item.changed(whole=None, cell_offsets=None), 0, x, lattice, half_width, time) for item in ties]
-    held = [t for t in [*tables, *others] if t.held]
+    others = [_Links(item.changed(whole=None, cell_offsets=None), 0, *place) for item in ties]
+    held = [*bonds, *others]
     keys = np.concatenate([np.zeros(0, np.int64), *(t.short(n_atoms) for t in held)])
     for table in tables:
         table.sort_rows(keys, n_atoms)
     if not any(table.whole.any() or table.unsure.any() for table in tables):
         return given, None
-    images, longest, component = _tree([*tables, *others], given, x, lattice, half_width)
+    firm = np.zeros(n_atoms, bool)
+    for item in given:
+        if item.width == 1:
+            firm[item.atoms] = True
+    images, longest, component = _tree([*tables, *others], firm, x, lattice, half_width)
     y = images.make_whole(x, lattice)
     frameworks = np.zeros(int(component.max(initial=-1)) + 1, bool)
     for table in tables:
         table.find_closures(y, lattice, longest, component, frameworks)
         for k in table.untied(images, n_atoms):
-            long = float(table.lengths[k, 0])
-            _refuse_long(given, table.start + int(k), table.item.atoms[k], long, half_width)
+            _refuse_long([table], table.start + int(k), table.item.atoms[k], float(table.lengths[k, 0]), half_width)
     pairs = np.concatenate([t.item.atoms for t in held] or [np.zeros((0, 2), np.int64)])
     ends = np.concatenate([pairs, pairs[:, ::-1]]).T
     neighbors = sp.csr_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(n_atoms, n_atoms))
@@ -176,17 +187,13 @@ class _Links:
         self.lengths = np.linalg.norm(nearest, axis=2)
         #: Held at one length for good.
         self.held = item.holds_length and not item.moving
-        self.whole: BoolArray = np.zeros(item.n_rows, np.bool_)
-        self.unsure: BoolArray = np.zeros(item.n_rows, np.bool_)
+        # Until the tree is known: the length found may be that of another image.
+        self.unsure: BoolArray = np.full(item.n_rows, self.held and item.target is None)
         self.cell_offsets = np.zeros((item.n_rows, item.width, 3), np.int64)
-        if self.held:
-            if item.target is None:
-                # Until the tree is known: the length found may be that of another image.
-                self.unsure[:] = True
-            else:
-                self.lengths = item.target_at(time)[:, None]
-            self.whole = ~self.unsure & (self.lengths[:, 0] >= NEARLY * half_width)
-        self._local: BoolArray | None = None
+        if self.held and item.target is not None:
+            self.lengths = item.target_at(time)[:, None]
+        self.whole: BoolArray = ~self.unsure & self.held & (self.lengths[:, 0] >= NEARLY * half_width)
+        self._local: BoolArray = np.zeros(item.n_rows, np.bool_)
 
     def short(self, n_atoms: int) -> IntArray:
         """Keys of the pairs that constant distances shorter than half the cell tie."""
@@ -260,9 +267,7 @@ class _Links:
 
     def settle(self, component: IntArray, frameworks: BoolArray, held: sp.csr_array) -> None:
         """Rows beside the tree: in a body they have its images, in a framework they are local."""
-        closing = self._closing
-        if self._local is not None:
-            closing = closing | (frameworks[component[self.item.atoms[:, 0]]] & self._local)
+        closing = self._closing | (frameworks[component[self.item.atoms[:, 0]]] & self._local)
         if self.held and self.item.target is None:
             self._refuse_doubtful(self.cell_offsets.any(axis=(1, 2)) & ~closing, held)
         if self.held:
@@ -274,7 +279,7 @@ class _Links:
 
         In a body that is held by distances they are one side of a triangle of such.
         """
-        for k in np.flatnonzero(beside & (self._local if self._local is not None else False)):
+        for k in np.flatnonzero(beside & self._local):
             a, b = (int(atom) for atom in self.item.atoms[k])
             if held[[a]].multiply(held[[b]]).nnz:
                 continue
@@ -295,22 +300,13 @@ class _Links:
         return self.item.changed(whole=self.whole, cell_offsets=offsets)
 
 
-def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: float) -> None:
-    """Lengths as found are right in pieces whose links, laid end to end, are shorter than half the cell."""
-    held = [table for table in tables if table.held]
-    if not any(table.unsure.any() for table in held):
-        return
-    pairs = np.concatenate([table.item.atoms for table in held])
-    piece, _ = connected(pairs, n_atoms)
-    reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([t.lengths[:, 0] for t in held]))
-    for table in held:
-        table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
-
-
 def _tree(
-    tables: Sequence[_Links], given: Sequence[Constraint], x: FloatArray, lattice: FloatArray, half_width: float
+    tables: Sequence[_Links], firm: BoolArray, x: FloatArray, lattice: FloatArray, half_width: float
 ) -> tuple[Images, FloatArray, IntArray]:
-    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component."""
+    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component.
+
+    Atoms that are `firm`, fixed or in a row of their own with a place in space, are not moved where that can be had.
+    """
     from scipy.sparse.csgraph import minimum_spanning_tree  # slow to import
 
     n_atoms = len(x)
@@ -331,17 +327,11 @@ def _tree(
     link = chosen[np.asarray(forest.data, dtype=np.int64) - 1]
     if np.any(length[link] >= half_width):
         worst = int(link[np.argmax(length[link])])
-        _refuse_long(given, int(row[worst]), pair[worst], float(length[worst]), half_width)
+        _refuse_long(tables, int(row[worst]), pair[worst], float(length[worst]), half_width)
     component, count = connected(pair[link], n_atoms)
     longest = np.zeros(count)
     np.maximum.at(longest, component[pair[link, 0]], length[link])
-    # Atoms that are fixed, or have a row of their own with a place in space, are not moved where that can be had.
-    firm = np.zeros(n_atoms, bool)
-    for item in given:
-        if item.width == 1:
-            firm[item.atoms.ravel()] = True
-    roots = np.concatenate([np.flatnonzero(firm), np.flatnonzero(~firm)])
-    atoms, parents = spanning_tree(pair[link], n_atoms, roots)
+    atoms, parents = spanning_tree(pair[link], n_atoms, np.argsort(~firm, kind="stable"))
     parent_of, unheld = np.empty(n_atoms, np.int64), np.full(n_atoms, -1)
     parent_of[atoms] = parents
     i, j = pair[link].T
@@ -352,17 +342,13 @@ def _tree(
     return Images(atoms, parents, unheld[atoms], ties), longest, component
 
 
-def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: float, half_width: float) -> None:
-    first = 0
-    for item in given:
-        if row < first + item.n_rows:
-            break
-        first += item.n_rows
-    atoms = [int(a) for a in pair]
+def _refuse_long(tables: Sequence[_Links], row: int, pair: IntArray, length: float, half_width: float) -> None:
+    table = next(table for table in tables if 0 <= row - table.start < table.item.n_rows)
+    item, atoms = table.item, pair.tolist()
     what = f"target {length:g}" if item.holds_length else f"distance {length:g} of atoms {atoms[0]} and {atoms[1]}"
     raise InputError(
-        f"row {row}, {item.row_name(row - first)}: {what} is not shorter than half the box ({half_width:g}), and no "
-        "shorter rows tie these atoms together; its minimum image is ambiguous. Use a larger cell, no cell, or list "
+        f"row {row}, {item.row_name(row - table.start)}: {what} is not shorter than half the box ({half_width:g}), and "
+        "no shorter rows tie these atoms together; its minimum image is ambiguous. Use a larger cell, no cell, or list "
         "the atoms so that neighbors in the row are neighbors in space",
         item="target" if item.holds_length else "positions",
         atoms=atoms,

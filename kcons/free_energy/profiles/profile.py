@@ -1,21 +1,26 @@
-"""Free energy along one coordinate from the mean forces of windows: thermodynamic integration with an error band.
+"""Free energies from the mean forces of windows: along one coordinate with an error band, and in several.
 
 F(b) - F(a) is the integral of dF/dx. It is that of a Gaussian process learned from the derivatives
 (`gaussian_process`), linear in the mean forces, so that the covariance of all differences is known and not only errors
 at points. The band has what the windows do not tell between them as well, and the process knows where the next window
-helps most.
+helps most. In several coordinates only gradients can be fitted: how much more likely the vectors are if their
+components need not belong to one free energy is the check of consistency.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.stats import chi2
 
-from kcons.constraints.arguments import FloatArray, checked, positive, whole_number
+from kcons.constraints.arguments import Finite, FloatArray, Positive, as_float_array, checked, positive, whole_number
+from kcons.constraints.target import nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, Learned, inside, learn
@@ -36,6 +41,14 @@ _BLUE, _RED, _GREY, _BAND = "#0072B2", "#D55E00", "0.35", 2.0
 _KNOWN = 1e-9
 #: Part of the range of the windows below which places are the same.
 _SAME = 1e-9
+#: Sizes of the field that is no gradient, relative to the gradient, among which the most likely one is looked for.
+_ROTATIONS = np.geomspace(0.01, 3.0, 12)
+#: Probability below which that field is warned of.
+_CHANCE = 1e-3
+#: Distance, in parts of the range, below which two minima are one.
+_ONE = 1e-3
+#: Places whose errors are computed at once, with the covariances among them.
+_TOGETHER = 200
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,7 +144,7 @@ class Profile:
 
 @checked
 def integrate(
-    x: ArrayLike, f: ArrayLike, e: ArrayLike, *, period: float | None = None, zero: float | None = None
+    x: ArrayLike, f: ArrayLike, e: ArrayLike, *, period: Positive | None = None, zero: Finite | None = None
 ) -> Profile:
     """Free energy along a coordinate from the mean forces of windows.
 
@@ -160,7 +173,41 @@ def integrate(
     UserWarning
         The integral over the period is more than 4 standard errors from 0: some mean force is wrong, or its error.
     """
-    places, forces, errors = _windows(x, f, e, period)
+    arrays = [finite(values, name, "window") for values, name in ((x, "x"), (f, "f"), (e, "e"))]
+    for array, name in zip(arrays, "xfe", strict=True):
+        if array.ndim != 1 or array.shape != arrays[0].shape:
+            raise InputError(f"{name} must have shape {(arrays[0].size,)}, not {array.shape}", item=name)
+    place, force, error = arrays
+    if (error < 0).any():
+        raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
+    if period is not None and place.size:
+        if np.ptp(place) > period * (1 + _SAME):
+            raise InputError(
+                f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
+                item="period",
+            )
+        place = place.min() + (place - place.min()) % period
+        place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
+    # Places that differ by rounding are one, with the weights that the errors give them.
+    order = np.argsort(place, kind="stable")
+    new = np.diff(place[order], prepend=-np.inf) > _SAME * (np.ptp(place) if place.size else 0.0)
+    places, which = place[order][new], np.empty(len(place), dtype=np.int64)
+    which[order] = np.cumsum(new) - 1
+    if len(places) < 3:
+        raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
+    for k in np.flatnonzero(np.bincount(which[error == 0]) > 1):
+        exact = force[(which == k) & (error == 0)]
+        if np.ptp(exact) > 1e-9 * np.abs(exact).max():
+            raise InputError(
+                f"windows at {places[k]:g} have mean forces from {exact.min():g} to {exact.max():g}, all with an error "
+                "of 0; give their errors",
+                item="e",
+            )
+    # Errors of 0 among others: exact values count alone.
+    weights = 1.0 / np.maximum(error, 1e-12 * float(error.max()) or 1.0) ** 2
+    total = np.bincount(which, weights)
+    forces, errors = np.bincount(which, weights * force) / total, np.sqrt(np.bincount(which, (weights * error) ** 2))
+    errors /= total
     low, high = float(places[0]), float(places[-1] if period is None else places[0] + period)
     axis = Axis(low, high - low, period is not None, _COEFFICIENTS if len(places) >= _MANY else 1)
     process, closure = learn(places[:, None], forces[:, None], errors[:, None, None] ** 2, [axis], [True]), None
@@ -178,48 +225,8 @@ def integrate(
     if zero is None:
         zero = float(grid[np.argmin(process.mean(grid[:, None], [-1])[0])])
     F, covariance = process.differences(grid[:, None], inside([[zero]], grid[:1], grid[-1:], [period], "zero")[0])
-    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return Profile(grid, F, error, covariance, zero, places, forces, errors, period, closure, process)
-
-
-def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> list[FloatArray]:
-    """Windows in order; those at one place are one, with the weights that their errors give them."""
-    arrays = [finite(values, name, "window") for values, name in ((x, "x"), (f, "f"), (e, "e"))]
-    for array, name in zip(arrays, "xfe", strict=True):
-        if array.ndim != 1 or array.shape != arrays[0].shape:
-            raise InputError(f"{name} must have shape {(arrays[0].size,)}, not {array.shape}", item=name)
-    place, force, error = arrays
-    if (error < 0).any():
-        raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
-    if period is not None and place.size:
-        positive(period, "period")
-        if np.ptp(place) > period * (1 + _SAME):
-            raise InputError(
-                f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
-                item="period",
-            )
-        place = place.min() + (place - place.min()) % period
-        place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
-    # Places that differ by rounding are one.
-    order = np.argsort(place, kind="stable")
-    new = np.diff(place[order], prepend=-np.inf) > _SAME * (np.ptp(place) if place.size else 0.0)
-    places, which = place[order][new], np.zeros(len(place), dtype=np.int64)
-    which[order] = np.cumsum(new) - 1
-    if len(places) < 3:
-        raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
-    for k in np.flatnonzero(np.bincount(which[error == 0]) > 1):
-        exact = force[(which == k) & (error == 0)]
-        if np.ptp(exact) > 1e-9 * np.abs(exact).max():
-            raise InputError(
-                f"windows at {places[k]:g} have mean forces from {exact.min():g} to {exact.max():g}, all with an error "
-                "of 0; give their errors",
-                item="e",
-            )
-    # Errors of 0 among others: exact values count alone.
-    weights = 1.0 / np.maximum(error, 1e-12 * float(error.max()) or 1.0) ** 2
-    total = np.bincount(which, weights)
-    together = np.bincount(which, weights * force) / total
-    return [places, together, np.sqrt(np.bincount(which, (weights * error) ** 2)) / total]
+    band = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Profile(grid, F, band, covariance, zero, places, forces, errors, period, closure, process)
 
 
 def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "energy") -> Figure:
@@ -246,3 +253,168 @@ def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "ener
     below.set(xlabel=coordinate, ylabel=f"dF/dx / ({energy}/unit of x)")
     below.legend(fontsize=8)
     return figure
+
+
+# -- several coordinates -----------------------------------------------------------------------------
+
+
+class Minimum(NamedTuple):
+    """A minimum of a surface: where, F and the standard error of F, both against the zero of the surface."""
+
+    x: FloatArray
+    F: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A free energy in d coordinates.
+
+    Attributes
+    ----------
+    windows, mean_forces : ndarray, shape (n, d)
+    low, high : ndarray, shape (d,)
+        The range of the windows, or one period.
+    periods : tuple of float or None
+    zero : ndarray, shape (d,)
+        Where F is 0.
+    """
+
+    windows: FloatArray
+    mean_forces: FloatArray
+    low: FloatArray
+    high: FloatArray
+    periods: tuple[float | None, ...]
+    zero: FloatArray
+    _process: Learned
+
+    def free_energy(self, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """F and its standard error, both against `zero`, at places of shape (m, d)."""
+        places = self._places(x)
+        F, variance = np.zeros(len(places)), np.zeros(len(places))
+        for k in range(0, len(places), _TOGETHER):
+            part = slice(k, k + _TOGETHER)
+            F[part], covariance = self._process.differences(places[part], self.zero)
+            variance[part] = np.diag(covariance)
+        return F, np.sqrt(np.maximum(variance, 0.0))
+
+    def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
+        """F(b) - F(a) with its standard error."""
+        ends = [as_float_array(place, item) for place, item in ((a, "a"), (b, "b"))]
+        if any(end.shape != self.low.shape for end in ends):
+            raise InputError(f"a and b must be places of {len(self.low)} coordinates", item="a")
+        return self._process.difference(*self._places(np.stack(ends)))
+
+    def minima(self) -> list[Minimum]:
+        """Minima inside of the range, lowest first; each is what a search from some window comes to."""
+        size, periods = self.high - self.low, np.array([period or 0.0 for period in self.periods])
+        bounds = [(0.0, 1.0) if period is None else (None, None) for period in self.periods]
+        how: dict[str, Any] = {"jac": True, "method": "L-BFGS-B", "bounds": bounds, "options": {"ftol": 1e-13}}
+
+        def value(part: FloatArray) -> tuple[float, FloatArray]:
+            there = self._process.mean((self.low + part * size)[None], range(-1, len(size)))[:, 0]
+            return float(there[0]), there[1:] * size
+
+        found: list[FloatArray] = []
+        for start in self.windows:
+            (place,) = self._places((self.low + minimize(value, (start - self.low) / size, **how).x * size)[None])
+            at_an_end = (periods == 0) & ((place <= self.low) | (place >= self.high))
+            known = (np.abs(nearest_image(place - other, periods) / size).max() <= _ONE for other in found)
+            if not at_an_end.any() and not any(known):
+                found.append(place)
+        if not found:
+            return []
+        F, errors = self.free_energy(found)
+        minima = [Minimum(x, float(value), float(error)) for x, value, error in zip(found, F, errors, strict=True)]
+        return sorted(minima, key=lambda minimum: minimum.F)
+
+    def _places(self, x: ArrayLike) -> FloatArray:
+        return inside(x, self.low, self.high, self.periods, "x")
+
+
+def fit_surface(
+    x: ArrayLike,
+    f: ArrayLike,
+    errors: ArrayLike,
+    *,
+    periods: Sequence[float | None] | None = None,
+    zero: ArrayLike | None = None,
+) -> Surface:
+    """Free energy in d coordinates from the mean forces of n windows, on a grid or not.
+
+    The time goes with the third power of n d: some hundred windows in two coordinates take seconds to a minute.
+
+    Parameters
+    ----------
+    x : array_like, shape (n, d)
+        Places of the windows.
+    f : array_like, shape (n, d)
+        The gradient of the free energy there.
+    errors : array_like, shape (n, d) or (n, d, d)
+        Standard errors of f, or covariances of its components.
+    periods : sequence of d periods, optional
+        None for a coordinate that is not periodic.
+    zero : array_like, shape (d,), optional
+        Where F is 0; by default at the lowest window.
+
+    Raises
+    ------
+    InputError
+        Fewer than d + 2 windows; a NaN or infinity; shapes that do not go together; a covariance that is none;
+        windows further apart than a period.
+
+    Warns
+    -----
+    UserWarning
+        The mean forces are not the gradient of any free energy.
+    """
+    places, forces, given = (finite(a, name, "window") for a, name in ((x, "x"), (f, "f"), (errors, "errors")))
+    if places.ndim != 2 or not places.shape[1] or len(places) < places.shape[1] + 2:
+        raise InputError(f"x has shape {places.shape}; give (n, d) with n of d + 2 or more", item="x")
+    n, d = places.shape
+    if forces.shape != (n, d):
+        raise InputError(f"f must have shape {(n, d)}, not {forces.shape}", item="f")
+    if given.shape not in ((n, d), (n, d, d)):
+        raise InputError(f"errors must have shape {(n, d)} or {(n, d, d)}, not {given.shape}", item="errors")
+    if given.ndim == 2 and (given < 0).any():
+        raise InputError(f"an error of window {np.argwhere(given < 0)[0, 0]} is negative", item="errors")
+    covariances = given if given.ndim == 3 else given[:, :, None] ** 2 * np.eye(d)
+    sizes = np.linalg.eigvalsh(covariances)
+    skew = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2))
+    bad = np.flatnonzero((sizes[:, 0] < -1e-9 * np.abs(sizes[:, -1])) | (skew > 1e-9 * np.abs(sizes).max(axis=1)))
+    if len(bad):
+        raise InputError(f"the covariance of window {bad[0]} is not symmetric and positive", item="errors")
+    turns = tuple(None if p is None else positive(p, "periods") for p in ((None,) * d if periods is None else periods))
+    if len(turns) != d:
+        raise InputError(f"periods must be {d} positive numbers or None", item="periods")
+    for j, (spread, period) in enumerate(zip(np.ptp(places, axis=0), turns, strict=True)):
+        if spread == 0 or (period is not None and spread > period * (1 + 1e-9)):
+            reason = "windows are further apart than the period in" if spread else "all windows are at one value of"
+            raise InputError(f"{reason} coordinate {j}; check the units, or leave it out", item="x")
+    low = places.min(axis=0)
+    lengths = np.array([spread if p is None else p for spread, p in zip(np.ptp(places, axis=0), turns, strict=True)])
+    axes = [Axis(float(a), float(b), p is not None) for a, b, p in zip(low, lengths, turns, strict=True)]
+    process = learn(places, forces, covariances, axes, [p is None for p in turns])
+    if d > 1:
+        # By the ratio of likelihoods, all lengths as they are. The size cannot be negative: chance has it at 0 half of
+        # the time.
+        found = [replace(process.best, rotation=float(size)).log_likelihood() for size in _ROTATIONS]
+        best = int(np.argmax(found))
+        chance = 0.5 * float(chi2.sf(2 * (found[best] - process.best.log_likelihood()), 1))
+        if chance < _CHANCE:
+            warnings.warn(
+                f"the mean forces are no gradient: a field beside it of {_ROTATIONS[best]:.0%} of its size is more "
+                f"likely (p = {chance:.1e}). Windows are in different states of what is not held, or their errors are "
+                "too small",
+                UserWarning,
+                stacklevel=2,
+            )
+    if zero is None:
+        lowest = places[np.argmin(process.mean(places, [-1])[0])]
+    else:
+        lowest = as_float_array(zero, "zero")
+        if lowest.shape != (d,) or not np.isfinite(lowest).all():
+            raise InputError(f"zero must be {d} finite numbers", item="zero")
+    surface = Surface(places, forces, low, low + lengths, turns, lowest, process)
+    surface._places(lowest[None])
+    return surface

@@ -104,7 +104,9 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike | None = None, *, t
         return Pulled(jarzynski, effective)
     back = _works(backward, "backward") / kT
     difference, error = _bar(ahead, back)
-    overlap = _overlap(ahead, back, difference)
+    # What MBAR's overlap matrix has off its diagonal: Klimovich et al., J. Comput.-Aided Mol. Des. 29, 397 (2015).
+    odds = np.concatenate([ahead, -back]) - difference + math.log(len(ahead) / len(back))
+    overlap = float((expit(odds) * expit(-odds)).sum() * (1 / len(ahead) + 1 / len(back)))
     if overlap < _OVERLAP:
         warnings.warn(
             f"forward and backward pulls have an overlap of {overlap:.1%}; below {_OVERLAP:.0%} errors are not to be "
@@ -159,9 +161,3 @@ def _works(works: ArrayLike, item: str) -> FloatArray:
 def _jarzynski(works: FloatArray) -> FloatArray:
     """-ln <exp(-w)> along the last axis."""
     return np.asarray(math.log(works.shape[-1]) - logsumexp(-works, axis=-1))
-
-
-def _overlap(ahead: FloatArray, back: FloatArray, difference: float) -> float:
-    """What MBAR's overlap matrix has off its diagonal (Klimovich et al., J. Comput.-Aided Mol. Des. 29, 397 (2015))."""
-    odds = np.concatenate([ahead, -back]) - difference + math.log(len(ahead) / len(back))
-    return float((expit(odds) * expit(-odds)).sum() * (1 / len(ahead) + 1 / len(back)))

@@ -1,7 +1,6 @@
-"""Relaxed scans: minima of the energy at held values of coordinates.
+"""Relaxed scans.
 
-- `relaxation`: the optimizer
-- `relaxed_scan`: from neighbor to neighbor
-- `scan_result`: the points, what was found and how it is shown, and relaxations in files
-- `system_calculator`: a System of OpenMM as a calculator of ASE
+- `relaxation`: minima on constraints with few evaluations
+- `system_calculator`: an OpenMM System as an ASE calculator
+- `relaxed_scan`: the scan, its points, what it found and its files
 """

@@ -75,7 +75,12 @@ class Internals:
         # From now on each term keeps its images: in a small cell, others may come as near.
         self._tables = [*(item.atoms for item in self._families), straight]
         self._images = [lined_up(x[atoms], lattice) - x[atoms] for atoms in self._tables]
-        self._frames = self._sideways(x)
+        # Two directions across each straight angle, shape (2, n, 3).
+        r = self._gathered(x)[-1]
+        axis = (r[:, 2] - r[:, 0]) / norm(r[:, 2] - r[:, 0])[:, None]
+        first = cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)])
+        first /= norm(first)[:, None]
+        self._frames = np.stack([first, cross(axis, first)])
         constants = [
             math.prod((close[*table[:, k : k + 2].T] for k in range(table.shape[1] - 1)), start=size) * units.Hartree
             for size, table in zip((STRETCH, BEND, TURN, BEND), self._tables, strict=True)
@@ -104,14 +109,6 @@ class Internals:
         r = lined_up(x[triples], self.lattice)
         u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
         return norm(cross(u, w)) / (norm(u) * norm(w))
-
-    def _sideways(self, x: FloatArray) -> FloatArray:
-        """Two directions across each straight angle, shape (2, n, 3)."""
-        r = self._gathered(x)[-1]
-        axis = (r[:, 2] - r[:, 0]) / norm(r[:, 2] - r[:, 0])[:, None]
-        first = cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)])
-        first /= norm(first)[:, None]
-        return np.stack([first, cross(axis, first)])
 
     def values(self, x: FloatArray) -> FloatArray:
         """Angstrom and radian, shape (n,)."""
@@ -233,14 +230,14 @@ class Descent:
                 free[item.atoms.ravel()] = False
         self.columns: IntArray = np.flatnonzero(np.repeat(free, 3))
 
+    @np.errstate(all="ignore")
     def relaxed(self, x: FloatArray, fmax: float, most: int = 200) -> Relaxed:
         """Follow the forces on the constraints to a minimum of the energy, by at most so many evaluations.
 
         `ConvergenceError` of too many, or of forces that are not the gradient; `error.positions` is the last place.
         """
         try:
-            with np.errstate(all="ignore"):
-                return self._relaxed(x, fmax, most)
+            return self._relaxed(x, fmax, most)
         except np.linalg.LinAlgError as error:
             raise ConvergenceError(
                 "an angle became straight, or two atoms met, where internal coordinates are undefined; start elsewhere"

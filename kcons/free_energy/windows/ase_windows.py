@@ -26,7 +26,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Sampler, Settings, Window, digest_of
+from kcons.free_energy.windows.driver import Sampler, Settings, Window, digest_of
 from kcons.motion import minimize
 from kcons.motion.motion import Motion
 from kcons.thermostats import IsokineticSpheres

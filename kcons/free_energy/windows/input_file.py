@@ -1,7 +1,7 @@
 """Windows as an input file describes them, in TOML.
 
 A table of the file is a dataclass below, a key one of its fields. What may be given is said by the annotation,
-`Annotated[type, rule]`, as for arguments. A key without a default has to be there.
+its type or `Annotated[type, rule]`, as for arguments. A key without a default has to be there.
 """
 
 from __future__ import annotations
@@ -11,111 +11,89 @@ import sys
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
-from functools import partial
+from functools import partial, reduce
 from itertools import product
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
-from typing import Annotated, Any, TypeAlias
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, FixedAtoms
-from kcons.constraints.arguments import ANGLE, Count, Positive, Rule, rules_of, whole_number
+from kcons.constraints.arguments import ANGLE, Count, Positive, rules_of, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, did_you_mean
 from kcons.free_energy.profiles.pulls import MIN_PULLS
-from kcons.free_energy.windows.window import Sampler, Settings
+from kcons.free_energy.windows.driver import Sampler, Settings
 from kcons.steppers.files import as_path
 
 #: Windows of an input file, at most.
 MOST_WINDOWS = 100_000
 
 
-def _difference(rows: Sequence[Sequence[int]]) -> DistanceDifference:
-    """r(i, j) - r(k, l) of each row i, j, k, l."""
-    for row in rows:
-        if len(row) != 4:
-            raise InputError(
-                f"difference names {len(row)} atoms; give four, i j k l for r(i, j) - r(k, l)", item="difference"
-            )
-    return DistanceDifference([[row[:2], row[2:]] for row in rows])
-
-
-#: What each kind of coordinate becomes, from the atoms of its rows.
-FAMILIES: dict[str, Callable[[list[list[int]]], Constraint]] = {
-    "distance": Distance,
-    "difference": _difference,
-    "angle": Angle,
-    "dihedral": Dihedral,
+#: How many atoms each kind of coordinate has, and what it becomes.
+FAMILIES: dict[str, tuple[int, Callable[[ArrayLike], Constraint]]] = {
+    "distance": (2, Distance),
+    "difference": (4, lambda rows: DistanceDifference(np.reshape(rows, (-1, 2, 2)))),
+    "angle": (3, Angle),
+    "dihedral": (4, Dihedral),
 }
 #: Values between which each kind lies, in angstrom and degrees; the others may have any.
 _RANGES = {"distance": (0.0, math.inf), "angle": (0.0, 180.0)}
 
 
-def _is(words: str, test: Callable[[Any], bool]) -> Rule:
-    """A rule for a value of TOML, in words and as a test."""
-
-    def rule(value: Any, item: str) -> Any:
-        if not test(value):
-            raise InputError(f"{item} is {short(value)}; give {words}", item=item.split()[0])
-        return value
-
-    return rule
+#: What values of TOML are called, one and several.
+_WORDS: dict[Any, tuple[str, ...]] = {str: ("a text",), dict: ("a table",), bool: ("true or false",)}
+_WORDS |= {float: ("a number", "numbers"), int: ("a whole number", "whole numbers")}
 
 
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+def _kinds(hint: Any) -> list[Any]:
+    """The types that an annotation names, but None; of a number with a rule, which says more, a number."""
+    if get_origin(hint) in (Union, UnionType):
+        return [kind for part in get_args(hint) for kind in _kinds(part)]
+    return [] if hint is NoneType else [float] if get_origin(hint) in (Annotated, Literal) else [hint]
 
 
-def _whole(value: Any) -> bool:
-    return isinstance(value, int) and _number(value)
+def _is(value: Any, kind: Any) -> bool:
+    if get_origin(kind) is list:
+        return isinstance(value, list) and bool(value) and all(_is(each, *get_args(kind)) for each in value)
+    if isinstance(value, bool) or kind is not float:
+        return isinstance(value, kind) and isinstance(value, bool) == (kind is bool)
+    return isinstance(value, int | float) and abs(value) <= sys.float_info.max
 
 
-def _list(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and bool(value) and all(map(test, value))
-
-
-_NUMBERS, _ATOMS = _list(_number), _list(_whole)
-Text: TypeAlias = Annotated[str, _is("a text", lambda v: isinstance(v, str))]
-Table: TypeAlias = Annotated[dict, _is("a table", lambda v: isinstance(v, dict))]
-Truth: TypeAlias = Annotated[bool, _is("true or false", lambda v: isinstance(v, bool))]
-Number: TypeAlias = Annotated[float, _is("a number", _number)]
-ZeroOrOne: TypeAlias = Annotated[int, _is("0 or 1", lambda v: _whole(v) and v in (0, 1))]
-Numbers: TypeAlias = Annotated[list, _is("numbers", _NUMBERS)]
-NumberOrNumbers: TypeAlias = Annotated[Any, _is("a number, or numbers", lambda v: _number(v) or _NUMBERS(v))]
-Atoms: TypeAlias = Annotated[list, _is("whole numbers", _ATOMS)]
-Pairs: TypeAlias = Annotated[list, _is("pairs of whole numbers", _list(lambda pair: _ATOMS(pair) and len(pair) == 2))]
-#: Of which `Settings` and `Windows` say more.
-Single: TypeAlias = Annotated[Any, _is("one value", lambda v: not isinstance(v, dict | list))]
+def _words(kind: Any, many: int = 0) -> str:
+    return "lists of " * many + _words(get_args(kind)[0], 1) if get_origin(kind) is list else _WORDS[kind][many]
 
 
 @dataclass(kw_only=True)
 class Structure:
-    file: Text
-    count_from: ZeroOrOne = 0
+    file: str
+    count_from: Literal[0, 1] = 0
 
 
 @dataclass(kw_only=True)
 class Forces:
-    calculator: Text | None = None
-    settings: Table | None = None
-    system: Text | None = None
-    platform: Text | None = None
+    calculator: str | None = None
+    settings: dict | None = None
+    system: str | None = None
+    platform: str | None = None
 
 
 @dataclass(kw_only=True)
 class Coordinate:
-    name: Text | None = None
-    distance: Atoms | None = None
-    difference: Atoms | None = None
-    angle: Atoms | None = None
-    dihedral: Atoms | None = None
-    begin: Number | None = field(default=None, metadata={"key": "from"})
-    to: Number | None = None
+    name: str | None = None
+    distance: list[int] | None = None
+    difference: list[int] | None = None
+    angle: list[int] | None = None
+    dihedral: list[int] | None = None
+    begin: float | None = field(default=None, metadata={"key": "from"})
+    to: float | None = None
     windows: Count | None = None
-    values: Numbers | None = None
+    values: list[float] | None = None
 
     def __post_init__(self) -> None:
         families = [family for family in FAMILIES if getattr(self, family) is not None]
@@ -136,7 +114,7 @@ class Coordinate:
         self.count = len(self.values) if self.values is not None else self.windows or 0
 
     def constraint(self, first: int) -> Constraint:
-        return FAMILIES[self.family]([counted(getattr(self, self.family), first)])
+        return coordinate_of(self.family, getattr(self, self.family), first)
 
     def places(self) -> FloatArray:
         """Where windows are, in angstrom and radian."""
@@ -155,9 +133,9 @@ class Coordinate:
 
 @dataclass(kw_only=True)
 class HeldRows:
-    constrain: Text | None = None
-    fixed: Atoms | None = None
-    distances: Pairs | None = None
+    constrain: str | None = None
+    fixed: list[int] | None = None
+    distances: list[list[int]] | None = None
 
     def rows(self, atoms: Any, first: int) -> list[Constraint]:
         from kcons.ase import constraints_of
@@ -178,15 +156,15 @@ class Improve:
 
 @dataclass(kw_only=True)
 class Pulls:
-    begin: NumberOrNumbers | None = field(default=None, metadata={"key": "from"})
-    to: NumberOrNumbers | None = None
+    begin: float | list[float] | None = field(default=None, metadata={"key": "from"})
+    to: float | list[float] | None = None
     count: Annotated[int, partial(whole_number, least=MIN_PULLS)] = 20
     steps: Count = 20_000
 
 
 #: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
-_OF_WINDOWS = {"both_sides": Truth, "approach": NumberOrNumbers, "rng": Single}
-_SAMPLING = {each.name: Single for each in fields(Settings)} | _OF_WINDOWS
+_OF_WINDOWS = {"both_sides": bool, "approach": float | list[float], "rng": int}
+_SAMPLING = get_type_hints(Settings, include_extras=True) | _OF_WINDOWS
 #: Tables of a file.
 _TABLES: dict[str, Any] = {
     "structure": Structure,
@@ -246,7 +224,10 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         windows; a calculator that is neither in `kcons.ase.named_calculators.LISTED` nor of one of these modules.
     """
     path = as_path(file, "file")
-    data = _toml(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no TOML that can be read: {error}", item="file") from error
     tables: dict[str, Any] = {}
     for name, content in {"forces": {}, "sampling": {}, **data}.items():
         _refuse_unknown(name, _TABLES, "the input file")
@@ -271,7 +252,15 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
         options["approach"] = _in_radian("approach", options["approach"], coordinates)
-    pulls = tables.get("pulls")
+    pulls, ways = tables.get("pulls"), None
+    if pulls is not None:
+        start, end = (
+            place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
+            for key, given, place in (("from", pulls.begin, targets[0]), ("to", pulls.to, targets[-1]))
+        )
+        if np.array_equal(start, end):
+            raise InputError("[pulls] begin where they end; give from and to", item="pulls")
+        ways = {"start": start, "end": end, "count": pulls.count}
     if "improve" in data and (len(coordinates) > 1 or count < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
@@ -284,24 +273,9 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         targets,
         options,
         data.get("improve"),
-        None if pulls is None else _pulls(pulls, coordinates, targets),
+        ways,
         Pulls.steps if pulls is None else pulls.steps,
     )
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"there is no file {path}", item="file") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error}", item="file") from error
-    except ValueError as error:
-        raise InputError(f"{path} is no TOML: {error}", item="file") from error
-    except RecursionError:
-        raise InputError(
-            f"{path}: lists or tables are too deep in each other; an input file needs two levels", item="file"
-        ) from None
 
 
 def _read(kind: Any, name: str, entry: Any) -> Any:
@@ -309,15 +283,19 @@ def _read(kind: Any, name: str, entry: Any) -> Any:
     if not isinstance(entry, dict):
         raise InputError(f"{name} is {short(entry)}; write [{name}] and its keys below", item=name)
     own = {each.metadata.get("key", each.name): each for each in fields(kind)}
-    rules = rules_of(kind)
+    hints, rules = get_type_hints(kind, include_extras=True), rules_of(kind)
+    given: dict[str, Any] = {}
     for key, value in entry.items():
         _refuse_unknown(key, own, f"[{name}]")
-        for rule in rules[own[key].name].rules:
-            rule(value, f"{key} of [{name}]")
+        field_name, item = own[key].name, f"{key} of [{name}]"
+        kinds = _kinds(hints[field_name])
+        if not any(_is(value, each) for each in kinds):
+            raise InputError(f"{item} is {short(value)}; give {', or '.join(map(_words, kinds))}", item=key)
+        given[field_name] = reduce(lambda value, rule: rule(value, item), rules[field_name].rules, value)
     for key, each in own.items():
-        if key not in entry and each.default is MISSING:
+        if each.name not in given and each.default is MISSING:
             raise InputError(f"[{name}] has no {key}; write {key} = ...", item=key)
-    return kind(**{own[key].name: value for key, value in entry.items()})
+    return kind(**given)
 
 
 def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
@@ -326,15 +304,12 @@ def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
         raise InputError(f"{where} has an unknown key {key!r}{hint}; there are {', '.join(known)}", item=key)
 
 
-def _pulls(entry: Pulls, coordinates: Mapping[str, Constraint], targets: FloatArray) -> dict[str, Any]:
-    """Arguments of `Windows.pull`; by default from the first window to the last."""
-    start, end = (
-        place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
-        for key, given, place in (("from", entry.begin, targets[0]), ("to", entry.to, targets[-1]))
-    )
-    if np.array_equal(start, end):
-        raise InputError("[pulls] begin where they end; give from and to", item="pulls")
-    return {"start": start, "end": end, "count": entry.count}
+def coordinate_of(family: str, atoms: Sequence[int], first: int) -> Constraint:
+    """A coordinate of one of `FAMILIES`, on atoms that are counted from `first`."""
+    size, made = FAMILIES[family]
+    if len(atoms) != size:
+        raise InputError(f"{family} names {len(atoms)} atoms; give {size}", item=family)
+    return made([counted(atoms, first)])
 
 
 def counted(atoms: Sequence[int], first: int) -> list[int]:
@@ -387,7 +362,14 @@ def _sampler(
     if forces.system is not None:
         if "held" in tables:
             raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
-        return _of_openmm(place, folder / forces.system, forces.platform, coordinates)
+        from openmm import app
+
+        from kcons.free_energy.scans.system_calculator import read_system
+        from kcons.free_energy.windows.openmm_windows import OpenMMWindows
+
+        system = read_system(folder / forces.system, "system")
+        pdb = _opened("OpenMM", app.PDBxFile if place.suffix == ".cif" else app.PDBFile, place)
+        return OpenMMWindows(pdb.topology, system, pdb.positions, coordinates, platform=forces.platform)
     from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
     from kcons.free_energy.windows.ase_windows import AseWindows
 
@@ -398,14 +380,3 @@ def _sampler(
     if forces.calculator in LISTED:
         make()  # complain of settings
     return AseWindows(atoms, make, coordinates, rows)
-
-
-def _of_openmm(structure: Path, system: Path, platform: str | None, coordinates: Mapping[str, Constraint]) -> Sampler:
-    from openmm import app
-
-    from kcons.free_energy.scans.system_calculator import read_system
-    from kcons.free_energy.windows.openmm_windows import OpenMMWindows
-
-    made = read_system(system, "system")
-    pdb = _opened("OpenMM", app.PDBxFile if structure.suffix == ".cif" else app.PDBFile, structure)
-    return OpenMMWindows(pdb.topology, made, pdb.positions, coordinates, platform=platform)

@@ -19,7 +19,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Sampler, Settings, Window, digest_of
+from kcons.free_energy.windows.driver import Sampler, Settings, Window, digest_of
 from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin, ProjectedIntegrator, hold
 from kcons.openmm.callback_rows import CarriedConstraints, constraints_about, refuse_virtual_sites
 from kcons.openmm.device.device_integrator import choose
@@ -210,13 +210,29 @@ class OpenMMWindows(Sampler):
         platform: str | None = None,
         properties: Mapping[str, str] | None = None,
     ) -> None:
-        _refuse_another(topology, system)
+        if topology.getNumAtoms() != system.getNumParticles():
+            raise InputError(
+                f"the Topology has {topology.getNumAtoms()} atoms and the System {system.getNumParticles()} particles; "
+                "give those of one structure",
+                item="topology",
+            )
+        wraps, box = system.usesPeriodicBoundaryConditions(), topology.getPeriodicBoxVectors()
+        cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
+        if box is not None and cell is not None and np.abs(cell_of(box) - cell).max() > _SAME_BOX * np.abs(cell).max():
+            raise InputError(
+                f"the box of the Topology is {cell_of(box).tolist()} nm, and that of the System, which windows are "
+                f"sampled in, {cell.tolist()}; give it by "
+                "system.setDefaultPeriodicBoxVectors(*topology.getPeriodicBoxVectors()), or take the structure that "
+                "the System was made for",
+                item="topology",
+            )
+        barostats = [type(force).__name__ for force in system.getForces() if "Barostat" in type(force).__name__]
+        if barostats:
+            raise UnsupportedError(f"the System has a {barostats[0]}; windows are sampled in a box at rest: remove it")
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
         x, masses = nanometers(positions, system.getNumParticles()).copy(), masses_of(system)
         bonds, others = bonds_of(system, x), _beside(system, list(named(coordinates).values()), masses)
-        wraps = system.usesPeriodicBoundaryConditions()
-        cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
         where = (x, np.where(masses > 0, masses, 1.0), cell, True)
         super().__init__(coordinates, others, *where, bonds, _turning(system, bonds, masses), angstrom=10.0)
 
@@ -294,26 +310,3 @@ def _state(state: openmm.State) -> tuple[FloatArray, FloatArray, FloatArray, flo
     for kind, array in zip((openmm.State.Positions, openmm.State.Velocities, openmm.State.Forces), arrays, strict=True):
         state._getVectorAsNumpy(kind, array)
     return arrays[0], arrays[1], arrays[2], state.getTime()._value
-
-
-def _refuse_another(topology: app.Topology, system: openmm.System) -> None:
-    """Refuse a Topology that is not of this System, and Systems whose box would change."""
-    if topology.getNumAtoms() != system.getNumParticles():
-        raise InputError(
-            f"the Topology has {topology.getNumAtoms()} atoms and the System {system.getNumParticles()} particles; "
-            "give those of one structure",
-            item="topology",
-        )
-    box = topology.getPeriodicBoxVectors()
-    if box is not None and system.usesPeriodicBoundaryConditions():
-        mine, its = cell_of(box), cell_of(system.getDefaultPeriodicBoxVectors())
-        if np.abs(mine - its).max() > _SAME_BOX * np.abs(its).max():
-            raise InputError(
-                f"the box of the Topology is {mine.tolist()} nm, and that of the System, which windows are sampled in, "
-                f"{its.tolist()}; give it by system.setDefaultPeriodicBoxVectors(*topology.getPeriodicBoxVectors()), "
-                "or take the structure that the System was made for",
-                item="topology",
-            )
-    barostats = [type(force).__name__ for force in system.getForces() if "Barostat" in type(force).__name__]
-    if barostats:
-        raise UnsupportedError(f"the System has a {barostats[0]}; windows are sampled in a box at rest: remove it")

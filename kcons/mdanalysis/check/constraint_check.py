@@ -392,7 +392,13 @@ def check_trajectory(
     UnreadableError
         A trajectory of which nothing can be told: cut off, or not finite, in its first frame.
     """
-    chosen = _slice(frames)
+    try:
+        numbers = [int(word) if word.strip() else None for word in (":" if frames is None else frames).split(":")]
+    except ValueError:
+        numbers = []
+    if not 2 <= len(numbers) <= 3 or (numbers[2:] and numbers[2] is not None and numbers[2] < 1):
+        raise InputError(f"frames are {frames!r}; give them as A:B or A:B:STEP, such as 100::10", item="frames")
+    chosen: dict[str, Any] = dict(zip(("start", "stop", "step"), numbers, strict=False))
     whole_number(workers, "workers", 1)
     if str(targets) not in ("topology", "first", "mean"):
         read_targets(targets)  # complain of it before anything long
@@ -448,14 +454,3 @@ def _held(universe: Any, constrain: str | None, held: dict[str, Any]) -> HeldRow
                 "one (--frames A:), or write the file again",
                 item="trajectory",
             ) from None
-
-
-def _slice(frames: str | None) -> dict[str, Any]:
-    """'A:B:STEP' as arguments."""
-    try:
-        numbers = [int(word) if word.strip() else None for word in (":" if frames is None else frames).split(":")]
-    except ValueError:
-        numbers = []
-    if not 2 <= len(numbers) <= 3 or (numbers[2:] and numbers[2] is not None and numbers[2] < 1):
-        raise InputError(f"frames are {frames!r}; give them as A:B or A:B:STEP, such as 100::10", item="frames")
-    return dict(zip(("start", "stop", "step"), numbers, strict=False))

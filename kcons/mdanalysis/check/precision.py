@@ -98,11 +98,20 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
             steps = _xtc_precision(file)
         return FilePrecision(name, 10.0 / steps, exact=True) if steps else FilePrecision(name, unit=10.0)
     if name == "GRO":
-        return FilePrecision(name, 10.0 * 10.0 ** -_gro_decimals(path))
+        # Columns are n + 5 wide for n decimals, so that two points of the third line are n + 5 apart.
+        with anyopen(str(path), "rb") as file:
+            line: bytes = [file.readline() for _ in range(3)][2]
+        points = [k for k, c in enumerate(line) if c == ord(".")]
+        return FilePrecision(name, 10.0 * 10.0 ** -(points[1] - points[0] - 5 if len(points) > 1 else 3))
     if name in _DECIMALS:
         return FilePrecision(name, 10.0 ** -_DECIMALS[name])
-    if name in ("XYZ", "LAMMPSDUMP"):
-        return _of_xyz(path) if name == "XYZ" else _of_dump(path)
+    if name == "XYZ":
+        with anyopen(str(path), "rb") as file:
+            head, _ = _words(file), file.readline()
+            lines = [_words(file) for _ in range(min(int(head[0]), MOST_READ) if head and head[0].isdigit() else 0)]
+        return _of_words(name, [word for words in lines for word in words[1:4]])
+    if name == "LAMMPSDUMP":
+        return _of_dump(path)
     return FilePrecision(name, unit=10.0 if name in _NANOMETERS else 1.0)
 
 
@@ -174,24 +183,8 @@ def _off_grid(x: FloatArray, step: float) -> FloatArray:
     return np.asarray(np.abs(x - np.rint(x / step) * step))
 
 
-def _gro_decimals(path: str | Path) -> int:
-    """Columns are n + 5 wide for n decimals, so that two points of the third line are n + 5 apart."""
-    with anyopen(str(path), "rb") as file:
-        line: bytes = [file.readline() for _ in range(3)][2]
-    points = [k for k, c in enumerate(line) if c == ord(".")]
-    return points[1] - points[0] - 5 if len(points) > 1 else 3
-
-
 def _words(file: BinaryIO) -> list[str]:
     return file.readline().decode("ascii", "replace").split()
-
-
-def _of_xyz(path: str | Path) -> FilePrecision:
-    with anyopen(str(path), "rb") as file:
-        head, _ = _words(file), file.readline()
-        n_atoms = int(head[0]) if head and head[0].isdigit() else 0
-        lines = [_words(file) for _ in range(min(n_atoms, MOST_READ))]
-    return _of_words("XYZ", [word for words in lines for word in words[1:4]])
 
 
 def _of_dump(path: str | Path) -> FilePrecision:

@@ -46,7 +46,7 @@ def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **optio
     """Words to the left, numbers to the right; where there is no room, cells are folded and not cut."""
     shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1), collapse_padding=True, **options)
     for header in headers:
-        shown.add_column(header, justify="left" if header in ("unit", "what") else "right", overflow="fold")
+        shown.add_column(header, justify="left" if header[:4] in ("unit", "what") else "right", overflow="fold")
     for row in rows:
         shown.add_row(*row)
     return shown
@@ -55,10 +55,10 @@ def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **optio
 def _units(result: CheckResult) -> Table:
     """One line for lengths, one for angles."""
     headers = ["unit", "rows", "largest", "rms", "rms of\nrounding", "mean", "largest mean\nof a row"]
-    headers.append("drift of rms\na ns")
+    headers.append("drift of rms\nper ns")
     rates = any(unit.rate_rms is not None for unit in result.units)
     if rates:
-        headers += ["largest |Av|\na ps", "rms |Av|\na ps"]
+        headers += ["largest |Av|\nper ps", "rms |Av|\nper ps"]
     rows = []
     for unit in result.units:
         drift = ""
@@ -79,10 +79,10 @@ def _rows(result: CheckResult) -> Table:
     rows: list[list[str | Text]] = []
     for row in result.worst:
         largest = Text(f"{row.largest:.2e}", style="red" if row.largest > row.allowed else "")
-        frame = "" if row.frame is None else str(row.frame)
         target, means = f"{row.target:.4f} {row.unit}", (f"{row.allowed:.2e}", f"{row.mean:.1e}")
-        rows.append([str(row.row), row.name, target, largest, *means, frame])
-    headers = ["row", "what", "target", "largest", "allowed", "mean", "frame"]
+        what = f"{row.name} ({', '.join(map(str, row.atoms[:4]))})"
+        rows.append([str(row.row), what, target, largest, *means, "" if row.frame is None else str(row.frame)])
+    headers = ["row", "what (atoms from 0)", "target", "largest", "allowed", "mean", "frame"]
     return _table(headers, rows, title="worst rows", title_justify="left")
 
 

@@ -11,15 +11,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 from scipy.special import ellipj, ellipkinc
 
-from kcons.constraints.arguments import (
-    FloatArray,
-    NotNegative,
-    Positive,
-    as_float_array,
-    check_call,
-    checked,
-    positive,
-)
+from kcons.constraints.arguments import FloatArray, NotNegative, Positive, as_float_array, check_call, checked, positive
 from kcons.errors import InputError
 from kcons.models.flows.flow import Flow, phase_volume
 from kcons.models.flows.linear import JordanBlocks, JordanForm, LinearFlow, jordan_block
@@ -142,8 +134,6 @@ class Pendulum(HamiltonianFlow):
         # Measured from the nearest lowest position.
         turns = np.round(theta0 / (2 * np.pi))
         sine, half_rate = np.sin(0.5 * (theta0 - 2 * np.pi * turns)), 0.5 * rate0
-        if m == 0.0:
-            return np.stack(np.broadcast_arrays(theta0 + 0 * times, 0.0 * times), axis=-1)
         k = np.sqrt(m)
         if m < 1.0:
             start = ellipkinc(np.arctan2(sine, half_rate), m)

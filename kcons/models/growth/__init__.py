@@ -9,14 +9,7 @@
 from kcons.models.growth.constrained import ConstrainedGrowth, GrowthSolution, entropy_balance, solve
 from kcons.models.growth.hypercycle import ConstrainedHypercycle, Hypercycle
 from kcons.models.growth.model import GrowthModel, Logistic, LotkaVolterra, Mixture, Populations
-from kcons.models.growth.rows import (
-    EntropyRow,
-    HolonomicRow,
-    LinearRow,
-    Row,
-    TotalPopulation,
-    VelocityRow,
-)
+from kcons.models.growth.rows import EntropyRow, HolonomicRow, LinearRow, Row, TotalPopulation, VelocityRow
 
 __all__ = [
     "ConstrainedGrowth",

@@ -354,7 +354,7 @@ def solve(
     solver, span, times = check_run(t_span, t_eval, method, options, system.n)
     rtol, atol = (as_float_array(options[name], name) for name in ("rtol", "atol"))
     tolerance = max(float(np.min(rtol + atol)), 1e-13)
-    p0 = Populations.start(span[0], system.n, x0, log_x0)
+    p0 = Populations.start(span[0], x0, log_x0)
     bound = system.bind(p0)
     end, settled_time = p0, None
 

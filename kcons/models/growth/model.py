@@ -23,6 +23,8 @@ from kcons.models.integration import called
 
 #: Below this |ln x/x_eq| the excess of a species is summed as a power series.
 NEAR = 0.2
+#: Of h(u)/u^2, h(u) = u^2/2 + u^3/3 + u^4/8 + ...: the sum over k >= 2 of (k - 1) u^k/k!.
+_SERIES = [(k - 1) / math.factorial(k) for k in range(14, 1, -1)]
 #: A function of time and populations, arguments in SciPy's order.
 OfState = Callable[[float, FloatArray], ArrayLike]
 
@@ -60,19 +62,16 @@ class Populations(NamedTuple):
         return cls(time, array, np.log(array))
 
     @classmethod
-    def start(cls, time: float, n: int, x0: ArrayLike | None, log_x0: ArrayLike | None) -> Self:
-        """The start of a run with n species, given as populations or as their logarithms."""
-        if x0 is not None and log_x0 is None:
-            p = cls.from_values(time, x0)
-        elif log_x0 is not None and x0 is None:
-            p = cls.from_logarithms(time, as_float_array(log_x0, "log_x0").copy())
-        else:
+    def start(cls, time: float, x0: ArrayLike | None, log_x0: ArrayLike | None) -> Self:
+        """The start of a run, given as populations or as their logarithms."""
+        if (x0 is None) == (log_x0 is None):
             raise InputError("give the start either as x0 or as log_x0", item="x0")
-        if p.log_x.shape != (n,):
-            raise InputError(f"the start has shape {p.log_x.shape}, not ({n},)", item="x0")
-        if not np.all(np.isfinite(p.log_x)):
+        if x0 is not None:
+            return cls.from_values(time, x0)
+        log_x = np.array(as_float_array(log_x0, "log_x0"))
+        if not np.all(np.isfinite(log_x)):
             raise InputError("log_x0 is not finite", item="log_x0")
-        return p
+        return cls.from_logarithms(time, log_x)
 
 
 class GrowthModel:
@@ -257,40 +256,24 @@ class Mixture:
         """g_eq = -c kT ln sum exp(-mu0/kT)."""
         return -total * self.kT * self._log_w
 
-    def excess(self, p: Populations, total: float, level: float = 0.0) -> Any:
-        """g - g_eq less `level`, a number a state, to the round-off of the potentials about their mean.
+    def excess(self, p: Populations, total: float) -> Any:
+        """g - g_eq, a number a state, to the round-off of the potentials about their mean.
 
         g_eq is taken at the actual sum X of the populations, near `total`. The terms of
-        kT [sum (x_eq h(ln x/x_eq) - a x) - c h(ln X/c) + a (X - c)], h(u) = u e^u - e^u + 1, a = level/(c kT)
-        are never negative for level = 0, so that nothing cancels near equilibrium; x_eq and c are those of `total`. Far
-        from it, the part of each population in `level` is taken from its own term, with ln x/x_eq and X - c to twice
-        the precision.
+        kT [sum x_eq h(ln x/x_eq) - c h(ln X/c)], h(u) = u e^u - e^u + 1, are never negative, so that nothing cancels
+        near equilibrium; x_eq and c are those of `total`.
         """
         if p.x.ndim == 2:
             states = zip(p.x.T, p.log_x.T, strict=True)
-            return np.array([self.excess(Populations(p.time, *state), total, level) for state in states])
+            return np.array([self.excess(Populations(p.time, *state), total) for state in states])
         log_eq = self.equilibrium(total)
-        a = level / (total * self.kT)
         # A trial step of an integrator may overflow; it is then rejected.
         with np.errstate(all="ignore"):
-            u = p.log_x - log_eq
-            part = u - p.log_x
-            rest = (p.log_x - (u - part)) - (log_eq + part)  # what rounding took from u (Knuth)
-            near = np.abs(u) < NEAR
-            x_eq = np.exp(log_eq)
-            terms = np.where(
-                near, x_eq * _series(np.where(near, u + rest, 0.0)) - a * p.x, p.x * ((u - a) + rest) - (p.x - x_eq)
-            )
+            u, x_eq = p.log_x - log_eq, np.exp(log_eq)
+            small = np.where(np.abs(u) < NEAR, u, 0.0)
+            series = np.polyval(_SERIES, small) * small * small
+            terms = np.where(np.abs(u) < NEAR, x_eq * series, p.x * u - (p.x - x_eq))
             if not (np.all(np.isfinite(terms)) and np.all(np.isfinite(p.x))):
                 return math.nan
-            more = math.fsum([*p.x, -total])
-            over = (1.0 + more / total) * np.log1p(more / total) - more / total
-            return self.kT * math.fsum([*terms, -total * over, a * more])
-
-
-def _series(u: FloatArray) -> FloatArray:
-    """u^2/2 + u^3/3 + u^4/8 + ...: the sum over k >= 2 of (k - 1) u^k/k!."""
-    return np.asarray(np.polyval(_COEFFICIENTS, u) * u * u)
-
-
-_COEFFICIENTS = [(k - 1) / math.factorial(k) for k in range(14, 1, -1)]
+            more = math.fsum([*p.x, -total]) / total
+            return self.kT * math.fsum([*terms, total * more, -total * (1.0 + more) * np.log1p(more)])

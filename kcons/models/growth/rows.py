@@ -262,8 +262,6 @@ class VelocityRow(Row):
 BUDGET_TOLERANCE = 1e-9
 #: Excess, as a part of the largest there is, that rounding leaves of none (it is quadratic in x - x_eq).
 AT_EQUILIBRIUM = 1e-29
-#: Slope of the excess, as a part of the excess, below which the populations cannot mend its round-off.
-FADED = 1e-2
 
 
 class EntropyRow(Row):
@@ -311,27 +309,21 @@ class EntropyRow(Row):
         return -self.mixture.excess(p, total) / self.tau
 
     def value(self, p: Populations) -> float:
-        return self.mixture.excess(p, self.total, self.law_excess(p.time))
+        return self.mixture.excess(p, self.total) - self.law_excess(p.time)
 
     def size(self, p: Populations) -> float:
         # ln x carries an error of some 1e-16 of itself, which enters through the gradient; squared where there is none.
         error = np.maximum(1.0, np.abs(p.log_x))
         epsilon = float(np.finfo(np.float64).eps)
         slope = float(np.sum(p.x * np.maximum(np.abs(self.gradient(p)), 4.0 * epsilon * error) * error))
-        excess = abs(self.law_excess(p.time))
-        # Where one species is nearly alone, no ln x must be moved to mend what the rounding of sum x does here.
-        slope = excess if slope < FADED * excess else slope
-        # Elsewhere the excess cancels, see Mixture.excess; terms of some kT sum x are left.
-        return max(4.0 * min(excess, self.mixture.kT * self.total), slope)
+        return max(4.0 * abs(self.law_excess(p.time)), slope)
 
     def bind(self, p: Populations) -> EntropyRow:
         if self.mixture.n != len(p.x):
             raise InputError(f"the mixture has {self.mixture.n} species, the start {len(p.x)}", item="mixture")
         bound = copy.copy(self)
         bound.start, bound.total = p.time, math.fsum(p.x)
-        # In two steps, the second of which sees what the first rounded off.
-        about = self.mixture.excess(p, bound.total)
-        bound.excess0 = about + self.mixture.excess(p, bound.total, about)
+        bound.excess0 = self.mixture.excess(p, bound.total)
         if self.tau < math.inf:
             bound._check_budget()
         return bound

@@ -15,7 +15,7 @@ from kcons.constraints.periodic.one_piece import connected, make_whole, minimum_
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
-from kcons.plan.independent_blocks import edge_blocks, fixed_atoms
+from kcons.plan.independent_blocks import edge_blocks, fixed_rows
 from kcons.solvers.rank_revealing import independent
 from kcons.topology.guessed_bonds import NEAREST, across, bonds_without_elements
 from kcons.topology.topology import BoolArray, bond_angles, sorted_pairs
@@ -180,7 +180,7 @@ class Geometry:
         self.held, self.labels, self.start, self.time, self._bonds = held, labels, start, time, bonds
         # Particles without mass are sites or walls: whoever places them does so, not a bond.
         self.pinned = np.equal(held.masses, 0.0)
-        self.pinned[fixed_atoms(held)] = True
+        self.pinned[fixed_rows(held)[0]] = True
         with np.errstate(all="ignore"):
             self.misfit = np.abs(held.value(start, time)) / held.scale
         self.usable = bool(np.isfinite(start[held.touched]).all())
@@ -320,9 +320,8 @@ class Geometry:
     def placed(self) -> FloatArray:
         """The start with fixed atoms in their places; a new array."""
         x = self.start.copy()
-        for item in self.held.constraints:
-            if item.fixes_atoms:
-                x[item.atoms[::3, 0]] = item.target_at(self.time).reshape(-1, 3)
+        atoms, rows = fixed_rows(self.held)
+        x[atoms] = self.held.target(self.time)[rows].reshape(-1, 3)
         return x
 
     @cached_property

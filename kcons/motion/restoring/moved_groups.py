@@ -29,6 +29,7 @@ from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsErr
 from kcons.motion.certificate import off_row
 from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
 from kcons.motion.restoring.nearest_point import least_squares
+from kcons.plan.independent_blocks import fixed_atoms
 from kcons.plan.plan import Plan
 from kcons.solvers import tolerances
 
@@ -73,8 +74,7 @@ def restored(
         Such positions were not found.
     """
     geometry = Geometry(held, plan.labels, x, time, bonds)
-    ways: list[Callable[[], FloatArray | None]] = [lambda: x, lambda: moved(geometry)]
-
+    ways: list[Callable[[], FloatArray | None]] = [lambda: x, _Motions(geometry).moved]
     if geometry.far() and not geometry.free and len(geometry.pieces.bonds):
         ways.reverse()
     ways.append(lambda: eased(geometry))
@@ -119,13 +119,6 @@ def _off(held: ConstraintSet, plan: Plan, x: FloatArray, time: float) -> Infeasi
     )
 
 
-def moved(geometry: Geometry) -> FloatArray | None:
-    """The start with pieces moved as the rows ask; None if they cannot come near."""
-    if not geometry.usable or not np.isfinite(geometry.start[geometry.pieces.atoms]).all():
-        return None
-    return _Motions(geometry).moved()
-
-
 def eased(geometry: Geometry) -> FloatArray | None:
     """The start with all atoms of its molecules moved, bonds and angles as near to theirs as the rows allow, or None.
 
@@ -164,14 +157,17 @@ class _Motions:
     """The motions of one restoration, made on positions with every molecule in one piece."""
 
     def __init__(self, geometry: Geometry) -> None:
-        self.geometry, self.held, self.pieces = geometry, geometry.held, geometry.pieces
+        self.geometry, self.held = geometry, geometry.held
         self.time, self.pinned = geometry.time, geometry.pinned
-        self._whole = self.pieces.whole(geometry.start, self.held.lattice)
-        self._images = self._whole - geometry.start
 
     def moved(self) -> FloatArray | None:
-        """See the function of this name."""
-        held, y = self.held, self._whole.copy()
+        """The start with pieces moved as the rows ask; None if they cannot come near."""
+        held, start = self.held, self.geometry.start
+        if not self.geometry.usable or not np.isfinite(start[self.geometry.pieces.atoms]).all():
+            return None
+        self.pieces = self.geometry.pieces
+        y = self.pieces.whole(start, held.lattice)
+        self._images = y - start
         self._follow_fixed(y)
         with np.errstate(all="ignore"):
             self._sweep(y)
@@ -184,15 +180,10 @@ class _Motions:
         """Molecules with fixed atoms that are placed elsewhere go along, in place."""
         from scipy.spatial.transform import Rotation  # slow to import, rarely needed
 
-        places = {
-            int(a): item.target_at(self.time)[3 * n : 3 * n + 3]
-            for item in self.held.constraints
-            if item.fixes_atoms
-            for n, a in enumerate(item.atoms[::3, 0])
-        }
+        held, places = fixed_atoms(self.held), self.geometry.placed() + self._images
         for molecule in self.pieces.molecules:
-            fixed = molecule[[a in places for a in molecule.tolist()]]
-            target = np.array([places[a] for a in fixed.tolist()]).reshape(-1, 3) + self._images[fixed]
+            fixed = molecule[np.isin(molecule, held)]
+            target = places[fixed]
             if np.array_equal(y[fixed], target):
                 continue
             here, there = y[fixed].mean(axis=0), target.mean(axis=0)
@@ -217,7 +208,7 @@ class _Motions:
                 pieces.append(self._piece(molecules, order, len(order) - last))
             for piece in pieces:
                 if piece is not None:
-                    move = torsion(piece, j, k) if family == "Dihedral" else bend(piece, i, j, k)
+                    move = _torsion(piece, j, k) if family == "Dihedral" else _bend(piece, i, j, k)
                     able.append((float(self.held.masses[piece].sum()), move))
                     break
         return min(able, key=lambda entry: entry[0])[1] if able else None
@@ -229,18 +220,27 @@ class _Motions:
         return piece if np.array_equal(np.isin(order, piece), np.arange(len(order)) >= first) else None
 
     def _shifted(self, i: int, k: int) -> Move | None:
-        """Shift the two sides of a bond, or two molecules, along the way between two atoms."""
+        """Shift the two sides of a bond, or two molecules, along the way between two atoms, their center at rest."""
         one, other = self.pieces.beyond(i, k), self.pieces.beyond(k, i)
         if one is None or other is None:
             one, other = self.pieces.molecule(k), self.pieces.molecule(i)
             if np.isin(i, one):
                 return None
         one, other = (side[:0] if self.pinned[side].any() else side for side in (one, other))
+        if not (len(one) or len(other)):
+            return None
+        a, b = (float(self.held.masses[side].sum()) for side in (one, other))
+        part = (b / (a + b) if a + b > 0 else 0.5) if len(one) and len(other) else float(len(one) > 0)
 
-        def axis(x: FloatArray) -> FloatArray:
-            return minimum_image(x[k] - x[i], self.held.lattice)
+        def move(x: FloatArray, amount: float) -> bool:
+            way = minimum_image(x[k] - x[i], self.held.lattice)
+            size = float(np.linalg.norm(way))
+            if size > 0:
+                x[one] += amount * part / size * way
+                x[other] += amount * (part - 1.0) / size * way
+            return size > 0
 
-        return stretch(one, other, self.held.masses, axis) if len(one) or len(other) else None
+        return move
 
     def _owns(self) -> list[tuple[int, ConstraintSet, IntArray, Move]]:
         """Rows that are off and have a motion of their own, each as a set of its own with its atoms, and the motion."""
@@ -274,12 +274,7 @@ class _Motions:
             last = min(last, largest)
 
 
-def torsion(atoms: IntArray, j: int, k: int) -> Move:
-    """Turn about the line from j to k: with the last atom of a dihedral among `atoms`, it grows by the amount."""
-    return lambda x, amount: _turn(x, atoms, x[j], x[k] - x[j], amount)
-
-
-def bend(atoms: IntArray, i: int, j: int, k: int) -> Move:
+def _bend(atoms: IntArray, i: int, j: int, k: int) -> Move:
     """Turn about j in the plane of i, j, k: with k among `atoms`, the angle i-j-k grows by the amount."""
 
     def move(x: FloatArray, amount: float) -> bool:
@@ -292,29 +287,9 @@ def bend(atoms: IntArray, i: int, j: int, k: int) -> Move:
     return move
 
 
-def stretch(atoms: IntArray, others: IntArray, masses: FloatArray, axis: Callable[[FloatArray], FloatArray]) -> Move:
-    """Shift one piece along an axis and the other against it, their common center at rest.
-
-    Parameters
-    ----------
-    atoms, others : ndarray of int
-        The pieces; one without atoms means that the other one moves alone.
-    masses : ndarray, shape (n_atoms,)
-    axis : callable
-        Points from `others` to `atoms`, any length.
-    """
-    a, b = float(masses[atoms].sum()), float(masses[others].sum())
-    part = (b / (a + b) if a + b > 0 else 0.5) if len(atoms) and len(others) else float(len(atoms) > 0)
-
-    def move(x: FloatArray, amount: float) -> bool:
-        way = axis(x)
-        size = float(np.linalg.norm(way))
-        if size > 0:
-            x[atoms] += amount * part / size * way
-            x[others] += amount * (part - 1.0) / size * way
-        return size > 0
-
-    return move
+def _torsion(atoms: IntArray, j: int, k: int) -> Move:
+    """Turn about the line from j to k: with the last atom of a dihedral among `atoms`, it grows by the amount."""
+    return lambda x, amount: _turn(x, atoms, x[j], x[k] - x[j], amount)
 
 
 def _turn(x: FloatArray, atoms: IntArray, origin: FloatArray, axis: FloatArray, angle: float) -> bool:

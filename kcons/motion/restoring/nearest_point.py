@@ -13,6 +13,7 @@ from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import extent
 from kcons.errors import ConvergenceError, KconsError
 from kcons.motion.solver_sequence import FAILED, IterationBudget, SolverSequence
+from kcons.plan.clusters import atom_labels
 from kcons.solvers.tolerances import EPS
 
 #: Rounds of the search for the nearest point on the constraints, and steps towards any point on them.
@@ -57,6 +58,7 @@ class FarStart:
         self._sequence, self._budget, self._time = sequence, IterationBudget(sequence.plan), time
         self.left = 0.0
         self._rows, self._plan, self._failures = sequence.rows, sequence.plan, sequence.failures
+        self._labels = atom_labels(self._rows, self._plan.labels, self._plan.inverse_masses)
 
     def _positions(self, x: FloatArray, reference: FloatArray) -> None:
         """Project in place along the gradients at `reference`."""
@@ -64,8 +66,8 @@ class FarStart:
         self._sequence.positions(x, reference, self._time, self._time, None, 0.0, None)
         self._budget.iterations += FAILED - max(self._sequence.iterations, default=0)
 
-    def _tangents(self, x: FloatArray, y: FloatArray, rates: FloatArray | None = None) -> None:
-        self._sequence.tangents(x, y, rates, self._time, None, "position")
+    def _tangents(self, x: FloatArray, y: FloatArray) -> None:
+        self._sequence.tangents(x, y, None, self._time, None, "position")
 
     def restore(self, x: FloatArray) -> None:
         """Bring `x` onto the constraints in place, or raise `InfeasibleError`."""
@@ -86,7 +88,7 @@ class FarStart:
             self._reach(here)
         self._descend(start, here)
         np.copyto(x, here)
-        held = self._atom_labels() >= 0
+        held = self._labels >= 0
         along = np.where(held[:, None], start - x, 0.0)
         size = float(np.max(np.abs(along), initial=0.0))
         self._tangents(x, along)
@@ -100,7 +102,7 @@ class FarStart:
         if error is not None:
             raise error
         rows = np.flatnonzero((self._plan.labels >= 0) & held.holonomic)
-        atoms = np.flatnonzero(self._atom_labels() >= 0)
+        atoms = np.flatnonzero(self._labels >= 0)
         with np.errstate(all="ignore"):
             table = held.jacobian(start, time)[rows]
             # By how far an atom is off: what rows measure has units of its own.
@@ -134,7 +136,7 @@ class FarStart:
 
     def _descend(self, start: FloatArray, x: FloatArray) -> None:
         """Walk along the constraints towards the start in place, to the foot of a perpendicular from there."""
-        away = self._atom_labels() < 0
+        away = self._labels < 0
         inverse = self._plan.inverse_masses
         mass = np.divide(1.0, inverse, out=np.zeros(len(x)), where=inverse > 0)[:, None]
 
@@ -160,15 +162,6 @@ class FarStart:
             if not gained:
                 return
             np.copyto(x, ahead)
-
-    def _atom_labels(self) -> IntArray:
-        """Cluster of each local atom, -1 for atoms that belong to none."""
-        incidence, labels = self._rows.incidence, self._plan.labels
-        entry_label = np.repeat(labels, np.diff(incidence.indptr))
-        atom_label = np.full(self._rows.n_atoms, -1, dtype=np.int64)
-        atom_label[incidence.indices[entry_label >= 0]] = entry_label[entry_label >= 0]
-        atom_label[self._plan.inverse_masses == 0] = -1
-        return atom_label
 
 
 class Descent:

@@ -63,6 +63,7 @@ from kcons.openmm.quantities import (
     box_of,
     energy_of,
     forces_at,
+    held_pairs,
     masses_of,
     motion_of,
     positions_of,
@@ -197,8 +198,8 @@ class CollectiveRows(Part):
                     "the end of a step only; build the coordinate from the particles that define the site"
                 )
         self.sited = bool(virtual_sites(system))
-        pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
-        tied = {atom for pair in pairs for atom in pair}
+        pairs = held_pairs(system)[0]
+        tied = set(pairs.ravel().tolist())
         self.meets_system = asked or any(tied.intersection(touched) for touched in self.atoms)
         body = components(system.getNumParticles(), pairs if self.meets_system else [])
         bodies = [{int(body[atom]) for atom in touched} for touched in self.atoms]

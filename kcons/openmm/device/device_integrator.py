@@ -47,22 +47,8 @@ _REFUSALS: list[Exception] = []
 _MOTION, _FAILED, _STEP, _ROW, _RESIDUAL = 0, 2, 3, 4, 5
 
 
-class _Given(ctypes.Structure):
-    """What the plugin tells of a Context, as plugin/program_integrator.h has it."""
-
-    _fields_ = (
-        ("integrator", ctypes.c_void_p),
-        *((name, ctypes.c_char_p) for name in ("description", "platform")),
-        *((name, ctypes.c_int) for name in ("groups", "particles", "constraints")),
-        ("masses", ctypes.POINTER(ctypes.c_double)),
-        ("pairs", ctypes.POINTER(ctypes.c_int)),
-        *((name, ctypes.POINTER(ctypes.c_double)) for name in ("lengths", "positions", "box")),
-        ("time", ctypes.c_double),
-    )
-
-
 class _Shared(ctypes.Structure):
-    """What the plugin keeps of an integrator, as there: what both sides read and write."""
+    """What both sides read and write of an integrator, as plugin/program_integrator.h has it."""
 
     _fields_ = (
         *((name, ctypes.c_int) for name in ("whole", "noisy", "every", "since", "moved")),
@@ -186,7 +172,8 @@ class DeviceIntegrator(ProjectedIntegrator):
     def _make(self, dt: float) -> None:
         library = build.library()
         library.kcons_set_planner(_planner)
-        library.kcons_shared.restype, library.kcons_read.restype = ctypes.POINTER(_Shared), _DOUBLES
+        library.kcons_shared.restype = ctypes.POINTER(_Shared)
+        library.kcons_read.restype = library.kcons_plan_given.restype = _DOUBLES
         made = openmm.XmlSerializer.deserialize(_EMPTY.decode())
         self.this = made.this  # the proxy of this class owns what XmlSerializer has made
         openmm.Integrator.setStepSize(self, dt)
@@ -430,10 +417,10 @@ for _name, _method in vars(openmm.CustomIntegrator).items():
 # -- plans for a Context ------------------------------------------------------------------------------
 
 
-@ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_Given))
-def _planner(made: int, given: Any) -> int:
+@ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_int)
+def _planner(made: int, integrator: int, description: bytes, platform: bytes, groups: int) -> int:
     try:
-        _fill(ctypes.c_void_p(made), given.contents)
+        _fill(ctypes.c_void_p(made), _ALIVE.get(integrator), json.loads(description), platform.decode(), groups)
     except Exception as error:  # told by the exception that OpenMM raises, or by `read`
         _REFUSALS[:] = [error]
         build.library().kcons_set_error(f"{type(error).__name__}: {error}".encode())
@@ -441,12 +428,16 @@ def _planner(made: int, given: Any) -> int:
     return 1
 
 
-def _fill(made: ctypes.c_void_p, given: _Given) -> None:
+def _fill(
+    made: ctypes.c_void_p, integrator: DeviceIntegrator | None, described: dict[str, Any], platform: str, groups: int
+) -> None:
     """Hand a plan over to the plugin, for what it tells of a Context."""
-    library, platform = build.library(), given.platform.decode()
-    n, described = given.constraints, json.loads(given.description)
-    pairs, lengths = np.array(given.pairs[: 2 * n], dtype=np.int64).reshape(n, 2), np.array(given.lengths[:n])
-    integrator = _ALIVE.get(given.integrator)
+    library = build.library()
+
+    def given(name: str) -> FloatArray:
+        found = library.kcons_plan_given(made, name.encode(), ctypes.byref(count := ctypes.c_int()))
+        return np.ctypeslib.as_array(found, (count.value,)).copy() if count.value else np.zeros(0)
+
     if described["parts"] and integrator is None:
         raise UnsupportedError(
             "the parts of an integrator are those of its Python object: keep a reference to it, and in place of "
@@ -454,11 +445,10 @@ def _fill(made: ctypes.c_void_p, given: _Given) -> None:
         )
     part = integrator.parts[0] if integrator is not None and integrator.parts else KernelRows(())
     assert isinstance(part, KernelRows)
-    masses = np.ctypeslib.as_array(given.masses, (given.particles,)).copy()
-    positions = np.ctypeslib.as_array(given.positions, (given.particles, 3)).copy()
-    box = np.array(given.box[:9]).reshape(3, 3)
-    rows = part.rows_at(masses, pairs, lengths, positions, box if box.any() else None, given.time)
-    source, arrays, parts, sizes = plan(described, platform, masses, given.groups, rows)
+    masses, box, held = given("masses"), given("box").reshape(3, 3), given("constraints").reshape(-1, 3)
+    at = given("positions").reshape(-1, 3), box if box.any() else None, float(given("time")[0])
+    rows = part.rows_at(masses, held[:, :2].astype(np.int64), held[:, 2], *at)
+    source, arrays, parts, sizes = plan(described, platform, masses, groups, rows)
     if integrator is not None:
         integrator.rows, integrator.saved = rows, [array.name for array in arrays if array.saved]
     compiled = str(build.kernels_library(source)) if platform in PLAIN else ""

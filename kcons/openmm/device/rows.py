@@ -35,7 +35,7 @@ from kcons.openmm.device.clusters import (
     large_clusters,
 )
 from kcons.openmm.integrator.guard import SystemRows, settled_rows
-from kcons.openmm.integrator.part import Precision, Solver
+from kcons.openmm.integrator.part import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import accepted, masses_of, positions_of
 from kcons.plan.clusters_alike import alike
@@ -111,18 +111,14 @@ class DeviceRows:
     """What kernels hold: the System's constraints, pairs (n, 2) and lengths in nm (n,), and what was given beside them.
 
     Masses are 0 for particles that do not move; `positions` are on or near the constraints, nm, in a `cell` where rows
-    take periodic images.
+    take periodic images. Raises UnsupportedError for rows that only Python can compute and fixed atoms that move.
 
     Attributes
     ----------
-    motion, set : Motion, ConstraintSet
-        The engine of all rows, and these, the System's first.
-    functions, parameters : list
-        Functions of rows, and of each row its parameters.
-    target, scale : ndarray, shape (n_rows,)
-        The scale is what tolerances are relative to: the length held, 1 for all that is no length.
-    doubtful : ndarray of bool, shape (n_rows,)
-        Rows of clusters in which rows depend on others.
+    set : ConstraintSet
+        All rows, the System's first; `motion` is their engine.
+    scale : ndarray, shape (n_rows,)
+        What tolerances are relative to: the length held, 1 for all that is no length.
     mover, cell : ndarray of int, shape (n_rows,)
         Number of a row's moving target, and where its cells begin; of other rows the number of the next.
     shapes, arrays, source
@@ -130,12 +126,9 @@ class DeviceRows:
     scratch, work_group : int
         Numbers of LOCAL memory that a work-group needs, and its size.
     fixed, placed : ndarray of int
-        Particles that do not move, whatever their mass; those whose rows have a place in space, so that positions as
-        they are told of count.
+        Particles that do not move; those whose rows have a place in space, as a State tells of it.
     block : int
         Steps after which `renew` is due.
-
-    Raises UnsupportedError for rows that only Python can compute and fixed atoms that move.
     """
 
     def __init__(
@@ -167,6 +160,7 @@ class DeviceRows:
         self.target = held.target(time)
         size = np.concatenate([item.scale(time) for item in held.constraints] or [np.zeros(0)])
         self.scale = np.where(size > 0, size, 1.0)
+        #: Rows of clusters in which rows depend on others.
         self.doubtful = plan.eliminate_last.copy()
         for some in plan.dependent:
             self.doubtful[some] = True
@@ -399,10 +393,6 @@ class KernelRows(CarriedConstraints):
 
     def attach(self, program: Program, context: openmm.Context) -> None:
         self.bind(context)
-
-    def solver_at(self, context: openmm.Context) -> Solver:
-        self.bind(context)
-        return super().solver_at(context)
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
         self.bind(context)

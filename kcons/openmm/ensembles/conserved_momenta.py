@@ -20,14 +20,7 @@ from kcons.openmm.integrator.guard import (
 )
 from kcons.openmm.integrator.program import Ensemble, Integrator
 from kcons.openmm.quantities import box_of, forces_at, held_without_mass, masses_of, positions_of, velocities_of
-from kcons.thermostats.freedom import (
-    BALANCED,
-    SHAKE,
-    SHIFT,
-    RigidMotions,
-    open_directions,
-    warn_of_conserved_momenta,
-)
+from kcons.thermostats.freedom import BALANCED, SHAKE, SHIFT, RigidMotions, open_directions, warn_of_conserved_momenta
 
 Momentum = Literal["auto", "conserved", "free"]
 

@@ -11,13 +11,7 @@ from openmm import app, unit
 
 from kcons.constraints.arguments import Positive, Rng, Share, checked, positive, seed_from, whole_number
 from kcons.constraints.target import FloatArray
-from kcons.errors import (
-    CertificateError,
-    ConvergenceError,
-    NonFiniteError,
-    ReversibilityError,
-    UnsupportedError,
-)
+from kcons.errors import CertificateError, ConvergenceError, NonFiniteError, ReversibilityError, UnsupportedError
 from kcons.openmm.integrator.guard import forces_of
 from kcons.openmm.integrator.program import ConstantEnergy, Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator

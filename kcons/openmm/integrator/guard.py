@@ -32,6 +32,7 @@ from kcons.openmm.integrator.part import NEAR, SINGLE, Part, Precision, Violatio
 from kcons.openmm.integrator.program import Integrator, forces_at_old_positions
 from kcons.openmm.quantities import (
     box_of,
+    held_pairs,
     held_without_mass,
     masses_of,
     motion_of,
@@ -117,29 +118,23 @@ class SystemRows:
     @classmethod
     def of(cls, system: openmm.System, *, rounded: bool = False) -> SystemRows:
         """Those of a System, `rounded` as on GPUs; `InputError` for lengths of 0 and less."""
-        masses = masses_of(system)
-        pairs, lengths, numbers = [], [], []
-        for k in range(system.getNumConstraints()):
-            i, j, d = system.getConstraintParameters(k)
-            if masses[i] or masses[j]:
-                if not 0 < d._value < np.inf:
-                    raise InputError(
-                        f"constraint {k} of the System (particles {i} and {j}) has a length of {d._value:g} nm, and a "
-                        "distance can be held above zero only; give it its length, or make one of the particles a "
-                        "virtual site at the place of the other",
-                        item="constraints",
-                        atoms=(i, j),
-                    )
-                pairs.append((i, j))
-                lengths.append(d._value)
-                numbers.append(k)
-        table = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        given = np.array(lengths, dtype=float)
-        settled = settled_rows(table, given, len(masses))
+        masses, (pairs, lengths) = masses_of(system), held_pairs(system)
+        numbers = np.flatnonzero((masses[pairs] != 0).any(axis=1))
+        pairs, given = pairs[numbers], lengths[numbers]
+        for k in np.flatnonzero(~((given > 0) & (given < np.inf)))[:1]:
+            i, j = pairs[k].tolist()
+            raise InputError(
+                f"constraint {numbers[k]} of the System (particles {i} and {j}) has a length of {given[k]:g} nm, and a "
+                "distance can be held above zero only; give it its length, or make one of the particles a virtual site "
+                "at the place of the other",
+                item="constraints",
+                atoms=(i, j),
+            )
+        settled = settled_rows(pairs, given, len(masses))
         held = np.where(settled, given.astype(np.float32).astype(float), given)
         shaken = np.sqrt((given**2).astype(np.float32).astype(float)) if rounded else held
         slack = np.where(settled & rounded, 2.0**-23, 0.0)
-        return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled, shaken, slack)
+        return cls(masses, pairs, held, numbers, settled, shaken, slack)
 
     @property
     def n_rows(self) -> int:
@@ -226,7 +221,7 @@ def worst_length(context: openmm.Context) -> tuple[str, float]:
     rows = SystemRows.of(system)
     if not rows.n_rows:
         return "no constraint of the System", 0.0
-    given = np.array([system.getConstraintParameters(k)[2]._value for k in rows.numbers.tolist()])
+    given = held_pairs(system)[1][rows.numbers]
     rows = replace(rows, lengths=given, others=given)  # not what OpenMM makes of them
     off = np.abs(rows.stretches(np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)))
     row = int(np.argmax(off))

@@ -44,13 +44,6 @@ def in_one_array(pieces: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
     return room
 
 
-def copied(tables: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A copy of what `in_one_array` made, aligned as that is."""
-    found = aligned(len(tables))
-    found[:] = tables
-    return found
-
-
 def room(n: int) -> NDArray[np.float64]:
     """A piece of n zeros to work in."""
     return np.broadcast_to(0.0, n)

@@ -12,8 +12,6 @@ from ase.calculators.calculator import all_changes
 from ase.calculators.emt import EMT
 from ase.constraints import Hookean
 from ase_systems import FS, TEMPERATURE, Field, Free, dumbbells, follow, state
-from pressure_systems import p_value
-from scipy import stats
 
 from kcons.ase import (
     ConstrainedDynamics,
@@ -25,12 +23,13 @@ from kcons.ase import (
     constrain,
     draw_velocities,
 )
-from kcons.constraints import Distance, FixedAtoms
+from kcons.constraints import Distance
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.thermostats import CellRescaling, MonteCarloBarostat, mean
+from kcons.thermostats import CellRescaling, MonteCarloBarostat
 
 KT = units.kB * TEMPERATURE
 N, SIDE = 60, 40.0
+CUBE = np.diag([SIDE] * 3).tolist()
 PRESSURE = (N + 1) * KT / SIDE**3
 MADE = {
     "langevin": lambda a, **k: ConstrainedLangevin(a, 2 * FS, TEMPERATURE, 0.1 / FS, rng=1, **k),
@@ -51,19 +50,6 @@ def gas():
     return dumbbells(N, side=SIDE)
 
 
-def test_volumes_of_a_rigid_ideal_gas():
-    atoms, held = gas()
-    dyn = MADE["isokinetic"](atoms, barostat=barostats(rng=4)["rescaling"])
-    volumes = follow(dyn, atoms.get_volume, 400)[50:]
-    exact = stats.gamma(N + 1, scale=KT / PRESSURE)
-    assert p_value(volumes, exact) > 0.01
-    found = mean(volumes)
-    assert found.error < 0.04 * exact.mean()
-    assert abs(found.off(exact.mean())) < 3
-    held.engine(atoms).certify(atoms.positions, atoms.get_velocities())
-    assert dyn.listing().splitlines()[-1].split()[0] == "press"
-
-
 @made
 @pytest.mark.parametrize("which", ["monte carlo", "rescaling"])
 def test_a_run_goes_on_bit_for_bit(name, which):
@@ -77,7 +63,7 @@ def test_a_run_goes_on_bit_for_bit(name, which):
     other.calc = Free()
     again = MADE[name](other, barostat=barostat, state=middle)
     again.run(8)
-    assert other.cell.array.tolist() == atoms.cell.array.tolist() != [[SIDE, 0, 0], [0, SIDE, 0], [0, 0, SIDE]]
+    assert other.cell.array.tolist() == atoms.cell.array.tolist() != CUBE
     assert np.array_equal(other.positions, atoms.positions)
     assert np.array_equal(other.get_momenta(), atoms.get_momenta())
     assert np.array_equal(again.state.barostat, whole.state.barostat)
@@ -91,14 +77,14 @@ def test_a_run_goes_on_without_its_barostat_in_its_cell():
     whole.run(5)
     other.calc = Free()
     MADE["langevin"](other, state=whole.state).run(3)
-    assert other.cell.array.tolist() == atoms.cell.array.tolist() != [[SIDE, 0, 0], [0, SIDE, 0], [0, 0, SIDE]]
+    assert other.cell.array.tolist() == atoms.cell.array.tolist() != CUBE
     third, _ = gas()
     with pytest.raises(InputError, match="another barostat"):
         MADE["langevin"](third, barostat=barostats(kind="lateral")["monte carlo"], state=whole.state)
-    assert third.cell.array.tolist() == [[SIDE, 0, 0], [0, SIDE, 0], [0, 0, SIDE]]
+    assert third.cell.array.tolist() == CUBE
     with pytest.raises(InputError, match="off row"):
         ConstrainedDynamics(third, FS, state=replace(whole.state, positions=1.1 * atoms.positions))
-    assert third.cell.array.tolist() == [[SIDE, 0, 0], [0, SIDE, 0], [0, 0, SIDE]]
+    assert third.cell.array.tolist() == CUBE
 
 
 # -- forces, and what moves ---------------------------------------------------------------------------
@@ -117,10 +103,11 @@ def crystal(calculator=None):
 @pytest.mark.parametrize(("which", "kind"), [("monte carlo", "semi-isotropic"), ("rescaling", "flexible")])
 def test_the_energy_that_trials_bring_is_accounted_for(which, kind):
     atoms = crystal()
-    made = {
-        "monte carlo": MonteCarloBarostat(0.0, every=2, kind=kind, width=1e-3),
-        "rescaling": CellRescaling(0.0, 100 * FS, 1.0, every=2, kind=kind),
-    }[which]
+    if which == "monte carlo":  # forces of ASE's objects count in the energy, and have no stress
+        atoms.set_constraint([*atoms.constraints, Hookean(a1=4, a2=5, rt=2.0, k=5.0)])
+        made = MonteCarloBarostat(0.0, every=2, kind=kind, width=1e-3)
+    else:
+        made = CellRescaling(0.0, 100 * FS, 1.0, every=2, kind=kind)
     dyn = ConstrainedLangevin(atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=made)
     before, cell = dyn.get_conserved_energy(), atoms.cell.array.copy()
     dyn.run(40)
@@ -150,21 +137,6 @@ def test_trials_are_judged_by_the_energy_that_forces_belong_to():
     dyn = MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0, every=1, width=0.01, rng=1))
     volumes = follow(dyn, atoms.get_volume, 100)
     assert 0 < np.abs(volumes / SIDE**3 - 1).max() < 0.06
-
-
-def test_fixed_atoms_stay_as_a_wall_where_asked():
-    atoms, _ = gas()
-    atoms.set_constraint()
-    constrain(atoms, [FixedAtoms([0, 1]), Distance([[2, 3]])])
-    with pytest.raises(UnsupportedError, match=r"FixedAtoms.* holds atom 0 in space along z.*held='stay'"):
-        MADE["langevin"](atoms, barostat=MonteCarloBarostat(PRESSURE, kind="normal"))
-    barostat = MonteCarloBarostat(PRESSURE, kind="normal", held="stay", every=1, width=0.05)
-    before = atoms.positions[:2].copy()
-    dyn = MADE["langevin"](atoms, barostat=barostat)
-    dyn.run(20)
-    assert np.array_equal(atoms.positions[:2], before)
-    assert barostat.pieces(dyn._systems(), atoms.positions).moving.tolist() == [2 * N - 3] * 3
-    assert atoms.cell[2, 2] != SIDE
 
 
 # -- errors, with the state kept --------------------------------------------------------------------------------
@@ -228,17 +200,6 @@ def test_what_has_no_temperature_or_no_cell():
     atoms.pbc = False
     with pytest.raises(InputError, match="no periodic cell"):
         MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0))
-
-
-def test_forces_of_ase_constraints_count_in_the_energy():
-    atoms = crystal()
-    atoms.set_constraint([*atoms.constraints, Hookean(a1=4, a2=5, rt=2.0, k=5.0)])
-    dyn = ConstrainedLangevin(
-        atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=MonteCarloBarostat(0.0, every=2, width=1e-3)
-    )
-    before = dyn.get_conserved_energy()
-    dyn.run(20)
-    assert dyn.get_conserved_energy() == pytest.approx(before, abs=2e-3)
 
 
 def test_a_step_that_fails_after_a_trial_leaves_the_cell(monkeypatch):

@@ -1,59 +1,207 @@
-"""Rows that are formulas against hand-written families, their data, and what is refused."""
+"""Formulas: read, written as code, exact, kept in files; as rows, and what is refused."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
-from constraint_cases import MASSES, TIME, scattered
+from constraint_cases import TIME
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import (
-    CenterDistance,
-    Distance,
-    Ellipsoid,
-    Formula,
-    KnifeEdge,
-    Plane,
-    Rolling,
-    Sphere,
-    Torus,
-    VelocityFormula,
-    from_dict,
-)
+from kcons.constraints import Formula, KnifeEdge, Rolling, Sphere, VelocityFormula, from_dict
+from kcons.constraints.functions import formula as formulas
+from kcons.constraints.functions.formula import FUNCTIONS, code_of, parsed, undefined_part
 from kcons.errors import InputError, SingularGeometryError
 
-LENGTH = "sqrt((x1 - x2)**2 + (y1 - y2)**2 + (z1 - z2)**2)"
-TORUS = "sqrt((sqrt((x1 - a)**2 + (y1 + 0.1)**2) - R)**2 + (z1 - c)**2)"
-FAMILIES = {
-    "distance": (Formula(LENGTH, [[0, 1], [5, 2]], target=None), Distance([[0, 1], [5, 2]])),
-    "sphere": (Formula("sqrt(x1**2 + y1**2 + (z1 - h)**2)", [3, 6], {"h": [0.5, 4]}, None), None),
-    "torus": (Formula(TORUS, [4], {"a": 0.2, "R": 1.5, "c": 0.3}, None), Torus(4, [0.2, -0.1, 0.3], [0, 0, 2.0], 1.5)),
-    "ellipsoid": (
-        Formula("6**(1/3)*(sqrt(x1**2 + y1**2/4 + z1**2/9) - 1)", 7, target=None),
-        Ellipsoid(7, [0.0, 0.0, 0.0], [1.0, 2.0, 3.0], target=None),
-    ),
-    "centers": (
-        Formula(f"sqrt({' + '.join(f'((m1*{c}1 + m2*{c}2)/(m1 + m2) - {c}3)**2' for c in 'xyz')})", [0, 1, 2],
-                {"m1": MASSES[0], "m2": MASSES[1]}, None),
-        CenterDistance([0, 1], [2]),
-    ),
-}  # fmt: skip
-FAMILIES["sphere"] = (FAMILIES["sphere"][0], Sphere([3, 6], [[0, 0, 0.5], [0, 0, 4.0]]))
+
+@pytest.mark.parametrize(
+    ("formula", "item", "message"),
+    [
+        ("x1 - y", "y", r"'y' in .* is not known; known are x1, .* Give it as a parameter"),
+        ("sine(x1)", "sine", r"sine\(x1\) .* no function of formulas; these are abs, acos"),
+        ("atan2(x1)", "atan2", "atan2 of two"),
+        ("x1^2", "formula", r"is not allowed.* a power is written \*\*"),
+        ("x1 -", "formula", "cannot be read"),
+        ("z1 = x1**2", "formula", "cannot be read.*write what is held at zero, the left side less the right one"),
+        ("x1 if x2 else 0", "formula", "is not allowed"),
+        ("x1.real", "formula", "is not allowed"),
+        ("__import__('os').getcwd()", "formula", "is not allowed|no function"),
+        ("x1*'a'", "formula", "is not allowed"),
+        ("3*t + a", "formula", "names no coordinate"),
+        ("x3 - x1", "formula", "names atom 3 of a row and not atom 2"),
+    ],
+)
+def test_what_is_no_formula_is_named(formula, item, message):
+    with pytest.raises(InputError, match=message) as caught:
+        code_of(formula, ("a",))
+    assert caught.value.item == item
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-def test_a_formula_is_the_family_written_by_hand(name):
-    ours, theirs = FAMILIES[name]
-    x, v = scattered(0), scattered(1)
-    one, other = ConstraintSet(ours, x, MASSES), ConstraintSet(theirs, x, MASSES)
-    np.testing.assert_allclose(one.target(), other.target(), rtol=1e-14)
-    np.testing.assert_allclose(one.jacobian(x).toarray(), other.jacobian(x).toarray(), atol=1e-14)
-    np.testing.assert_allclose(one.acceleration_target(x, v), other.acceleration_target(x, v), rtol=1e-12)
-    a, b = Motion(one, x), Motion(other, x)
-    u = a.project_velocities(x, v)
-    np.testing.assert_allclose(u, b.project_velocities(x, v), atol=1e-13)
-    step = x + 0.02 * u
-    np.testing.assert_allclose(a.project_positions(step, x), b.project_positions(step, x), atol=1e-13)
+#: What takes for ever or all memory, or is no formula in other ways: some text, and what is said of it.
+FROM_OTHERS = {
+    "x1*9**9**9": r"9 \*\* 9 \*\* 9 is inf",
+    "x1*10**-9**9": "its gradient is zero",
+    "x1+2**2**40": "is inf",
+    "pi**pi**pi**pi*x1": "is inf",
+    "x1*1e999": "a number that is too large",
+    "x1+" + "9" * 400: "a number that is too large",
+    "x1+0x" + "f" * 4000: "a number that is too large",
+    "x1+log(0)": "is -inf",
+    "x999999": "names atom 999999 of a row and not atom 1",
+    "x99999999999999999999999": "is not known",
+    "+".join(["x1"] * 900): "more than 200 levels",
+    "x1+" * 5000 + "x1": "at most 10000",
+    "-" * 3000 + "x1": "nested",
+    "(" * 3000 + "x1" + ")" * 3000: "nested",
+    "x1*sin": "sin in .* is a function; write what it is of",
+    "x1*True": "is not allowed",
+    "x1\ud800": "cannot be read",
+    "x1\0": "cannot be read",
+    "x\u0661": "is not known",
+}
+
+
+@pytest.mark.parametrize("formula", FROM_OTHERS, ids=range(len(FROM_OTHERS)))
+def test_formulas_without_bound_are_refused_at_once(formula):
+    with pytest.raises(InputError, match=FROM_OTHERS[formula]) as caught:
+        code_of(formula, ())
+    assert len(str(caught.value)) < 500 and caught.value.item
+
+
+def row_of(formula, r, t=0.0):
+    """Value and gradient of a formula of one atom, at places of shape (3, n)."""
+    out = np.empty((4, np.shape(r)[1]))
+    code_of(formula, ()).row(r, (), t, out)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("formula", "value"),
+    [
+        ("x1**(2**40)", 1.0),
+        ("(((9*x1)**99)**99)**99", np.inf),
+        ("(" * 40 + "x1" + "**99)" * 40, 1.0),
+        ("exp(1000*(1000*(1000*log(9*x1))))", np.inf),
+        ("x1*1e200*1e200", np.inf),
+        ("x1*12345678901234567890*1e100 + (9*x1)**40", 12345678901234567890e100 + 9.0**40),
+        ("sin(" * 60 + "0*x1" + ")" * 60 + "+ x1", 1.0),
+    ],
+)
+def test_large_numbers_and_long_formulas_are_computed_as_others_are(formula, value):
+    with np.errstate(all="ignore"):
+        assert row_of(formula, np.ones((3, 1)))[0, 0] == value
+
+
+@pytest.mark.parametrize(
+    ("formula", "found"),
+    [
+        ("(x1 - x2 + y1 - y2)**60", True),  # multiplied out it has thousands of parts
+        ("sin(x1)*cos(x2) - cos(x1)*sin(x2)", True),
+        ("acos((x1 - x2)/2)", True),
+        ("abs(x1 - x2)", True),
+        ("(x1 + y1 + z1 + x2 + y2 + z2)**60", False),
+        ("abs(x1 - 5e8) + x1 + x1 - x2", False),  # on this side of the wall it is x1 - x2 + 5e8
+        ("x1 - x2 + 1e-8*x1", False),
+        ("exp(exp(exp(exp(x1 - x2))))", True),
+        ("exp(exp(exp(exp(x1 + x2))))", False),
+        ("(x1 - x2)**((x1 - x2)**((x1 - x2)**(x1 - x2)))", True),
+        ("(x1 - x2)**0 + y1 - y2", True),
+        ("(x1 - x2)**2 + sin(z1 - z2)*y1 - y2*sin(z1 - z2)", True),
+        ("x1 - x2 + z1*1e-9", False),
+    ],
+)
+def test_shifts_are_found_out(formula, found):
+    assert code_of(formula, ()).invariant == found
+
+
+def test_a_gradient_of_zero_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    with pytest.raises(InputError, match="does not change with the positions"):
+        code_of("x1 - x1 + 3.25", ())
+    assert not list(tmp_path.rglob("*.py"))
+
+
+def test_every_function_is_differentiated_exactly():
+    """Value, gradient and second derivatives against differences, for each function."""
+    rng = np.random.default_rng(0)
+    for name in sorted(FUNCTIONS):
+        inner = "1 + x1**2*y1/9" if name in ("log", "sqrt", "abs") else "x1*y1/3 - z1**3/7"
+        two = f"{name}({inner}, 2 + z1)" if name == "atan2" else f"{name}({inner})"
+        text, t = f"{two}*y1 + x1/(2 + t)", 0.3
+        r = rng.uniform(0.2, 0.9, (3, 5))
+        first = row_of(text, r, t)
+        for axis in range(3):
+            h = np.zeros((3, 1))
+            h[axis] = 1e-4
+            up, down, far, deep = (row_of(text, r + k * h, t)[0] for k in (1, -1, 2, -2))
+            slope = (8 * (up - down) - (far - deep)) / 12e-4
+            np.testing.assert_allclose(first[1 + axis], slope, atol=1e-10, err_msg=name)
+        row, v, s = Formula(text, np.zeros(5, int)), rng.normal(size=(5, 1, 3)), 2e-3
+        up, here, down = (row.measure(r.T[:, None] + k * s * v, t + k * s) for k in (1, 0, -1))
+        far, deep = (row.measure(r.T[:, None] + k * s * v, t + k * s) for k in (2, -2))
+        bend = (16 * (up + down) - (far + deep) - 30 * here) / (12 * s * s)
+        found = row.curvature(r.T[:, None], v, t) + row.time_terms(r.T[:, None], v, t)[1]
+        np.testing.assert_allclose(found, bend, rtol=1e-7, atol=1e-7, err_msg=name)
+
+
+def test_smallest_undefined_part():
+    tree = parsed("x1 + log(sqrt(1 - x1**2) - 2)/y1", ())[0]
+    half, two = np.float64(0.5), np.float64(2.0)
+    assert undefined_part(tree, {"x1": half, "y1": two}).startswith("log(sqrt(1 - x1 ** 2) - 2) is nan where ")
+    assert undefined_part(tree, {"x1": two, "y1": two}) == "sqrt(1 - x1 ** 2) is nan where 1 - x1 ** 2 = -3"
+    tree = parsed("1/x1", ())[0]
+    assert undefined_part(tree, {"x1": 0.0 * two}) == "1 / x1 is inf"
+    assert undefined_part(tree, {"x1": two}) is None
+
+
+PROGRAM = """
+import numpy as np
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Formula
+x = np.array([[0.3, 0.2, 0.1]])
+motion = Motion(ConstraintSet(Formula("x1**2 + a*y1 - z1", 0, {"a": 2.0}, None), x, [1.0]), x)
+print(motion.project_positions(x + 0.01, x)[0].tolist())
+"""
+
+
+def projected(folder: Path) -> tuple[str, str]:
+    """What the program prints, and what it says besides."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(formulas.__file__).parents[3],
+        env={**os.environ, "XDG_CACHE_HOME": str(folder), "NUMBA_CACHE_DIR": ""},
+    )
+    return done.stdout, done.stderr
+
+
+def test_another_process_needs_no_compiler(tmp_path):
+    """What the first one wrote serves the second one."""
+    first, _ = projected(tmp_path)
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert {path.suffix for path in files} == {".py", ".nbi", ".nbc"}
+    assert projected(tmp_path) == (first, "")
+    assert files == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_a_file_that_is_damaged_is_written_anew(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    file = Path(code_of("x1 + 0.625*y1", ()).row.__code__.co_filename)
+    whole = file.read_text()
+    assert file.is_relative_to(tmp_path)
+    for damaged in ("", whole[:-20], whole.replace("0.625", "0.626")):
+        file.write_text(damaged)
+        code_of.cache_clear()
+        assert code_of("x1 + 0.625*y1", ()).row.__code__.co_filename == str(file) and file.read_text() == whole
+
+
+# -- as rows -----------------------------------------------------------------------------------------------
 
 
 def test_a_moving_formula_is_followed():
@@ -94,16 +242,13 @@ def test_files_keep_formulas():
     [
         (lambda: Formula("x1 - x2", [[0, 1, 2]]), "atoms", "a row has 2 atoms, but"),
         (lambda: Formula("x1 - y1", [[0, 1]]), "atoms", "a row has 1 atom, but"),
-        (lambda: Formula(3.0, 0), "formula", "formula is 3.0; give text"),
         (lambda: Formula("a*x1", [0, 1], 2.0), "parameters", "parameters is 2.0; give numbers by name"),
         (lambda: Formula("a*x1", [0, 1], {"a": [1.0, 2.0, 3.0]}), "a", r"Formula: a has shape \(3,\); give one number"),
-        (lambda: Formula("a*x1", [0, 1], {"a": np.nan}), "a", "Formula: a of row 0 is not finite"),
         (lambda: Formula("x1", 0, {"x7": 1.0}), "x7", "cannot be the name"),
         (lambda: Formula("x1", 0, {"sin": 1.0}), "sin", "cannot be the name"),
         (lambda: Formula("x1", 0, {"lambda": 1.0}), "lambda", "cannot be the name"),
         (lambda: Formula("abs(x1)*copysign", 0, {"copysign": 1.0}), "copysign", "cannot be the name"),
         (lambda: Formula("x1", 0, {3: 1.0}), "parameters", "3 cannot be the name of a parameter; give text"),
-        (lambda: Formula("x1 - b", 0, {"a": 1.0}), "b", "known are .*a. Give it"),
     ],
 )
 def test_bad_arguments_are_named(make, item, message):
@@ -145,17 +290,11 @@ UP = np.array([0.0, 0.0, 1.0])
     ],
     ids=["blade", "wheel"],
 )
-def test_formulas_move_as_the_families_do(formula, family):
-    x = np.array([[0.3, -0.2, 0.0], [0.9, 0.4, 0.3]])
-    v = np.array([[0.5, 0.2, 0.0], [-0.4, 1.0, 0.3]])
-    ends = []
-    for row in (formula, family):
-        motion = Motion(ConstraintSet([Distance([0, 1]), Plane([0], UP), row], x, [1.0, 2.0]), x)
-        assert motion.plan.kinds[0].solver == "SparseRows"
-        start = State(x, motion.project_velocities(x, v))
-        ends.append(run(System(motion, lambda x, t: np.sin(3 * x)), start, 0.02, 20))
-    np.testing.assert_allclose(ends[0].positions, ends[1].positions, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(ends[0].velocities, ends[1].velocities, rtol=0, atol=1e-12)
+def test_formulas_are_what_the_families_are(formula, family):
+    x, v = np.array([[0.3, -0.2, 0.0], [0.9, 0.4, 0.3]]), np.array([[0.5, 0.2, 0.0], [-0.4, 1.0, 0.3]])
+    one, other = (ConstraintSet(row, x, [1.0, 2.0]) for row in (formula, family))
+    np.testing.assert_allclose(one.jacobian(x).toarray(), other.jacobian(x).toarray(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(one.acceleration_target(x, v), other.acceleration_target(x, v), rtol=1e-12)
     assert formula.translation_invariant and not formula.holonomic and not formula.moving
 
 
@@ -163,7 +302,6 @@ def test_formulas_move_as_the_families_do(formula, family):
     ("formula", "message", "item"),
     [
         ("vx1**2 - y1", "is not a sum of velocities times functions", "formula"),
-        ("vx1*vy1", "is not a sum of velocities times functions", "formula"),
         ("vx1 - x1*t", "at rest it is not 0: what the sum is held at is the target", "formula"),
         ("x1 - y1", "does not change with the velocities: it has none of them", "formula"),
         ("vx1 - a*vy1", "'a' in 'vx1 - a\\*vy1' is not known; known are x1, y1, z1, x2, ..., vx1, vy1, ...,", "a"),

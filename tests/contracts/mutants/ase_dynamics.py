@@ -3,7 +3,7 @@
 MUTANTS = {
     "ase/dynamics.py": [
         (
-            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                    last = replace",
+            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                last = replace",
             "ase/edits::time_that_is_set_is_no_way_of_moving_targets",
         ),
         (
@@ -11,7 +11,7 @@ MUTANTS = {
             "logger::with_noise_the_log_is_of_the_middle_of_the_step",
         ),
         (
-            "«replace(state.copied(), forces=None, origin=None→state.copied(»)",
+            "replace(state.copied(), **known«, forces=None, origin=None→»)",
             "thermostat_dynamics::a_restart_asks_the_calculator_for_forces",
         ),
         (
@@ -24,7 +24,7 @@ MUTANTS = {
     "ase/thermostat_dynamics.py": [
         (
             "known[POTENTIAL] = «self._systems().potential_energy(state.positions, state.time)→math.nan»",
-            "thermostat_dynamics::a_state_of_monte_carlo_can_be_saved_and_exchanged_where_calculators_give_new_results",
+            "thermostat_dynamics::a_state_of_monte_carlo_knows_its_energy_where_calculators_give_new_results",
         ),
     ],
     "thermostats/langevin.py": [

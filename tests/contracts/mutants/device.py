@@ -22,10 +22,10 @@ MUTANTS = {
     ],
     "plan/clusters_alike.py": [
         (
-            "if k not in beside and not «(k in last and coupled[k] - last)→False»",
+            "for k in left if not «(k in last and coupled[k] - last)→False»]",
             "rows::levels_have_rows_that_share_no_entry",
         ),
-        ("if «k not in beside→True» and not", "rows::levels_have_rows_that_share_no_entry"),
+        ("if «k not in beside→True» and count", "rows::levels_have_rows_that_share_no_entry"),
     ],
     "openmm/device/clusters.c": [
         ("if («missed > 0→1») {", "rows::rows_without_a_solution_are_told"),

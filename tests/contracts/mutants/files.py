@@ -41,6 +41,7 @@ MUTANTS = {
         ("_off_grid(x, «10 * step) >→step) <=» error", "mdanalysis/check/precision::what_is_no_grid"),
     ],
     "constraints/constraint_set.py": [
+        ("agreed = np.where(«open_→False», np.repeat", "images::a_length_found_and_the_same_one_given"),
         (
             "change = change[«periodic→:»]",
             "images::directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
@@ -54,9 +55,6 @@ MUTANTS = {
             "images::lengths_found_far_away_can_be_held_near_the_origin",
         ),
         ("«x→whole»[item.atoms] if self.moved is None", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
-    ],
-    "constraints/contradictions.py": [
-        ("agreed = np.where(«open_→False», np.repeat", "images::a_length_found_and_the_same_one_given"),
     ],
     "constraints/constraint.py": [
         ('powers.get("length", «0→1»)', "constraint::the_same_points_fulfil_it"),
@@ -75,8 +73,8 @@ MUTANTS = {
             "turning = «(earlier.sum(axis=1) == 1) & ~earlier[:, 0]→earlier.sum(axis=1) > 9»",
             "angle_rows::beside_a_rigid_body_only_what_it_leaves_is_held",
         ),
-        ("FLAT_RING = «2→»0.0", "ring_systems::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
-        ("_independent(rows[«held→:0»], rows[~held])", "ring_systems::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
+        ("FLAT_RING = «2→»0.0", "angle_rows::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
+        ("_independent(rows[«held→:0»], rows[~held])", "angle_rows::a_ring_is_rigid_by_as_many_rows_as_it_needs"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         ('(p, "«2→1»")', "nose_hoover_ensemble::a_chain_in_the_middle_is_the_same_chain_in_small_steps"),
@@ -92,7 +90,7 @@ MUTANTS = {
         ("single &= «~anchored→anchored >= 0»", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
     ],
     "motion/solver_sequence.py": [
-        ("_beside(then[first], then[first + 1]) <= «0→-1».0", "failures::a_dihedral_that_becomes_straight_is_named"),
+        ("_beside(then[first], then[first + 1]) <= «0→-1».0", "motion::a_dihedral_that_becomes_straight_is_named"),
         (
             "                moved = None« if places is None else rows.moved_places(places, x)→»",
             "places::a_molecule_is_the_same_in_the_cell_as_in_open_space",
@@ -102,18 +100,18 @@ MUTANTS = {
         ("good = np.«abs(values) <= LARGEST→isfinite(values)»", "target::numbers_whose_squares_overflow_are_refused"),
     ],
     "constraints/periodic/images.py": [
-        ("«| (not self._in_line)→»", "distance_difference::each_pair_takes_its_shortest_image"),
-        ("«self.item.links is None and →»2 < self.", "distance_difference::pairs_of_a_row_need_not_be_near_each_other"),
+        ("«| (not self._in_line)→»", "families::each_pair_takes_its_shortest_image"),
+        ("«self.item.links is None and →»2 < self.", "families::pairs_of_a_row_need_not_be_near_each_other"),
         (
             "«np.where(distance, length, BOND_LIKE * length)→length»",
             "images::a_chain_of_moving_bonds_may_open_beyond_half_the_cell",
         ),
     ],
     "motion/restoring/kept_geometry.py": [
-        ("leg in («(i, k), (k, i)→»)", "distance_difference::a_proton_goes_over_within_a_molecule_that_stays_as_it_is"),
+        ("leg in («(i, k), (k, i)→»)", "families::a_proton_goes_over_within_a_molecule_that_stays_as_it_is"),
     ],
     "solvers/tolerances.py": [
-        ("FLAT = 0.0«1→»", "mixed_rows::a_dihedral_that_turns_over_has_no_solution_far_away"),
+        ("FLAT = 0.0«1→»", "row_functions::a_dihedral_that_turns_over_has_no_solution_far_away"),
     ],
     "topology/topology.py": [
         ("if «not isinstance(given, kind)→given is None»:", "openmm/topology::what_is_no_topology_is_refused"),

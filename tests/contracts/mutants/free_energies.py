@@ -3,7 +3,6 @@
 MUTANTS = {
     "free_energy/scans/relaxed_scan.py": [
         ("attempt.energy «<→>» best[point].energy:", "relaxed_scan::both_ways_find_the_lower_of_two_minima"),
-        ("if «with_it.rank != rank + n + 1→False»:", "free_energy/refusals::refusals"),
         (
             "if attempt is «not None and (attempt.point, attempt.source) != (point, source)→None and source == point»:",
             "relaxed_scan::relaxations_in_files_are_whole_and_of_this_scan",
@@ -21,7 +20,7 @@ MUTANTS = {
         ),
     ],
     "cli/free_energy.py": [
-        ('if «family in ("angle", "dihedral")→family != "distance"» else axis)', "cli/scan::a_difference_of_distances"),
+        ("made.constraint(«chosen.count_from→0»)", "cli/scan::a_torsion"),
     ],
     "free_energy/windows/driver.py": [
         (".«pop(job.name, None→clear(»)", "driver::windows_that_failed_before_others_are_added_are_still_told_of"),
@@ -33,7 +32,8 @@ MUTANTS = {
             "named_calculators::files_name_calculators_of_a_list_or_of_modules_that_their_reader_names",
         ),
     ],
-    "free_energy/torsion_force.py": [
+    "free_energy/held_coordinates.py": [
+        ("if «dependent→False»:", "free_energy/refusals::refusals"),
         ("{*pair} not in joined« and bonded.issuperset(pair)→»", "ase_windows::torsions_over_atoms_that_form_no_bonds"),
     ],
     "constraints/target.py": [
@@ -63,8 +63,6 @@ MUTANTS = {
     ],
     "free_energy/profiles/profile.py": [
         ("process = process«.closed()→»", "profile::a_period_closes"),
-    ],
-    "free_energy/profiles/mean_force_surface.py": [
         ("if chance < «_CHANCE→0.0»:", "mean_force_surface::vectors_that_are_no_gradient_are_warned_of"),
     ],
     "free_energy/profiles/pulls.py": [

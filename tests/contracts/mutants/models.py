@@ -9,7 +9,7 @@ MUTANTS = {
         ("= 1e-«9→10»", "constrained::dependent_rows_may_disagree_by_a_part_in_a_thousand_million"),
     ],
     "steppers/compiled_operations.py": [
-        ("(«(r * n - d) + →»r", "flights::great_circles_end_on_the_sphere_wherever_they_start"),
+        ("(«(r * n - d) + →»r", "schemes::great_circles_end_on_the_sphere_wherever_they_start"),
     ],
     "models/growth/model.py": [
         ("self.alpha1 / self.beta«1→2»])", "models::lotka_volterra_with_four_different_parameters"),
@@ -45,6 +45,7 @@ MUTANTS = {
             "multibody::one_place_against_the_theory multibody::a_linear_change_of_coordinates_changes_nothing",
         ),
         ("left[rank - 1] > «DEPENDENT * left[0]→0.0»", "multibody::a_crossing_of_two_ways_is_passed_straight_on"),
+        ("range(«8→1»))", "multibody::far_starts_are_reached_by_parts_of_steps"),
         ("for _ in range(«ITERATIONS→1»):", "multibody::a_start_off_the_constraints_is_refused_and_can_be_mended"),
     ],
     "models/integration.py": [
@@ -52,8 +53,8 @@ MUTANTS = {
         ("«self.D[0] += y - self.y→pass»", "integration::the_next_step_starts_from_the_projection"),
     ],
     "solvers/sparse/row_functions.py": [
-        ("_from(p, «stride→0» * i)", "rows_at_once::solutions_are_those_of_rows_called_one_by_one"),
-        ("alike[«first + size - 1→:»] = True", "rows_at_once::who_is_called_one_by_one"),
+        ("_from(p, «stride→0» * i)", "single_rows::solutions_are_those_of_rows_called_one_by_one"),
+        ("alike[«first + size - 1→:»] = True", "single_rows::who_is_called_one_by_one"),
         ("] == time« and before[2] == value→»", "row_functions::a_gradient_is_found_again_where_the_value_has_changed"),
     ],
 }

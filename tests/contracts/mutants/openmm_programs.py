@@ -22,7 +22,7 @@ MUTANTS = {
         ("«self._left == self._place(context)→True»", "steps::change_of_the_box"),
         (
             "except (ConvergenceError, «InputError, →»NonFiniteError) as",
-            "langevin_ensemble::a_force_that_gets_another_group_before_an_explosion_leaves_the_state_that_was_checked",
+            "langevin_ensemble::a_force_that_gets_another_group_leaves_the_state_that_was_checked",
         ),
         (
             "rows = replace(rows, «lengths=given, others=given→others=given»)",
@@ -131,7 +131,10 @@ MUTANTS = {
         ('again = f"select({sure}, «3→1», 1)"', "row_program::many_steps_look_less_often"),
     ],
     "openmm/surface_integrator.py": [
-        ("«positions is None→False»:", "surface_integrator::great_circles_at_any_time_step"),
+        (
+            "«positions is None→False»:",
+            "surfaces_on_the_device::a_particle_at_the_center_is_refused_and_one_far_from_the_origin_is_held",
+        ),
     ],
     "openmm/callback_rows.py": [
         ("if self._count == count + «1 > 0→2 > 0»:", "callbacks::an_integrator_that_does_not_hold_the_rows_is_refused"),
@@ -144,8 +147,6 @@ MUTANTS = {
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "part::integrators_in_turn_hold_the_same_part",
         ),
-        ("u * np.cos(w) - d * (w * np.sin(w))« - way→»", "surface_integrator::great_circles_at_any_time_step"),
-        ('"ij,ij->i", d, way)[:, None] / radius«**2→»)', "surface_integrator::the_steps_are_those_of_the_core"),
         ("self.motion.rank« - 3 * fixed→»", "hold::particles_without_mass_take_no_degree_of_freedom"),
     ],
 }

@@ -8,9 +8,9 @@ MUTANTS = {
             "compilation::damaged_files_are_made_anew",
         ),
     ],
-    "constraints/functions/expressions.py": [
-        ("    undefined = «undefined_part(tree, _PI)→None»", "expressions::formulas_without_bound_are_refused_at_once"),
-        ("lambda _, x: «next(some)→-np.ones(40)»", "expressions::shifts_are_found_out"),
+    "constraints/functions/formula.py": [
+        ("    undefined = «undefined_part(tree, _PI)→None»", "formula::formulas_without_bound_are_refused_at_once"),
+        ("lambda _, x: «next(some)→-np.ones(40)»", "formula::shifts_are_found_out"),
     ],
     "constraints/constraint.py": [
         (", v, time + step) «+→- 0 *»", "constraint_set::acceleration_target_is_the_second_derivative_along_any_curve"),
@@ -50,10 +50,16 @@ MUTANTS = {
         ("rx + real * (gx «-→+» fx)", "distance_solvers::ten_thousand_bonds[free]"),
     ],
     "solvers/sparse/mixed_rows.py": [
-        ("if abs(d) > «PIVOT_TOLERANCE * abs(whole)→0.0» else 0.0", "mixed_rows::dependent_rows_are_dropped"),
-        ("(along > «0.→-1e30»0)", "mixed_rows::a_molecule_turned_through_a_point_is_no_solution_though_its_rows_hold"),
+        ("if abs(d) > «PIVOT_TOLERANCE * abs(whole)→0.0» else 0.0", "row_functions::dependent_rows_are_dropped"),
+        (
+            "(along > «0.→-1e30»0)",
+            "row_functions::a_molecule_turned_through_a_point_is_no_solution_though_its_rows_hold",
+        ),
         ("= «(here - load_quad(moved, 4 * p))→here» +", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
-        ("= «period * np.rint(→0.5 * period * np.rint(2 * »", "mixed_rows::rows_with_a_period_miss_by_the_shorter_way"),
+        (
+            "= «period * np.rint(→0.5 * period * np.rint(2 * »",
+            "row_functions::rows_with_a_period_miss_by_the_shorter_way",
+        ),
     ],
     "solvers/kernels/lattices.py": [
         ("y = y - (i * a[1] + j * b[1]« + k * c[1]→»)", "distance_solvers::periodic_equals_unwrapped"),
@@ -83,7 +89,10 @@ MUTANTS = {
         ("f, g = h / «(rho * q)→rho», up / q", "constraint::gradient_and_curvature_by_taylor_remainder[Torus-0]"),
     ],
     "solvers/sparse/row_functions.py": [
-        ("if np.a«ll→ny»(table == table[0]):", "single_rows::rows_agree_with_the_dense_solver[Sphere-open]"),
+        (
+            "if np.a«ll→ny»(table == table[0]):",
+            "row_functions::kernels_agree_with_the_dense_solver[SingleRows-Sphere-near]",
+        ),
     ],
     "solvers/single_rows.py": [
         ("store_double(solution, k, la«st + 0.5 * (lam - last)→m»)", "single_rows::steps_that_overshoot_are_halved"),

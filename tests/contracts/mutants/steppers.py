@@ -6,10 +6,10 @@ MUTANTS = {
             "«np.copyto(velocities, saved[1])→pass»\n            if isinstance(error",
             "motion::velocities_are_put_back_when_a_later_solver_fails",
         ),
-        ("«0.5 * (reference_time + time)→reference_time»", "flights::driven_velocities_hold_at_the_middle_of_the_time"),
+        ("«0.5 * (reference_time + time)→reference_time»", "schemes::flights_are_those_of_dense_algebra"),
     ],
     "steppers/interpreter.py": [
-        ("=self.at(row.«begin→end»)", "flights::impulses_act_along_the_gradients_of_the_time_of_the_start"),
+        ("=self.at(row.«begin→end»)", "schemes::flights_are_those_of_dense_algebra"),
         (
             "if «held.lattice is not cell or given.lattice is not cell→False»:",
             "interpreter::a_cell_that_the_force_function_changes",
@@ -24,12 +24,12 @@ MUTANTS = {
         ),
         ("self.time + «(end * self.dt + self.left_over)→end * self.dt»", "interpreter::times_within_a_step_are_exact"),
         ("(«start, float(np.abs(push).max(initial=0.0)), →0.0, »", "coming_to_rest::a_damped_pendulum_comes_to_rest"),
-        ("change <= «2→1e8» * _EPS * size", "coming_to_rest::settled_velocities_are_those_of_the_implicit_equation"),
+        ("change <= «2→1e8» * EPS * size", "coming_to_rest::settled_velocities_are_those_of_the_implicit_equation"),
     ],
     "solvers/sparse/mixed_rows.py": [
         (
             "time = «0.5 * (time + load_double(parameters, 1)→load_double(parameters, 0»)",
-            "flights::driven_velocities_hold_at_the_middle_of_the_time",
+            "schemes::flights_are_those_of_dense_algebra",
         ),
     ],
     "solvers/general_clusters.py": [
@@ -73,7 +73,7 @@ MUTANTS = {
     ],
     "steppers/files.py": [
         ("if «count != len(archive.namelist())→False»:", "state::a_damaged_byte_is_noticed"),
-        ("«unfinished.unlink(missing_ok=True)→pass»", "state::a_full_disk_leaves_nothing_behind"),
+        ("«unfinished.unlink(missing_ok=True)→pass»", "steppers/files::a_file_is_there_once_it_is_whole"),
         ('{target.name}«.{token_hex(8)}→»{UNFINISHED}"', "steppers/files::writers_of_one_path_do_not_meet"),
         (
             "«fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)→pass»",

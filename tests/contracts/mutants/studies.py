@@ -40,20 +40,18 @@ MUTANTS = {
     ],
     "free_energy/held_coordinates.py": [
         ("result[:, j] += mixed[:, «s→j»]", "held_coordinates::mean_force_is_the_one_of_the_definition"),
-        ("d * d«] @ metric.shares.swapaxes(1, 2)→, -d:]»", "held_coordinates::mean_force_is_the_one_of_the_definition"),
+        ("d * d«] @ shares.swapaxes(1, 2)→, -d:]»", "held_coordinates::mean_force_is_the_one_of_the_definition"),
         ("bent[:, 1 + d * d :].sum(axis=1) «-→+» traces)", "held_coordinates::mean_force_is_the_one_of_the_definition"),
         ("(respond @ b[:, :, None] «-→+» pull)", "held_coordinates::multipliers_are_those_of_the_engine"),
-    ],
-    "free_energy/mean_forces.py": [
-        ("series.kinetic / «(g - 1) if g→g if g > 99»", "mean_forces::one_end_to_end_length_beside_two_bonds"),
-        ("[:, k]) / spread * «difference→away / 2»", "mean_forces::of_two_estimates_the_mixture_that_fluctuates_least"),
-    ],
-    "free_energy/torsion_force.py": [
         ("np.isfinite(before)« and abs(after - before) < _SAME→»", "torsion_force::other_rows_must_not_change"),
         (
             "arms = x[..., self.group, :]« - x[..., self.axis[1:], :]→»",
             "torsion_force::the_smaller_group_turns_and_its_force_is_the_slope_of_the_energy",
         ),
+    ],
+    "free_energy/series.py": [
+        ("series.kinetic / «(g - 1) if g→g if g > 99»", "mean_forces::one_end_to_end_length_beside_two_bonds"),
+        ("[:, k]) / spread * «difference→away / 2»", "mean_forces::of_two_estimates_the_mixture_that_fluctuates_least"),
     ],
     "free_energy/profiles/profile.py": [
         ("aims = grid[«→~»self.lower_than(below)]", "profile::windows_that_help_what_is_low"),

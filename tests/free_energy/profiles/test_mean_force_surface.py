@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from kcons.free_energy.profiles.mean_force_surface import fit_surface
+from kcons.free_energy.profiles.profile import fit_surface
 
 TURN = 2 * math.pi
 
@@ -89,7 +89,6 @@ def test_a_grid_without_noise_gives_the_surface(name):
 
 
 def test_minima():
-    """Found where they are, and within their errors."""
     from scipy.optimize import minimize
 
     surface = fitted("wells", 60, 0.4, 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -130,42 +129,6 @@ def test_windows_at_one_place_are_put_together(off):
     assert profile.windows.tolist() == [0.3, 1.0, 2.0]
     assert profile.mean_forces[0] == pytest.approx((1.0 + 4 * 2.0) / 5)
     assert profile.mean_force_errors[0] == pytest.approx(1 / math.sqrt(5))
-
-
-def rms(profile, case):
-    """Of all differences of free energy."""
-    away = profile.F - case.F(profile.x)
-    return float(np.std(away))
-
-
-@cache
-def adapted(name, start, to, error, seeds=2):
-    """Windows proposed one by one, and the errors on the way by the number of windows."""
-    case, found = CASES[name], {}
-    for seed in range(seeds):
-        rng = np.random.default_rng(seed)
-        x = case.grid(start)
-        f = case.f(x) + error * rng.standard_normal(start)
-        while True:
-            profile = integrate(x, f, np.full(len(x), error), period=case.period)
-            found.setdefault(len(x), []).append(rms(profile, case))
-            if len(x) == to:
-                break
-            (new,) = profile.next_windows(1)
-            x = np.append(x, new)
-            f = np.append(f, case.f(new) + error * rng.standard_normal())
-    return {n: math.sqrt(np.mean(np.square(each))) for n, each in found.items()}
-
-
-def uniform(name, n, error, seeds=2):
-    case = CASES[name]
-    found = [rms(made(case, n, error, seed), case) for seed in range(seeds)]
-    return math.sqrt(np.mean(np.square(found)))
-
-
-def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side():
-    """Each window is sampled equally long."""
-    assert adapted("Lennard-Jones", 7, 10, 0.009)[10] < uniform("Lennard-Jones", 20, 0.009)
 
 
 def test_next_windows_lie_apart_and_where_little_is_known():

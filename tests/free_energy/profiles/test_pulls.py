@@ -44,13 +44,6 @@ def test_pulls_that_count():
     assert many.n_effective == pytest.approx(4000 / np.e, rel=0.1)
 
 
-def test_directions_are_alike():
-    """Backward pulls taken for forward ones give the difference with the other sign."""
-    one, other = normal(np.random.default_rng(4), 300, KT, 250)
-    here, there = pull_free_energy(one, other, thermal_energy=KT), pull_free_energy(other, one, thermal_energy=KT)
-    assert here.bar.value == pytest.approx(-there.bar.value, abs=1e-6) and here.overlap == pytest.approx(there.overlap)
-
-
 def test_a_spring_that_is_dragged():
     """Overdamped, x' = -(x - vt) + sqrt(2) dW: the free energy stays the same, whatever work is done.
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ase.build import molecule
-from scan_systems import ANGLE, LENGTH, chain, threefold
+from scan_systems import chain, threefold
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import Dihedral, Distance, FixedAtoms
+from kcons.constraints import Dihedral
 from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.errors import ConvergenceError
 from kcons.free_energy.scans import relaxation
@@ -35,17 +35,6 @@ def setting(rows, n=5):
     return atoms, motion, motion.restore_positions(x)
 
 
-def test_the_minimum_is_where_it_is():
-    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9), Distance([[1, 2]], 1.5)])
-    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-5)
-    assert found.energy == pytest.approx(0.5 * 30 * (1.5 - LENGTH) ** 2 + 0.2 * (1 + np.cos(2.7)), abs=1e-9)
-    assert found.largest <= 1e-5 and found.evaluations == atoms.calc.calls
-    motion.certify(found.positions)
-    arms = found.positions[[2, 4]] - found.positions[3]
-    angle = np.arccos(arms[0] @ arms[1] / np.prod(np.linalg.norm(arms, axis=1)))
-    assert angle == pytest.approx(ANGLE, abs=1e-5)
-
-
 def test_what_was_learned_goes_along():
     atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=6)
     internals = Internals(atoms.numbers, x)
@@ -53,14 +42,6 @@ def test_what_was_learned_goes_along():
     assert first.memory.shape == (first.evaluations - 1, 2, len(internals.terms))
     again = relax(motion, forces_of(atoms), internals, x, fmax=1e-3, memory=first.memory)
     assert again.evaluations < first.evaluations
-
-
-def test_fixed_atoms_stay():
-    atoms, motion, x = setting([FixedAtoms([0, 4]), Distance([[1, 2]], 1.45)])
-    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-4)
-    assert np.array_equal(found.positions[[0, 4]], x[[0, 4]])
-    forces = motion.project_forces(found.positions, forces_of(atoms)(found.positions)[1])
-    assert np.abs(forces[[1, 2, 3]]).max() < 1e-3
 
 
 def test_forces_that_are_no_gradient_are_told():
@@ -81,7 +62,6 @@ def test_forces_that_are_no_gradient_are_told():
 
 
 def test_undefined_internal_coordinates_are_told():
-    """Two atoms in one place."""
     atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 1.0)])
     internals = Internals(atoms.numbers, x)
     met = x.copy()

@@ -21,7 +21,6 @@ RING = np.radians(np.arange(-180, 180, 30))
 
 
 def test_a_torsion_has_its_profile():
-    """Bonds and angles relax to where they cost nothing, the dihedral stays where it is held."""
     atoms = chain(4, threefold)
     before = atoms.positions.copy()
     found = scan(atoms, TURN, RING, fmax=1e-3)
@@ -139,7 +138,6 @@ def test_one_failed_point_does_not_stop_the_others():
 
 
 def test_a_failed_point_is_leapt_over():
-    """What lies behind it is reached from before it."""
     atoms = chain(4, threefold, lambda phi: RuntimeError("no") if 1.2 < phi[0] < 1.3 else None, turns=[1.0])
     found = scan(atoms, TURN, [1.0, 1.25, 1.5, 1.6])
     assert set(found.failed) == {(1,)} and np.isfinite(found.energies[2:]).all()
@@ -261,21 +259,6 @@ def test_large_structures_need_no_table(monkeypatch):
     monkeypatch.setattr("kcons.free_energy.scans.relaxed_scan.MOST_ATOMS", 3)
     found = scan(chain(4, threefold), TURN, [0.5, 0.8], fmax=1e-3)
     np.testing.assert_allclose(found.energies, 0.2 * (1 + np.cos(3 * np.array([0.5, 0.8]))), atol=1e-6)
-
-
-def test_a_second_scan_into_the_same_folder_is_told(tmp_path):
-    refused = []
-
-    def meanwhile(done, points, line):
-        if not refused:
-            with pytest.raises(OccupiedError, match="another run writes into"):
-                scan(chain(4, threefold), TURN, RING, folder=tmp_path)
-            refused.append(line)
-
-    found = scan(chain(4, threefold), TURN, RING, folder=tmp_path, progress=meanwhile)
-    again = scan(chain(4, threefold), TURN, RING, folder=tmp_path)
-    assert refused and np.array_equal(found.energies, again.energies)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["plan.json", "relaxations"]
 
 
 def test_a_torsion_over_atoms_that_are_not_bonded():

@@ -14,7 +14,7 @@ from scan_systems import chain, threefold, two_wells
 from kcons.cli.terminal import rendered
 from kcons.constraints import Dihedral, Distance
 from kcons.free_energy import scan
-from kcons.free_energy.scans.scan_result import KJ
+from kcons.free_energy.scans.relaxed_scan import KJ
 
 TURN = Dihedral([[0, 1, 2, 3]])
 

@@ -34,7 +34,6 @@ def four_atoms(constrained=True):
 
 
 def test_energy_and_forces():
-    """Forces are the slope of the energy, in ASE's units."""
     system, atoms = four_atoms(constrained=False)
     atoms.calc = SystemCalculator(system, "Reference")
     forces, x, h = atoms.get_forces(), atoms.positions.copy(), 1e-4

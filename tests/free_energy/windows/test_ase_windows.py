@@ -15,7 +15,6 @@ from ase.calculators.lj import LennardJones
 from ase.constraints import FixAtoms
 
 from kcons.constraints import Dihedral, Distance
-from kcons.errors import SingularGeometryError
 from kcons.free_energy import AseWindows, Series, Settings, Window, Windows
 
 CALCULATOR = partial(LennardJones, sigma=1.0, epsilon=0.02, rc=6.0)
@@ -86,11 +85,6 @@ def test_torsions_over_atoms_that_form_no_bonds():
     AseWindows(molecule("Si2H6"), CALCULATOR, {"turn": Dihedral([[2, 0, 1, 5]])})
     copper = Atoms("Cu4", [[0, 0, 0], [2.5, 0, 0], [2.5, 2.5, 0], [2.5, 2.5, 2.5]])
     AseWindows(copper, CALCULATOR, {"turn": Dihedral([[0, 1, 2, 3]])})
-
-
-def test_coordinates_that_cannot_be_held():
-    with pytest.raises(SingularGeometryError, match="turn depends on the other"):
-        sampler(held=[PIECES, Distance([[2, 3]])])
 
 
 def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):

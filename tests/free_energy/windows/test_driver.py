@@ -68,14 +68,6 @@ def test_windows_and_their_profile(tmp_path):
     assert known["windows"][0]["mean force"] == pytest.approx(result.windows[0].force.tolist())
 
 
-def test_finished_windows_are_not_sampled_again(tmp_path):
-    _, first = run(tmp_path)
-    assert sorted(diary(tmp_path)) == sorted(set(diary(tmp_path))) and len(diary(tmp_path)) == 16
-    _, second = run(tmp_path)
-    assert len(diary(tmp_path)) == 16
-    assert json.dumps(first.numbers()) == json.dumps(second.numbers())
-
-
 def test_one_failed_window_does_not_stop_the_others_and_is_tried_again(tmp_path):
     _, result = run(tmp_path, fails=("window-0002-up", "window-0005-down", "window-0005-up"))
     assert result.failed == dict.fromkeys(
@@ -96,12 +88,6 @@ def test_the_same_object_asked_again_has_the_same_windows(tmp_path):
     assert again.failed == {} and len(first.windows) == len(again.windows) == 4
     assert len(diary(tmp_path)) == 9
     assert sorted(w.number for w in windows.run([0.0, 2.0]).windows) == [0, 1, 2, 3, 4]
-
-
-def test_without_a_pull_windows_begin_where_they_end(tmp_path):
-    windows = made(tmp_path, Settings(pull=0, production=320, every=10))
-    windows.run([0.5])
-    assert [(job.start, job.target) for job in windows._jobs(0)] == [((0.5,), (0.5,))] * 2
 
 
 def test_sides_that_disagree_are_seen(tmp_path):
@@ -148,7 +134,7 @@ def test_a_second_run_in_the_same_folder_is_told(tmp_path):
         other.run(PLACES[:1])
 
 
-@pytest.mark.parametrize("name", ["window-0000-up.npz", "free_energy.json", "profile.png"])
+@pytest.mark.parametrize("name", ["window-0000-up.npz", "free_energy.json", "profile.png", "pulls.json"])
 def test_files_of_others_are_not_taken_for_windows(tmp_path, name):
     (tmp_path / name).write_text("precious")
     with pytest.raises(OccupiedError, match=f"other files called {name}; give another folder"):
@@ -226,7 +212,6 @@ def test_pulls_by_long_steps(tmp_path):
 
 
 def test_pulls_that_fail_are_told_of(tmp_path):
-    """And those that did not are kept."""
     names = tuple(f"pull--0.5-to-0.5-{k:04d}" for k in range(3))
     with pytest.raises(InputError, match=r"3 of 14 pulls failed; pull--0.5-to-0.5-000.: RuntimeError.* are kept"):
         made(tmp_path, fails=names).pull(-0.5, 0.5, 7)

@@ -14,7 +14,7 @@ from openmm_systems import DATA
 from kcons.constraints import Angle, Dihedral, Distance, MovingTarget
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy import HeldCoordinatesReporter
-from kcons.free_energy.mean_forces import local_mean_force
+from kcons.free_energy.series import local_mean_force
 from kcons.openmm import CollectiveRows, Langevin, ProjectedIntegrator, hold
 
 PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
@@ -68,7 +68,6 @@ def test_a_torsion_held_as_a_collective_variable(bonds):
 
 
 def test_the_same_coordinate_held_in_three_ways(tmp_path):
-    """By the System, as a collective variable, and by `hold`: one multiplier at one configuration."""
     pair, angle = [8, 14], [6, 8, 14]
     x = np.array(PDB.positions.value_in_unit(unit.nanometer))
     found = {}
@@ -182,8 +181,3 @@ def test_bad_input():
     other.reporters = simulation.reporters
     with pytest.raises(InputError, match="belongs to another simulation"):
         other.step(1)
-    simulation.reporters = [
-        HeldCoordinatesReporter(io.StringIO(), 1, {"r": Distance([[0, 99]])}, beside=[Dihedral([psi])])
-    ]
-    with pytest.raises(InputError, match="no atom 99"):
-        simulation.step(1)

@@ -12,7 +12,7 @@ from openmm import app
 from openmm_systems import DATA
 
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, DistanceDifference, Formula
-from kcons.errors import InputError, SingularGeometryError, UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy import OpenMMWindows, Series, Settings, Window, mean_force
 from kcons.openmm.device import build
 
@@ -63,11 +63,6 @@ def test_windows_on_the_device_are_those_of_the_program(tmp_path, monkeypatch):
     np.testing.assert_allclose(forces[0], forces[1], rtol=1e-9)
 
 
-def test_a_torsion_over_atoms_that_are_not_bonded():
-    with pytest.warns(UserWarning, match="phi is a torsion over the atoms 6, 4, 8, 14, .* and 4-8 is no bond"):
-        sampler({"phi": Dihedral([[6, 4, 8, 14]])})
-
-
 @pytest.mark.parametrize(
     ("coordinate", "target"),
     [
@@ -85,15 +80,6 @@ def test_other_coordinates(tmp_path, coordinate, target):
     windows.sample(Window(0, "down", (target + 0.02,), (target,), 7), settings, tmp_path / "window.npz")
     series = Series.load(tmp_path / "window.npz")
     np.testing.assert_allclose(series.value, target, atol=1e-10)
-
-
-def test_coordinates_that_cannot_be_held():
-    tight = system()
-    x = PDB.positions
-    for i, j in ((4, 6), (6, 8), (4, 8), (8, 14), (6, 14), (4, 14)):
-        tight.addConstraint(i, j, openmm.unit.norm(x[i] - x[j]))
-    with pytest.raises(SingularGeometryError, match="q depends on the other"):
-        sampler({"q": Angle([[4, 6, 8]])}, tight)
 
 
 def test_structures_that_are_not_of_the_system():

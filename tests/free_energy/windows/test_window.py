@@ -9,8 +9,8 @@ from ase.calculators.emt import EMT
 
 from kcons.constraints import Dihedral, Distance, Formula
 from kcons.errors import InfeasibleError
-from kcons.free_energy import AseWindows, Window
-from kcons.free_energy.windows.window import digest_of
+from kcons.free_energy import AseWindows
+from kcons.free_energy.windows.driver import digest_of
 
 X = np.array([[0.0, 1.0, 0.1], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.6, 1.0, 0.2], [2.0, -0.6, 0.8]])
 TURN = Dihedral([[0, 1, 2, 3]])
@@ -24,14 +24,6 @@ def of_atoms(x, coordinates, others, bonds):
 
 def held(coordinates=None, others=()):
     return of_atoms(X, coordinates or {"turn": TURN}, others, BONDS)
-
-
-def test_names_and_units():
-    """Of OpenMM a formula is in nm, and nobody knows whether it is a length."""
-    assert Window(12, "up", (0.0,), (1.0,), 1).name == "window-0012-up"
-    both = {"r": Distance([[0, 1]]), "turn": TURN, "f": Formula("x1 - 1", [[0]])}
-    sampler = AseWindows(Atoms("H5", X), EMT, both)
-    assert sampler.scales.tolist() == [1.0, 1.0, 1.0] and sampler.angles == (False, True, None)
 
 
 def test_groups_are_turned_and_keep_their_shape():
@@ -69,13 +61,6 @@ def test_a_ring_comes_to_its_window_by_small_steps():
 def test_a_ring_is_not_torn():
     with pytest.raises(InfeasibleError, match="angle"):
         ring().placed([2.5])
-
-
-def test_a_pull_ends_where_the_window_is():
-    rows = held()
-    (pulled,) = rows.towards([0.3], [0.5], duration=4.0)
-    assert [pulled.target_at(t)[0] for t in (0.0, 2.0, 4.0)] == pytest.approx([0.3, 0.4, 0.5])
-    assert rows.at([0.5])[0].target_at(0.0)[0] == 0.5
 
 
 def test_digests_tell_systems_apart():

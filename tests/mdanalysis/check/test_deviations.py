@@ -66,7 +66,6 @@ def test_xtc_is_told_to_far_better_than_single_precision_would_allow(tmp_path):
 
 
 def test_rows_of_all_kinds(water):
-    """Angles, dihedrals, collective and linear rows, against plain formulas."""
     x = files.dcd_frames(water["dcd"])
 
     def near(d):
@@ -330,11 +329,6 @@ def test_transformed_coordinates_are_taken_as_they_are(water):
 def test_what_cannot_be_is_refused(water, rows, options, match):
     with pytest.raises(InputError, match=match):
         checked(water["dcd"], rows, **options)
-
-
-def test_options_that_do_not_exist_are_refused(water):
-    with pytest.raises(TypeError, match="unexpected keyword argument 'tolerence'"):
-        checked(water["dcd"], ROWS, tolerence=1e-3)
 
 
 def test_rows_that_were_made_for_a_part_are_refused(water):

@@ -216,7 +216,6 @@ def test_xtc_beyond_the_reach_of_its_grid(tmp_path):
 
 
 def test_xtc_files_put_together_from_two_precisions(tmp_path):
-    """Frames of steps of 0.01 and of 0.0001: each is told by its own."""
     x = whole()
     x[6, 3 * 2 + 1] += 0.01 * (x[6, 3 * 2 + 1] - x[6, 3 * 2])
     coarse = files.write(tmp_path / "c.xtc", x[:4], side=None)

@@ -2,7 +2,6 @@
 
 import json
 
-import MDAnalysis as mda
 import numpy as np
 import pytest
 import water_files as files
@@ -66,29 +65,6 @@ def test_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
     assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)
     with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*give a topology with masses"):
         files.checked(path, N, CenterOfMass([0, 1, 2]), masses=False)
-
-
-def test_sites_of_water_do_not_count(tmp_path):
-    """MDAnalysis takes EPW for phosphorus; as a mass it would be most of the kinetic energy."""
-    x = files.water(N, 3, side=SIDE)
-    four = np.concatenate([x.reshape(3, N, 3, 3), x.reshape(3, N, 3, 3)[:, :, :1]], axis=2).reshape(3, 4 * N, 3)
-    v = np.random.default_rng(1).normal(size=four.shape)
-    pairs = (4 * np.arange(N)[:, None, None] + [[0, 1], [0, 2], [1, 2]]).reshape(-1, 2)
-    found = []
-    for masses in ([15.999, 1.008, 1.008, 0.0], None):
-        universe = mda.Universe.empty(
-            4 * N, n_residues=N, atom_resindex=np.repeat(np.arange(N), 4), trajectory=True, velocities=True
-        )
-        universe.add_TopologyAttr("names", ["O", "H1", "H2", "EPW"] * N)
-        universe.add_TopologyAttr("resnames", ["WAT"] * N)
-        if masses is None:
-            universe.guess_TopologyAttrs(to_guess=["types", "masses"])
-        else:
-            universe.add_TopologyAttr("masses", masses * N)
-        universe.load_new(four, velocities=v, dimensions=[SIDE, SIDE, SIDE, 90.0, 90.0, 90.0])
-        found.append(ConstraintCheck(universe, Distance(pairs), targets="first").run().check)
-    assert found[0].degrees_of_freedom == found[1].degrees_of_freedom
-    assert found[0].temperature["mean"] == pytest.approx(found[1].temperature["mean"])
 
 
 def test_velocities_without_a_unit_are_no_temperature(tmp_path):

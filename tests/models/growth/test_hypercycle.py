@@ -7,14 +7,7 @@ from growth_reference import case, system
 from scipy.integrate import simpson
 
 from kcons.errors import BudgetError, InputError
-from kcons.models.growth import (
-    EntropyRow,
-    Hypercycle,
-    Mixture,
-    Populations,
-    entropy_balance,
-    solve,
-)
+from kcons.models.growth import EntropyRow, Hypercycle, Mixture, Populations, entropy_balance, solve
 
 STARTS = ("IC1", "IC2", "IC3sum2")
 CASES = [f"A11_hypercycle_{start}_{letter}" for start in STARTS for letter in "abc"]
@@ -113,19 +106,6 @@ def test_settled_motion_continues_the_integrated_one():
     assert coarse.y == pytest.approx(fine.y, rel=1e-6)
 
 
-@pytest.mark.parametrize("part", [0.0004, 0.005, 0.05], ids=["at once", "between", "at a time shown"])
-def test_events_are_found_wherever_a_settled_motion_passes_them(part):
-    system = Hypercycle().with_entropy_production(1.0)
-    settled = solve(system, (0.0, 100.0), X0, rtol=1e-4, atol=1e-5).settled_time
-    time = settled + part * (100.0 - settled)
-    passed = lambda t, x: t - time  # noqa: E731
-    passed.terminal = 1
-    found = solve(system, (0.0, 100.0), X0, rtol=1e-4, atol=1e-5, events=passed)
-    assert found.status == 1 and found.settled_time == settled
-    assert found.t_events[0] == pytest.approx([time], rel=1e-12)
-    assert found.t[-1] == found.t_events[0][0]
-
-
 def test_start_at_equilibrium():
     """H36: with nothing to produce it is refused; with no production asked for, or the total alone, it stays."""
     model = Hypercycle()
@@ -167,7 +147,7 @@ def test_near_extinction_and_return():
 
 
 def test_extinction_beyond_all_numbers_ends_at_the_least_logarithm():
-    # Species 3 to 5 die for good under (c): ln x falls like -e^(lambda t) and would overflow before t = 100.
+    # Under (c) species 3 to 5 die for good: ln x falls like -e^(lambda t) and would overflow before t = 100.
     x0 = np.array([0.18899264, 0.01101811, 0.01901061, 0.74291806, 0.03806058])
     found = solve(Hypercycle().without_entropy_production(), (0.0, 100.0), x0 / x0.sum(), rtol=1e-7, atol=1e-9)
     assert found.success and np.all(np.isfinite(found.log_y))
@@ -240,19 +220,19 @@ def test_budget_is_computed_from_the_start():
     assert same.law_excess(1e4) == pytest.approx(BUDGET * np.exp(-1e4 / 30), rel=1e-9)
 
 
-@pytest.mark.parametrize(("factor", "time"), [(1.1, 71.94), (1.5, 32.96)])
-def test_too_large_a_budget_is_refused_with_its_time(factor, time):
-    with pytest.raises(BudgetError, match=r"more than the start can produce") as caught:
+@pytest.mark.parametrize(
+    ("factor", "time", "words"),
+    [
+        (1.1, 71.94, r"more than the start can produce: .* t = 71\.9"),
+        (1.5, 32.96, r"more than the start can produce: .* t = 32\.9"),
+        (0.5, np.inf, "less than what lies between the start and equilibrium"),
+    ],
+)
+def test_another_budget_is_refused_with_its_time(factor, time, words):
+    with pytest.raises(BudgetError, match=words) as caught:
         solve(Hypercycle().with_entropy_production(30.0, factor * BUDGET), (0.0, 1.0), X0)
     assert caught.value.time == pytest.approx(time, abs=0.005)
-    assert f"t = {caught.value.time:.6g}" in str(caught.value)
     assert caught.value.consistent == pytest.approx(BUDGET)
-
-
-def test_too_small_a_budget_is_refused():
-    with pytest.raises(BudgetError, match="less than what lies between the start and equilibrium") as caught:
-        Hypercycle().with_entropy_production(30.0, 0.5 * BUDGET).bind(START)
-    assert caught.value.time == np.inf
 
 
 PRODUCED = {"closed": BUDGET * -np.expm1(-4.0 / 3.0), "open": 0.0}
@@ -264,8 +244,8 @@ SYSTEMS = {
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_entropy_produced_is_the_integral_of_its_rate(name):
-    there = solve(SYSTEMS[name], (0.0, 4.0), X0, t_eval=[2.0], dense_output=True)  # whatever times are shown
-    balance = entropy_balance(there)
+    # Whatever times are shown.
+    balance = entropy_balance(solve(SYSTEMS[name], (0.0, 4.0), X0, t_eval=[2.0], dense_output=True))
     assert balance.prescribed == pytest.approx(PRODUCED[name], abs=1e-14)
     assert balance.lost == pytest.approx(PRODUCED[name], abs=1e-13)
     assert balance.integrated == pytest.approx(PRODUCED[name], abs=1e-9)
@@ -292,17 +272,13 @@ def test_entropy_produced_inside_and_exchanged(name):
     ("make", "words"),
     [
         (lambda: Hypercycle().with_entropy_production(0.0), "tau is 0"),
-        (lambda: Hypercycle().with_entropy_production(np.nan), "tau is nan"),
         (lambda: Hypercycle().with_entropy_production(-np.inf), "tau is -inf"),
         (lambda: Hypercycle().with_entropy_production(1.0, -0.1), "budget is -0.1; give a number of 0 or more"),
         (lambda: Hypercycle().with_entropy_production(3.0, "all"), "budget is 'all'"),
         (lambda: EntropyRow(3, 1.0), "mixture is 3"),
         (lambda: EntropyRow(Mixture([0.1, 0.2]), 1.0).bind(START), "the mixture has 2 species"),
-        (
-            lambda: entropy_balance(solve(Hypercycle().with_fixed_total(), (0.0, 0.1), X0, dense_output=True)),
-            "no row",
-        ),
-        (lambda: entropy_balance(solve(Hypercycle().without_entropy_production(), (0.0, 0.1), X0)), "dense_output"),
+        (lambda: entropy_balance(solve(Hypercycle().with_fixed_total(), (0.0, 0.1), X0)), "no row"),
+        (lambda: entropy_balance(solve(SYSTEMS["open"], (0.0, 0.1), X0)), "dense_output"),
     ],
 )
 def test_bad_laws_and_balances_are_refused(make, words):

@@ -1,7 +1,5 @@
 """Growth models without constraints: equations, closed forms, invariants, and what is refused; ideal mixtures."""
 
-from decimal import Decimal
-
 import numpy as np
 import pytest
 from exact_mixture import exact_energies
@@ -121,7 +119,7 @@ def test_row_that_is_conserved_anyway_does_nothing():
 
 
 def test_lotka_volterra_with_four_different_parameters():
-    # Each parameter at its own place in (69)-(77), none equal to another.
+    # No parameter equals another, so that each is seen at its own place in (69)-(77).
     model, x = LotkaVolterra(alpha1=1.1, beta1=0.4, alpha2=0.25, beta2=0.7), np.array([2.0, 3.0])
     assert model.equilibrium == pytest.approx([0.7 / 0.25, 1.1 / 0.4], rel=1e-15)
     assert model.velocity(0.0, x) == pytest.approx([2.0 * (1.1 - 0.4 * 3.0), -3.0 * (0.7 - 0.25 * 2.0)], rel=1e-14)
@@ -155,22 +153,12 @@ def test_reference_states(start):
     assert mixture.excess(p, total)[0] == pytest.approx(given["T_times_seq_minus_s0"], rel=1e-14)
 
 
-def test_excess_off_the_total_is_that_of_the_actual_sum():
+def test_excess_off_the_total_is_that_of_the_actual_sum_and_its_gradient_the_potentials():
     mixture, x = Mixture(MU0, 0.7), np.array([0.3, 0.2, 0.4, 0.1, 0.05])
     p = Populations.from_values(0.0, x)
     plain = mixture.gibbs_energy(p) - mixture.least_gibbs_energy(x.sum())
     assert mixture.excess(p, 1.0) == pytest.approx(plain, rel=1e-12)
     assert plain == pytest.approx(0.7 * rel_entr(x, np.exp(mixture.equilibrium(x.sum()))).sum(), rel=1e-12)
-
-
-def test_excess_of_species_that_are_all_extinct_is_no_number():
-    p = Populations.from_logarithms(0.0, np.full(3, -800.0))
-    assert np.isnan(Mixture([0.1, 0.2, 0.3]).excess(p, 1.0))  # as trial steps find it, which are then rejected
-
-
-def test_potentials_are_the_gradient_of_the_excess():
-    mixture, x = Mixture(MU0, 0.7), np.array([0.3, 0.2, 0.4, 0.1, 0.05])
-    p = Populations.from_values(0.0, x)
     gradient = mixture.potentials(p) - mixture.least_gibbs_energy(1.0)
     slopes = jacobian_by_differences(
         lambda t, x: mixture.excess(Populations.from_values(t, x), 1.0), 0.0, x, np.full(5, 1e-3)
@@ -179,25 +167,12 @@ def test_potentials_are_the_gradient_of_the_excess():
     relative = mixture.relative_potentials(p)
     assert relative == pytest.approx(gradient - gradient[2], abs=1e-14)
     assert relative[2] == 0.0
+    extinct = Populations.from_logarithms(0.0, np.full(5, -800.0))
+    assert np.isnan(mixture.excess(extinct, 1.0))  # as trial steps find it, which are then rejected
 
 
-def test_excess_over_a_level_has_the_round_off_of_its_terms():
-    rng = np.random.default_rng(5)
-    off = []
-    for _ in range(200):
-        # The third would be nearly alone at equilibrium, and is rare: the excess is hundreds of the terms of g.
-        mixture = Mixture(rng.normal(size=3) * 30.0 - [0.0, 0.0, 200.0])
-        p = Populations.from_logarithms(0.0, np.log(rng.dirichlet([1.0, 1.0, 1.0])) - [0.0, 0.0, 40.0])
-        total = float(np.sum(p.x))
-        level = mixture.excess(p, total)
-        X, g, least = exact_energies(mixture.mu0, 1.0, p.log_x)
-        exact = float(g - X * least - Decimal(level))
-        off.append(abs(mixture.excess(p, total, level) - exact) / level)
-    assert max(off) < 1e-15
-
-
-@pytest.mark.parametrize("size", [1e-9, 0.05, 0.3])
-def test_excess_over_a_level_near_equilibrium(size):
+@pytest.mark.parametrize("size", [1e-9, 0.05, 0.3, 40.0])
+def test_excess_near_equilibrium_and_far_from_it(size):
     mixture = Mixture(MU0)
     log_x = mixture.equilibrium(1.0) + size * np.array([1.0, -2.0, 0.5, 3.0, -1.0])
     p = Populations.from_logarithms(0.0, log_x - np.log(np.sum(np.exp(log_x))))
@@ -205,7 +180,6 @@ def test_excess_over_a_level_near_equilibrium(size):
     excess = float(g - X * least)
     rounding = 4e-16 / size  # of ln x, in which the excess is quadratic
     assert mixture.excess(p, 1.0) == pytest.approx(excess, rel=1e-14 + rounding)
-    assert mixture.excess(p, 1.0, 0.75 * excess) == pytest.approx(0.25 * excess, rel=1e-13 + 4 * rounding)
 
 
 # -- refused ------------------------------------------------------------------------------------------
@@ -219,18 +193,10 @@ def test_excess_over_a_level_near_equilibrium(size):
         (lambda: Populations.from_values(0.0, [0.5, np.nan]), "population 1 is nan"),
         (lambda: Populations.from_values(0.0, [[[1.0]]]), "shape"),
         (lambda: Populations.from_values(0.0, [0.5, 0.5 + 1e-3j]), "complex"),
-        (lambda: Populations.start(0.0, 1, None, None), "either as x0 or as log_x0"),
-        (lambda: Populations.start(0.0, 1, [1.0], [0.0]), "either as x0 or as log_x0"),
-        (lambda: Populations.start(0.0, 2, None, [0.0, -np.inf]), "log_x0 is not finite"),
-        (lambda: Populations.start(0.0, 3, [1.0, 1.0], None), r"the start has shape \(2,\), not \(3,\)"),
         (lambda: GrowthModel(lambda t, x: x, n=0), "n is 0; give a whole number, 1 or more"),
         (lambda: GrowthModel(lambda x: x, n=2), r"rates takes \(x\), but is called with \(t, x\)"),
         (lambda: GrowthModel(lambda t, x: [1.0, 2.0, 3.0], n=2).velocity(0.0, [1.0, 1.0]), "shape"),
         (lambda: GrowthModel(lambda t, x: x * 1j, n=2).velocity(0.0, [1.0, 1.0]), "complex"),
-        (
-            lambda: solve(ConstrainedGrowth(GrowthModel(lambda t, x: [np.nan, 1.0], n=2)), (0.0, 1.0), [1.0, 1.0]),
-            "rate of species 0 is not finite at t = 0;",
-        ),
         (
             lambda: GrowthModel(lambda t, x: x, lambda t, x: [0.0, -1.0], n=2).velocity(0.0, [1.0, 1.0]),
             "source 1 is negative",

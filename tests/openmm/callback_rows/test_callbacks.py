@@ -10,9 +10,10 @@ import sys
 import numpy as np
 import openmm
 import pytest
-from carried_systems import begun, context_of, driven, free, off_target, peptide, started, state_of
+from carried_systems import begun, driven, off_target, peptide
+from ensemble_runs import run
 from openmm import unit
-from openmm_systems import context_of as context_on
+from openmm_systems import context_of, particles, started, state_of
 
 from kcons.constraints import Custom, Distance
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
@@ -24,9 +25,9 @@ from kcons.openmm.integrator.part import Precision
 
 def test_positions_come_back_to_the_last_bit():
     """Carrying v through x must not move x: without forces and rows in the way, x = x0 + v t exactly as without."""
-    system = free([12.0] * 4)
+    system = particles([12.0] * 4)
     part = hold(system, Distance([[0, 1]]), np.eye(4, 3))
-    plain = context_of(free([12.0] * 4), ProjectedIntegrator(0.001))
+    plain = context_of(particles([12.0] * 4), ProjectedIntegrator(0.001))
     carried = context_of(system, ProjectedIntegrator(0.001, parts=[part]))
     x = np.eye(4, 3) + 1e-3
     v = np.array([[0.1, 0.1, 0.3], [0.1, 0.1, 0.3], [0.7, -0.3, 0.123456789], [1 / 3, 1e-9, 1e5]])
@@ -53,11 +54,9 @@ def _up(r):
 
 
 def test_errors_of_user_functions_come_through():
-    part = hold(system := free([1.0]), Custom([0], _clumsy, _up), [[0, 0, 0]])
+    part = hold(system := particles([1.0]), Custom([0], _clumsy, _up), [[0, 0, 0]])
     integrator = ProjectedIntegrator(0.01, parts=[part])
-    context = context_of(system, integrator)
-    context.setPositions([[0, 0, 0]])
-    context.setVelocities([[1.0, 0, 0]])
+    context = started(system, integrator, [[0, 0, 0]], [[1.0, 0, 0]])
     with pytest.raises(ZeroDivisionError, match="user code") as caught:
         integrator.step(100)
     assert "in step 6" in caught.value.__notes__[0]
@@ -87,12 +86,9 @@ def test_callbacks_keep_no_memory():
 @pytest.mark.parametrize("platform", ["Reference", "CPU"])
 @pytest.mark.usefixtures("without_device")
 def test_a_step_too_large_is_taken_back(platform):
-    part = hold(system := free([1.0, 1.0]), Distance([[0, 1]]), [[-0.5, 0, 0], [0.5, 0, 0]])
+    part = hold(system := particles([1.0, 1.0]), Distance([[0, 1]]), [[-0.5, 0, 0], [0.5, 0, 0]])
     integrator = ProjectedIntegrator(0.1 * unit.picosecond, parts=[part])
-    context = context_on(system, integrator, platform)
-    context.setPositions([[-0.5, 0, 0], [0.5, 0, 0]])
-    context.setVelocities([[0, -0.5, 0], [0, 0.5, 0]])
-    integrator.step(3)
+    context = run(system, integrator, [[-0.5, 0, 0], [0.5, 0, 0]], [[0, -0.5, 0], [0, 0.5, 0]], 3, platform)
     integrator.setStepSize(1.5 * unit.picosecond)  # no solution where angle would be asin(1.5)
     before = state_of(context)
     with pytest.raises(ConvergenceError, match="step 4: time step too large") as caught:
@@ -123,8 +119,7 @@ def test_copies_of_an_integrator_take_turns_with_the_rows_of_the_system():
     integrator, context = begun(system, part, x)
     integrator.step(5)
     other = copy.deepcopy(integrator)
-    again = context_of(system, other)
-    again.setPositions(x)
+    again = started(system, other, x)
     other.applyVelocityConstraints(again)
     other.setStepSize(0.004)
     for _ in range(2):
@@ -169,18 +164,18 @@ def _later(system):
     ],
 )
 def test_a_system_that_does_not_go_with_the_rows_is_refused(made, error, words):
-    system = free([12.0] * 3)
+    system = particles([12.0] * 3)
     part = made(system)
-    context = started(context_of(system, ProjectedIntegrator(0.01, parts=[part])), np.eye(3))
+    context = started(system, ProjectedIntegrator(0.01, parts=[part]), np.eye(3))
     with pytest.raises(error, match=words):
         part.check(context)
 
 
 def test_masses_that_change_in_a_run_are_noticed_at_the_next_check():
-    system = free([12.0] * 2)
+    system = particles([12.0] * 2)
     part = hold(system, Distance([[0, 1]]), np.eye(2, 3))
     integrator = ProjectedIntegrator(0.01, parts=[part])
-    context = started(context_of(system, integrator), np.eye(2, 3))
+    context = started(system, integrator, np.eye(2, 3))
     integrator.step(5)
     system.setParticleMass(0, 4.0)
     context.reinitialize(True)
@@ -190,10 +185,10 @@ def test_masses_that_change_in_a_run_are_noticed_at_the_next_check():
 
 def test_an_integrator_that_does_not_hold_the_rows_is_refused():
     """The constraints that moved to the rows would be held by nobody."""
-    system = free([12.0] * 2)
+    system = particles([12.0] * 2)
     hold(system, Distance([[0, 1]]), np.eye(2, 3))
     verlet = openmm.VerletIntegrator(0.01)
-    context = started(context_of(system, verlet), np.eye(2, 3))
+    context = started(system, verlet, np.eye(2, 3))
     with pytest.raises(openmm.OpenMMException, match=r"does not hold the rows of hold.* parts=\[rows\]"):
         verlet.step(2)
     del context
@@ -201,12 +196,12 @@ def test_an_integrator_that_does_not_hold_the_rows_is_refused():
 
 def test_rows_that_need_the_time_are_not_held_without_their_integrator():
     """Nobody else knows the time step: a CompoundIntegrator keeps no object of Python."""
-    system = free([12.0] * 2)
+    system = particles([12.0] * 2)
     part = hold(system, Distance([[0, 1]], lambda t: np.sqrt(2) + t), np.eye(2, 3))
     both = openmm.CompoundIntegrator()
     both.addIntegrator(ProjectedIntegrator(0.01, parts=[part], device=False))
     gc.collect()
-    context = started(context_of(system, both), np.eye(2, 3))
+    context = started(system, both, np.eye(2, 3))
     with pytest.raises(openmm.OpenMMException, match="keep a reference"):
         both.step(1)
     del context

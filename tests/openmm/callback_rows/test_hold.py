@@ -5,20 +5,10 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from carried_systems import (
-    PEPTIDE,
-    begun,
-    context_of,
-    driven,
-    free,
-    off_target,
-    pull,
-    start,
-    started,
-    state_of,
-)
+from carried_systems import PEPTIDE, begun, driven, off_target, start
 from collective_cases import dihedral
 from openmm import app, unit
+from openmm_systems import context_of, field, particles, started, state_of
 
 from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, FixedAtoms, Plane, RadiusOfGyration, Sphere
 from kcons.errors import ContradictionError, InputError, UnsupportedError
@@ -39,21 +29,15 @@ def peptide(constraints=app.AllBonds):
 
 def waters(count, *forces):
     """Rigid waters in a box, and a dumbbell behind them."""
-    system = openmm.System()
-    system.setDefaultPeriodicBoxVectors([3, 0, 0], [0, 3, 0], [0, 0, 3])
     x = [r + np.array([0.35 * k, 0.1, 0.1]) for k in range(count) for r in TRIANGLE] + [[0.1, 0.7, 0], [0.25, 0.7, 0]]
-    for mass in [15.999, 1.008, 1.008] * count + [12.0, 12.0]:
-        system.addParticle(mass)
-    for k in range(count):
-        for (i, j), length in SIDES.items():
-            system.addConstraint(3 * k + i, 3 * k + j, length)
-    system.addConstraint(3 * count, 3 * count + 1, 0.15)
     nonbonded = openmm.NonbondedForce()
     nonbonded.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
     for _ in x:
         nonbonded.addParticle(0.0, 0.1, 0.0)
-    for force in (nonbonded, *forces):
-        system.addForce(force)
+    held = [(3 * k + i, 3 * k + j) for k in range(count) for i, j in SIDES]
+    masses = [15.999, 1.008, 1.008] * count + [12.0, 12.0]
+    system = particles(masses, nonbonded, *forces, held=[*held, (3 * count, 3 * count + 1)], x=x)
+    system.setDefaultPeriodicBoxVectors([3, 0, 0], [0, 3, 0], [0, 0, 3])
     return system, np.array(x)
 
 
@@ -77,7 +61,7 @@ def test_all_constraints_change_hands(constraints):
     for taken in (False, True):
         if taken:
             (rows,) = move_constraints(system)
-        state = started(context_of(system, openmm.VerletIntegrator(1e-3)), X).getState(energy=True, forces=True)
+        state = started(system, openmm.VerletIntegrator(1e-3), X).getState(energy=True, forces=True)
         kept.append((state.getPotentialEnergy(), state.getForces(asNumpy=True)._value.tolist(), molecules(system)))
     assert kept[0] == kept[1]
     assert system.getNumConstraints() == 0
@@ -175,7 +159,7 @@ def test_agents_that_break_rows_are_refused(rows, force, words):
     system, x = waters(2, force)
     part = hold(system, rows, x, take="all", keep_water=False)
     integrator = ProjectedIntegrator(0.001, parts=[part])
-    context = started(context_of(system, integrator), x)
+    context = started(system, integrator, x)
     with pytest.raises(UnsupportedError, match=words):
         integrator.step(1)
     np.testing.assert_array_equal(state_of(context)[0], x)
@@ -183,9 +167,8 @@ def test_agents_that_break_rows_are_refused(rows, force, words):
 
 @pytest.mark.usefixtures("without_device")
 def test_two_parts_that_share_particles_are_refused():
-    system, x = openmm.System(), np.array([[0, 0, 0], [0.15, 0, 0], [0.2, 0.14, 0], [0.35, 0.14, 0.05]])
-    for _ in x:
-        system.addParticle(12.0)
+    x = np.array([[0, 0, 0], [0.15, 0, 0], [0.2, 0.14, 0], [0.35, 0.14, 0.05]])
+    system = particles([12.0] * 4)
     parts = [hold(system, Distance([pair]), x) for pair in ([0, 1], [1, 2], [2, 3])]
     with pytest.raises(UnsupportedError, match="two parts hold particle 1; give all rows"):
         ProjectedIntegrator(0.001, parts=parts)
@@ -217,7 +200,7 @@ def test_both_torsions_of_the_backbone_far_away(kind, constraints):
         rows = hold(system, Dihedral(torsions, targets), X)
     else:
         rows = CollectiveRows(system, [Row(dihedral(*a), float(t)) for a, t in zip(torsions, targets, strict=True)])
-    context = started(context_of(system, integrator := ProjectedIntegrator(0.001, parts=[rows])), X)
+    context = started(system, integrator := ProjectedIntegrator(0.001, parts=[rows]), X)
     integrator.applyConstraints(context)
     y = state_of(context)[0]
     np.testing.assert_allclose(Dihedral(torsions).measure(y[torsions], 0.0), targets, rtol=0, atol=1e-11)
@@ -235,12 +218,11 @@ def test_both_torsions_of_the_backbone_far_away(kind, constraints):
 
 def test_particles_without_mass_take_no_degree_of_freedom():
     """Bonds to a particle that OpenMM does not move, and one that is held there as well: two degrees go, not eight."""
-    system = free([0.0, 12.0, 12.0, 0.0])
+    system = particles([0.0, 12.0, 12.0, 0.0])
     x = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0.5, 0.5, 0.5]])
     part = hold(system, [Distance([[0, 1], [1, 2], [2, 1]]), FixedAtoms([3])], x)  # a row twice
     integrator = ProjectedIntegrator(0.001, parts=[part])
-    context = context_of(system, integrator)
-    context.setPositions(x)
+    context = started(system, integrator, x)
     assert part.rank(context) == 2
     assert integrator.degrees_of_freedom(context) == 2 * 3 - 2
     context.setVelocities([[0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 0]])
@@ -268,7 +250,7 @@ def test_targets_move_with_the_time_after_a_new_step_size():
         return 0.3 + 0.05 * t
 
     x = np.array([[0.0, 0, 0], [0.3, 0, 0]])
-    system = free([12.0, 12.0])
+    system = particles([12.0, 12.0])
     integrator, context = begun(system, hold(system, Distance([[0, 1]], target), x), x)
     integrator.step(20)
     integrator.setStepSize(0.005)
@@ -287,7 +269,7 @@ def test_places_of_a_molecule_that_is_stored_in_several_images(platform, tie):
     whole = np.array([[0.98, 0.5, 0.5], [1.03, 0.5, 0.55], [1.06, 0.54, 0.5]])
     ends = []
     for images in (np.zeros((3, 3)), np.array([[0, 0, 0], [-1.0, 0, 0], [-1, 2, 0]])):
-        system = free([12.0, 1.0, 16.0], pull(20.0, 3))
+        system = particles([12.0, 1.0, 16.0], field("-20*z", 3))
         system.setDefaultPeriodicBoxVectors([1, 0, 0], [0, 1, 0], [0, 0, 1])
         places = whole + images + [[0, 0.1, 0], [0, -0.1, 0], [0, 0, 0]]
         rows = [Sphere([0, 1], places[:2]), CenterOfMass([[1, 2]], axes=(0,)), tie]
@@ -326,14 +308,12 @@ def test_velocities_are_those_of_the_core(every):
     """To the last digits, also where somebody looks at each step; carried with x they have three digits less."""
     masses, x, v = in_frame_of_its_center(10.0)
     rows = Distance([[k, k + 1] for k in range(len(masses) - 1)])
-    system = free(masses)
+    system = particles(masses)
     part = hold(system, rows, x)
     core = System(part.motion)
     state = core.initial_state(x, v, project=True)
     integrator = ProjectedIntegrator(0.01, parts=[part])
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    context.setVelocities(state.velocities)
+    context = started(system, integrator, x, state.velocities)
     for _ in range(500 // every):
         integrator.step(every)
         found = state_of(context)

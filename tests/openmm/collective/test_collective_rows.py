@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -23,7 +22,7 @@ from collective_cases import (
     spring_forces,
 )
 from openmm import unit
-from openmm_systems import GPUS, PLATFORMS, residuals, started, state_of
+from openmm_systems import GPUS, PLATFORMS, field, pairs_force, particles, residuals, started, state_of
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, RadiusOfGyration
@@ -94,11 +93,7 @@ def test_same_trajectory_and_multipliers_as_the_core(kind, scheme):
 @pytest.mark.parametrize("target", [math.pi, -math.pi, 3 * math.pi])
 def test_dihedral_held_across_its_jump(target):
     x = np.array([[0.0, 0.1, 0.0], [0.0, 0, 0], [0.15, 0, 0], [0.15, -0.1, 0.0]])
-    system = openmm.System()
-    for mass in (1.0, 12.0, 12.0, 1.0):
-        system.addParticle(mass)
-    for i, j in ((0, 1), (1, 2), (2, 3), (0, 2), (1, 3)):
-        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
+    system = particles([1.0, 12.0, 12.0, 1.0], held=((0, 1), (1, 2), (2, 3), (0, 2), (1, 3)), x=x)
     part = CollectiveRows(system, [Row(dihedral(0, 1, 2, 3), target)])
     assert part.periods == (2 * math.pi,)
     integrator = ProjectedIntegrator(0.001, parts=[part], tolerance=1e-13)
@@ -153,9 +148,6 @@ def test_velocities_that_are_no_numbers_are_refused():
 # -- how many rows, and which ---------------------------------------------------------------------------
 
 
-PAIRS = list(itertools.combinations(range(6), 2))
-
-
 def test_two_parts_of_rows_in_one_integrator():
     system = chain_system()
     system.addConstraint(0, 1, float(np.linalg.norm(CHAIN[0] - CHAIN[1])))
@@ -186,9 +178,7 @@ def _pressed(system):
 
 def _placed(system):
     system.addForce(openmm.CMMotionRemover())
-    force = openmm.CustomExternalForce("x")
-    force.addParticle(2)
-    return CollectiveRows(system, [force], positions=CHAIN)
+    return CollectiveRows(system, [field("x", [2])], positions=CHAIN)
 
 
 def _elsewhere(system):
@@ -233,30 +223,10 @@ def test_what_is_no_context_and_no_integrator():
         rows.set_target(integrator, 0, 0.3, rate=1.0)
 
 
-@pytest.mark.parametrize(
-    ("told", "error", "words"),
-    [
-        ({"singular1": 1.0}, SingularGeometryError, "row 0 .* vanishes"),
-        ({"residual1": math.nan}, NonFiniteError, "is not a number"),
-        ({"residual1": 0.0}, NonFiniteError, "velocities are not finite"),
-    ],
-)
-def test_why_a_step_failed(told, error, words):
-    _, integrator, part = held_chain([bond(0, 3)])
-    for name, value in told.items():
-        integrator.setGlobalVariableByName(name, value)
-    with pytest.raises(error, match=f"step 12: .*{words}"):
-        raise part.failure(integrator, 12)
-
-
 def test_rows_that_become_singular_within_a_step_are_named_by_the_program():
     # The gradient of (r - 0.3)^2 vanishes as r goes to 0.3.
-    system = openmm.System()
-    system.addParticle(1.0)
-    system.addParticle(1.0)
-    force = openmm.CustomBondForce("(r-0.3)^2")
-    force.addBond(0, 1)
-    part = CollectiveRows(system, [Row(force, 0.01, rate=-0.5)])
+    system = particles([1.0, 1.0])
+    part = CollectiveRows(system, [Row(bond(0, 1, "(r-0.3)^2"), 0.01, rate=-0.5)])
     integrator = ProjectedIntegrator(0.001, parts=[part])
     context = started(system, integrator, [[0, 0, 0], [0.4, 0, 0]], np.zeros((2, 3)))
     part.restore(context)
@@ -293,21 +263,15 @@ def test_gradients_and_rates():
 @pytest.mark.parametrize("platform", ["Reference", *(p for p in GPUS if "mixed" in str(p.id))])
 def test_an_angle_is_held_far_from_the_origin_of_a_wide_box(platform):
     """Forces in single precision see coordinates of 7 nm to 5e-7 nm, whatever the State has: there is a floor."""
-    system = openmm.System()
-    system.setDefaultPeriodicBoxVectors(*(8.0 * np.eye(3)))
-    bonds, nonbonded = openmm.HarmonicBondForce(), openmm.NonbondedForce()
+    bonds = pairs_force(openmm.HarmonicBondForce(), (1, 0, 0.1, 1e5), (1, 2, 0.1, 1e5))
+    nonbonded = openmm.NonbondedForce()
     nonbonded.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
     for _ in range(3):
-        system.addParticle(12.0)
         nonbonded.addParticle(0.0, 0.3, 0.0)
-    for j in (0, 2):
-        bonds.addBond(1, j, 0.1, 1e5)
-    system.addForce(bonds)
-    system.addForce(nonbonded)
-    angle = openmm.CustomAngleForce("theta")
-    angle.addAngle(0, 1, 2, [])
+    system = particles([12.0] * 3, bonds, nonbonded)
+    system.setDefaultPeriodicBoxVectors(*(8.0 * np.eye(3)))
     x = np.array([7.1, 7.2, 7.3]) + 0.1 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
-    part = CollectiveRows(system, [Row(angle, np.pi / 2)])
+    part = CollectiveRows(system, [Row(angle(0, 1, 2), np.pi / 2)])
     integrator = ProjectedIntegrator(0.001, parts=[part])
     context = started(system, integrator, x, platform=platform)
     part.restore(context)  # before the first step
@@ -375,19 +339,12 @@ def test_a_target_out_of_reach_is_infeasible():
     np.testing.assert_array_equal(state_of(context)[0], x)
 
 
-def _sine(*atoms):
-    force = openmm.CustomTorsionForce("sin(theta)")
-    force.addTorsion(*atoms)
-    return force
-
-
 def test_rows_of_any_function_are_left_to_newton():
     system, x, _ = peptide()
-    rows = CollectiveRows(system, [Row(_sine(4, 6, 8, 14), 0.4)])
+    rows = CollectiveRows(system, [Row(dihedral(4, 6, 8, 14, expression="sin(theta)"), 0.4)])
     context = started(system, ProjectedIntegrator(1e-3, parts=[rows]), x)
     rows.apply_positions(context)
     assert abs(rows.values(context)[0] - 0.4) < 1e-11
     with pytest.raises(ConvergenceError):
-        CollectiveRows(system, [Row(_sine(6, 8, 14, 16), 1.5)]).apply_positions(
-            started(system, openmm.VerletIntegrator(1e-3), x)
-        )
+        far = CollectiveRows(system, [Row(dihedral(6, 8, 14, 16, expression="sin(theta)"), 1.5)])
+        far.apply_positions(started(system, openmm.VerletIntegrator(1e-3), x))

@@ -7,38 +7,17 @@ import math
 import numpy as np
 import openmm
 import pytest
-from collective_cases import (
-    angle,
-    bond,
-    centers,
-    dihedral,
-    points,
-    with_variable,
-)
+from collective_cases import angle, bond, centers, dihedral, points, with_variable
 from openmm import unit
-from openmm_systems import loose_alanine, started
+from openmm_systems import field, loose_alanine, particles, started
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
-from kcons.openmm.collective.coordinates import (
-    as_constraint,
-    moved_atoms,
-    period_of,
-    unit_of,
-)
+from kcons.openmm.collective.coordinates import as_constraint, moved_atoms, period_of, unit_of
 
 X = np.array([[0.0, 0, 0], [0.14, 0.03, 0], [0.2, 0.15, 0.02], [0.1, 0.22, 0.1]])
-
-
-def particles(n=4, *forces):
-    system = openmm.System()
-    for _ in range(n):
-        system.addParticle(1.0)
-    for force in forces:
-        system.addForce(force)
-    return system
 
 
 def torsion(text="theta"):
@@ -51,7 +30,7 @@ def torsion(text="theta"):
 
 
 def test_rows_are_in_units_of_openmm():
-    system = particles(2)
+    system = particles([1.0] * 2)
     rows = CollectiveRows(system, [Row(bond(0, 1), 3 * unit.angstrom, rate=1 * unit.nanometer / unit.nanosecond)])
     integrator = ProjectedIntegrator(0.001, parts=[rows])
     settings = integrator.program.settings
@@ -66,10 +45,8 @@ def test_rows_are_in_units_of_openmm():
 def test_atoms_of_each_kind():
     centroid = centers([0, 1], [2, 3])
     centroid.addGroup([5])  # in no bond
-    place = openmm.CustomExternalForce("x+y")
-    place.addParticle(1)
-    place.addParticle(2)
-    of = lambda force: moved_atoms(particles(6), force)  # noqa: E731
+    place = field("x+y", [1, 2])
+    of = lambda force: moved_atoms(particles([1.0] * 6), force)  # noqa: E731
     assert of(bond(0, 1)) == {0, 1}
     assert of(torsion()) == of(points("angle(p1, p2, p3)*z4", (0, 1, 2, 3))) == of(centroid) == {0, 1, 2, 3}
     assert of(place) == {1, 2}
@@ -151,7 +128,7 @@ def test_free_groups_are_taken_around_those_in_use():
     second.setReciprocalSpaceForceGroup(3)
     for _ in range(4):
         second.addParticle(0, 1, 0)
-    system = particles(4, first, second)
+    system = particles([1.0] * 4, first, second)
     assert CollectiveRows(system, [bond(1, 2), bond(2, 3)], positions=X).groups == {2, 4}
     assert system.getNumForces() == 4
 
@@ -159,7 +136,7 @@ def test_free_groups_are_taken_around_those_in_use():
 def test_a_force_of_the_system_keeps_a_group_of_its_own():
     alone, shared, other = bond(0, 1), bond(1, 2), bond(2, 3)
     alone.setForceGroup(5)
-    system = particles(4, alone, shared, other)
+    system = particles([1.0] * 4, alone, shared, other)
     assert CollectiveRows(system, [alone, shared], positions=X)._groups == (5, 1)
     assert other.getForceGroup() == 0
     assert system.getNumForces() == 3
@@ -171,7 +148,7 @@ _KEPT = []
 
 
 def _owned():
-    _KEPT.append(particles(4, force := bond(0, 1)))
+    _KEPT.append(particles([1.0] * 4, force := bond(0, 1)))
     return force
 
 
@@ -203,17 +180,17 @@ def _owned():
     ],
 )
 def test_rows_that_make_no_sense_are_refused(rows, options, match):
-    system = particles(5, bond(0, 1))
+    system = particles([1.0] * 5, bond(0, 1))
     system.getForce(0).setForceGroup(3)
     system.addConstraint(0, 1, 0.14)
-    assert CollectiveRows(particles(2), Row(bond(0, 1), 0.1), meets_system=True).meets_system
+    assert CollectiveRows(particles([1.0] * 2), Row(bond(0, 1), 0.1), meets_system=True).meets_system
     with pytest.raises(InputError, match=match):
         CollectiveRows(system, rows(system), **{"positions": np.vstack([X, [1.0, 1, 1]])} | options)
     assert system.getNumForces() == 1
 
 
 def test_too_many_rows_and_virtual_sites_are_refused_before_the_system_changes():
-    system = particles(64, openmm.HarmonicBondForce())
+    system = particles([1.0] * 64, openmm.HarmonicBondForce())
     with pytest.raises(UnsupportedError, match="31 are free"):
         CollectiveRows(system, [Row(bond(2 * k, 2 * k + 1), 0.1) for k in range(32)])
     system.setParticleMass(4, 0.0)

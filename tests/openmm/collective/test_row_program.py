@@ -9,18 +9,10 @@ import math
 import numpy as np
 import openmm
 import pytest
-from collective_cases import (
-    CHAIN,
-    FORCES,
-    angle,
-    bond,
-    dihedral,
-    dipeptide,
-    energy_of,
-    held_chain,
-)
+from collective_cases import CHAIN, angle, bond, dihedral, dipeptide, energy_of, held_chain
+from ensemble_runs import run
 from openmm import app, unit
-from openmm_systems import loose_alanine, started, state_of
+from openmm_systems import loose_alanine, pairs_force, particles, started, state_of
 
 from kcons.constraints import Dihedral
 from kcons.errors import ConstraintError, ConvergenceError
@@ -106,8 +98,7 @@ def test_the_second_half_of_a_drift_begins_in_the_middle(ensemble):
         system, x, v = loose_alanine()  # whose bonds of hydrogen the System holds
         part = hold(system, Dihedral([phi]), x) if carried else CollectiveRows(system, [dihedral(*phi)], positions=x)
         integrator = ProjectedIntegrator(0.001, parts=[part], ensemble=ensemble)
-        context = started(system, integrator, x, v)
-        integrator.step(40)
+        context = run(system, integrator, x, v, 40)
         ends.append(np.hstack(state_of(context)))
         assert carried or part.meets_system
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-7)
@@ -115,12 +106,7 @@ def test_the_second_half_of_a_drift_begins_in_the_middle(ensemble):
 
 def molecule():
     """A System of three particles, and a Force that is the distance of two of them."""
-    system, springs = openmm.System(), openmm.HarmonicBondForce()
-    for mass in (12.0, 16.0, 14.0):
-        system.addParticle(mass)
-    springs.addBond(1, 2, 0.15, 1e4)
-    system.addForce(springs)
-    return system, bond(0, 1)
+    return particles([12.0, 16.0, 14.0], pairs_force(openmm.HarmonicBondForce(), (1, 2, 0.15, 1e4))), bond(0, 1)
 
 
 def test_a_state_of_another_program_has_no_time_of_targets():
@@ -147,19 +133,6 @@ def test_a_state_of_another_program_has_no_time_of_targets():
 
 
 # -- what programs do where nobody looks ----------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("kind", "constrained"), [("rmsd", False), ("three", True)])
-def test_steps_where_nobody_looks_lead_where_others_do(kind, constrained):
-    """Calls of many steps, and calls of one."""
-    ends = []
-    for block in (60, 1):
-        context, integrator, part = held_chain(FORCES[kind](), constrained=constrained)
-        for _ in range(60 // block):
-            integrator.step(block)
-        assert np.abs(part.residuals(context)).max() <= 1e-12
-        ends.append(state_of(context))
-    assert np.abs(np.array(ends[1]) - ends[0]).max() <= 1e-11
 
 
 ASKED = []
@@ -202,10 +175,7 @@ def test_the_iteration_learns_from_each_push(count):
 
 
 def test_products_are_summed_only_where_rows_meet():
-    system = openmm.System()
-    for _ in range(8):
-        system.addParticle(1.0)
-    part = CollectiveRows(system, [Row(bond(2 * k, 2 * k + 1), 0.1) for k in range(4)])
+    part = CollectiveRows(particles([1.0] * 8), [Row(bond(2 * k, 2 * k + 1), 0.1) for k in range(4)])
     integrator = ProjectedIntegrator(0.002, parts=[part])
     sums = [integrator.getComputationStep(k)[2] for k in range(integrator.getNumComputations())]
     assert sum(text.startswith("m*row1_") for text in sums) == 3 * 4  # where a call begins, in it, where it ends
@@ -215,11 +185,8 @@ def test_products_are_summed_only_where_rows_meet():
 def test_copies_of_an_integrator_have_its_clock(steps):
     """Also after a single step."""
     x = np.array([[0, 0, 0], [0.3, 0, 0]])
-    system, force = openmm.System(), openmm.CustomBondForce("r")
-    for _ in x:
-        system.addParticle(12.0)
-    force.addBond(0, 1)
-    part = CollectiveRows(system, [Row(force, 0.3, rate=1.0)])
+    system = particles([12.0, 12.0])
+    part = CollectiveRows(system, [Row(bond(0, 1), 0.3, rate=1.0)])
     integrator = ProjectedIntegrator(1e-3, parts=[part])
     context = started(system, integrator, x)
     part.restore(context)

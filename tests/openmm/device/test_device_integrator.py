@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import openmm
 import pytest
-from device_systems import waters
-from openmm_systems import GPUS, LONG, dumbbell, masses_of, residuals, started, state_of
+from device_systems import dumbbells, waters
+from openmm_systems import GPUS, LONG, dumbbell, field, masses_of, particles, residuals, started, state_of
 
 from kcons.constraints import Distance, Plane
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
@@ -97,18 +97,8 @@ def test_trajectories_are_those_of_the_custom_integrator(name, platform):
 @pytest.mark.parametrize("platform", PLAIN)
 def test_langevin_has_the_temperature_of_its_bath(platform):
     """Also in a strong field at high friction, from a start that is in equilibrium."""
-    system = openmm.System()
-    n = 300
-    field = openmm.CustomExternalForce("2000*(x*x+y*y+z*z)")
-    rng = np.random.default_rng(0)
-    x = np.zeros((2 * n, 3))
-    for k in range(n):
-        for mass in (12.0, 1.0):
-            field.addParticle(system.addParticle(mass))
-        system.addConstraint(2 * k, 2 * k + 1, 0.1)
-        u = rng.normal(size=3)
-        x[2 * k + 1] = 0.1 * u / np.linalg.norm(u)
-    system.addForce(field)
+    n, strength = 300, "2000*(x*x+y*y+z*z)"
+    system, x = dumbbells(n, (12.0, 1.0), field(strength, 2 * n))
     integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300.0, 100.0), device=True)
     integrator.setRandomNumberSeed(5)
     context = started(system, integrator, x, platform=platform)
@@ -141,18 +131,15 @@ def test_noise_belongs_to_particle_and_step():
 @pytest.mark.parametrize("platform", [pytest.param(*p.values, id=p.id, marks=[*p.marks, LONG]) for p in GPUS])
 def test_atoms_in_other_places_stay_on_their_rows(platform):
     """Mixed fluid, so that OpenMM sorts its atoms anew every 250 evaluations; pairs that cross the box."""
-    system, rng = openmm.System(), np.random.default_rng(2)
-    system.setDefaultPeriodicBoxVectors(*(2.0 * np.eye(3)))
+    rng = np.random.default_rng(2)
     force = openmm.NonbondedForce()
     force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
     force.setCutoffDistance(0.9)
     x = 0.4 * np.array(list(np.ndindex(5, 5, 4)), dtype=float)
     for _ in x:
-        system.addParticle(40.0)
         force.addParticle(0.0, 0.2, 0.5)
-    for k in range(0, 100, 2):
-        system.addConstraint(k, k + 1, 0.4)
-    system.addForce(force)
+    system = particles([40.0] * 100, force, held=[(k, k + 1, 0.4) for k in range(0, 100, 2)])
+    system.setDefaultPeriodicBoxVectors(*(2.0 * np.eye(3)))
     integrator = ProjectedIntegrator(0.004, ensemble=Langevin(300.0, 1.0), device=True)
     integrator.setRandomNumberSeed(1)
     context = started(system, integrator, x, 0.8 * rng.normal(size=x.shape), platform)
@@ -212,10 +199,7 @@ def test_checkpoints_and_states_continue_bit_for_bit(ensemble, platform):
 
 def test_states_of_other_rows_are_refused():
     def made(pairs, ensemble=None):
-        system, field = openmm.System(), openmm.CustomExternalForce("10*x^2+20*y^2+30*z^2")
-        for _ in range(6):
-            field.addParticle(system.addParticle(12.0))
-        system.addForce(field)
+        system = particles([12.0] * 6, field("10*x^2+20*y^2+30*z^2", 6))
         x = np.arange(18).reshape(6, 3) ** 1.1 * 0.03
         integrator = ProjectedIntegrator(0.001, parts=[Distance(pairs)], ensemble=ensemble, device=True)
         context = started(system, integrator, x, 0.01 * np.sin(x))

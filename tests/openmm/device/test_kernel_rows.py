@@ -7,11 +7,12 @@ import numpy as np
 import openmm as mm
 import pytest
 from openmm import app, unit
-from openmm_systems import GPUS, started
+from openmm_systems import GPUS, masses_of, particles, rows_of, started
+from openmm_systems import field as on_each
 
 from kcons import ConstraintSet, Motion, State, System
-from kcons.constraints import Angle, Custom, Dihedral, Distance, Formula, LinearRelation, Plane, Sphere
-from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.constraints import Angle, Dihedral, Distance, Formula, LinearRelation, Plane, Sphere
+from kcons.errors import ConvergenceError
 from kcons.openmm import Langevin, ProjectedIntegrator, hold
 from kcons.openmm.device import build
 from kcons.steppers import Rattle
@@ -30,23 +31,17 @@ def field(n, rng, strength=20.0):
     return force
 
 
-def waters(n=9, held=True):
-    rng, system = np.random.default_rng(0), mm.System()
-    base = np.array([[0, 0, 0], [0.09572, 0, 0], [-0.0239987, 0.0926627, 0]])
-    x = []
-    for k in range(n):
-        for mass in (15.9994, 1.008, 1.008):
-            system.addParticle(mass)
-        x.append(base @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + 0.6 * np.array([k % 3, k // 3 % 3, k // 9]))
-        for i, j in ((0, 1), (0, 2), (1, 2)) if held else ():
-            system.addConstraint(3 * k + i, 3 * k + j, np.linalg.norm(base[i] - base[j]))
-    system.addForce(field(3 * n, rng))
-    return system, np.concatenate(x)
+def waters(n=9):
+    rng, base = np.random.default_rng(0), np.array([[0, 0, 0], [0.09572, 0, 0], [-0.0239987, 0.0926627, 0]])
+    turned = [base @ np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(n)]
+    x = np.concatenate([water + 0.6 * np.array([k % 3, k // 3 % 3, k // 9]) for k, water in enumerate(turned)])
+    held = [(3 * k + i, 3 * k + j) for k in range(n) for i, j in ((0, 1), (0, 2), (1, 2))]
+    return particles([15.9994, 1.008, 1.008] * n, field(3 * n, rng), held=held, x=x), x
 
 
 def start(system, x, seed=1):
     rng = np.random.default_rng(seed)
-    masses = np.array([system.getParticleMass(k)._value for k in range(len(x))])
+    masses = masses_of(system)
     return 0.4 * rng.normal(size=x.shape) * np.sqrt(2.494 / np.where(masses > 0, masses, np.inf))[:, None]
 
 
@@ -153,18 +148,10 @@ def protein(constraints):
 def test_a_protein_goes_the_way_of_the_engine_on_arrays():
     """582 atoms in the field of one force; all bonds are one cluster of 589 rows in 12 levels."""
     whole, x = protein(app.AllBonds)
-    system = mm.System()
-    masses = np.array([whole.getParticleMass(k)._value for k in range(len(x))])
-    for mass in masses:
-        system.addParticle(mass)
-    rows = [whole.getConstraintParameters(k) for k in range(whole.getNumConstraints())]
-    for i, j, length in rows:
-        system.addConstraint(i, j, length)
-    force = mm.CustomExternalForce("20*sin(3*x)+20*cos(4*y+z)")
-    for k in range(len(x)):
-        force.addParticle(k)
-    system.addForce(force)
-    bonds = Distance([[i, j] for i, j, _ in rows], [length._value for *_, length in rows])
+    masses, (pairs, lengths) = masses_of(whole), rows_of(whole)
+    rows = [(*pair, length) for pair, length in zip(pairs.tolist(), lengths.tolist(), strict=True)]
+    system = particles(masses, on_each("20*sin(3*x)+20*cos(4*y+z)", len(x)), held=rows)
+    bonds = Distance(pairs, lengths)
     held = ConstraintSet(bonds, x, masses)
     motion = Motion(held, x)
     x = motion.restore_positions(x, bonds=[])
@@ -192,9 +179,7 @@ def test_targets_move_with_time_and_with_a_parameter():
     system, x = waters(2)
     pull = Distance([[0, 3]], lambda t: 0.6 + 0.05 * t)
     level = Plane(1, [0, 0, 1.0], lambda t: contexts[0].getParameter("level") if contexts else x[1, 2])
-    force = mm.CustomExternalForce("0*level*x")
-    force.addGlobalParameter("level", x[1, 2])
-    system.addForce(force)
+    system.addForce(on_each("0*level*x", 0, level=x[1, 2]))
     contexts = []
     integrator = ProjectedIntegrator(0.002, parts=[pull, level], device=True)
     context = started(system, integrator, x, platform="CPU")
@@ -213,21 +198,18 @@ def test_rows_across_faces_and_places_in_a_box_that_openmm_sorts(platform):
     """Molecules scattered over many boxes are moved back and sorted by OpenMM; rows mean what State gives."""
     rng = np.random.default_rng(5)
     n, edge = 400, 3.0
-    system = mm.System()
-    system.setDefaultPeriodicBoxVectors(*(edge * np.eye(3)))
     force = mm.NonbondedForce()
     force.setNonbondedMethod(mm.NonbondedForce.CutoffPeriodic)
     force.setCutoffDistance(1.0)
     grid = np.array([[i, j, k] for i in range(8) for j in range(8) for k in range(8)])[: n // 2] * edge / 8
     x = np.zeros((n, 3))
     for k in range(n):
-        system.addParticle(39.9)
         force.addParticle(0, 0.2, 0.5)
         x[k] = grid[k // 2] + (k % 2) * np.array([0.15, 0, 0])
     for k in range(0, n, 2):
         force.addException(k, k + 1, 0, 1, 0)
-        system.addConstraint(k, k + 1, 0.15)
-    system.addForce(force)
+    system = particles([39.9] * n, force, held=[(k, k + 1, 0.15) for k in range(0, n, 2)])
+    system.setDefaultPeriodicBoxVectors(*(edge * np.eye(3)))
     x = x + np.repeat(rng.integers(-3, 4, size=(n // 2, 3)), 2, axis=0) * edge
     rng.shuffle(pairs := np.arange(n // 2))
     x = x.reshape(-1, 2, 3)[pairs].reshape(n, 3)  # 90 % of them are not where they would be in space
@@ -249,9 +231,7 @@ def test_rows_across_faces_and_places_in_a_box_that_openmm_sorts(platform):
 
 def test_linear_rows_of_a_straight_molecule_are_found():
     """CO2 held by three distances is converted as the engine converts it."""
-    system = mm.System()
-    for mass in (16.0, 12.0, 16.0):
-        system.addParticle(mass)
+    system = particles([16.0, 12.0, 16.0])
     rows = Distance([[0, 1], [1, 2], [0, 2]], [0.116, 0.116, 0.232])
     system.addForce(field(3, np.random.default_rng(2), 20.0))
     x = np.array([[0, 0, 0], [0.116, 0, 0], [0.232, 0, 0.0]])
@@ -267,14 +247,11 @@ def test_linear_rows_of_a_straight_molecule_are_found():
 @pytest.mark.parametrize("platform", ["Reference", *MIXED])
 def test_multipliers_are_summed_where_the_rows_are(platform):
     """A pair that is pulled apart by 100 kJ/mol/nm at each end, and a bath that adds nothing on average."""
-    system = mm.System()
-    for _ in range(2):
-        system.addParticle(12.0)
-    force = mm.CustomExternalForce("-c*x")
-    force.addPerParticleParameter("c")
-    force.addParticle(0, [-100.0])
-    force.addParticle(1, [100.0])
-    system.addForce(force)
+    apart = mm.CustomExternalForce("-c*x")
+    apart.addPerParticleParameter("c")
+    for k in range(2):
+        apart.addParticle(k, [200.0 * k - 100.0])
+    system = particles([12.0] * 2, apart)
     x = np.array([[0, 0, 0], [0.15, 0, 0]])
     _, context = run(system, x, 0 * x, platform, 50, Distance([[0, 1]]))
     integrator = context.getIntegrator()
@@ -293,10 +270,7 @@ def test_multipliers_are_summed_where_the_rows_are(platform):
 
 def test_noise_is_in_no_multiplier():
     """A free pair in a bath: the mean of lambda is minus the centrifugal force, 2 kT/3r of two directions by r."""
-    system = mm.System()
-    for _ in range(2):
-        system.addParticle(12.0)
-    x = np.array([[0, 0, 0], [0.15, 0, 0]])
+    system, x = particles([12.0] * 2), np.array([[0, 0, 0], [0.15, 0, 0]])
     integrator = ProjectedIntegrator(0.002, parts=Distance([[0, 1]]), device=True, ensemble=Langevin(300, 5.0))
     integrator.setRandomNumberSeed(3)
     context = started(system, integrator, x)
@@ -314,13 +288,7 @@ def test_noise_is_in_no_multiplier():
 def test_a_row_without_a_solution_is_told_and_the_state_put_back(platform, large):
     """A particle that is kicked far away within one step."""
     n = 12 if large else 3
-    system = mm.System()
-    for _ in range(n):
-        system.addParticle(12.0)
-    force = mm.CustomExternalForce("select(step(x-0.01), -k*z, 0)")
-    force.addPerParticleParameter("k")
-    force.addParticle(1, [1e9])
-    system.addForce(force)
+    system = particles([12.0] * n, on_each("select(step(x-0.01), -1e9*z, 0)", [1]))
     x = 0.1 * np.stack([np.arange(n) * 1.2, np.arange(n) % 2 * 0.9, np.zeros(n)], axis=1)
     x -= x[1]
     v = np.zeros_like(x)
@@ -340,15 +308,3 @@ def test_a_row_without_a_solution_is_told_and_the_state_put_back(platform, large
     assert context.getStepCount() == told.value.step - 1
     assert np.abs(rows.with_target(None).measure(after[rows.atoms], 0.0) - 0.15).max() < 1e-5
     assert np.abs(after - before).max() < 0.01 * (told.value.step - 3)
-
-
-def test_what_the_device_does_not_hold():
-    system, x = waters(2)
-    item = Custom([0, 3], lambda r: float(np.linalg.norm(r[0] - r[1])))
-    with pytest.raises(UnsupportedError, match="Formula"):
-        ProjectedIntegrator(0.002, parts=[item], device=True)
-    integrator = ProjectedIntegrator(0.002, parts=[Distance([[0, 3]], 0.9)], device=True)
-    context = started(system, integrator, x)
-    assert not integrator.bound or context.getStepCount() == 0
-    with pytest.raises(InputError, match="off row"):
-        integrator.step(1)

@@ -3,8 +3,8 @@
 import numpy as np
 import openmm
 import pytest
-from device_systems import waters
-from openmm_systems import masses_of, started, state_of
+from device_systems import dumbbells, waters
+from openmm_systems import context_of, field, forces_at, masses_of, rows_of, started, state_of
 
 from kcons import ConstraintSet, Motion, System, run
 from kcons.constraints import Distance
@@ -33,22 +33,16 @@ def system_of(groups=False):
     v = np.vstack([v, [[0.2, -0.3, 0.1], [0.4, 0.1, -0.2], [-0.3, 0.1, 0.3]]])
     texts = ["400*(x*x+1.2*y*y+0.8*z*z)", "60*sin(20*x)*cos(17*y+11*z)"]
     for group, text in enumerate(texts if groups else ["+".join(texts)]):
-        field = openmm.CustomExternalForce(text)
-        for k in range(n):
-            field.addParticle(k)
-        field.setForceGroup(group)
-        system.addForce(field)
-    rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-    held = Distance([(i, j) for i, j, _ in rows], [d._value for *_, d in rows])
-    return system, x, v, Motion(ConstraintSet(held, x, masses_of(system)), x)
+        system.addForce(field(text, n, group=group))
+    return system, x, v, Motion(ConstraintSet(Distance(*rows_of(system)), x, masses_of(system)), x)
 
 
-def forces(system, groups):
-    context = started(system, openmm.VerletIntegrator(0.001), np.zeros((system.getNumParticles(), 3)))
+def forces(system):
+    context = context_of(system, openmm.VerletIntegrator(0.001))
 
     def force(x, t):
         context.setPositions(x.reshape(-1, 3))
-        return np.array(context.getState(forces=True, groups=groups).getForces(asNumpy=True)._value)
+        return forces_at(context)
 
     return force
 
@@ -95,7 +89,7 @@ def test_trajectories_are_those_on_arrays(kind, auxiliary):
     x1, v1 = state_of(context)
     integrator.step(20)
     bath = OnArrays(GAS_CONSTANT * 300.0, NO_BATH, 1, **made)
-    whole = System(motion, forces(system, -1))
+    whole = System(motion, forces(system))
     start = run(whole, whole.initial_state(x1, v1), 1e-12, 1, stepper=bath)
     layout = bath.layout(whole, x1)
     known = start.thermostat.copy()
@@ -130,29 +124,11 @@ def test_forces_of_groups_without_a_number_of_steps_are_refused():
         context.getIntegrator().step(1)
 
 
-@pytest.mark.parametrize("steps", [{40: 1, 0: 2}, {"a": 1, 0: 2}, 3])
-def test_steps_of_what_is_no_force_group_are_refused(steps):
-    with pytest.raises(InputError, match=r"no number from 0 to 31|must name each force group"):
-        IsokineticSpheres(300.0, 1.0, steps)
-
-
 def test_configurations_are_canonical_at_long_steps():
     """Of dumbbells in a harmonic field, with fast and slow forces apart and a bath."""
     n, stiffness = 200, 800.0
-    system, x = openmm.System(), np.zeros((2 * n, 3))
-    rng = np.random.default_rng(1)
-    fields = [openmm.CustomExternalForce(f"{share * stiffness}*(x*x+y*y+z*z)") for share in (0.2, 0.8)]
-    for k in range(n):
-        for j in range(2):
-            system.addParticle(12.0)
-            for group, field in enumerate(fields):
-                field.addParticle(2 * k + j)
-                field.setForceGroup(group)
-        system.addConstraint(2 * k, 2 * k + 1, 0.1)
-        u = rng.normal(size=3)
-        x[2 * k + 1] = 0.1 * u / np.linalg.norm(u)
-    for field in fields:
-        system.addForce(field)
+    fields = [field(f"{share * stiffness}*(x*x+y*y+z*z)", 2 * n, group=k) for k, share in enumerate((0.2, 0.8))]
+    system, x = dumbbells(n, (12.0, 12.0), *fields)
     for kind, auxiliary in (("split", 1), ("axes", 4), ("cluster", 2)):
         bath = IsokineticSpheres(300.0, 10.0, {0: 1, 1: 2}, spheres=kind, auxiliary=auxiliary)
         integrator = ProjectedIntegrator(0.006, ensemble=bath, device=True)

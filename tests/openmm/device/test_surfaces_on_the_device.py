@@ -61,9 +61,10 @@ def test_the_device_refuses_particles_that_are_not_there():
 
 
 @pytest.mark.parametrize("place", [0.0, 1e3])
-def test_a_particle_at_the_center_is_refused_and_one_far_from_the_origin_is_held(place):
+@pytest.mark.parametrize("device", [False, True])
+def test_a_particle_at_the_center_is_refused_and_one_far_from_the_origin_is_held(place, device):
     system, center = system_of([1.0], "0", 0), np.array([[place, -place, place]])
-    integrator = SurfaceIntegrator(0.001, surfaces=Sphere([0], center, 0.5), system=system, device=True)
+    integrator = SurfaceIntegrator(0.001, surfaces=Sphere([0], center, 0.5), system=system, device=device)
     context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
     context.setPositions(center)
     with pytest.raises(SingularGeometryError, match="center of the sphere"):

@@ -6,19 +6,12 @@ import warnings
 import numpy as np
 import openmm
 import pytest
+from collective_cases import bond
 from ensemble_runs import run, tied
-from openmm_systems import dumbbell, masses_of, started
+from openmm_systems import dumbbell, field, masses_of, particles, started
 
 from kcons.constraints import Cylinder, Ellipsoid, Formula, Sphere
-from kcons.openmm import (
-    CollectiveRows,
-    Isokinetic,
-    NoseHoover,
-    NoseHooverMiddle,
-    ProjectedIntegrator,
-    Row,
-    hold,
-)
+from kcons.openmm import CollectiveRows, Isokinetic, NoseHoover, NoseHooverMiddle, ProjectedIntegrator, Row, hold
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 
@@ -28,8 +21,7 @@ def test_momenta_that_are_conserved_are_found():
     ensemble = Isokinetic(300.0)
     context = run(system, integrator := ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
     assert ensemble.count(integrator) == 5  # the field stands in space
-    field = system.getForce(0)
-    field.setEnergyFunction("k*x^2+c*0")
+    system.getForce(0).setEnergyFunction("k*x^2+c*0")
     with pytest.warns(UserWarning, match="total momentum is not zero"):
         context = run(system, integrator := ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
     assert ensemble.count(integrator) == 3  # along y and z nothing acts
@@ -58,16 +50,12 @@ def carried(*rows):
 
 def from_a_fixed_place(system, x):
     """A collective row: the distance of particle 0 from (0.1, 0.2, 0)."""
-    force = openmm.CustomExternalForce("sqrt((x-0.1)^2+(y-0.2)^2+z^2)")
-    force.addParticle(0, [])
-    return [CollectiveRows(system, [Row(force)], positions=x)]
+    return [CollectiveRows(system, [Row(field("sqrt((x-0.1)^2+(y-0.2)^2+z^2)", 1))], positions=x)]
 
 
 def between_two(system, x):
     """A collective row: a distance."""
-    force = openmm.CustomBondForce("r")
-    force.addBond(0, 1)
-    return [CollectiveRows(system, [Row(force)], positions=x)]
+    return [CollectiveRows(system, [Row(bond(0, 1))], positions=x)]
 
 
 SPHERE = Sphere(FOUR, [0, 0, 0], 0.6)
@@ -78,7 +66,7 @@ LOPSIDED = "30*(x-0.1)^2+40*y^2+20*(z+0.3)^2+9*x*y*z"
 
 
 @pytest.mark.parametrize(
-    ("parts", "field", "warned"),
+    ("parts", "text", "warned"),
     [
         (carried(SPHERE), "", True),
         (carried(SPHERE), "20*z^2", True),
@@ -98,14 +86,11 @@ LOPSIDED = "30*(x-0.1)^2+40*y^2+20*(z+0.3)^2+9*x*y*z"
         (lambda system, x: [], LOPSIDED, False),
     ],
 )
-def test_angular_momentum_about_the_axes_of_what_is_held_is_said(parts, field, warned):
+def test_angular_momentum_about_the_axes_of_what_is_held_is_said(parts, text, warned):
     """Pairs that repel exert no torque, and rows none about some axis; a field across it does."""
     system, x = tied([20.0] * 4, CALM, PLACES)
-    if field:
-        force = openmm.CustomExternalForce(field)
-        for k in FOUR:
-            force.addParticle(k, [])
-        system.addForce(force)
+    if text:
+        system.addForce(field(text, 4))
     assert said(system, x, NoseHoover(300.0, 5.0), parts(system, x)) == warned
 
 
@@ -175,11 +160,7 @@ def test_a_motion_remover_leaves_turns_about_the_center_of_mass():
     system.addForce(openmm.CMMotionRemover())
     bath = Isokinetic(300.0)
     assert said(system, x, bath)
-    trap = openmm.CustomExternalForce("20*((x-0.1)^2+y^2)+k*z^2")
-    trap.addGlobalParameter("k", 20.0)
-    for k in FOUR:
-        trap.addParticle(k, [])
-    system.addForce(trap)
+    system.addForce(trap := field("20*((x-0.1)^2+y^2)+k*z^2", 4, k=20.0))
     assert said(system, x, bath)
     trap.setGlobalParameterDefaultValue(0, 9.0)
     assert not said(system, x, bath)
@@ -204,21 +185,14 @@ def test_a_box_is_not_turned(monkeypatch):
     assert not said(system, x, Isokinetic(300.0))
     held = copy.deepcopy(system)
     assert not said(held, x, Isokinetic(300.0), [hold(held, SPHERE, x)])
-    field = openmm.CustomExternalForce("x^2")
-    field.addParticle(0, [])
-    system.addForce(field)
+    system.addForce(field("x^2", 1))
     system.addForce(openmm.CMMotionRemover())
     assert not said(system, x, Isokinetic(300.0))
 
 
 def test_forces_that_do_not_act_take_no_momentum():
     """Of the groups that `setIntegrationForceGroups` leaves out."""
-    system = openmm.System()
-    idle = openmm.CustomExternalForce("100*(x-0.1)^2")
-    idle.setForceGroup(3)
-    for _ in range(4):
-        idle.addParticle(system.addParticle(12.0), [])
-    system.addForce(idle)
+    system = particles([12.0] * 4, field("100*(x-0.1)^2", 4, group=3))
     integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(300))
     integrator.setIntegrationForceGroups({0})
     v = np.random.default_rng(1).normal(size=(4, 3))

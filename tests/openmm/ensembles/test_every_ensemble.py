@@ -11,7 +11,7 @@ import openmm
 import pytest
 from ensemble_runs import on_their_rows, run, twice_kinetic, two_parts, warm
 from openmm_ensembles import ENSEMBLES
-from openmm_systems import context_of, loose_alanine, started, state_of, water_box
+from openmm_systems import field, loose_alanine, started, state_of, water_box
 
 from kcons.errors import InputError
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, hold
@@ -26,14 +26,10 @@ WITHOUT_NOISE = [name for name, make in ENSEMBLES.items() if not make(300).noisy
 def test_a_run_has_the_temperature(bath):
     """From 200 K to 300 K, within three standard errors: rigid waters in a weak well, none of whose momenta last."""
     system, x = water_box(8)
-    well = openmm.CustomExternalForce("20*(x^2+y^2+1.5*z^2)")
-    for k in range(0, 24, 3):
-        well.addParticle(k)
-    system.addForce(well)
+    system.addForce(field("20*(x^2+y^2+1.5*z^2)", range(0, 24, 3)))
     integrator = ProjectedIntegrator(2e-3, ensemble=ENSEMBLES[bath](300.0, 50.0))
     integrator.setRandomNumberSeed(3)
-    context = context_of(system, integrator)
-    context.setPositions(x)
+    context = started(system, integrator, x)
     integrator.setVelocitiesToTemperature(context, 200, 1)
     integrator.step(1000)
     values = []

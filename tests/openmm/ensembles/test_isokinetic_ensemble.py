@@ -3,21 +3,8 @@
 import numpy as np
 import openmm
 import pytest
-from ensemble_runs import (
-    in_calls_of_any_length,
-    run,
-    twice_kinetic,
-    warm,
-)
-from openmm_systems import (
-    alanine,
-    dumbbell,
-    masses_of,
-    on_gpus,
-    started,
-    state_of,
-    water_box,
-)
+from ensemble_runs import in_calls_of_any_length, run, twice_kinetic, warm
+from openmm_systems import alanine, dumbbell, field, masses_of, on_gpus, particles, started, state_of, water_box
 
 from kcons import ConstraintSet, Motion, State
 from kcons import System as CoreSystem
@@ -88,14 +75,8 @@ def test_rigid_bodies_take_two_sums_and_make_the_same_motion():
 def test_strong_kicks_keep_the_kinetic_energy():
     """c h of 2 to 10^6 in one kick, without overflow; velocities end along the force."""
     for strength in (1.0, 1e3, 1e6, 1e12):
-        system = openmm.System()
-        field = openmm.CustomExternalForce("-a*x")
-        field.addGlobalParameter("a", 16.0 * strength)
-        for _ in range(2):
-            field.addParticle(system.addParticle(16.0), [])
-        system.addForce(field)
-        ensemble = Isokinetic()
-        integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+        system = particles([16.0, 16.0], field("-a*x", 2, a=16.0 * strength))
+        integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic())
         v = np.array([[0.0, 0.3, 0.4], [-0.1, 0.2, 0.5]])
         context = run(system, integrator, np.zeros((2, 3)), v, 1)
         u = state_of(context)[1]
@@ -106,11 +87,7 @@ def test_strong_kicks_keep_the_kinetic_energy():
 
 @pytest.mark.filterwarnings("ignore:total momentum")
 def test_velocities_straight_against_a_strong_force():
-    system = openmm.System()
-    field = openmm.CustomExternalForce("-a*x")
-    field.addGlobalParameter("a", 1e9)
-    field.addParticle(system.addParticle(16.0), [])
-    system.addForce(field)
+    system = particles([16.0], field("-a*x", 1, a=1e9))
     integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(), check_every=1)
     context = started(system, integrator, np.zeros((1, 3)), np.array([[-1.0, 0, 0]]))
     with pytest.raises(ConvergenceError, match="turned"):
@@ -125,8 +102,7 @@ def test_of_velocities_set_between_calls_only_the_direction_counts(platform):
 
     def end(factor, start=x):
         integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0))
-        context = started(system, integrator, x, v, platform)
-        integrator.step(1)
+        context = run(system, integrator, x, v, 1, platform)
         context.setPositions(start)
         context.setVelocities(factor * v)
         integrator.step(20)
@@ -165,8 +141,7 @@ def unlike(dt):
     ends = []
     for exact in (1.0, 0.0):
         integrator = ProjectedIntegrator(dt, tolerance=1e-13, ensemble=Isokinetic(300.0))
-        context = started(system, integrator, x, v)
-        integrator.step(1)
+        context = run(system, integrator, x, v, 1)
         integrator.program.set("exact", exact)
         integrator.step(round(0.1 / dt) - 1)
         off = abs(integrator.getGlobalVariableByName("ww") / integrator.getGlobalVariableByName("two_k") - 1)
@@ -189,17 +164,13 @@ def test_two_sums_do_where_velocities_are_not_read():
 @pytest.mark.parametrize("platform", on_gpus("single"))
 def test_weak_forces_are_not_lost_in_single_precision(platform, ensemble):
     """Heavy particles far from the origin: a kick is less than the rounding of x in a step."""
-    system, pull = openmm.System(), openmm.CustomExternalForce("-30*x")
-    for _ in range(20):
-        pull.addParticle(system.addParticle(1000.0), [])
-    system.addForce(pull)
+    system = particles([1000.0] * 20, field("-30*x", 20))
     rng = np.random.default_rng(0)
     x, v = 4.5 + 2.5 * rng.random((20, 3)), 0.05 * rng.normal(size=(20, 3))
     ends = []
     for place in ("Reference", platform):
         integrator = ProjectedIntegrator(2e-3, ensemble=ensemble)
-        context = started(system, integrator, x, v, place)
-        integrator.step(1000)
+        context = run(system, integrator, x, v, 1000, place)
         ends.append(state_of(context)[1])
     assert ends[0][:, 0].mean() > v[:, 0].mean() + 0.02
     assert np.abs(ends[1] - ends[0]).max() < 1e-4

@@ -11,7 +11,19 @@ import openmm
 import pytest
 from ensemble_runs import twice_kinetic
 from openmm import app, unit
-from openmm_systems import GPUS, alanine, context_of, loose_alanine, potential_energy, state_of, water_box
+from openmm_systems import (
+    GPUS,
+    alanine,
+    context_of,
+    field,
+    loose_alanine,
+    masses_of,
+    particles,
+    potential_energy,
+    started,
+    state_of,
+    water_box,
+)
 
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, hold
@@ -26,8 +38,7 @@ reversing = HamiltonianMonteCarlo.reversing_integrator
 def relaxed(n):
     system, x = water_box(n)
     integrator = ProjectedIntegrator(0.001)
-    context = context_of(system, integrator)
-    context.setPositions(x)
+    context = started(system, integrator, x)
     integrator.minimizeEnergy(context, maxIterations=5)
     return state_of(context)[0]
 
@@ -35,8 +46,7 @@ def relaxed(n):
 def waters(dt=0.004, scheme="rattle", kind=reversing, platform="Reference", n=8, steps=(2, 5), **options):
     system, _ = water_box(n)
     integrator = kind(dt * unit.picosecond, scheme)
-    context = context_of(system, integrator, platform)
-    context.setPositions(relaxed(n))
+    context = started(system, integrator, relaxed(n), platform=platform)
     return system, HamiltonianMonteCarlo(context, 300, steps, 3, **{"keep": 0.4} | options)
 
 
@@ -46,7 +56,7 @@ def test_every_decision_follows_from_the_energies(scheme, dt):
     system, sampler = waters(dt, scheme)
     plain = ProjectedIntegrator(dt, scheme)
     other = context_of(system, plain)
-    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])[:, None]
+    masses = masses_of(system)[:, None]
     kt, outcomes = GAS_CONSTANT * 300, set()
     for number in range(1, 21):
         x, v = state_of(sampler.context)
@@ -136,19 +146,10 @@ def test_reporters_of_a_simulation_see_every_proposal():
 
 def trimer(steps=(3, 8), dt=0.15, spring=0.0, **options):
     """Masses 10, 1, 10, two bonds held, each in a well if there is a spring; kT = 1."""
-    system = openmm.System()
-    for mass in (10.0, 1.0, 10.0):
-        system.addParticle(mass)
-    system.addConstraint(0, 1, 1.0)
-    system.addConstraint(1, 2, 1.0)
-    if spring:
-        force = openmm.CustomExternalForce(f"{spring}*(x^2+2*y^2+3*z^2)/2")
-        for k in range(3):
-            force.addParticle(k)
-        system.addForce(force)
+    well = [field(f"{spring}*(x^2+2*y^2+3*z^2)/2", 3)] if spring else []
+    system = particles([10.0, 1.0, 10.0], *well, held=[(0, 1, 1.0), (1, 2, 1.0)])
     integrator = HamiltonianMonteCarlo.reversing_integrator(dt * unit.picosecond)
-    context = context_of(system, integrator)
-    context.setPositions(np.array([[1.0, 0, 0], [0, 0, 0], [0, 1.0, 0]]))
+    context = started(system, integrator, np.array([[1.0, 0, 0], [0, 0, 0], [0, 1.0, 0]]))
     return HamiltonianMonteCarlo(context, 1 / GAS_CONSTANT, steps, 21, **options)
 
 
@@ -168,8 +169,7 @@ def test_a_free_angle_has_the_average_of_its_metric():
 def test_other_constraints_are_held_and_taken_back():
     system, x, _ = loose_alanine()
     integrator = ProjectedIntegrator(2e-3, parts=[hold(system, [], positions=x, take="all")])
-    context = context_of(system, integrator)
-    context.setPositions(x)
+    context = started(system, integrator, x)
     sampler = HamiltonianMonteCarlo(context, 300, 3, 5)
     sampler.step(3)
     assert sampler.counts.proposals == 3 and sampler.counts.accepted > 0
@@ -196,8 +196,7 @@ def test_bad_input_changes_nothing():
         with_others = openmm.XmlSerializer.clone(system)
         for force in others:
             with_others.addForce(force)
-        context = context_of(with_others, integrator)
-        context.setPositions(x)
+        context = started(with_others, integrator, x)
         return HamiltonianMonteCarlo(context, **{"temperature": 300.0, "steps": 3, "rng": 1} | options)
 
     for options, words in (
@@ -223,12 +222,9 @@ def test_bad_input_changes_nothing():
 
 def test_an_energy_that_is_not_finite_is_an_error():
     sampler = trimer()
-    force = openmm.CustomExternalForce("log(x-10)")
-    force.addParticle(0)
     system = openmm.XmlSerializer.clone(sampler.context.getSystem())
-    system.addForce(force)
-    context = context_of(system, HamiltonianMonteCarlo.reversing_integrator(0.01))
-    context.setPositions(state_of(sampler.context)[0])
+    system.addForce(field("log(x-10)", 1))
+    context = started(system, HamiltonianMonteCarlo.reversing_integrator(0.01), state_of(sampler.context)[0])
     with pytest.raises(NonFiniteError, match="potential energy is nan"):
         HamiltonianMonteCarlo(context, 300, 2, 1).step(1)
 
@@ -256,14 +252,9 @@ def missed(integrator):
 
 def test_what_is_taken_back_is_so_by_the_step_from_its_end():
     """Also where a kick pushes so far across a constraint that the solver, from there, finds the other end of it."""
-    system, length, h = openmm.System(), 0.1, 0.1
-    for mass in (1e9, 1.0):
-        system.addParticle(mass)
-    system.addConstraint(0, 1, length)
-    push = openmm.CustomExternalForce("f*x")
-    push.addGlobalParameter("f", 2.6 * length / h**2)  # 1.3 lengths in a step
-    push.addParticle(1)
-    system.addForce(push)
+    length, h = 0.1, 0.1
+    push = field("f*x", [1], f=2.6 * length / h**2)  # 1.3 lengths in a step
+    system = particles([1e9, 1.0], push, held=[(0, 1, length)])
     integrator = reversing(h * unit.picosecond)
     context = context_of(system, integrator)
     begun = np.array([[0.0, 0, 0], [0, length, 0]])

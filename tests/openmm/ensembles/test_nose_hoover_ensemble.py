@@ -5,31 +5,15 @@ import copy
 import numpy as np
 import openmm
 import pytest
-from ensemble_runs import (
-    in_calls_of_any_length,
-    run,
-)
+from ensemble_runs import in_calls_of_any_length, run
 from openmm import unit
-from openmm_systems import (
-    alanine,
-    dumbbell,
-    loose_alanine,
-    masses_of,
-    started,
-    state_of,
-)
+from openmm_systems import alanine, dumbbell, field, loose_alanine, masses_of, particles, started, state_of
 
 from kcons import ConstraintSet, Motion, State
 from kcons import System as CoreSystem
 from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
-from kcons.openmm import (
-    NoseHoover,
-    NoseHooverMiddle,
-    ProjectedIntegrator,
-    hold,
-    positions_of,
-)
+from kcons.openmm import NoseHoover, NoseHooverMiddle, ProjectedIntegrator, hold, positions_of
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import NoseHooverChain
 
@@ -156,10 +140,7 @@ def test_a_step_that_fails_leaves_the_chain_where_it_was():
 def test_a_nan_leaves_the_chain_of_the_last_check():
     system, x, v = alanine()
     mine = copy.deepcopy(system)
-    bomb = openmm.CustomExternalForce("select(step(x-edge), sqrt(edge-x), 0)")
-    bomb.addGlobalParameter("edge", 1e6)
-    bomb.addParticle(0, [])
-    mine.addForce(bomb)
+    mine.addForce(field("select(step(x-edge), sqrt(edge-x), 0)", 1, edge=1e6))
     integrator = ProjectedIntegrator(1e-3, check_every=10, ensemble=NoseHoover(300.0, 20.0))
     context = run(mine, integrator, x, v, 10)
     before, good = integrator.program.remembered(), state_of(context)
@@ -172,13 +153,6 @@ def test_a_nan_leaves_the_chain_of_the_last_check():
     context.setParameter("edge", 1e6)
     integrator.step(5)
     assert np.isfinite(state_of(context)[1]).all()
-
-
-# -- degrees of freedom ----------------------------------------------------------------------------------
-
-
-#: Five atoms, ten distances of rank nine.
-BODY = 0.063 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 
 
 # -- settings --------------------------------------------------------------------------------------------
@@ -196,13 +170,7 @@ def test_what_cannot_be_thermostatted_is_refused():
     system, x, v = dumbbell()
     with pytest.raises(InputError, match="take a frequency of at most 100/ps"):
         run(system, ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 5000.0)), x, v, 1)
-    system.addParticle(14.0)
-    x, v = np.vstack([x, x[:1] + 0.2]), np.vstack([v, v[:1]])
-    part = hold(system, [Distance([[0, 2]], lambda t: np.sqrt(0.12) + 0.5 * t)], positions=x)
-    with pytest.raises(UnsupportedError, match="needs constant targets"):
-        run(system, ProjectedIntegrator(1e-3, parts=[part], ensemble=NoseHoover(300.0, 20.0)), x, v, 1)
-    one = openmm.System()
-    one.addParticle(1.0)
+    one = particles([1.0])
     with pytest.raises(OverdeterminedError, match="no degree of freedom"):
         run(one, ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 20.0)), np.zeros((1, 3)), np.ones((1, 3)), 1)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import openmm
 import pytest
+from collective_cases import bond
 from openmm import unit
-from openmm_systems import PLATFORMS, masses_of, on_gpus, started, state_of
+from openmm_systems import PLATFORMS, field, masses_of, on_gpus, particles, started, state_of
 
 from kcons.constraints import Distance
 from kcons.openmm import (
@@ -31,16 +31,10 @@ TWO = {0: 1, 1: 4}
 
 
 def oscillators(n=200, spring=SPRING):
-    system = openmm.System()
-    for group, share in ((1, 1.0), (0, 0.01)):
-        force = openmm.CustomExternalForce(f"0.5*{share * spring}*(x^2+y^2+z^2)")
-        force.setForceGroup(group)
-        system.addForce(force)
-    for _ in range(n):
-        k = system.addParticle(12.0)
-        for force in system.getForces():
-            force.addParticle(k)
-    return system, np.random.default_rng(1).normal(0, np.sqrt(GAS_CONSTANT * 300 / SPRING), (n, 3))
+    shares = ((1, 1.0), (0, 0.01))
+    forces = [field(f"0.5*{share * spring}*(x^2+y^2+z^2)", n, group=group) for group, share in shares]
+    x = np.random.default_rng(1).normal(0, np.sqrt(GAS_CONSTANT * 300 / SPRING), (n, 3))
+    return particles([12.0] * n, *forces), x
 
 
 def beside(system, x):
@@ -50,10 +44,8 @@ def beside(system, x):
 
 
 def collective(system, x):
-    force = openmm.CustomBondForce("r")
     a, b, x = beside(system, x)
-    force.addBond(a, b)
-    return x, [CollectiveRows(system, [Row(force, 1.0)], positions=x)]
+    return x, [CollectiveRows(system, [Row(bond(a, b), 1.0)], positions=x)]
 
 
 def carried(system, x):

@@ -7,25 +7,13 @@ import logging
 import numpy as np
 import openmm
 import pytest
+from collective_cases import bond
+from ensemble_runs import run
 from openmm_systems import started, state_of, water_box
-from tied_cluster import (
-    X,
-    bond,
-    carried_at,
-    cluster,
-    row_at,
-    thermostatted,
-)
+from tied_cluster import X, carried_at, cluster, row_at, thermostatted
 
-from kcons.constraints import Distance
 from kcons.errors import CertificateError, InputError, KconsError
-from kcons.openmm import (
-    CollectiveRows,
-    Langevin,
-    ProjectedIntegrator,
-    Row,
-    hold,
-)
+from kcons.openmm import CollectiveRows, Langevin, ProjectedIntegrator, Row, hold
 
 parts = pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective", "carried"])
 
@@ -36,8 +24,7 @@ parts = pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective",
 @pytest.mark.parametrize("preserved", [True, False])
 def test_rows_after_reinitialize(preserved):
     system, integrator = cluster(), ProjectedIntegrator(0.002)
-    context = started(system, integrator, X, 0 * X)
-    integrator.step(3)
+    context = run(system, integrator, X, 0 * X, 3)
     free = integrator.degrees_of_freedom()
     x, v = state_of(context)
     system.addConstraint(0, 1, 1.01 * float(np.linalg.norm(x[0] - x[1])))
@@ -60,8 +47,7 @@ def test_masses_and_lengths_after_reinitialize():
     system, integrator = cluster(), ProjectedIntegrator(0.002)
     length = float(np.linalg.norm(X[0] - X[1]))
     system.addConstraint(0, 1, length)
-    context = started(system, integrator, X, np.sin(np.arange(X.size)).reshape(X.shape))
-    integrator.step(3)
+    context = run(system, integrator, X, np.sin(np.arange(X.size)).reshape(X.shape), 3)
     system.setParticleMass(2, 50.0)
     system.setConstraintParameters(0, 0, 1, 1.002 * length)
     context.reinitialize(preserveState=True)
@@ -157,18 +143,10 @@ def test_a_start_that_is_a_little_off_is_put_right(kind, caplog):
 # -- parts that were forgotten ------------------------------------------------------------------------------
 
 
-def _held(how):
-    system = cluster()
-    if how == "hold":
-        hold(system, [Distance([[0, 7]])], X)
-    else:
-        CollectiveRows(system, [bond()], positions=X)
-    return system
-
-
-@pytest.mark.parametrize("how", ["hold", "collective"])
-def test_forgotten_parts_are_refused(how):
-    context = started(_held(how), integrator := ProjectedIntegrator(1e-3), X)
+@parts
+def test_forgotten_parts_are_refused(make):
+    made = make()  # which has the System
+    context = started(made.context.getSystem(), integrator := ProjectedIntegrator(1e-3), X)
     with pytest.raises(InputError, match=r"parts=\[rows\]"):
         integrator.step(1)
     del context
@@ -234,7 +212,7 @@ def test_velocities_along_constraints_of_the_system_are_certified():
 def test_moving_row_goes_on_through_a_state():
     def make():
         system = cluster()
-        rows = CollectiveRows(system, [Row(bond(), 0.30, rate=1.0)], positions=X)
+        rows = CollectiveRows(system, [Row(bond(0, 7), 0.30, rate=1.0)], positions=X)
         integrator = ProjectedIntegrator(0.002, parts=[rows])
         context = started(system, integrator, X, 0 * X)
         rows.restore(context)

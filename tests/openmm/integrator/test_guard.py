@@ -7,30 +7,27 @@ import copy
 import numpy as np
 import openmm
 import pytest
+from collective_cases import bond, dihedral, points, with_variable
+from ensemble_runs import run
 from openmm import unit
 from openmm_systems import (
     PLATFORMS,
     alanine,
     dumbbell,
+    field,
     hexagon,
     holding,
     loose_alanine,
+    pairs_force,
+    particles,
     residuals,
     started,
     state_of,
 )
 
-from kcons.constraints import Dihedral, Plane, Sphere
+from kcons.constraints import Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
-from kcons.openmm import (
-    CollectiveRows,
-    Isokinetic,
-    Langevin,
-    NoseHoover,
-    ProjectedIntegrator,
-    Row,
-    hold,
-)
+from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row, hold
 from kcons.openmm.integrator import guard
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
@@ -78,8 +75,7 @@ def test_compound_integrator():
     """OpenMM runs the bare program; checks and steps of its own are to be had once it knows the Context."""
     system, x, v = alanine()
     alone = ProjectedIntegrator(1e-3)
-    lonely = started(system, alone, x, v)
-    alone.step(10)
+    lonely = run(system, alone, x, v, 10)
     compound, ours, other = openmm.CompoundIntegrator(), ProjectedIntegrator(1e-3), openmm.VerletIntegrator(1e-3)
     compound.addIntegrator(ours)
     compound.addIntegrator(other)
@@ -115,40 +111,29 @@ def test_a_member_of_a_compound_integrator_stops_where_a_part_fails():
 # -- the start --------------------------------------------------------------------------------------
 
 
-def test_start_off_the_constraints_is_refused():
+@pytest.mark.parametrize(
+    ("stretch", "speed", "error", "words"),
+    [
+        (0.03, 1.0, InputError, r"constraint \d+ of the System .* at the start; minimize"),
+        (None, 1.0, InputError, "at the start; set positions first"),
+        (0.0, np.nan, NonFiniteError, "velocity of particle 0"),
+    ],
+    ids=["off the constraints", "without positions", "not finite"],
+)
+def test_starts_that_are_refused(stretch, speed, error, words):
     system, x, v = alanine()
-    x = x.copy()
-    x[4] += 0.03
-    integrator = ProjectedIntegrator(1e-3)
-    context = started(system, integrator, x, v)
-    with pytest.raises(InputError, match=r"constraint \d+ of the System .* at the start; minimize") as caught:
+    x[4] += stretch or 0.0
+    x = 0 * x if stretch is None else x
+    context = started(system, integrator := ProjectedIntegrator(1e-3), x, speed * v)
+    with pytest.raises(error, match=words) as caught:
         integrator.step(5)
-    assert 4 in caught.value.atoms
-    np.testing.assert_array_equal(state_of(context), [x, v])
-    integrator.applyConstraints(context)
-    integrator.step(5)
-    assert residuals(system, context)[0] < 1e-9
-
-
-def test_a_context_without_positions_is_refused():
-    system, integrator = alanine()[0], ProjectedIntegrator(1e-3)
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    with pytest.raises(InputError, match="at the start; set positions first"):
-        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context), [x, speed * v])
     assert context.getStepCount() == 0
-
-
-def test_small_misses_at_the_start_are_tidied_up():
-    system, x, v = alanine()
-    rng = np.random.default_rng(0)
-    integrator = ProjectedIntegrator(1e-3, tolerance=1e-12)
-    context = started(system, integrator, x + 1e-7 * rng.normal(size=x.shape), v + 0.3 * rng.normal(size=x.shape))
-    reference = started(system, other := ProjectedIntegrator(1e-3, tolerance=1e-12), *state_of(context))
-    other.applyConstraints(reference)
-    other.applyVelocityConstraints(reference)
-    integrator.step(1)
-    other.step(1)
-    np.testing.assert_array_equal(state_of(context), state_of(reference))
+    if stretch:
+        assert 4 in caught.value.atoms
+        integrator.applyConstraints(context)
+        integrator.step(5)
+        assert residuals(system, context)[0] < 1e-9
 
 
 def unconstrained_alanine():
@@ -159,38 +144,21 @@ def unconstrained_alanine():
     return system, x + 0.0, v
 
 
-def distance_row():
-    system, x, v = unconstrained_alanine()
-    force = openmm.CustomBondForce("r")
-    force.addBond(4, 14)
-    return system, x, v, CollectiveRows(system, [Row(force, float(np.linalg.norm(x[4] - x[14])))])
+#: Rows of each kind, on their targets at x.
+NEARLY = {
+    "distance": lambda system, x: CollectiveRows(system, [Row(bond(4, 14))], positions=x),
+    "dihedral": lambda system, x: CollectiveRows(system, [Row(dihedral(4, 6, 8, 14))], positions=x),
+    "sphere": lambda system, x: hold(system, Sphere([3], center=(0.0, 0.0, 0.0)), x),
+    "plane": lambda system, x: hold(system, Plane([3], normal=(0.0, 0.0, 1.0)), x),
+}
 
 
-def dihedral_row():
-    system, x, v = unconstrained_alanine()
-    force = openmm.CustomTorsionForce("theta")
-    force.addTorsion(4, 6, 8, 14)
-    angle = Dihedral([4, 6, 8, 14]).measure(x[[4, 6, 8, 14]][None], 0.0)[0]
-    return system, x, v, CollectiveRows(system, [Row(force, float(angle), period=2 * np.pi)])
-
-
-def on_a_sphere():
-    system, x, v = unconstrained_alanine()
-    sphere = Sphere([3], center=(0.0, 0.0, 0.0), radius=float(np.linalg.norm(x[3])))
-    return system, x, v, hold(system, sphere, x)
-
-
-def on_a_plane():
-    system, x, v = unconstrained_alanine()
-    plane = Plane([3], normal=(0.0, 0.0, 1.0), offset=float(x[3, 2]))
-    return system, x, v, hold(system, plane, x)
-
-
-@pytest.mark.parametrize("make", [distance_row, dihedral_row, on_a_sphere, on_a_plane])
+@pytest.mark.parametrize("kind", NEARLY)
 @pytest.mark.parametrize(("off", "near"), [(0.006, True), (0.2, False)])
-def test_rows_that_are_near_are_put_right_in_the_first_step(make, off, near, caplog):
+def test_rows_that_are_near_are_put_right_in_the_first_step(kind, off, near, caplog):
     """As constraints of the System are: with a note in the log; farther ones are refused and nothing moves."""
-    system, x, v, part = make()
+    system, x, v = unconstrained_alanine()
+    part = NEARLY[kind](system, x)
     x[[3, 4]] += off * np.array([0.3, 0.5, 0.8])
     integrator = ProjectedIntegrator(1e-3, parts=[part])
     context = started(system, integrator, x, v)
@@ -210,10 +178,8 @@ def test_rows_that_are_near_are_put_right_in_the_first_step(make, off, near, cap
 def test_rows_that_constraints_of_the_system_pull_off_are_put_right_too():
     """A row that shares particles with them, on its target at the start, as coordinates of a file are."""
     system, x, _ = alanine()
-    row = openmm.CustomBondForce("r")
-    row.addBond(0, 10)
     x = x + np.random.default_rng(1).normal(0, 1e-6, x.shape)
-    rows = CollectiveRows(system, [row], positions=x, meets_system=True)
+    rows = CollectiveRows(system, [bond(0, 10)], positions=x, meets_system=True)
     context = started(system, integrator := ProjectedIntegrator(1e-3, parts=[rows]), x)
     integrator.step(2)
     assert abs(rows.residuals(context)[0]) < 1e-10
@@ -229,15 +195,6 @@ def test_a_row_that_is_far_off_keeps_the_others_where_they_are(together):
     with pytest.raises(InputError, match="apply_positions"):
         integrator.step(1)
     np.testing.assert_array_equal(state_of(context), [x, v])
-
-
-def test_nan_at_the_start():
-    system, x, v = dumbbell()
-    integrator = ProjectedIntegrator(1e-3)
-    context = started(system, integrator, x, v * np.nan)
-    with pytest.raises(NonFiniteError, match="velocity of particle 0"):
-        integrator.step(1)
-    del context
 
 
 # -- checks during a run ----------------------------------------------------------------------------
@@ -263,8 +220,7 @@ def test_solvers_that_do_not_converge_are_found(rows, error, platform):
         assert caught.value.residual > 2e-10
         assert caught.value.step == context.getStepCount() + 5
         shorter = ProjectedIntegrator(2e-3)
-        other = started(system, shorter, x, v, platform)
-        shorter.step(context.getStepCount())
+        other = run(system, shorter, x, v, context.getStepCount(), platform)
         np.testing.assert_array_equal(state_of(context), state_of(other))
 
 
@@ -277,8 +233,7 @@ def test_checks_that_would_take_too_long_come_later(monkeypatch, given, number):
     monkeypatch.setattr(guard.Guard, "check", lambda self: checks.append(1) or check(self))
     system, x, v = dumbbell()
     integrator = ProjectedIntegrator(1e-4, **given)
-    context = started(system, integrator, x, v)
-    integrator.step(100 * 104)
+    context = run(system, integrator, x, v, 100 * 104)
     # Of the first it is not known how long it takes; after it, a hundred are put off each time.
     assert len(checks) == number
     assert context.getStepCount() == 10400
@@ -288,8 +243,7 @@ def test_clock_follows_the_step_size():
     """OpenMM's own clock goes on with the first step size on Reference and CPU."""
     system, x, v = dumbbell()
     integrator = ProjectedIntegrator(1e-3)
-    context = started(system, integrator, x, v)
-    integrator.step(3)
+    context = run(system, integrator, x, v, 3)
     integrator.setStepSize(5e-4)
     integrator.step(4)
     assert context.getTime() / PS == pytest.approx(0.005, rel=1e-12)
@@ -320,17 +274,11 @@ def the_same_in_any_calls(system, x, v, steps, parts=(), bath=None):
 
 
 def external(n):
-    pull = openmm.CustomExternalForce("50*((x-1)^2+y^2+z^2)")
-    for k in range(n):
-        pull.addParticle(k, [])
-    return pull
+    return field("50*((x-1)^2+y^2+z^2)", n)
 
 
 def collective(n):
-    inner, pull = openmm.CustomCompoundBondForce(1, "500*x1^2"), openmm.CustomCVForce("20*pull")
-    inner.addBond([0], [])
-    pull.addCollectiveVariable("pull", inner)
-    return pull
+    return with_variable("20*pull", pull=points("500*x1^2", [0]))
 
 
 @pytest.mark.parametrize(
@@ -355,13 +303,9 @@ def test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_pl
 @pytest.mark.parametrize("kind", [*BATHS, "constant energy"])
 def test_a_motion_remover_meets_complete_velocities_beside_particles_without_mass(kind):
     """They take up momentum that forces between particles give: half a kick has some for the others."""
-    system, pairs, rng = openmm.System(), openmm.CustomBondForce("200*(r-0.3)^2"), np.random.default_rng(1)
-    for k, mass in enumerate([0.0, 0.0, 20.0, 25.0, 30.0]):
-        system.addParticle(mass)
-        for j in range(k):
-            pairs.addBond(j, k)
-    system.addForce(pairs)
-    system.addForce(openmm.CMMotionRemover())
+    rng, pairs = np.random.default_rng(1), [(j, k) for k in range(5) for j in range(k)]
+    springs = pairs_force(openmm.CustomBondForce("200*(r-0.3)^2"), *pairs)
+    system = particles([0.0, 0.0, 20.0, 25.0, 30.0], springs, openmm.CMMotionRemover())
     x = np.array([[0, 0, 0], [0.4, 0, 0], [0.1, 0.3, 0], [0.2, 0.1, 0.3], [0.3, 0.3, 0.3]])
     v = np.vstack([np.zeros((2, 3)), rng.normal(size=(3, 3))])
     the_same_in_any_calls(system, x, v, 40, bath=BATHS.get(kind))

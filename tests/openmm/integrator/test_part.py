@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import started, state_of
+from collective_cases import bond
+from openmm_systems import pairs_force, particles, started, state_of
 
 from kcons.constraints import Distance
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
@@ -13,17 +14,11 @@ from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrat
 
 def held(kind):
     """Three particles in a chain, a distance of the first two held."""
-    system, springs = openmm.System(), openmm.HarmonicBondForce()
-    for mass in (12.0, 16.0, 14.0):
-        system.addParticle(mass)
-    springs.addBond(1, 2, 0.15, 1e4)
-    springs.addBond(0, 2, 0.2, 1e2)
-    system.addForce(springs)
+    springs = pairs_force(openmm.HarmonicBondForce(), (1, 2, 0.15, 1e4), (0, 2, 0.2, 1e2))
+    system = particles([12.0, 16.0, 14.0], springs)
     x = np.array([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.15, 0.15, 0.0]])
     if kind == "collective":
-        bond = openmm.CustomBondForce("r")
-        bond.addBond(0, 1)
-        return system, CollectiveRows(system, [Row(bond, 0.15)]), x
+        return system, CollectiveRows(system, [Row(bond(0, 1), 0.15)]), x
     target = (lambda t: 0.15 + 0.03 * t) if kind == "moving" else 0.15
     return system, hold(system, Distance([[0, 1]], target), x), x
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import openmm
 import pytest
+from collective_cases import bond, dihedral
+from ensemble_runs import run
 from openmm_systems import (
     GPUS,
     LONG,
@@ -22,14 +22,7 @@ from openmm_systems import (
 
 from kcons.constraints import Angle, Dihedral, Distance
 from kcons.errors import UnsupportedError
-from kcons.openmm import (
-    CollectiveRows,
-    Isokinetic,
-    Langevin,
-    ProjectedIntegrator,
-    Row,
-    hold,
-)
+from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
 from kcons.openmm.integrator.part import Precision
 
 mixed = pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
@@ -56,33 +49,20 @@ def free_alanine():
     return system, x, v
 
 
-def hydrogens():
-    return copy.deepcopy(alanine("HBonds"))
-
-
-def bonds():
-    return copy.deepcopy(alanine())
-
-
 def water():
     system, x = water_box(27)
     rng = np.random.default_rng(3)
     return system, x, rng.normal(size=x.shape) * 0.3
 
 
-SYSTEMS = {"water": water, "hydrogens": hydrogens, "bonds": bonds}
-
-
-def on_pocl(platform):
-    """Whether the OpenCL is that of a processor; OpenMM itself warns of it."""
-    context = context_of(water()[0], openmm.VerletIntegrator(STEP), platform)
-    place = context.getPlatform()
-    return place.getName() == "OpenCL" and "Portable" in place.getPropertyValue(context, "OpenCLPlatformName")
+SYSTEMS = {"water": water, "hydrogens": lambda: alanine("HBonds"), "bonds": alanine}
 
 
 def ccma_ends_early(platform):
-    """Whether OpenMM's own solver for coupled bonds does not do there what it should."""
-    return "single" in platform and on_pocl(platform)
+    """Whether OpenMM's own solver for coupled bonds does not do what it should, as in OpenCL on a processor."""
+    context = context_of(water()[0], openmm.VerletIntegrator(STEP), platform)
+    place = context.getPlatform()
+    return platform == "OpenCL single" and "Portable" in place.getPropertyValue(context, "OpenCLPlatformName")
 
 
 def held_by_openmm(make, platform):
@@ -135,12 +115,11 @@ USUAL = (
 )
 def test_no_integrator_is_off_by_more_than_twice_what_openmm_is(make, kind, platform):
     """With tolerances left open, and all checks passed."""
-    if make is bonds and ccma_ends_early(platform):
+    if make is alanine and ccma_ends_early(platform):
         pytest.skip("OpenMM's CCMA ends early on pocl: VerletIntegrator is off by up to 1e-3 at a tolerance of 1e-5")
     system, x, v = make()
     integrator = kind(check_every=5)
-    context = started(system, integrator, x, v, platform)
-    integrator.step(20)
+    context = run(system, integrator, x, v, 20, platform)
     integrator.check()
     tolerance = Precision(*platform.split()).tolerance
     assert residuals(system, context)[0] <= 2 * held_by_openmm(make, platform) + 2 * tolerance
@@ -149,11 +128,10 @@ def test_no_integrator_is_off_by_more_than_twice_what_openmm_is(make, kind, plat
 
 @pytest.mark.parametrize("platform", on_gpus("mixed"))
 def test_the_listing_says_what_is_held(platform):
-    system, x, v = bonds()
+    system, x, v = alanine()
     integrator = ProjectedIntegrator(STEP)
     assert "1e-10 (relative), or what the precision of the Context allows" in integrator.listing().splitlines()[0]
-    context = started(system, integrator, x, v, platform)
-    integrator.step(1)
+    context = run(system, integrator, x, v, 1, platform)
     precision = Precision(*platform.split())
     assert integrator.listing().splitlines()[0].endswith(f"{precision.tolerance:g} (relative), {precision}")
     del context
@@ -165,8 +143,7 @@ def test_molecules_that_cross_a_face_of_the_box_are_no_failure(platform):
     system, x, v = water()
     v = v + np.array([40.0, 0.0, 0.0])  # all of them cross within the run
     integrator = ProjectedIntegrator(STEP, check_every=7)
-    context = started(system, integrator, x, v, platform)
-    integrator.step(200)
+    context = run(system, integrator, x, v, 200, platform)
     assert residuals(system, context)[0] < 2e-5
 
 
@@ -174,10 +151,7 @@ def test_molecules_that_cross_a_face_of_the_box_are_no_failure(platform):
 
 
 def rows_of_two_kinds(system, x):
-    length, angle = openmm.CustomBondForce("r"), openmm.CustomTorsionForce("theta")
-    length.addBond(4, 14)
-    angle.addTorsion(4, 6, 8, 14)
-    return [CollectiveRows(system, [Row(length), Row(angle)], positions=x)]
+    return [CollectiveRows(system, [Row(bond(4, 14)), Row(dihedral(4, 6, 8, 14))], positions=x)]
 
 
 @pytest.mark.parametrize(
@@ -192,8 +166,7 @@ def test_parts_run_in_any_precision(scheme, platform):
     system, x, v = free_alanine()
     parts = rows_of_two_kinds(system, x)
     integrator = ProjectedIntegrator(STEP, scheme, parts=parts, check_every=10)
-    context = started(system, integrator, x, v, platform)
-    integrator.step(30)
+    context = run(system, integrator, x, v, 30, platform)
     precision = Precision(*platform.split())
     for part in parts:
         assert np.abs(part.residuals(context)).max() < (1e-11 if precision.name == "double" else 2e-6)
@@ -279,17 +252,14 @@ def test_some_particles_or_all_are_the_same_motion(monkeypatch):
 def beside_water(kind):
     """Three atoms in the box of rigid water, two of them held; a triangle of the water itself."""
     system, x, v = water()
-    field = system.getForce(0)
     for _ in range(3):
-        field.addParticle(0.0, 0.1, 0.0)
+        system.getForce(0).addParticle(0.0, 0.1, 0.0)
         system.addParticle(12.0)
     x = np.vstack([x, [[0.4, 0.4, 0.4], [0.5, 0.45, 0.4], [0.6, 0.4, 0.4]]])
     v = np.vstack([v, np.random.default_rng(4).normal(size=(3, 3))])
     if kind == "carried":
         return system, x, v, hold(system, [Angle([[0, 1, 2]]), Distance([[81, 82]])], x)
-    force = openmm.CustomBondForce("r")
-    force.addBond(81, 82, [])
-    return system, x, v, CollectiveRows(system, [Row(force)], positions=x, meets_system=kind == "meeting")
+    return system, x, v, CollectiveRows(system, [Row(bond(81, 82))], positions=x, meets_system=kind == "meeting")
 
 
 BESIDE_WATER = {

@@ -12,11 +12,7 @@ from tied_cluster import KINDS
 from kcons import thermostats
 from kcons.errors import InputError
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
-from kcons.openmm.integrator.program import (
-    SCHEMES,
-    VARIABLES,
-    to_scheme,
-)
+from kcons.openmm.integrator.program import SCHEMES, VARIABLES, to_scheme
 from kcons.steppers import Geodesic, Rattle
 
 

@@ -2,37 +2,22 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import openmm
 import pytest
 from openmm import unit
 from openmm_parts import HeldCoordinates
-from openmm_systems import (
-    alanine,
-    dumbbell,
-    holding,
-    started,
-    state_of,
-    water_box,
-)
+from openmm_systems import dumbbell, holding, started, state_of, water_box
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
 
-PS = unit.picosecond
-
-
 # -- arguments --------------------------------------------------------------------------------------
 
 
-def test_units_and_arguments():
-    assert ProjectedIntegrator(2 * unit.femtoseconds).getStepSize() == 0.002 * PS
-    assert ProjectedIntegrator(0.002).getConstraintTolerance() == 1e-10
-    alone = holding()
+def test_only_one_part_may_share_atoms_with_the_system():
+    alone, *meeting = (holding() for _ in range(3))
     assert ProjectedIntegrator(0.001, parts=alone).parts == (alone,)
-    meeting = [holding(), holding()]
     for part in meeting:
         part.meets_system = True
     with pytest.raises(UnsupportedError, match="only one part"):
@@ -86,28 +71,6 @@ def test_a_barostat_that_scales_atoms_is_refused_beside_constraints():
 # -- force groups and seeds -------------------------------------------------------------------------
 
 
-def test_force_groups_of_the_user():
-    system, x, v = alanine()
-    system = copy.deepcopy(system)
-    for k, force in enumerate(system.getForces()):
-        force.setForceGroup(k % 3)
-    only = copy.deepcopy(system)
-    for k in reversed(range(only.getNumForces())):
-        if only.getForce(k).getForceGroup() != 1:
-            only.removeForce(k)
-    integrator, other = ProjectedIntegrator(1e-3), ProjectedIntegrator(1e-3)
-    integrator.setIntegrationForceGroups({1})
-    context, alone = started(system, integrator, x, v), started(only, other, x, v)
-    integrator.step(5)
-    other.step(5)
-    # CCMA takes its couplings from angle forces, which are not all there in the second System.
-    np.testing.assert_allclose(state_of(context), state_of(alone), rtol=1e-10, atol=1e-12)
-    with pytest.raises(UnsupportedError, match="before"):
-        integrator.setIntegrationForceGroups({0})
-    with pytest.raises(UnsupportedError, match="before"):
-        other.setIntegrationForceGroups(-1)
-
-
 def test_force_groups_of_rows_never_act():
     integrator = ProjectedIntegrator(1e-3, parts=[holding(groups={5, 7})])
     everything = set(range(32)) - {5, 7}
@@ -125,6 +88,12 @@ def test_force_groups_of_rows_never_act():
     for bad in ({0, 7}, 1 << 5):
         with pytest.raises(InputError, match="carry constraint rows"):
             integrator.setIntegrationForceGroups(bad)
+    system, x, v = dumbbell()
+    context = started(system, bound := ProjectedIntegrator(1e-3), x, v)
+    for late in ({0}, -1):
+        with pytest.raises(UnsupportedError, match="before"):
+            bound.setIntegrationForceGroups(late)
+    del context
 
 
 # -- restarts ---------------------------------------------------------------------------------------

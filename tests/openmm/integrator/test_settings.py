@@ -9,29 +9,14 @@ import pickle
 import numpy as np
 import openmm
 import pytest
+from ensemble_runs import run
 from openmm import unit
 from openmm_systems import holding, loose_alanine, potential_energy, started, state_of
-from tied_cluster import (
-    EVERYTHING,
-    KINDS,
-    MASSES,
-    X,
-    carried_at,
-    cluster,
-    row_at,
-    thermostatted,
-)
+from tied_cluster import EVERYTHING, KINDS, MASSES, X, carried_at, cluster, row_at, thermostatted
 
 from kcons.constraints import Plane
 from kcons.errors import KconsError, OverdeterminedError, UnsupportedError
-from kcons.openmm import (
-    HamiltonianMonteCarlo,
-    Isokinetic,
-    Langevin,
-    NoseHooverMiddle,
-    ProjectedIntegrator,
-    hold,
-)
+from kcons.openmm import HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
 from kcons.openmm.quantities import GAS_CONSTANT
 
 #: The trap of `cluster` is round.
@@ -146,8 +131,7 @@ def test_a_temperature_that_is_refused_changes_nothing():
     part = hold(system, [Plane([0], [0, 1, 0], 0.0), Plane([0], [0, 0, 1], 0.0)], np.zeros((1, 3)))
     bath = Isokinetic()
     integrator = ProjectedIntegrator(0.002, parts=[part], ensemble=bath)
-    context = started(system, integrator, np.zeros((1, 3)), np.array([[np.sqrt(0.2), 0, 0]]))
-    integrator.step(1)
+    context = run(system, integrator, np.zeros((1, 3)), np.array([[np.sqrt(0.2), 0, 0]]), 1)
     with pytest.raises(OverdeterminedError, match="g - 1 = 0"):
         integrator.setTemperature(300)
     assert integrator.ensemble is bath
@@ -301,8 +285,7 @@ def test_copies_make_the_same_steps(scheme, how):
     integrator = ProjectedIntegrator(1e-3, scheme, parts=[holding()], tolerance=1e-11, check_every=17)
     integrator.setRandomNumberSeed(3)
     integrator.setIntegrationForceGroups({0, 1, 2})
-    context = started(system, integrator, x, v)
-    integrator.step(3)
+    context = run(system, integrator, x, v, 3)
     again = how(integrator)
     assert again.program.lines == integrator.program.lines
     assert (again.getConstraintTolerance(), again.check_every, again.getRandomNumberSeed()) == (1e-11, 17, 3)

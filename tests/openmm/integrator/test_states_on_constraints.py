@@ -17,6 +17,7 @@ from openmm_systems import (
     loose_alanine,
     masses_of,
     on_gpus,
+    particles,
     potential_energy,
     residuals,
     started,
@@ -53,11 +54,7 @@ def test_what_cannot_be_applied_changes_nothing():
 
 
 def test_no_degree_of_freedom_no_temperature():
-    system = openmm.System()
-    system.addParticle(0.0)
-    integrator = ProjectedIntegrator(1e-3)
-    context = context_of(system, integrator)
-    context.setPositions([[0, 0, 0]])
+    context = started(particles([0.0]), integrator := ProjectedIntegrator(1e-3), [[0, 0, 0]])
     assert integrator.degrees_of_freedom(context) == 0
     with pytest.raises(InputError, match="no degree of freedom"):
         integrator.computeSystemTemperature()
@@ -80,30 +77,17 @@ def test_before_the_first_step_forces_tell_what_they_tell(platform):
 
 def test_degrees_of_freedom_are_counted_by_rank():
     """Five particles by all ten distances, nine of them independent: six, and three less with a motion remover."""
-    system, x = openmm.System(), 0.1 * np.random.default_rng(1).normal(size=(5, 3))
-    for i in range(5):
-        system.addParticle(12.0)
-        for j in range(i):
-            system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
-    integrator = ProjectedIntegrator(0.001)
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    assert integrator.degrees_of_freedom(context) == integrator.independent_momenta(context) == 6
-    other = openmm.XmlSerializer.clone(system)
-    other.addForce(openmm.CMMotionRemover())
-    integrator = ProjectedIntegrator(0.001)
-    context = context_of(other, integrator)
-    context.setPositions(x)
-    assert integrator.degrees_of_freedom(context) == 3 and integrator.independent_momenta(context) == 6
-
-
-platforms = pytest.mark.parametrize("platform", PLATFORMS)
+    x, every = 0.1 * np.random.default_rng(1).normal(size=(5, 3)), [(i, j) for i in range(5) for j in range(i)]
+    for removers, count in (([], 6), ([openmm.CMMotionRemover()], 3)):
+        system, integrator = particles([12.0] * 5, *removers, held=every, x=x), ProjectedIntegrator(0.001)
+        context = started(system, integrator, x)
+        assert integrator.degrees_of_freedom(context) == count and integrator.independent_momenta(context) == 6
 
 
 # -- minimization -----------------------------------------------------------------------------------
 
 
-@platforms
+@pytest.mark.parametrize("platform", PLATFORMS)
 def test_minimizer_of_openmm_keeps_the_constraints(platform):
     system, _, _ = alanine()
     pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import openmm
 import pytest
+from collective_cases import bond
+from ensemble_runs import run
 from openmm import unit
 from openmm_parts import HeldCoordinates
 from openmm_systems import (
@@ -15,25 +15,21 @@ from openmm_systems import (
     dumbbell,
     holding,
     loose_alanine,
+    masses_of,
     on_gpus,
+    pairs_force,
+    particles,
     residuals,
+    rows_of,
     started,
     state_of,
     water_box,
 )
-from tied_cluster import KINDS, bond
+from tied_cluster import KINDS
 
 from kcons.constraints import KnifeEdge, Plane
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
-from kcons.openmm import (
-    CollectiveRows,
-    Isokinetic,
-    Langevin,
-    LangevinRespa,
-    ProjectedIntegrator,
-    Row,
-    hold,
-)
+from kcons.openmm import CollectiveRows, Isokinetic, Langevin, LangevinRespa, ProjectedIntegrator, Row, hold
 
 #: The trap of `tied_cluster` is round.
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -124,13 +120,7 @@ def test_parameters_of_forces_are_used_in_the_next_step(kind):
 
 # -- calls ------------------------------------------------------------------------------------------
 
-LEAN = [
-    "part",
-    "moving row",
-    "carried",
-    "carried beside bonds",
-    "carried, with a velocity",
-]
+LEAN = ["part", "moving row", "carried", "carried beside bonds", "carried, with a velocity"]
 
 
 def held(kind, **arguments):
@@ -138,18 +128,14 @@ def held(kind, **arguments):
     system, x, v = loose_alanine()
     if kind == "carried":
         system, x, v = alanine()
-        system = copy.deepcopy(system)
         part = hold(system, [], x, take="all")
     elif kind == "carried beside bonds":
-        system = copy.deepcopy(system)
         part = hold(system, Plane([0], [0, 0, 1]), x)
         assert system.getNumConstraints()
     elif kind == "carried, with a velocity":
         part = hold(system, KnifeEdge(8, 20, [0, 0, 1]), x)
     elif kind.endswith("row"):
-        rate = 0.05 if kind == "moving row" else 0.0
-        system = copy.deepcopy(system)
-        part = CollectiveRows(system, [Row(bond(4, 20), rate=rate), Row(bond(0, 9))], positions=x)
+        part = CollectiveRows(system, [Row(bond(4, 20), rate=0.05), Row(bond(0, 9))], positions=x)
     else:
         part = holding(**arguments)
     integrator = ProjectedIntegrator(1e-3, parts=[part], tolerance=1e-13)
@@ -195,13 +181,8 @@ def test_calls_of_any_length_make_the_same_motion(kind):
 )
 def test_evaluations_of_forces_in_tens(make, more):
     """OpenMM evaluates the forces once a step (five times in that of order 4), in however many calls."""
-    system, x, v = alanine()
-    system = copy.deepcopy(system)
-    while system.getNumForces():
-        system.removeForce(0)
-    if more:
-        while system.getNumConstraints():
-            system.removeConstraint(0)
+    whole, x, v = alanine()
+    system = particles(masses_of(whole), held=() if more else rows_of(whole)[0].tolist(), x=x)
     evaluations = []
 
     def nothing(state):
@@ -210,8 +191,7 @@ def test_evaluations_of_forces_in_tens(make, more):
 
     system.addForce(openmm.PythonForce(nothing))
     integrator = make(system, x)
-    context = started(system, integrator, x, v)
-    integrator.step(10)
+    context = run(system, integrator, x, v, 10)
     each = integrator.scheme.force_evaluations
     evaluations.clear()
     for _ in range(5):
@@ -261,14 +241,12 @@ def test_checks_that_come_more_often_make_no_step_more(before):
     """Steps since the last check may be more than the new interval."""
     system, x, v = dumbbell()
     integrator = ProjectedIntegrator(1e-3, check_every=before)
-    context = started(system, integrator, x, v)
-    integrator.step(50)
+    context = run(system, integrator, x, v, 50)
     integrator.check_every = 10
     integrator.step(100)
     assert context.getStepCount() == 150
     at_once = ProjectedIntegrator(1e-3)
-    other = started(system, at_once, x, v)
-    at_once.step(150)
+    other = run(system, at_once, x, v, 150)
     np.testing.assert_array_equal(state_of(context)[0], state_of(other)[0])
 
 
@@ -287,13 +265,9 @@ LOOKING = {
 
 def springs(n=8):
     """A chain of stiff springs that no step of 20 fs can follow, and none of the solvers of constraints notice."""
-    system, force = openmm.System(), openmm.HarmonicBondForce()
-    for k in range(n):
-        system.addParticle(12.0)
-        if k:
-            force.addBond(k - 1, k, 0.1, 3e5)
+    force = pairs_force(openmm.HarmonicBondForce(), *((k - 1, k, 0.1, 3e5) for k in range(1, n)))
     force.setForceGroup(1)
-    system.addForce(force)
+    system = particles([12.0] * n, force)
     x = np.c_[0.1 * np.arange(n), 0.05 * (np.arange(n) % 2), np.zeros(n)]
     v = np.random.default_rng(2).normal(0, 0.4, x.shape)
     return system, x, v - v.mean(axis=0)
@@ -328,8 +302,7 @@ def test_light_is_the_limit_and_no_smaller_speed():
     """Particles may be fast: 1 dalton at a tenth of the speed of light is no explosion of a System of many."""
     system, x, _ = springs()
     integrator = LOOKING["rattle"](1e-6 * unit.femtosecond)
-    context = started(system, integrator, x, np.eye(8)[:, :3] * 3e4)
-    integrator.step(1)
+    context = run(system, integrator, x, np.eye(8)[:, :3] * 3e4, 1)
     context.setVelocities(np.full((8, 3), 3e5))
     with pytest.raises(NonFiniteError, match=r"particle \d has a velocity of 5.2e\+05 nm/ps at step 2"):
         integrator.step(1)

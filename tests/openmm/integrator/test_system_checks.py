@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import (
-    context_of,
-    started,
-    water_box,
-)
+from openmm_systems import context_of, particles, started, water_box
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Langevin, ProjectedIntegrator, worst_length
@@ -20,15 +16,9 @@ from kcons.openmm.integrator.guard import SystemRows
 
 def test_rows_of_a_system():
     """Triangles with two equal sides go to SETTLE, and only if nothing else holds their atoms."""
-    system = openmm.System()
-    for m in [16.0, 1.0, 1.0] * 3 + [12.0, 12.0, 0.0, 0.0]:
-        system.addParticle(m)
-    for first in (0, 3, 6):
-        system.addConstraint(first, first + 1, 0.1)
-        system.addConstraint(first, first + 2, 0.11 if first == 6 else 0.1)
-        system.addConstraint(first + 1, first + 2, 0.16)
-    system.addConstraint(5, 9, 0.2)
-    system.addConstraint(11, 12, 0.3)
+    waters = [((a, a + 1, 0.1), (a, a + 2, 0.11 if a == 6 else 0.1), (a + 1, a + 2, 0.16)) for a in (0, 3, 6)]
+    held = [*(pair for water in waters for pair in water), (5, 9, 0.2), (11, 12, 0.3)]
+    system = particles([16.0, 1.0, 1.0] * 3 + [12.0, 12.0, 0.0, 0.0], held=held)
     rows = SystemRows.of(system)
     assert rows.n_rows == 10
     np.testing.assert_array_equal(rows.numbers, range(10))
@@ -42,13 +32,8 @@ def test_rows_of_a_system():
 
 @pytest.mark.parametrize("kind", [ProjectedIntegrator, openmm.VerletIntegrator])
 def test_the_length_that_is_off_most(kind):
-    system = openmm.System()
-    for _ in range(3):
-        system.addParticle(12.0)
-    system.addConstraint(0, 1, 0.1)
-    system.addConstraint(1, 2, 0.2)
-    context = openmm.Context(system, kind(0.001), openmm.Platform.getPlatformByName("Reference"))
-    context.setPositions([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.21, 0.0]])
+    system = particles([12.0] * 3, held=[(0, 1, 0.1), (1, 2, 0.2)])
+    context = started(system, kind(0.001), [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.21, 0.0]])
     name, off = worst_length(context)
     assert "constraint 1 of the System (particles 1 and 2, 0.2 nm)" in name and off == pytest.approx(0.05)
     context.applyConstraints(1e-8)
@@ -59,23 +44,14 @@ def test_the_length_that_is_off_most(kind):
 
 def test_lengths_of_rigid_water_are_compared_with_those_of_the_system():
     """Not with those in single precision that OpenMM makes of them."""
-    system, lengths = openmm.System(), [0.09572, 0.09572, 0.15139]
-    for mass in (16.0, 1.0, 1.0):
-        system.addParticle(mass)
-    for (i, j), length in zip([(0, 1), (0, 2), (1, 2)], lengths, strict=True):
-        system.addConstraint(i, j, length)
-    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
-    context.setPositions([[0.0, 0.05858, 0.0], [-0.0757, 0.0, 0.0], [0.0757, 0.0, 0.0]])
+    lengths = np.array([0.09572, 0.09572, 0.15139])
+    system = particles([16.0, 1.0, 1.0], held=[(0, 1, lengths[0]), (0, 2, lengths[1]), (1, 2, lengths[2])])
+    x = [[0.0, 0.05858, 0.0], [-0.0757, 0.0, 0.0], [0.0757, 0.0, 0.0]]
+    context = started(system, openmm.VerletIntegrator(0.001), x)
     context.applyConstraints(1e-12)
-    assert worst_length(context)[1] == pytest.approx(
-        np.abs(np.float32(lengths) / np.array(lengths) - 1).max(), rel=1e-6
-    )
-
-
-def test_without_constraints_no_length_is_off():
-    system = openmm.System()
-    system.addParticle(1.0)
-    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+    rounding = np.abs(lengths.astype(np.float32) / lengths - 1).max()
+    assert worst_length(context)[1] == pytest.approx(rounding, rel=1e-6)
+    context = context_of(particles([1.0]), openmm.VerletIntegrator(0.001))
     assert worst_length(context) == ("no constraint of the System", 0.0)
 
 
@@ -94,28 +70,19 @@ def test_without_constraints_no_length_is_off():
     ],
 )
 def test_rigid_bodies_hold_all_their_distances(pairs, rigid):
-    system = openmm.System()
-    for _ in range(5):
-        system.addParticle(1.0)
-    for i, j in pairs:
-        system.addConstraint(i, j, 0.1)
-    assert SystemRows.of(system).rigid is rigid
+    assert SystemRows.of(particles([1.0] * 5, held=[(*pair, 0.1) for pair in pairs])).rigid is rigid
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (2, 1, 0)])
 @pytest.mark.parametrize("heavier", [0, 1, 2])
 def test_triangles_with_unequal_masses_beside_the_apex_are_refused(order, heavier):
     """OpenMM's SETTLE: HDO gains momentum from nothing. Heavy apexes are the rule."""
-    system, x = openmm.System(), np.array([[0.0, 0.0585882, 0.0], [-0.075695, 0.0, 0.0], [0.075695, 0.0, 0.0]])
+    x = np.array([[0.0, 0.0585882, 0.0], [-0.075695, 0.0, 0.0], [0.075695, 0.0, 0.0]])
     masses = np.array([16.0, 1.0, 1.0])
     masses[heavier] *= 2
-    for k in order:
-        system.addParticle(masses[k])
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        system.addConstraint(i, j, 0.15139 if 0 not in (order[i], order[j]) else 0.09572)
-    integrator = ProjectedIntegrator(1e-3)
-    context = context_of(system, integrator)
-    context.setPositions(x[list(order)])
+    held = [(i, j, 0.15139 if 0 not in (order[i], order[j]) else 0.09572) for i, j in ((0, 1), (0, 2), (1, 2))]
+    system, integrator = particles(masses[list(order)], held=held), ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x[list(order)])
     if heavier == 0:
         integrator.applyConstraints(context)
         integrator.step(1)
@@ -126,11 +93,8 @@ def test_triangles_with_unequal_masses_beside_the_apex_are_refused(order, heavie
 
 @pytest.mark.parametrize("length", [0.0, -0.1, np.nan, np.inf])
 def test_a_length_that_cannot_be_held_is_refused(length):
-    system = openmm.System()
-    for mass in (23.0, 23.0, 0.0, 0.0):
-        system.addParticle(mass)
-    system.addConstraint(2, 3, length)  # between particles without mass OpenMM holds nothing
-    system.addConstraint(0, 1, 0.1)
+    # Between particles without mass OpenMM holds nothing.
+    system = particles([23.0, 23.0, 0.0, 0.0], held=[(2, 3, length), (0, 1, 0.1)])
     x = np.array([[0.0, 0, 0], [0.1, 0, 0], [1.0, 0, 0], [1.0, 0, 0]])
     kept = started(system, integrator := ProjectedIntegrator(2e-3), x)
     integrator.step(1)

@@ -43,6 +43,7 @@ protected:
         for (auto& array : plan.arrays) {
             if (array.whole) integers[array.name].assign(array.values.begin(), array.values.end());
             else reals[array.name] = array.values;
+            own.push_back(array.whole ? (void*) integers[array.name].data() : (void*) reals[array.name].data());
         }
         library = dlopen(plan.library.c_str(), RTLD_NOW | RTLD_LOCAL);
         if (library == nullptr) throw OpenMMException(string("kcons: ")+dlerror());
@@ -54,8 +55,7 @@ protected:
         vector<void*> pointers = {data.positions->data(), data.velocities->data(), inverse.data()};
         for (int slot = 0; slot < plan.slots; slot++)
             pointers.push_back(plan.slots == 1 ? data.forces->data() : forces[slot].data());
-        for (auto& array : plan.arrays)
-            pointers.push_back(array.whole ? (void*) integers[array.name].data() : (void*) reals[array.name].data());
+        pointers.insert(pointers.end(), own.begin(), own.end());
         const Numbers given = numbers;
         numbers.launch++;
         // A sum of few shares does not depend on the number of threads more than one of many.
@@ -72,6 +72,7 @@ private:
     map<string, PlainKernel> kernels;
     map<string, vector<double>> reals;
     map<string, vector<int>> integers;
+    vector<void*> own;             // where these are, in the order of the plan
     vector<double> inverse;
     vector<vector<Vec3>> forces;
 };

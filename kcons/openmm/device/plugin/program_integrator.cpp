@@ -31,23 +31,23 @@ void ProgramIntegrator::initialize(ContextImpl& c) {
 }
 Plan ProgramIntegrator::made() const {
     const System& system = context->getSystem();
-    vector<double> masses, lengths;
-    vector<int> pairs;
-    for (int k = 0; k < system.getNumParticles(); k++) masses.push_back(system.getParticleMass(k));
+    Plan plan;
+    auto& given = plan.given;
+    for (int k = 0; k < system.getNumParticles(); k++) given["masses"].push_back(system.getParticleMass(k));
     for (int k = 0; k < system.getNumConstraints(); k++) {
         int i, j; double length;
         system.getConstraintParameters(k, i, j, length);
-        pairs.insert(pairs.end(), {i, j});
-        lengths.push_back(length);
+        given["constraints"].insert(given["constraints"].end(), {double(i), double(j), length});
     }
     vector<Vec3> positions, box(3);
     context->getPositions(positions);
     if (system.usesPeriodicBoundaryConditions()) context->getPeriodicBoxVectors(box[0], box[1], box[2]);
-    Plan plan;
-    Given given = {static_cast<const Integrator*>(this), description.c_str(), context->getPlatform().getName().c_str(),
-                   getIntegrationForceGroups(), (int) masses.size(), (int) lengths.size(), masses.data(), pairs.data(),
-                   lengths.data(), &positions[0][0], &box[0][0], context->getTime()};
-    if (!planner(&plan, &given)) throw OpenMMException(failure);
+    for (auto& place : positions) given["positions"].insert(given["positions"].end(), &place[0], &place[0]+3);
+    for (auto& edge : box) given["box"].insert(given["box"].end(), &edge[0], &edge[0]+3);
+    given["time"] = {context->getTime()};
+    string platform = context->getPlatform().getName();
+    if (!planner(&plan, static_cast<const Integrator*>(this), description.c_str(), platform.c_str(), getIntegrationForceGroups()))
+        throw OpenMMException(failure);
     return plan;
 }
 void ProgramIntegrator::cleanup() { handle = Kernel(); }
@@ -97,16 +97,20 @@ void ProgramIntegrator::write(const string& name, const vector<double>& values) 
 
 // -- what belongs to a state ------------------------------------------------------------------------------
 
-vector<double> ProgramIntegrator::saved() const {
-    vector<double> all = {middleKinetic, endKinetic};
+string ProgramIntegrator::saved() const {
+    ostringstream text;
+    text.precision(17);
+    text << middleKinetic << ' ' << endKinetic;
     for (auto& array : kernel().plan.arrays) if (array.saved) {
-        vector<double> values = read(array.name);
-        all.push_back(values.size());
-        all.insert(all.end(), values.begin(), values.end());
+        text << ' ' << array.values.size();
+        for (double value : read(array.name)) text << ' ' << value;
     }
-    return all;
+    return text.str();
 }
-void ProgramIntegrator::restore(const vector<double>& all, bool exactly) {
+void ProgramIntegrator::restore(const string& text, bool exactly) {
+    istringstream words(text);
+    vector<double> all;
+    for (double value; words >> value;) all.push_back(value);
     map<string, vector<double>> found;
     size_t next = 2;
     bool known = all.size() >= next;
@@ -122,31 +126,20 @@ void ProgramIntegrator::restore(const vector<double>& all, bool exactly) {
     for (auto& each : found) write(each.first, each.second);
     middleKinetic = all[0]; endKinetic = all[1];
 }
-void ProgramIntegrator::createCheckpoint(ostream& out) const {
-    vector<double> all = saved();
-    all.insert(all.begin(), all.size());
-    out.write((const char*) all.data(), all.size()*sizeof(double));
-}
+void ProgramIntegrator::createCheckpoint(ostream& out) const { out << saved() << '\n'; }
 void ProgramIntegrator::loadCheckpoint(istream& in) {
-    double size = 0;
-    in.read((char*) &size, sizeof(size));
-    vector<double> all(size >= 2 && size < 1e8 ? (size_t) size : 0);
-    if (!in.read((char*) all.data(), all.size()*sizeof(double))) all.clear();
+    string text;
+    getline(in, text);
     // Where constraints were added, `Context::reinitialize` brings what belongs to fewer rows.
-    restore(all, false);
+    restore(text, false);
     kernel().valid = false;
 }
 void ProgramIntegrator::serializeParameters(SerializationNode& node) const {
-    ostringstream text;
-    text.precision(17);
-    for (double value : saved()) text << value << ' ';
-    node.setIntProperty("version", 1).setStringProperty("state", text.str());
+    node.setIntProperty("version", 1).setStringProperty("state", saved());
 }
 void ProgramIntegrator::deserializeParameters(const SerializationNode& node) {
-    istringstream text(node.getStringProperty("state", ""));
-    vector<double> all;
-    for (double value; text >> value;) all.push_back(value);
-    if (!all.empty()) restore(all, true);      // else it is the state of another integrator
+    string text = node.getStringProperty("state", "");
+    if (!text.empty()) restore(text, true);    // else it is the state of another integrator
 }
 
 class Proxy : public SerializationProxy {
@@ -267,6 +260,11 @@ int kcons_write(void* integrator, const char* name, const double* values, int n)
     own(integrator).write(name, vector<double>(values, values+n));
     return n;
 } catch (exception& e) { failure = e.what(); return -1; }
+// What a Plan was given for a Context, by name.
+const double* kcons_plan_given(Plan* plan, const char* name, int* n) {
+    *n = plan->given[name].size();
+    return plan->given[name].data();
+}
 void kcons_plan_source(Plan* plan, const char* source, const char* library, int items, int workGroup, int slots) {
     plan->source = source; plan->library = library;
     plan->items = items; plan->workGroup = workGroup; plan->slots = slots;

@@ -28,23 +28,16 @@ struct Action {
 // What Python makes of an integrator for one Context: kernels, their arrays, and in which order they run. n steps are
 // the head, n-1 times the middle, which is the end of a step and the head of the next, and the tail.
 struct Plan {
+    // What there is: masses; i, j and length of each constraint; positions, box (zeros if there is none) and time.
+    std::map<std::string, std::vector<double>> given;
     std::string source, library;   // of the kernels; for plain C++ the file that they were compiled to
     std::vector<Array> arrays;
     std::vector<Action> parts[3];
     int items = 0, workGroup = 64, slots = 1;
 };
 
-// Python's part in the making: fills the plan, or returns 0.
-struct Given {
-    const void* integrator;        // an OpenMM::Integrator*, as Python has it
-    const char *description, *platform;
-    int groups, particles, constraints;
-    const double* masses;
-    const int* pairs;
-    const double *lengths, *positions, *box;
-    double time;
-};
-typedef int (*Planner)(Plan* plan, const Given* given);
+// Python's part in the making: fills the plan for an integrator, an OpenMM::Integrator*, or returns 0.
+typedef int (*Planner)(Plan* plan, const void* integrator, const char* description, const char* platform, int groups);
 
 // What Python reads and writes directly.
 struct Shared {
@@ -81,9 +74,9 @@ protected:
 private:
     StepKernel& kernel() const;    // with all that it needs, which is made when it is used first
     Plan made() const;
-    std::vector<double> saved() const;         // all that belongs to a state beside x and v
+    std::string saved() const;     // all that belongs to a state beside x and v: numbers
     // `exactly` that of these rows; else arrays of other rows stay as they are.
-    void restore(const std::vector<double>& all, bool exactly);
+    void restore(const std::string& text, bool exactly);
     mutable OpenMM::Kernel handle;
     // Of the middle of the last step, and of the velocities that it ended with: those of others have another. -1: none.
     double middleKinetic = -1, endKinetic = -1;
