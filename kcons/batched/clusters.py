@@ -376,6 +376,7 @@ class Levels(Lanes):
     def __init__(self, pattern: Pattern, device: torch.device) -> None:
         self.device = device
         super().__init__(pattern)
+        self.order = torch.cat([kind[1] for kind in self.kinds]).argsort()
 
     def table(self, numbers: list[Any]) -> Table:
         return torch.tensor(numbers, dtype=torch.long, device=self.device)
@@ -399,8 +400,7 @@ class Levels(Lanes):
             )
 
         x, y, z = (whole([some[c::3] for some in slopes]) for c in range(3))
-        numbers = torch.cat([kind[1] for kind in self.kinds])
-        return whole([[value] for value in values])[numbers.argsort()], (x, y, z)
+        return whole([[value] for value in values])[self.order], (x, y, z)
 
     def take(self, vector: Any, numbers: Tensor) -> Vector:
         return vector[numbers]

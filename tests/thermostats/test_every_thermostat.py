@@ -19,7 +19,7 @@ from thermostat_systems import (
 )
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.steppers import State, System, run
+from kcons.steppers import Rattle, State, System, run
 from kcons.thermostats import (
     ForceGroups,
     HamiltonianMonteCarlo,
@@ -130,6 +130,7 @@ SPHERES = [{"spheres": kind} for kind in ("split", "axes", "cluster", "global")]
 #: Without noise, and what they come near to: one step for all forces.
 SILENT = {
     "NoseHooverChain": (NoseHooverChain(0.5, 1.0),) * 2,
+    "Langevin": (Langevin(0.5, 0.0, 3, substeps=4), Rattle()),
     **{f"Respa{key}": (LangevinRespa(0.5, 0.0, 3, **more), Langevin(0.5, 0.0, 3)) for key, more in RESPA.items()},
     **{k["spheres"]: [IsokineticSpheres(0.5, 1e-32, 3, **k, **more) for more in ({"steps": TWO}, {})] for k in SPHERES},
 }
@@ -140,7 +141,8 @@ def test_without_noise_it_is_of_order_two(name):
     stepper, plain = SILENT[name]
     held, x = dumbbells(2)
     groups = {"fast": springs, "medium": lambda x, t: 0.1 * quartic(x), "slow": lambda x, t: 0.3 * waves(x)}
-    split = System(held.motion, ForceGroups({name: groups[name] for name in getattr(stepper, "names", groups)}))
+    named = [name for name in getattr(stepper, "names", ()) if name] or groups
+    split = System(held.motion, ForceGroups({name: groups[name] for name in named}))
     state = held.initial_state(x, 0.5 * np.random.default_rng(1).normal(size=x.shape), project=True)
     counts = (16, 32, 64)
     known = run(split, state, 1 / 1024, 1024, stepper=plain).positions

@@ -35,20 +35,6 @@ def test_free_flight_forgets_its_velocity_at_the_rate_asked_for():
         np.testing.assert_allclose(state.velocities.std(axis=0), spread, rtol=4.5 / math.sqrt(2 * n))
 
 
-def test_without_friction_it_is_the_plain_scheme():
-    held, state = started()
-    one = run(held, state, 0.01, 100, stepper=Langevin(0.5, 0.0, 3, substeps=4))
-    errors = []
-    for n in (50, 100, 200):
-        a = run(held, state, 1 / n, n, stepper=Langevin(0.5, 0.0, 3, substeps=4))
-        b = run(held, state, 1 / 1600, 1600)
-        errors.append(np.abs(a.positions - b.positions).max())
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.15)
-    assert np.array_equal(
-        one.positions, run(held, state, 0.01, 100, stepper=Langevin(0.9, 0.0, 8, substeps=4)).positions
-    )
-
-
 def test_moving_targets_are_followed_and_friction_knows_their_speed():
     x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     held = system([Distance([[0, 1]], lambda t: 1 + 0.5 * t), Sphere([0], [0, 0, -1.0], 1.0)], x, [1.0, 3.0], waves)

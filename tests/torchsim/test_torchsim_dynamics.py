@@ -10,7 +10,7 @@ import pytest
 import torch
 import torch_sim as ts
 from scipy.integrate import quad
-from torch_models import FS, Butanes, Drops, K, butane, drop, off, state_of, total_energy
+from torch_models import FS, Butanes, Drops, Free, K, butane, drop, off, state_of, total_energy
 
 from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, NonFiniteError
@@ -159,13 +159,6 @@ def test_each_copy_may_have_its_own_temperature():
     end = go_on(langevin, start, Free(), 40, 2 * FS, kT=wanted * K, gamma=0.05 / FS)
     found = end.calc_temperature().reshape(10, 3).mean(0).numpy()
     assert np.abs(found / [100, 300, 900] - 1).max() < 4 * np.sqrt(2 / (48 * 10))
-
-
-class Free(Drops):
-    """No forces."""
-
-    def energies(self, x, systems, n):
-        return torch.zeros(n, dtype=x.dtype) + 0.0 * x.sum()
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import torch_sim as ts
-from torch_models import Butanes, Drops, butane, drop, off, state_of
+from torch_models import Butanes, Drops, Free, butane, drop, off, state_of
 
 from kcons.constraints import Dihedral, Distance, FixedAtoms
 from kcons.torchsim import Constraints, hold, langevin, nose_hoover, nve, report
@@ -141,13 +141,6 @@ def test_a_periodic_cell():
     hold(state, "water", water_geometry="tip3p", project=True)
     made = ts.integrate(state, Free(), integrator=nve, n_steps=20, temperature=300, timestep=0.002)
     assert off(made).max() < 1e-12 and float((made.positions - state.positions).abs().max()) > 0.1
-
-
-class Free(Drops):
-    """No forces."""
-
-    def energies(self, x, systems, n):
-        return torch.zeros(n, dtype=x.dtype) + 0.0 * x.sum()
 
 
 def test_fixed_atoms_are_taken_over():
