@@ -5,7 +5,7 @@ said by the engines (`kcons.Motion`) of the systems. Gradients go through positi
 the equations at the solution.
 
 - `row_functions`: families of constraints on tensors
-- `clusters`: the equations of clusters that look alike, by elimination written out, or sparse elimination by levels
+- `clusters`: the equations of clusters that look alike, number by number or in one tensor, by sparse elimination
 - `groups`: where the clusters of a batch are in its tensors
 - `batch`: many systems, what is asked of them, and projections that torch differentiates
 - `steps`: RATTLE and Langevin dynamics
