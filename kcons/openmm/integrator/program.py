@@ -43,7 +43,7 @@ _FORCES = re.compile(r"\b(f|energy)(\d*)\b")
 
 #: Variables of steps that Python sets or that do not begin with 0: their kind, what they stand for, their first value.
 VARIABLES: dict[str, tuple[Any, ...]] = {
-    "phase": ("control", "0 for a whole step; else the number of the part of it that is made"),
+    "phase": ("control", "0: make a whole step; k: make part k of a step only"),
     "ending": ("control", "1 in the last step of a call"),
     "call": ("control", "1 where a call of step begins, 2 within it, 0 without Python"),
     "failed": ("control", "number of the part whose solve failed, 0 for none"),
@@ -619,7 +619,7 @@ def _single_step(p: Program) -> None:
             p.project()
         p.note_end()
         p.ensemble.close(p)
-    p.let("phase", f"select(phase, select({p.phases}-phase, phase+1, 1), 0)", "what follows")
+    p.let("phase", f"select(phase, select({p.phases}-phase, phase+1, 1), 0)", "the part that is next")
 
 
 def _loop_step(p: Program) -> None:
@@ -645,7 +645,7 @@ def _loop_step(p: Program) -> None:
         if not p.ends_tangent:
             p.project()
         p.ensemble.close(p)
-    p.let("phase", f"select(phase, select({p.phases}-phase, phase+1, 1), 0)", "what follows")
+    p.let("phase", f"select(phase, select({p.phases}-phase, phase+1, 1), 0)", "the part that is next")
 
 
 def _joined_step(p: Program) -> None:
@@ -682,7 +682,7 @@ def _joined_step(p: Program) -> None:
             p.project()
         p.note_end()
     p.let("behind", "between", "the next step makes up for it")
-    p.let("phase", "select(phase, 3-phase, 0)", "what follows")
+    p.let("phase", "select(phase, 3-phase, 0)", "the part that is next")
 
 
 def _declare_stages(p: Program) -> None:
@@ -725,7 +725,7 @@ def _guarded_step(p: Program) -> None:
         _up_to_forces(p, lambda _: None)
     with p.when("phase != 1", "with the forces there"):
         _with_forces(p)
-    p.let("phase", "select(phase, 3-phase, 0)", "what follows")
+    p.let("phase", "select(phase, 3-phase, 0)", "the part that is next")
 
 
 def _up_to_forces(p: Program, then: Callable[[Program], None]) -> None:
