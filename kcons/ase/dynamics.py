@@ -121,8 +121,16 @@ class ConstrainedDynamics(MolecularDynamics):
         self._cell: tuple[bytes, ...] = ()
         self._asked: tuple[Any, ...] = ()  # calculators, and where each keeps what it found
         self._momenta = self._masses = np.zeros((0, 3))  # momenta as written last; masses, 0 for fixed atoms
+        self.atoms, self.dt, self.nsteps = atoms, timestep, 0
         with unchanged_on_failure(atoms):
-            self._prepare(atoms, timestep, state)
+            if not atoms.has("momenta"):
+                atoms.set_momenta(np.zeros((len(atoms), 3)), apply_constraint=False)
+            if state is not None:
+                refuse_other(state, State, "state", "a kcons.State, such as State.load(file) or that of another run")
+                self._resume(state)
+            self._asked = self._calculators_now()
+            self._start(self._systems())
+            self._begin()
             # Files last: to open one for writing ends what an older run left there.
             steps, logfile = self.nsteps, kwargs.pop("logfile", None)
             super().__init__(atoms, timestep, **kwargs)
@@ -130,18 +138,6 @@ class ConstrainedDynamics(MolecularDynamics):
             if logfile:
                 log = self.closelater(ConstraintLogger(self, atoms, logfile, comm=self.comm))
                 self.attach(log, kwargs.get("loginterval", 1))
-
-    def _prepare(self, atoms: Atoms, timestep: float, state: State | None) -> None:
-        """Whatever can be refused, and what the first step needs."""
-        self.atoms, self.dt, self.nsteps = atoms, timestep, 0
-        if not atoms.has("momenta"):
-            atoms.set_momenta(np.zeros((len(atoms), 3)), apply_constraint=False)
-        if state is not None:
-            refuse_other(state, State, "state", "a kcons.State, such as State.load(file) or the state of another run")
-            self._resume(state)
-        self._asked = self._calculators_now()
-        self._start(self._systems())
-        self._begin()
 
     def _begin(self) -> None:
         """What else a class does before the first step is logged."""

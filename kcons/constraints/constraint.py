@@ -37,7 +37,7 @@ from kcons.constraints.arguments import (
     without_units,
 )
 from kcons.constraints.compilation import has_a_file, njit
-from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
+from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target, nearest_image
 from kcons.errors import ConstraintError, InputError, SingularGeometryError, UnsupportedError
 
 IntArray = NDArray[np.int64]
@@ -280,6 +280,12 @@ class Constraint:
                 atoms=self.atoms[k].tolist(),
             )
         return target
+
+    def sigma(self, r: FloatArray, time: float) -> FloatArray:
+        """q - target of each row, the nearest image where q has a period; 0 of velocity rows, shape (n_rows,)."""
+        if not self.holonomic:
+            return np.zeros(self.n_rows)
+        return nearest_image(self.measure(r, time) - self.target_at(time), self.period)
 
     def parameters(self) -> FloatArray:
         """Numbers for `row` and the compiled kernels, shape (n_rows, p): the width, where `alike`, and the data."""

@@ -229,7 +229,7 @@ class ConstraintSet:
 
     def value(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """sigma(x, t) = q(x, t) - target(t), shape (n_rows,); 0 for velocity rows (notes eq. 81)."""
-        return self._of_rows(x, time, self._sigma)
+        return self._of_rows(x, time, lambda c, r, t: c.sigma(r, t))
 
     def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
@@ -335,11 +335,6 @@ class ConstraintSet:
         other.constraints = tuple(marked)
         other._set_scale(positions, time)
         return other
-
-    def _sigma(self, c: Constraint, r: FloatArray, time: float) -> FloatArray:
-        if not c.holonomic:
-            return np.zeros(c.n_rows)
-        return nearest_image(c.measure(r, time) - c.target_at(time), c.period)
 
     def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
         return joined([function(c) for c in self.constraints])
@@ -486,7 +481,7 @@ class ConstraintSet:
         def miss(whole: FloatArray) -> FloatArray:
             def of(c: Constraint) -> FloatArray:
                 unknown = time is None and c.moving
-                return np.ones(c.n_rows) if unknown else self._sigma(c, self.gather(c, x, whole), time or 0.0)
+                return np.ones(c.n_rows) if unknown else c.sigma(self.gather(c, x, whole), time or 0.0)
 
             return np.abs(self._rows(of)) / self.scale
 

@@ -262,7 +262,14 @@ class HeldCoordinates:
         for k, turn in enumerate(self._turns):
             if turn is not None:
                 turned[:, k] = turn.force(whole[0], whole[2])
-        gradient = self._change_of_z(bent[:, 1 : 1 + d * d] @ shares.swapaxes(1, 2))
+        # Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarized.
+        bends = bent[:, 1 : 1 + d * d] @ shares.swapaxes(1, 2)
+        gradient, crossed = np.diagonal(bends[:, :d], axis1=1, axis2=2).copy(), iter(np.moveaxis(bends[:, d:], 1, 0))
+        for s in range(d):
+            for j in range(s):
+                mixed = (next(crossed) - next(crossed)) / 4
+                gradient[:, s] += mixed[:, j]
+                gradient[:, j] += mixed[:, s]
         columns = (value, moving, moving - still, log_det_z.tolist(), gradient, off.tolist(), turned, mean)
         return [Sample(*each) for each in zip(times, *columns, strict=True)]
 
@@ -340,17 +347,6 @@ class HeldCoordinates:
             each = found[:, k:].reshape(n, -1, 3, item.n_rows).sum(axis=2)
             traces.append((each * self._inverse_masses[::3][item.atoms].T[: each.shape[1]]).sum(axis=1))
         return np.concatenate(bent, axis=2)[:, :, self._order], np.concatenate(traces, axis=1)[:, self._order]
-
-    def _change_of_z(self, bent: FloatArray) -> FloatArray:
-        """Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarized; shape (n, d)."""
-        d = len(self)
-        result, pairs = np.diagonal(bent[:, :d], axis1=1, axis2=2).copy(), iter(np.moveaxis(bent[:, d:], 1, 0))
-        for s in range(d):
-            for j in range(s):
-                mixed = (next(pairs) - next(pairs)) / 4
-                result[:, s] += mixed[:, j]
-                result[:, j] += mixed[:, s]
-        return result
 
 
 def _root(product: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -18,8 +18,9 @@ from torch_sim.integrators.md import InverseTimeArg, NoseHooverChain, TimeArg, c
 from torch_sim.models.interface import ModelInterface
 from torch_sim.units import unit_factor_from_annotation
 
-from kcons.errors import ConvergenceError, InputError, NonFiniteError
-from kcons.torchsim.holding import Constraints, constraints_of
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.thermostats.freedom import open_directions
+from kcons.torchsim.holding import Constraints, array_of, constraints_of
 
 __all__ = ["Integrator", "NoseHooverState", "langevin", "nose_hoover", "nve"]
 
@@ -202,6 +203,14 @@ def _nose_hoover_init(
     state: SimState, model: ModelInterface, *, kT: Any, dt: Any, tau: Any = None, chain_length: int = 3
 ) -> NoseHooverState:
     made = _start(state, model, kT=kT)
+    held, free = constraints_of(made), _free(made)
+    for motion, k in zip(held.motions, held.system_idx.tolist(), strict=True):
+        x = array_of(made.positions[made.system_idx == k])
+        if not free[k] and len(axes := open_directions(motion, x)):
+            raise UnsupportedError(
+                f"system {k} has constraints that leave its total momentum conserved along {len(axes)} of three axes, "
+                "for which a Nose-Hoover chain does not sample; use kcons.torchsim.langevin"
+            )
     rest = torch.zeros((state.n_systems, chain_length), dtype=state.dtype, device=state.device)
     period = _each(state, PERIODS * dt if tau is None else tau)
     chain = {"chain_positions": rest, "chain_momenta": rest.clone(), "tau": period, "target_kT": _each(state, kT)}

@@ -2,7 +2,7 @@
 
 The car axis: two wheels on a road that moves one of them, an index-3 problem; parameters and the solution at t = 3 from
 Mazzia and Magherini, Test Set for Initial Value Problem Solvers, release 2.4 (2008), II-1. Thomson's problem is that of
-`motion/test_minimization.py`.
+`motion/test_motion.py`.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ _FOLDER = Path(tempfile.gettempdir()) / "kcons-device-rows"
 #: Types of positions and of matrices by precision.
 _TYPES = {
     "double": "typedef double real, mixed;",
-    "mixed": "typedef float real; typedef double mixed;",
-    "single": "#define SINGLE\ntypedef float real, mixed;",
+    "mixed": "#define USE_MIXED_PRECISION\ntypedef float real; typedef double mixed;",
+    "single": "typedef float real, mixed;",
 }
 _ANY = (
     "int steps, int launches, double allowed, const double* b, const int* atoms, int clusters, int first, double h, "

@@ -11,9 +11,9 @@ import torch
 import torch_sim as ts
 from torch_models import Butanes, Drops, K, butane, drop, state_of
 
-from kcons.constraints import Distance, LinearVelocity
+from kcons.constraints import Distance, LinearVelocity, Plane
 from kcons.errors import InputError, UnsupportedError
-from kcons.torchsim import hold, nve, report
+from kcons.torchsim import hold, langevin, nose_hoover, nve, report
 
 
 def held(n=2):
@@ -88,6 +88,15 @@ def test_constraints_of_torchsim_beside_are_refused():
     state.constraints = [*state.constraints, ts.constraints.FixCom([0])]
     with pytest.raises(UnsupportedError, match="FixCom"):
         nve.init(state, Drops(), kT=300 * K)
+
+
+def test_momentum_that_is_conserved_along_some_axes_is_refused():
+    """A Nose-Hoover chain would give it its share of the heat, and never change it; friction does."""
+    state = ts.concatenate_states([drop(1), drop(1, 1)])
+    hold(state, ["water", Plane(0, [0, 0, 1])])
+    with pytest.raises(UnsupportedError, match=r"system 0 .* along 2 of three axes.*kcons\.torchsim\.langevin"):
+        nose_hoover.init(state, Drops(), kT=300 * K, dt=1.0)
+    langevin.init(state, Drops(), kT=300 * K)
 
 
 @pytest.mark.parametrize("integrator", ["nve", "nvt_langevin", "nvt_nose_hoover", "nvt_vrescale"])

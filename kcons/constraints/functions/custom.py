@@ -153,10 +153,7 @@ class Custom(PythonRows):
         self.function, self.gradient_function = function, gradient
         self.translation_invariant, self.period = bool(translation_invariant), period
 
-    def measure(self, r: FloatArray, time: float) -> FloatArray:
-        return self._values(r, time, 0)
-
-    def _values(self, r: FloatArray, time: float, first: int) -> FloatArray:
+    def measure(self, r: FloatArray, time: float, first: int = 0) -> FloatArray:
         """Values of the rows from `first` on."""
         return np.array([self.row_value(first + k, read_only_view(r[k]), time) for k in range(len(r))])
 
@@ -175,7 +172,7 @@ class Custom(PythonRows):
     def _differenced_gradient(self, r: FloatArray, time: float, first: int = 0) -> FloatArray:
         step = 1e-3 * self._length(r)
         places = r + step[:, None, None] * _along(self.width)[:, None]
-        values = np.array([self._values(place, time, first) for place in places])
+        values = np.array([self.measure(place, time, first) for place in places])
         slope = np.dot(_DIFFERENCE, nearest_image(values - values[0], self.period).reshape(4, -1))
         return np.ascontiguousarray((slope.reshape(-1, len(r)) / step).T).reshape(r.shape)
 
@@ -319,7 +316,7 @@ class ImplicitSurface(Custom):
     def row_gradient(self, k: int, r: FloatArray, time: float) -> FloatArray:
         return np.asarray(self.gradient(r[None], time)[0])
 
-    def _values(self, r: FloatArray, time: float, first: int) -> FloatArray:
+    def measure(self, r: FloatArray, time: float, first: int = 0) -> FloatArray:
         found = self.function(read_only_view(r[:, 0]), *self._time(time))
         return np.asarray(self._checked(found, "function", (self.n_rows,)))
 

@@ -48,8 +48,7 @@ FUNCTIONS: dict[str, Any] = {
 }
 #: What a sum that vanishes may be off by, beside its parts, at places where these are of order one.
 _SAME = 1e-9
-_COORDINATE = re.compile(r"[xyz]([1-9][0-9]{0,5})")
-_SPEED = re.compile(r"v[xyz]([1-9][0-9]{0,5})")
+_COORDINATE = re.compile(r"(v?)[xyz]([1-9][0-9]{0,5})")
 _OPERATIONS: dict[type, Callable[[Any, Any], Any]]
 _OPERATIONS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power}
 _PI = {"pi": np.float64(np.pi)}
@@ -85,9 +84,9 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                     known = f"{', '.join(sorted(FUNCTIONS))}, of one number each, atan2 of two"
                     raise wrong(ast.unparse(node), f"is no function of formulas; these are {known}", name)
             case ast.Name(id=name):
-                known_as = _COORDINATE.fullmatch(name) or _SPEED.fullmatch(name)
-                if known_as and (speeds or name[0] != "v"):
-                    found.add(int(known_as[1]))
+                known_as = _COORDINATE.fullmatch(name)
+                if known_as and (speeds or not known_as[1]):
+                    found.add(int(known_as[2]))
                 elif known_as:
                     held = "what is linear in velocities is held by VelocityFormula"
                     raise wrong(repr(name), f"is a velocity; {held}", name)
@@ -379,13 +378,13 @@ class Formula(Constraint):
         self.formula, self.names = formula, list(given)
         self.period = period
         for name in self.names:
-            if not isinstance(name, str):
+            word = isinstance(name, str) and name.isidentifier() and not iskeyword(name)
+            taken = word and (name in (*FUNCTIONS, "copysign", "t", "pi") or name.startswith(("_", "vx", "vy", "vz")))
+            if not word or taken or (name[1:].isdigit() and name[0] in "xyz"):
                 raise InputError(
-                    f"Formula: {name!r:.60} cannot be the name of a parameter; give text", item="parameters"
+                    f"Formula: {name!r:.60} cannot be the name of a parameter; give another word",
+                    item=name if isinstance(name, str) else "parameters",
                 )
-            taken = name in (*FUNCTIONS, "copysign", "t", "pi") or name.startswith(("_", "vx", "vy", "vz"))
-            if not name.isidentifier() or iskeyword(name) or taken or (name[1:].isdigit() and name[0] in "xyz"):
-                raise InputError(f"Formula: {name!r} cannot be the name of a parameter; give another one", item=name)
         self.row_width = self.code().width
         super().__init__(atoms, target)
         columns = []

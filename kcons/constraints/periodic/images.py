@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.periodic.one_piece import BoolArray, connected, follow_parents, minimum_image, spanning_tree
-from kcons.constraints.target import FloatArray, nearest_image
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 #: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbors in the list.
@@ -241,7 +241,7 @@ class _Links:
             # The target tells which of the two is meant.
             other = r + self.cell_offsets @ lattice[0]
             with np.errstate(all="ignore"):
-                closing = np.abs(self._sigma(other)) < 0.5 * np.abs(self._sigma(r))
+                closing = np.abs(item.sigma(other, self.time)) < 0.5 * np.abs(item.sigma(r, self.time))
         else:
             bonds = (nearest < self.half_width) & (nearest <= BOND_LIKE * longest[label][:, None])
             if item.links is not None:
@@ -261,9 +261,6 @@ class _Links:
         tied = images.unheld < 0
         body, _ = connected(np.stack([images.atoms[tied], images.parents[tied]], axis=1), n_atoms)
         return long[body[self.item.atoms[long, 0]] != body[self.item.atoms[long, 1]]]
-
-    def _sigma(self, r: FloatArray) -> FloatArray:
-        return nearest_image(self.item.measure(r, self.time) - self.item.target_at(self.time), self.item.period)
 
     def settle(self, component: IntArray, frameworks: BoolArray, held: sp.csr_array) -> None:
         """Rows beside the tree: in a body they have its images, in a framework they are local."""

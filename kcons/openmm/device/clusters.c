@@ -153,7 +153,7 @@ DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const 
         int k = (missed > 0 ? missed : -missed)-1;
         FAIL(ROWS_FIRST_LARGE+k, rows_off[k])
     }
-    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) rows_sums[ROWS_FIRST_LARGE+k] -= rows_sum[k]/h;
+    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) ROWS_ADD(ROWS_FIRST_LARGE+k, rows_sum[k]/h)
     SYNC_THREADS;
 }
 
@@ -177,7 +177,7 @@ DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL co
         SYNC_THREADS;
         rows_solve(ROWS_PASS cluster, pass == 0, rows_there, rows_there, w);
         rows_push(ROWS_PASS cluster, rows_there, v, w);
-        if (rate != 0) for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) rows_sums[ROWS_FIRST_LARGE+k] -= rows_answer[k];
+        if (rate != 0) for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) ROWS_ADD(ROWS_FIRST_LARGE+k, rows_answer[k])
         SYNC_THREADS;
     } while (++pass < 2);
 }

@@ -301,7 +301,7 @@ class ItemWriter:
 
     def _sums(self, by: str) -> str:
         return self._each(
-            lambda k, r: f" rows_sums[{self.row_number}+{k}] -= {self._unit(k, r)}sum[{k}]{by};\n" if r.summed else ""
+            lambda k, r: f" ROWS_ADD({self.row_number}+{k}, {self._unit(k, r)}sum[{k}]{by})\n" if r.summed else ""
         )
 
     def _unit(self, k: int, row: Row) -> str:

@@ -44,6 +44,8 @@ from kcons.plan.clusters_alike import alike
 TURNS, CHORD = 30, 4
 #: Knots of moving targets in a step; steps between two looks at functions of Python; steps that knots reach beyond.
 KNOTS, BLOCK, BEYOND = 2, 500, 2
+#: Arrays of impulses, and of what rounding has taken from their sums.
+SUMS = ("rows_sums", "rows_lost")
 #: A pivot of a dependent row below this part of its diagonal is none.
 PIVOT, PIVOT_SINGLE = 1e-10, 1e-4
 
@@ -51,12 +53,16 @@ _COMMON = f"""
 #define ROWS_TURNS {TURNS}
 #define ROWS_CHORD {CHORD}
 #define ROWS_FAR ((mixed) 1e30)
-#ifdef SINGLE
-#define ROWS_PIVOT ((mixed) {PIVOT_SINGLE})
-#define ROWS_ROUNDING ((mixed) 5e-7)
-#else
+#if defined(USE_DOUBLE_PRECISION) || defined(USE_MIXED_PRECISION)
 #define ROWS_PIVOT ((mixed) {PIVOT})
 #define ROWS_ROUNDING ((mixed) 4e-16)
+#define ROWS_ADD(row, impulse) rows_sums[row] -= impulse;
+#else
+#define ROWS_PIVOT ((mixed) {PIVOT_SINGLE})
+#define ROWS_ROUNDING ((mixed) 5e-7)
+/* What rounding takes from a long sum of single numbers comes back with the next one. */
+#define ROWS_ADD(row, impulse) {{volatile mixed y_ = -(impulse)-rows_lost[row], t_ = rows_sums[row]+y_; \
+  rows_lost[row] = (t_-rows_sums[row])-y_; rows_sums[row] = t_;}}
 #endif
 /* Where atom a of a list is, after atom b before it, by the shortest image of the vector between them. */
 #define ROWS_STEP(to, at, from, a, b) {{ \\
@@ -225,8 +231,9 @@ class DeviceRows:
         self.arrays += [
             Array("rows_knots", "mixed", np.zeros(self._n_knots)),
             Array("rows_cells", "mixed", np.zeros(max(self.n_cells, 1))),
-            Array("rows_sums", "mixed", np.zeros(max(len(self._order), 1)), saved=True),
         ]
+        room = np.zeros(max(len(self._order), 1))
+        self.arrays += [Array(name, "mixed", room, saved=True) for name in SUMS]
 
     def renew(
         self, time: float, dt: float, steps: int, positions: FloatArray | None = None, cell: FloatArray | None = None
@@ -437,7 +444,8 @@ class KernelRows(CarriedConstraints):
 
     def reset_multipliers(self, integrator: Any) -> None:
         """Begin the sums of `mean_multipliers` anew, as the first step does, and one after the time was set."""
-        integrator.write("rows_sums", np.zeros(len(integrator.read("rows_sums"))))
+        for name in SUMS:
+            integrator.write(name, np.zeros(len(integrator.read(name))))
         self._since = self.left = float(integrator.context.getTime()._value)
 
     def __deepcopy__(self, memo: dict[int, object]) -> KernelRows:

@@ -248,7 +248,7 @@ def test_files_keep_formulas():
         (lambda: Formula("x1", 0, {"sin": 1.0}), "sin", "cannot be the name"),
         (lambda: Formula("x1", 0, {"lambda": 1.0}), "lambda", "cannot be the name"),
         (lambda: Formula("abs(x1)*copysign", 0, {"copysign": 1.0}), "copysign", "cannot be the name"),
-        (lambda: Formula("x1", 0, {3: 1.0}), "parameters", "3 cannot be the name of a parameter; give text"),
+        (lambda: Formula("x1", 0, {3: 1.0}), "parameters", "3 cannot be the name of a parameter; give another word"),
     ],
 )
 def test_bad_arguments_are_named(make, item, message):

@@ -78,7 +78,7 @@ MUTANTS = {
         ),
     ],
     "steppers/stepper.py": [
-        ("if not residual <«= self.tolerance→ 1e300»:", "stepper::check_finds_a_stepper_that_is_not_reversible"),
-        (': «None if name in ("_known", "_left") else →»', "stepper::copies_leave_behind_what_was_found_for_a_system"),
+        ("if not residual <«= self.tolerance→ 1e300»:", "state::check_finds_a_stepper_that_is_not_reversible"),
+        (': «None if name in ("_known", "_left") else →»', "state::copies_leave_behind_what_was_found_for_a_system"),
     ],
 }

@@ -9,6 +9,8 @@ MUTANTS = {
     ],
     "openmm/device/rows.py": [
         ("if «not item.n_rows→False»:", "rows::constraints_of_no_rows_hold_nothing"),
+        ("#define ROWS_PIVOT ((mixed) {«PIVOT_SINGLE→PIVOT»})", "kernel_rows::multipliers_in_single_precision"),
+        ("{volatile mixed y_ = -(impulse)«-rows_lost[row]→», t_", "kernel_rows::multipliers_in_single_precision"),
         (
             "part._engine._integrator = «weakref.ref(integrator)→other»",
             "kernel_rows::states_with_energies_of_rows_of_hold_that_move",

@@ -83,7 +83,7 @@ MUTANTS = {
     "topology/guessed_bonds.py": [
         (
             "wrapped = y« if lattice is None else wrapped_into(y, lattice)[1]→»",
-            "moved_groups::bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored",
+            "restoring::bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored",
         ),
     ],
     "plan/clusters.py": [

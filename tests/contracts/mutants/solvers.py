@@ -67,16 +67,16 @@ MUTANTS = {
     "motion/restoring/nearest_point.py": [
         (
             "        «self._descend(start, here)→pass»\n",
-            "nearest_point::the_nearest_point_is_found_where_the_surface_is_much_bent",
+            "restoring::the_nearest_point_is_found_where_the_surface_is_much_bent",
         ),
     ],
     "motion/restoring/moved_groups.py": [
-        ("«self._follow_fixed(y)→pass»", "moved_groups::fixed_atoms_that_go_elsewhere_take_their_molecule_along"),
+        ("«self._follow_fixed(y)→pass»", "restoring::fixed_atoms_that_go_elsewhere_take_their_molecule_along"),
     ],
     "motion/restoring/kept_geometry.py": [
         (
             "if not «self._follows(x, entry[1])→False»]",
-            "moved_groups::bonds_and_angles_that_rows_hold_may_change_as_the_rows_ask",
+            "restoring::bonds_and_angles_that_rows_hold_may_change_as_the_rows_ask",
         ),
     ],
     "constraints/internal.py": [

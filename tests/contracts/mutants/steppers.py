@@ -86,7 +86,7 @@ MUTANTS = {
         ("if steps and holds and «state is not system.last→False»:", "state::start_off_the_constraints"),
         (
             "    «refuse_clock(state.time, state.step, state.time_remainder)\n    →»stepper = Rattle",
-            "stepper::states_made_by_hand_with_impossible_numbers",
+            "state::states_made_by_hand_with_impossible_numbers",
         ),
     ],
     "steppers/state.py": [

@@ -39,7 +39,7 @@ MUTANTS = {
         ("= covariance + «→0 * »np.outer(half,", "free_energy::sides_that_differ_by_more_than_chance_widen_the_error"),
     ],
     "free_energy/held_coordinates.py": [
-        ("result[:, j] += mixed[:, «s→j»]", "held_coordinates::mean_force_is_the_one_of_the_definition"),
+        ("gradient[:, j] += mixed[:, «s→j»]", "held_coordinates::mean_force_is_the_one_of_the_definition"),
         ("d * d«] @ shares.swapaxes(1, 2)→, -d:]»", "held_coordinates::mean_force_is_the_one_of_the_definition"),
         ("bent[:, 1 + d * d :].sum(axis=1) «-→+» traces)", "held_coordinates::mean_force_is_the_one_of_the_definition"),
         ("(respond @ b[:, :, None] «-→+» pull)", "held_coordinates::multipliers_are_those_of_the_engine"),

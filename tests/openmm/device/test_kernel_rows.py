@@ -19,6 +19,7 @@ from kcons.steppers import Rattle
 
 pytestmark = pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
 ON_ALL = ["Reference", "CPU", *GPUS]
+SINGLE = [each for each in GPUS if each.id.endswith(("single", "none"))]
 MIXED = [each for each in GPUS if each.id.endswith(("mixed", "none"))]
 
 
@@ -266,6 +267,22 @@ def test_multipliers_are_summed_where_the_rows_are(platform):
         context.setTime(time)
         integrator.step(10)
         assert part.mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("platform", SINGLE)
+def test_multipliers_in_single_precision(platform):
+    """Of rows that depend on others, as on Reference; and where one impulse is little beside the sum of many."""
+    rng = np.random.default_rng(2)
+    x, rows = 0.15 * rng.normal(size=(5, 3)), Distance([[i, j] for i in range(5) for j in range(i)])
+    system, found = particles([12.0] * 5, field(5, rng)), []
+    for place in ("Reference", platform):
+        _, context = run(system, x, 0 * x, place, 100, rows)
+        found.append(context.getIntegrator().parts[0].mean_multipliers(context.getIntegrator()))
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-4 * np.abs(found[0]).max())
+    pair = particles([12.0] * 2, on_each("-100*x", [1]), on_each("100*x", [0]))
+    _, context = run(pair, np.array([[0, 0, 0], [0.15, 0, 0]]), np.zeros((2, 3)), platform, 20_000, Distance([[0, 1]]))
+    integrator = context.getIntegrator()
+    assert integrator.parts[0].mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-4)
 
 
 def test_noise_is_in_no_multiplier():

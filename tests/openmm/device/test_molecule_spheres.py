@@ -52,7 +52,8 @@ def in_order(auxiliary_variables, integrator, layout, auxiliary):
 
     On the device they come by kinds of clusters, the spheres of a cluster one after another; single atoms are last.
     """
-    shapes = [*integrator.rows.shapes, Shape(np.setdiff1d(np.arange(27), _held(integrator))[:, None])]
+    held = np.concatenate([shape.atoms.ravel() for shape in integrator.rows.shapes])
+    shapes = [*integrator.rows.shapes, Shape(np.setdiff1d(np.arange(27), held)[:, None])]
     found, at = np.zeros(auxiliary_variables.size), 0
     for shape in shapes:
         for atoms in shape.atoms:
@@ -63,10 +64,6 @@ def in_order(auxiliary_variables, integrator, layout, auxiliary):
                 at += auxiliary
     assert at == found.size
     return found
-
-
-def _held(integrator):
-    return np.concatenate([shape.atoms.ravel() for shape in integrator.rows.shapes])
 
 
 @pytest.mark.parametrize(("kind", "auxiliary"), [("split", 0), ("split", 2), ("axes", 1), ("axes", 4), ("cluster", 1)])
