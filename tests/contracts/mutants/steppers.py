@@ -104,7 +104,7 @@ MUTANTS = {
         ("if «carriers < FEW_INDEPENDENT→False» else", "correlated_series::heavy_tails_are_said"),
     ],
     "thermostats/freedom.py": [
-        ("for k in range(1, «NEARER + 1→2»)", "freedom::bodies_that_feel_another_are_not[gas]"),
+        ("for k in range(1, «NEARER + 1→2»)", "freedom::bodies_that_feel_no_other_are_warned_of_once[gas]"),
     ],
     "thermostats/barostats.py": [
         (
