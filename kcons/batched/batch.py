@@ -123,7 +123,7 @@ class Batch:
         self._is_position = self._joined(lambda each: each.constraint_set.holonomic, torch.bool)
         self._holonomic = bool(self._is_position.all())
         self._set_lattices()
-        self._known: dict[bool, list[Group]] = {}
+        self._given, self._known = (self.masses, self.targets), dict[bool, list[Group]]()
         self._groups(True)
 
     def _joined(self, of: Any, dtype: torch.dtype | None = None, starts: Any = None) -> Tensor:
@@ -223,8 +223,8 @@ class Batch:
         return self._joined(lambda each: each.constraint_set.target_rates(time, order))
 
     def _task(self, of_positions: bool, time: float, start: float, flight: float = 0.0) -> Task:
-        for item in ("masses", "targets"):
-            if getattr(self, item)._version:  # numbers that follow from them are kept
+        for item, own in zip(("masses", "targets"), self._given, strict=True):
+            if getattr(self, item) is not own or own._version:  # numbers that follow from them are kept
                 raise InputError(f"{item} of a Batch were written to; give other ones as {item}= of a call", item=item)
         t, t_start = (torch.full((), each, dtype=self.dtype, device=self.device) for each in (time, start))
         return Task(self, self._groups(flight != 0 or not of_positions), of_positions, flight != 0, t, t_start)

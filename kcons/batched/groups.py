@@ -129,6 +129,7 @@ class Group:
         begins, whole = np.repeat([np.cumsum([0, *sizes])[:-1], [row.whole for row in some]], sizes, axis=1)
         self._begin = torch.as_tensor(begins, device=like.device)
         self._whole = torch.as_tensor(whole, device=like.device, dtype=torch.bool)[:, None]
+        self._any_whole = bool(whole.any())
         self.worst = torch.zeros(self.rows.shape, dtype=like.dtype, device=like.device)
 
     def lanes(self, values: Tensor, numbers: Tensor) -> Tensor:
@@ -152,7 +153,7 @@ class Group:
         cell, inverse = lattice[self.systems].unbind(1)
         sums = -torch.round(torch.einsum("xen,nxy->yen", apart(flat, self._before), inverse)).cumsum(1)
         cells = sums - torch.cat([torch.zeros_like(sums[:, :1]), sums], 1)[:, self._begin]
-        if bool(self._whole.any()):
+        if self._any_whole:
             found = apart(tree(x).reshape(-1), self._first) + self._offsets.movedim(1, 0)
             cells = torch.where(self._whole, found, cells)
         return flat[self.flat], torch.einsum("xen,nxy->eyn", cells, cell).reshape(-1, n)

@@ -111,10 +111,12 @@ def test_what_is_refused():
     with pytest.raises(InputError, match=r"x_reference: torch.float32 on cpu.*convert it"):
         batch.project_positions(x, x.float())
     for item in ("masses", "targets"):
-        other = Batch(water(), copies=2)
-        getattr(other, item)[0] = 1.1
-        with pytest.raises(InputError, match=rf"{item} of a Batch were written to; give other ones as {item}="):
-            other.project_positions(x, x)
+        written, replaced = Batch(water(), copies=2), Batch(water(), copies=2)
+        getattr(written, item)[0] = 1.1
+        setattr(replaced, item, 1.1 * getattr(replaced, item))
+        for other in (written, replaced):
+            with pytest.raises(InputError, match=rf"{item} of a Batch were written to; give other ones as {item}="):
+                other.project_positions(x, x)
     with pytest.raises(InputError, match=r"targets must be a tensor of shape \(6,\)"):
         batch.project_positions(x, x, targets=torch.ones(4, dtype=torch.float64))
     with pytest.raises(InputError, match=r"a kcons.Motion and the number of copies"):
