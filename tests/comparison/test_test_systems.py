@@ -93,19 +93,6 @@ def test_thermal_velocities():
     assert np.array_equal(v, draw(rng=3)) and not np.allclose(v, draw(rng=4))
 
 
-@pytest.mark.parametrize(
-    ("dt", "words"), [(0.0, "positive step"), (-1.0, "positive"), (1e9, "positive"), (3.0, "does not divide")]
-)
-def test_bad_time_step(dt, words):
-    with pytest.raises(InputError, match=words):
-        small("chain").with_time_steps([dt])
-
-
-def test_time_steps_are_sorted_coarse_first():
-    system = small("chain").with_time_steps([2.5, 10.0, 5.0, 5.0])
-    np.testing.assert_allclose(np.array(system.time_steps) / units.fs, [10.0, 5.0, 2.5])
-
-
 @pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "breathing"])
 def test_shortened_system_has_its_solution_at_its_own_horizon(name):
     half = small(name).shortened(2)
