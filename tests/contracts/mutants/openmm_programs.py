@@ -68,7 +68,7 @@ MUTANTS = {
         ("[«-1→0»] += operation.fraction", "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
     ],
     "openmm/ensembles/isokinetic_ensemble.py": [
-        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "every_ensemble::a_run_has_the_temperature"),
+        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "openmm_replay::temperature"),
         ('"max(qq«-wq→», wq^2/ww)"', "isokinetic_ensemble::two_sums_do_where_velocities_are_not_read"),
         (
             'program.set("exact", «float(precision == "double" and not rigid)→0.0»)',
@@ -106,7 +106,7 @@ MUTANTS = {
             "«groups_of(force)→{force.getForceGroup()}» - set(known)",
             "langevin_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
-        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
+        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "openmm_replay::temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         ('(name, «f"{name}_last"→name», "the', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),
