@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 import openmm
 import pytest
-from ensemble_runs import on_their_rows, run, twice_kinetic, two_parts, warm
+from ensemble_runs import in_calls_of_any_length, on_their_rows, run, twice_kinetic, two_parts, warm
 from openmm_ensembles import ENSEMBLES
 from openmm_systems import loose_alanine, started, state_of, water_box
 
@@ -46,6 +46,12 @@ def test_rows_that_are_carried_move_as_those_of_the_system(bath):
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=3e-12)
     np.testing.assert_allclose(ends[0][1], ends[1][1], atol=3e-9)
     assert ends[0][2] == pytest.approx(ends[1][2], rel=1e-7)
+
+
+@pytest.mark.parametrize("bath", WITHOUT_NOISE)
+def test_calls_of_any_length_make_the_same_motion(bath):
+    """Within a call two half kicks at one place are a whole one, and so are halves of a chain: nobody looks at K."""
+    in_calls_of_any_length(lambda: ENSEMBLES[bath](300.0, 20.0))
 
 
 @pytest.mark.parametrize("bath", ["Isokinetic", "NoseHoover"])
