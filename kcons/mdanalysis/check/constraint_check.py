@@ -393,7 +393,7 @@ def check_trajectory(
         A trajectory of which nothing can be told: cut off, or not finite, in its first frame.
     """
     try:
-        numbers = [int(word) if word.strip() else None for word in (":" if frames is None else frames).split(":")]
+        numbers = [int(word) if word.strip() else None for word in (":" if frames is None else str(frames)).split(":")]
     except ValueError:
         numbers = []
     if not 2 <= len(numbers) <= 3 or (numbers[2:] and numbers[2] is not None and numbers[2] < 1):

@@ -32,6 +32,7 @@ def test_check_from_files(run):
     for options, match in (
         ({"frames": "a:b"}, "frames are"),
         ({"frames": "3"}, "frames are"),
+        ({"frames": 3}, "frames are 3; give them as A:B"),
         ({"frames": "1:5:0"}, "frames are"),
         ({"workers": 0}, "workers is 0"),
         ({"select": "resname NOPE"}, r"(?i)matches no|no atoms"),
