@@ -270,11 +270,13 @@ class Constraints(FixConstraint):
         IndexError
             If no row is left; ASE then drops the object.
         """
-        if not self._keep(np.arange(len(atoms))[ind], len(atoms)):
+        kept = self._within(np.arange(len(atoms))[ind], len(atoms))
+        if not kept:
             raise IndexError("no constraint lies within the slice")
+        self.constraints = kept
 
-    def _keep(self, atoms: IntArray, n_atoms: int) -> bool:
-        """Keep the rows all of whose atoms are among `atoms`, of n_atoms, renumbered in their order; whether any is."""
+    def _within(self, atoms: IntArray, n_atoms: int) -> tuple[Constraint, ...]:
+        """The rows all of whose atoms are among `atoms`, of n_atoms, renumbered in their order."""
         new_index = np.full(n_atoms, -1, dtype=np.int64)
         new_index[atoms] = np.arange(len(atoms))
         kept = []
@@ -282,8 +284,7 @@ class Constraints(FixConstraint):
             inside = np.flatnonzero((new_index[item.atoms] >= 0).all(axis=1))
             if len(inside):
                 kept.append((item if len(inside) == item.n_rows else item.select(inside)).renumbered(new_index))
-        self.constraints = tuple(kept)
-        return bool(kept)
+        return tuple(kept)
 
     def repeat(self, m: Any, n: int) -> Constraints:
         """Hold the fixed atoms of all replicas of a cell of `n` atoms, `m` times along each axis; returns this object.
@@ -329,7 +330,7 @@ class Constraints(FixConstraint):
         object instead of failing.
         """
         try:
-            rows = [item.todict() for item in self.constraints]
+            rows = [item.todict() for item in self.constraints if item.n_rows]
         except InputError as error:
             warnings.warn(f"constraints are left out of the file: {error}", stacklevel=3)
             raise AttributeError(f"todict: {error}") from None
@@ -419,7 +420,8 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
 
     def delete_atoms(self, indices: Any, natoms: int) -> Constraints | None:
         """Keep the rows whose atoms all stay, renumbered; None if there are none."""
-        return self if self._keep(np.delete(np.arange(natoms), indices), natoms) else None
+        self.constraints = self._within(np.delete(np.arange(natoms), indices), natoms)
+        return self if self.constraints else None
 
 
 def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:

@@ -155,7 +155,7 @@ class ConstraintSet:
         self.scale: FloatArray = self._rows(lambda c: c.scale(time))
         if not np.all(self.scale > 0):
             size = self._reach(x, time)
-            size = np.where(size > 0, size, extent(x) or 1.0)
+            size = np.where(size > 0, size, extent(x[np.isfinite(x).all(axis=1)]) or 1.0)
             self.scale = np.where(self.scale > 0, self.scale, size)
 
     def _reach(self, x: FloatArray, time: float) -> FloatArray:
@@ -348,7 +348,10 @@ class ConstraintSet:
         return self._rows(lambda c: function(c, self.gather(c, positions, whole), time))
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
-        return as_array(x, (self.n_atoms, 3), item)
+        array = as_float_array(x, item)  # not `as_array`, which copies the read-only positions of a State
+        if array.shape != (self.n_atoms, 3):
+            raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
+        return array
 
     # -- the cell -------------------------------------------------------------------------------
 

@@ -77,16 +77,7 @@ def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = T
     held = constraints_of(state)
     held.check_fits(state)
     start = copy.copy(state)
-    start.positions = held.move(state, state.positions)[0]
-    held.check(state)
-    away = (start.positions - state.positions).abs().amax(1)
-    if bool(away.max() > FAR):
-        atom = int(away.argmax())
-        raise InputError(
-            f"system {int(state.system_idx[atom])} has atom {atom} {float(away[atom]):.3g} off its constraints, moved "
-            "since these were made; put it back, or set state.constraints = [] and hold again",
-            item="state",
-        )
+    start.positions = _placed(state, held)
     masses = state.masses[:, None]
     given = getattr(state, "momenta", None)
     if given is None:
@@ -98,10 +89,43 @@ def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = T
             sums = sums.index_add(0, state.system_idx, torch.cat([given, masses], dim=1))
             given = given - masses * (_free(state)[:, None] * sums[:, :3] / sums[:, 3:])[state.system_idx]
     momenta = masses * held.tangent(start, given / masses)
-    output = model(start)
+    output = _output(start, model)
     made = MDState.from_state(start, momenta=momenta, energy=output["energy"], forces=output["forces"])
     made.store_model_extras(output)
     return made
+
+
+def _placed(state: SimState, held: Constraints) -> torch.Tensor:
+    """Positions on the constraints; refuses those that somebody has moved off them."""
+    found = held.move(state, state.positions)[0]
+    held.check(state)
+    away = (found - state.positions).abs().amax(1)
+    if bool(away.max() > FAR):
+        atom = int(away.argmax())
+        raise InputError(
+            f"system {int(state.system_idx[atom])} has atom {atom} {float(away[atom]):.3g} off its constraints, moved "
+            "since these were made; put it back, or set state.constraints = [] and hold again",
+            item="state",
+        )
+    return found
+
+
+def _output(state: SimState, model: ModelInterface) -> dict[str, torch.Tensor]:
+    output = model(state)
+    _check_forces(state, output["forces"])
+    return output
+
+
+def _check_forces(state: SimState, forces: torch.Tensor) -> None:
+    bad = (~torch.isfinite(forces).all(dim=1)).nonzero().ravel()
+    if len(bad):
+        atom, system = int(bad[0]), int(state.system_idx[bad[0]])
+        raise NonFiniteError(
+            f"force of atom {atom} (in system {system}) is not finite: look at what the model returned; the state is "
+            "as before the step",
+            item="force",
+            atom=atom,
+        )
 
 
 def _free(state: SimState) -> torch.Tensor:
@@ -124,25 +148,20 @@ def _whole(step: Callable[..., State]) -> Callable[..., State]:
 
     @functools.wraps(step)
     def made(state: State, model: ModelInterface, **settings: Any) -> State:
-        before = dict(state.__dict__)
+        before, held = dict(state.__dict__), constraints_of(state)
+        if held.left is None or state.positions is not held.left[0] or state.positions._version != held.left[1]:
+            _placed(state, held)
         try:
             return step(state, model, **settings)
         except BaseException as error:
-            bad = (~torch.isfinite(state.forces).all(dim=1)).nonzero().ravel()
+            forces = state.forces
             state.__dict__.clear()
             state.__dict__.update(before)
             if not isinstance(error, ConvergenceError):
                 raise
-            if not len(bad):
-                error.add_note("In TorchSim: take a smaller timestep; the state is as before the step")
-                raise
-            atom, system = int(bad[0]), int(state.system_idx[bad[0]])
-            raise NonFiniteError(
-                f"force of atom {atom} (in system {system}) is not finite: look at what the model returned; the state "
-                "is as before the step",
-                item="force",
-                atom=atom,
-            ) from error
+            _check_forces(state, forces)
+            error.add_note("In TorchSim: take a smaller timestep; the state is as before the step")
+            raise
 
     return made
 
@@ -169,7 +188,8 @@ def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
 def _evaluate(state: MDState, model: ModelInterface) -> None:
     """Forces at the end of a step, at positions that are on the constraints: looked at here, once a step."""
     constraints_of(state).check(state)
-    output = model(state)
+    output = _output(state, model)
+    constraints_of(state).left = state.positions, state.positions._version
     state.energy, state.forces = output["energy"], output["forces"]
     state.store_model_extras(output)
 
@@ -202,15 +222,16 @@ def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, g
 def _nose_hoover_init(
     state: SimState, model: ModelInterface, *, kT: Any, dt: Any, tau: Any = None, chain_length: int = 3
 ) -> NoseHooverState:
-    made = _start(state, model, kT=kT)
-    held, free = constraints_of(made), _free(made)
+    held, free = constraints_of(state), _free(state)
+    held.check_fits(state)
     for motion, k in zip(held.motions, held.system_idx.tolist(), strict=True):
-        x = array_of(made.positions[made.system_idx == k])
+        x = array_of(state.positions[state.system_idx == k])
         if not free[k] and len(axes := open_directions(motion, x)):
             raise UnsupportedError(
                 f"system {k} has constraints that leave its total momentum conserved along {len(axes)} of three axes, "
                 "for which a Nose-Hoover chain does not sample; use kcons.torchsim.langevin"
             )
+    made = _start(state, model, kT=kT)
     rest = torch.zeros((state.n_systems, chain_length), dtype=state.dtype, device=state.device)
     period = _each(state, PERIODS * dt if tau is None else tau)
     chain = {"chain_positions": rest, "chain_momenta": rest.clone(), "tau": period, "target_kT": _each(state, kT)}

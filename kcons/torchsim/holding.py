@@ -57,6 +57,8 @@ class Constraints(SystemConstraint):
         self.motions = tuple(motions)
         #: Tensors that the engine was made for, with their versions, the engine, and its atoms.
         self._made: tuple[list[tuple[torch.Tensor, int]], Batch, torch.Tensor] | None = None
+        #: Positions that the last step ended with, and their version.
+        self.left: tuple[torch.Tensor, int] | None = None
 
     def batch(self, state: SimState) -> tuple[Batch, torch.Tensor]:
         """The engine for all systems of a state that have rows, and the numbers of their atoms."""

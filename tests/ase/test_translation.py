@@ -31,7 +31,7 @@ from ase.md.verlet import VelocityVerlet
 from ase_systems import AS_ASE, loose_waters, rigid
 
 from kcons.ase import ConstrainedDynamics, Constraints, attach, constrain, from_ase_constraints, rigid_water
-from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, ImplicitSurface, LinearCombination
+from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, ImplicitSurface, LinearCombination, Sphere
 from kcons.errors import UnsupportedError
 
 
@@ -267,6 +267,13 @@ def test_function_rows_are_left_out_of_files_with_a_warning(tmp_path):
     assert len(atoms.copy().constraints[0].constraints) == 2
 
 
+def test_objects_without_rows_are_left_out_of_files(tmp_path):
+    atoms = Atoms("H2", positions=[[1, 0, 0], [3, 0, 0]])
+    constrain(atoms, [Sphere([], [0.0, 0.0, 0.0]), Distance([0, 1])])
+    write(tmp_path / "a.traj", atoms)
+    assert [item.family for item in attach(read(tmp_path / "a.traj")).constraints] == ["Distance"]
+
+
 def test_slicing_keeps_whole_rows_only():
     atoms, _ = rigid(3)
     part = atoms[3:8]
@@ -275,6 +282,9 @@ def test_slicing_keeps_whole_rows_only():
     assert atoms[[0, 3, 6]].constraints == []
     assert np.array_equal(targets(atoms[np.arange(9) < 3]), targets(atoms)[:3])
     assert np.array_equal(targets(atoms[[2, 1, 0]]), targets(atoms)[:3])
+    with pytest.raises(IndexError):
+        atoms.constraints[0].index_shuffle(atoms, [0, 3, 6])
+    assert targets(atoms).shape == (9,)
 
 
 def test_rows_are_not_repeated_but_fixed_atoms_are():

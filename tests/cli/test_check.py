@@ -54,15 +54,10 @@ def test_kept(folder, capsys):
     assert data["verdict"] in (out / "check.txt").read_text()
 
 
-def test_violated(folder, capsys):
-    assert command(folder, "bad.xtc") == 1
-    page = capsys.readouterr().out
-    assert "violated by" in page and "SOL3:OW–HW1 (6, 7)" in page and "0.001 nm" in page
-
-
-def test_a_file_that_ends_too_early(folder, capsys):
+def test_violated_in_a_file_that_ends_too_early(folder, capsys):
     assert command(folder, "cut.xtc") == 1
     page = capsys.readouterr().out
+    assert "violated by" in page and "SOL3:OW–HW1 (6, 7)" in page and "0.001 nm" in page
     assert "4 of 5 frames" in page and "ends too early, at frame 4" in page
 
 

@@ -10,7 +10,7 @@ from kcons.cli import main
 from kcons.comparison import measure, observed_orders, production, read_csv
 
 ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
-CHAIN = ("compare", "chain", "--size", 4, "--dt", "10,5", "--budget", 5)
+CHAIN = ("compare", "chain", "--size", 4, "--dt", "5,10,5", "--budget", 5)
 
 
 def run(*arguments):
@@ -82,13 +82,13 @@ def test_it_goes_on_from_the_rows_that_are_there(tmp_path, monkeypatch, capsys):
     assert "leave --resume out" in capsys.readouterr().err
 
 
-def test_nothing_is_written_where_nothing_was_done(tmp_path, monkeypatch):
+def test_nothing_is_written_where_nothing_was_done(tmp_path, monkeypatch, capsys):
     def stopped(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(measure, "all_settings", stopped)
     assert run(*CHAIN, "--methods", "rattle", "--out", tmp_path) == 130
-    assert list(tmp_path.iterdir()) == []
+    assert capsys.readouterr().err.endswith("kcons: interrupted\n") and list(tmp_path.iterdir()) == []
 
 
 def test_a_file_of_ones_own(tmp_path, monkeypatch, capsys):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kcons.cli import compare, main
+from kcons.cli import main
 
 ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
 needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
@@ -64,6 +64,7 @@ MISTAKES = [
     ("compare chain --methods ,", "no method"),
     ("compare chain --size 0", "size is 0; give a whole number, 1 or more"),
     ("compare chain --size 3 --dt 3", "does not divide the horizon"),
+    *((f"compare chain --size 3 --dt {dt}", "give a positive step of at most the horizon") for dt in (0, -1, 1e9)),
     ("compare chain --size 3 --dt ,", "--dt is empty"),
     ("compare chain --size 3 --budget -1", "budget is -1.0; give a positive number"),
     ("compare chain --size 3 --out /dev/null/x", "/dev/null"),
@@ -111,15 +112,6 @@ def test_a_file_where_a_folder_has_to_be(place, tmp_path, capsys):
     (tmp_path / "taken").touch()
     assert run("compare", "chain", "--size", 4, "--methods", "rattle", "--dt", 10, "--out", tmp_path / place) == 2
     assert "there is a file where a folder has to be; give another folder (--out)" in capsys.readouterr().err
-
-
-def test_interrupt(monkeypatch, capsys):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(compare, "test_system", stop)
-    assert run("plan", "chain") == 130
-    assert capsys.readouterr().err == "kcons: interrupted\n"
 
 
 def test_importing_the_command_imports_no_md_engine():

@@ -139,3 +139,11 @@ def test_steps_are_found_for_an_error():
     with pytest.raises(InputError, match="the target error is -1; give a positive number"):
         find_steps(system, table, -1, reference)
     assert find_steps(system, table, 1e-16, reference) == []
+
+
+def test_nothing_of_the_table_is_changed():
+    table = made(*ROWS)
+    before = table.copy()
+    rank(table)
+    observed_orders(table)
+    pd.testing.assert_frame_equal(table, before)

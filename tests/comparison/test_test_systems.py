@@ -1,4 +1,4 @@
-"""Test systems: their contract, their geometry, and solutions that share nothing with the engine.
+"""Test systems: their contract and their geometry.
 
 Starts, forces, orders and stored solutions of all of them: tests/contracts/test_all_test_systems.py.
 """
@@ -6,10 +6,8 @@ Starts, forces, orders and stored solutions of all of them: tests/contracts/test
 from __future__ import annotations
 
 import functools
-import json
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,11 +16,10 @@ from ase.calculators.calculator import CalculationFailed, Calculator
 from small_test_systems import SMALL, end, small
 
 from kcons.comparison import Potential, add_system, compare, test_systems
-from kcons.comparison.test_systems import chain, sphere, water
+from kcons.comparison.test_systems import chain, water
 from kcons.comparison.test_systems.potential import of_calculator
 from kcons.comparison.test_systems.system import converged, thermal_velocities
 from kcons.errors import CalculatorError, InputError
-from kcons.steppers import State, System, run
 
 
 def apart(system):
@@ -91,35 +88,6 @@ def test_thermal_velocities():
     assert np.abs(np.sum(masses * v, axis=0)).max() < 1e-12
     assert 0.5 * np.sum(masses * v**2) == pytest.approx(0.5 * (6 * 8 - 3) * units.kB * 300.0, rel=1e-12)
     assert np.array_equal(v, draw(rng=3)) and not np.allclose(v, draw(rng=4))
-
-
-@pytest.mark.parametrize(
-    ("dt", "words"), [(0.0, "positive step"), (-1.0, "positive"), (1e9, "positive"), (3.0, "does not divide")]
-)
-def test_bad_time_step(dt, words):
-    with pytest.raises(InputError, match=words):
-        small("chain").with_time_steps([dt])
-
-
-def test_time_steps_are_sorted_coarse_first():
-    system = small("chain").with_time_steps([2.5, 10.0, 5.0, 5.0])
-    np.testing.assert_allclose(np.array(system.time_steps) / units.fs, [10.0, 5.0, 2.5])
-
-
-@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "breathing"])
-def test_shortened_system_has_its_solution_at_its_own_horizon(name):
-    half = small(name).shortened(2)
-    assert half.horizon == small(name).horizon / 2
-    system = System(half.motion, half.potential.forces)
-    last = run(system, State(half.positions, half.velocities), half.horizon / 800, 800)
-    assert half.deviation(last.positions, half.reference().positions) < 1e-4
-
-
-def test_a_moving_constraint_is_followed_in_time():
-    system = small("breathing")
-    state = end(system, system.time_steps[-1])
-    assert system.residuals(state.positions, state.velocities, system.horizon) < (1e-12, 1e-12)
-    assert system.residuals(state.positions, state.velocities)[0] > 0.1
 
 
 # -- forces -----------------------------------------------------------------------------------------
@@ -209,26 +177,3 @@ def test_slab_is_periodic_and_its_lower_layers_are_fixed(size):
         assert heights[oxygen] > heights[carbon] + 1.0
     state = end(system, system.time_steps[0])
     assert np.array_equal(state.positions[system.fixed], system.positions[system.fixed])
-
-
-# -- solutions --------------------------------------------------------------------------------------
-
-
-def test_free_particles_stay_on_their_great_circles():
-    system = test_systems.build("sphere", 3, rng=5)
-    there, x, v = system.reference().positions[0], system.positions[0], system.velocities[0]
-    assert np.linalg.norm(there) == pytest.approx(1.0, abs=1e-14)
-    assert there @ np.cross(x, v) == pytest.approx(0.0, abs=1e-14)
-    # The angle covered is speed times time.
-    assert np.clip(there @ x, -1, 1) == pytest.approx(np.cos(np.linalg.norm(v) * system.horizon), abs=1e-13)
-
-
-def test_a_spherical_pendulum_meets_the_one_in_spherical_angles():
-    case = json.loads((Path(__file__).parents[1] / "reference/data/A02_spherical_pendulum_generic.json").read_text())
-    x, v = (np.array(case["initial"][key], dtype=float)[0] for key in ("positions", "velocities"))
-    (gravity,) = (force["g"] for force in case["forces"] if force["type"] == "uniform_acceleration")
-    (point,) = (np.array(c.get("point"), float) for c in case["constraints"] if c["type"] == "distance_to_point")
-    assert gravity[:2] == [0, 0]
-    for time, wanted in list(zip(case["times"], case["reference"]["positions"], strict=True))[1:4]:
-        found = sphere.swing(x - point, v, -gravity[2], time)
-        np.testing.assert_allclose(found + point, np.array(wanted, dtype=float)[0], atol=1e-11 * np.exp(0.3 * time))

@@ -129,25 +129,6 @@ def test_mean_force_is_the_one_of_the_definition(case):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_multipliers_are_those_of_the_engine(case):
-    constraint_set, coordinates, _ = held(case)
-    motion = Motion(constraint_set, CHAIN)
-    mine = HeldCoordinates(motion, coordinates, CHAIN)
-    rng = np.random.default_rng(1)
-    v, f = motion.project_velocities(CHAIN, rng.normal(size=(N, 3))), rng.normal(size=(N, 3))
-    sample = mine.sample(CHAIN, v, f)
-    np.testing.assert_allclose(sample.multiplier, motion.multipliers(CHAIN, v, f)[mine.rows], rtol=0, atol=1e-12)
-    still = motion.multipliers(CHAIN, np.zeros_like(v), f)[mine.rows]
-    np.testing.assert_allclose(sample.kinetic, sample.multiplier - still, rtol=0, atol=1e-12)
-    a = constraint_set.jacobian(CHAIN).toarray()
-    gram = a / np.repeat(MASSES, 3) @ a.T
-    others = np.setdiff1d(np.arange(constraint_set.n_rows), mine.rows)
-    ratio = np.linalg.slogdet(gram)[1] - np.linalg.slogdet(gram[np.ix_(others, others)])[1]
-    assert sample.log_det_z == pytest.approx(ratio, abs=1e-13)
-    assert sample.off < 1e-15
-
-
-@pytest.mark.parametrize("case", CASES)
 def test_many_samples_at_once_are_those_taken_alone(case):
     constraint_set, coordinates, _ = held(case)
     mine = HeldCoordinates(constraint_set, coordinates, CHAIN, bonds=[[0, 1], [1, 2], [2, 3]])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import openmm
 import pytest
@@ -170,12 +168,3 @@ def test_multipliers_know_which_forces_act():
     context = started(system, integrator, [[2, 0, 0]], [[0, 3, 0]])
     assert integrator.multipliers(context) == pytest.approx([-45])
     np.testing.assert_allclose(integrator.constraint_forces(context), [[-45, 0, 0]], atol=1e-12)
-
-
-def test_copies_hold_the_same_surfaces():
-    integrator, context = on_surface("torus", "rattle", 0.01)
-    integrator.step(20)
-    other = copy.deepcopy(integrator)
-    assert isinstance(other, SurfaceIntegrator)
-    there = run(context.getSystem(), other, POSITIONS, VELOCITIES, 20)
-    assert np.array_equal(state_of(there)[0], state_of(context)[0])

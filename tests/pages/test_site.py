@@ -48,14 +48,6 @@ def test_what_the_front_door_hands_on_is_described_where_it_lives():
         assert name == "__version__" or any(f"{home}.".startswith(f"{at}.") for at in described()), name
 
 
-def test_modules_among_the_public_names_have_their_place():
-    from types import ModuleType
-
-    found = import_module("kcons.comparison")
-    modules = {value.__name__ for name in found.__all__ if isinstance(value := getattr(found, name), ModuleType)}
-    assert modules <= set(described())
-
-
 def test_each_command_has_its_help():
     commands = main.parsers()[1]
     assert {"compare", "plan", "check", "scan", "freeenergy", "warmup"} <= set(commands)

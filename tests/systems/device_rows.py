@@ -87,7 +87,7 @@ class PlainRows:
             getattr(self.library, f"run_{what}_{shape.name}")(
                 3, 7, ctypes.c_double(tolerance), box.ctypes.data_as(ctypes.c_void_p),
                 atoms.ctypes.data_as(ctypes.c_void_p), len(atoms), shape.first, ctypes.c_double(h),
-                ctypes.c_double(time), atoms.shape[1], x.ctypes.data_as(ctypes.c_void_p),
+                ctypes.c_double(time - self.arrays["rows_knots"][0]), atoms.shape[1], x.ctypes.data_as(ctypes.c_void_p),
                 change.ctypes.data_as(ctypes.c_void_p), w.ctypes.data_as(ctypes.c_void_p), *pointers,
             )  # fmt: skip
         return change.astype(float)

@@ -247,6 +247,13 @@ def test_forces_that_are_not_finite_are_named(pair):
     with pytest.raises(NonFiniteError, match=r"force of atom 8 \(in system 1\)"):
         pair.step(state, Drops(), dt=2 * FS, kT=300 * K)
     assert state.positions is x
+    state = pair.init(held_drops(3, 2), Drops(), kT=300 * K, dt=2 * FS)
+    model = lambda state: {**Drops()(state), "forces": torch.full_like(state.forces, torch.inf)}  # noqa: E731
+    for call in (pair.step, pair.init):  # also those of a last step
+        before = dict(vars(state))
+        with pytest.raises(NonFiniteError, match=r"force of atom 0 \(in system 0\)"):
+            call(state, model, dt=2 * FS, kT=300 * K)
+        assert vars(state) == before
 
 
 def test_the_settings_of_integrate_are_in_the_units_of_torchsim():

@@ -94,8 +94,10 @@ def test_momentum_that_is_conserved_along_some_axes_is_refused():
     """A Nose-Hoover chain would give it its share of the heat, and never change it; friction does."""
     state = ts.concatenate_states([drop(1), drop(1, 1)])
     hold(state, ["water", Plane(0, [0, 0, 1])])
+    numbers = state.rng.get_state()
     with pytest.raises(UnsupportedError, match=r"system 0 .* along 2 of three axes.*kcons\.torchsim\.langevin"):
         nose_hoover.init(state, Drops(), kT=300 * K, dt=1.0)
+    assert torch.equal(state.rng.get_state(), numbers)
     langevin.init(state, Drops(), kT=300 * K)
 
 
@@ -157,6 +159,20 @@ def test_masses_that_are_edited_in_a_run_are_refused():
     state.masses.mul_(2)
     with pytest.raises(InputError, match="system 0 has masses"):
         nve.step(state, Drops(), dt=torch.tensor(0.01))
+
+
+def test_positions_that_are_edited_between_steps_are_refused():
+    model, settings = Drops(), {"dt": torch.tensor(0.01)}
+    state = nve.step(nve.init(held(), model, kT=300 * K), model, **settings)
+    state.positions.add_(0.3)  # stays on the constraints
+    state = nve.step(state, model, **settings)
+    for edit in (lambda x: x[1].add_(0.1), lambda x: setattr(state, "positions", x + torch.eye(len(x), 3) * 0.1)):
+        kept = state.positions.clone()
+        edit(state.positions)
+        with pytest.raises(InputError, match=r"atom [012] .* off its constraints"):
+            nve.step(state, model, **settings)
+        state.positions = kept
+    nve.step(state, model, **settings)
 
 
 def test_rows_that_are_singular_are_converted():

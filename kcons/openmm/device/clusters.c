@@ -41,7 +41,7 @@ DEVICE void rows_evaluate(ROWS int cluster, mixed time, mixed half_way, int move
             }
             r[at] = ux; r[at+1] = uy; r[at+2] = uz;
         }
-        rows_function(ROW(k, 0), r, rows_parameter+ROW(k, 2), rolls ? time-half_way : time, result+3*begin+k);
+        rows_function(ROW(k, 0), r, rows_parameter+ROW(k, 2), rows_knots[0]+(rolls ? time-half_way : time), result+3*begin+k);
     }
 }
 
@@ -167,7 +167,7 @@ DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL co
             mixed off = 0;
             if (ROW(k, 7) >= 0) off = -rate*rows_moving(rows_knots, ROW(k, 7), time, rolls ? 0 : 1);
             else if (rolls) off = -rate*rows_number[3*k];
-            if (rate != 0) off += rate*rows_drift(ROW(k, 0), rows_place+9*begin, rows_parameter+ROW(k, 2), time);
+            if (rate != 0) off += rate*rows_drift(ROW(k, 0), rows_place+9*begin, rows_parameter+ROW(k, 2), rows_knots[0]+time);
             for (int p = begin; p < ROW(k+1, 1); p++) {
                 int g = 3*p+k+1, a = PLACE(p);
                 off += rows_there[g]*v[a]+rows_there[g+1]*v[a+1]+rows_there[g+2]*v[a+2];

@@ -224,7 +224,7 @@ class ItemWriter:
         """Value less target, or value alone, and gradient of a row."""
         text = self._gathered(k, row, moved)
         if not self._plain(row):
-            return f"{text} rows_f{row.function}(r{k}, {self.parameters[k]}, {time}, o{k});\n"
+            return f"{text} rows_f{row.function}(r{k}, {self.parameters[k]}, rows_knots[0]+{time}, o{k});\n"
         u, t = [f"r{k}[{3 + c}]" for c in range(3)], self.targets[k]
         square = "+".join(f"{each}*{each}" for each in u)
         lines = [f" o{k}[{1 + c}] = {u[c]};" for c in range(3)]
@@ -352,7 +352,7 @@ class ItemWriter:
         def demanded(k: int, row: Row) -> str:
             rate = self._wanted(k, row, "time", 0 if row.rolls else 1)
             if self.held.functions[row.function].rate is not None:
-                rate += f"-rows_f{row.function}_rate(r{k}, {self.parameters[k]}, time)"
+                rate += f"-rows_f{row.function}_rate(r{k}, {self.parameters[k]}, rows_knots[0]+time)"
             return f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
 
         def speed(k: int, row: Row) -> str:

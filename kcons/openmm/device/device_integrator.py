@@ -52,6 +52,7 @@ class _Shared(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_int) for name in ("whole", "noisy", "every", "since", "moved")),
+        ("origin", ctypes.c_double),
         ("told", ctypes.c_double * 7),
     )
 
@@ -296,8 +297,10 @@ class DeviceIntegrator(ProjectedIntegrator):
         for done in range(0, steps, rows.block):
             block = min(steps - done, rows.block)
             now = (positions_of(context), np.array(box_of(context))) if rows.n_cells else ()
-            for name, values in rows.renew(context.getTime()._value, self._dt, block, *now).items():
+            time = context.getTime()._value
+            for name, values in rows.renew(time, self._dt, block, *now).items():
                 self.write(name, values)
+            self._shared.origin = time if rows.n_movers else 0.0
             openmm.Integrator.step(self, block)
 
     def _unsolved(self, told: Sequence[float], guard: Guard) -> KconsError:

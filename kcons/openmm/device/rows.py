@@ -70,16 +70,17 @@ _COMMON = f"""
   mixed n_ = rint(w_/box2.z); u_ -= n_*box2.x; v_ -= n_*box2.y; w_ -= n_*box2.z; \\
   n_ = rint(v_/box1.y); u_ -= n_*box1.x; v_ -= n_*box1.y; u_ -= rint(u_/box0.x)*box0.x; \\
   to[at] = to[(at)-3]+u_; to[(at)+1] = to[(at)-2]+v_; to[(at)+2] = to[(at)-1]+w_;}}
-/* Moving target j or its rate, by polynomials between knots that have value, rate and acceleration; NaN beyond them. */
+/* Moving target j or its rate, by polynomials between knots that have value, rate and acceleration; NaN beyond them.
+   Times are those since knots[0], which single numbers of a long run could not tell apart. */
 DEVICE mixed rows_moving(GLOBAL const mixed* knots, int j, mixed time, int rate) {{
-  int last = (int) knots[2]-1;
-  mixed u = (time-knots[0])*knots[1];
+  int last = (int) knots[3]-1;
+  mixed u = (time-knots[1])*knots[2];
   if (!(u > (mixed) -0.01 && u < last+(mixed) 0.01)) return sqrt((mixed) -1);
   int k = max(min((int) u, last-1), 0);
-  GLOBAL const mixed* a = knots+3+3*(j*(last+1)+k);
+  GLOBAL const mixed* a = knots+4+3*(j*(last+1)+k);
   mixed s = u-k, w = a[3]-a[0], c2 = a[2]/2, c3 = 10*w-6*a[1]-4*a[4]-(3*a[2]-a[5])/2;
   mixed c4 = -15*w+8*a[1]+7*a[4]+(3*a[2]-2*a[5])/2, c5 = 6*w-3*(a[1]+a[4])-(a[2]-a[5])/2;
-  if (rate) return (a[1]+s*(2*c2+s*(3*c3+s*(4*c4+s*5*c5))))*knots[1];
+  if (rate) return (a[1]+s*(2*c2+s*(3*c3+s*(4*c4+s*5*c5))))*knots[2];
   return a[0]+s*(a[1]+s*(c2+s*(c3+s*(c4+s*c5))));
 }}
 """
@@ -227,7 +228,7 @@ class DeviceRows:
         placed = [each.atoms[:, a] for each in shapes for r in each.rows if r.how == STORED for a in r.atoms]
         self.placed: IntArray = np.unique(np.concatenate([*placed, np.zeros(0, np.int64)]))
         self.block = BLOCK if self.n_movers else 10**9
-        self._n_knots = 3 + self.n_movers * 3 * ((BLOCK + 2 * BEYOND) * KNOTS + 1)
+        self._n_knots = 4 + self.n_movers * 3 * ((BLOCK + 2 * BEYOND) * KNOTS + 1)
         self.arrays += [
             Array("rows_knots", "mixed", np.zeros(self._n_knots)),
             Array("rows_cells", "mixed", np.zeros(max(self.n_cells, 1))),
@@ -244,7 +245,7 @@ class DeviceRows:
         """
         found: dict[str, FloatArray] = {}
         if self.n_movers:
-            known = self._knots(time - BEYOND * dt, dt / KNOTS, (steps + 2 * BEYOND) * KNOTS + 1)
+            known = self._knots(time, -BEYOND * dt, dt / KNOTS, (steps + 2 * BEYOND) * KNOTS + 1)
             found["rows_knots"] = np.pad(known, (0, self._n_knots - len(known)))
         if self.n_cells:
             assert positions is not None
@@ -262,9 +263,9 @@ class DeviceRows:
             found.append((cells - cells[:, :1])[item.whole].ravel())
         return np.concatenate(found)
 
-    def _knots(self, start: float, spacing: float, count: int) -> FloatArray:
-        """Times, then value, rate and acceleration of each moving row at each knot, in units of the spacing."""
-        times = start + spacing * np.arange(count)
+    def _knots(self, time: float, start: float, spacing: float, count: int) -> FloatArray:
+        """Times, those of knots after `time`, then value, rate, acceleration of moving rows at each, per spacing."""
+        times = time + start + spacing * np.arange(count)
         tables = []
         for item in self.set.constraints:
             if isinstance(of := item.target, MovingTarget):
@@ -276,7 +277,7 @@ class DeviceRows:
                     for order, each in ((1, of.rate_at), (2, of.acceleration_at))
                 )
                 tables.append(np.stack([values, *slopes], axis=2).swapaxes(0, 1).ravel())
-        return np.concatenate([[start, 1 / spacing, count], *tables])
+        return np.concatenate([[time, start, 1 / spacing, count], *tables])
 
     def multipliers(self, sums: FloatArray, time: float) -> FloatArray:
         """Mean multipliers by row of the `set`, from the array ``rows_sums`` of a time; NaN where they are not summed.

@@ -17,6 +17,7 @@ MUTANTS = {
         ),
     ],
     "openmm/device/plugin/program_integrator.cpp": [
+        ("numbers.time = «→(float) »c.getTime()-shared.origin;", "kernel_rows::targets_move_late_in_a_long_run"),
         ('!(exactly || array.name == «"memory"→""»)', "device_integrator::states_of_other_rows_are_refused"),
     ],
     "openmm/device/build.py": [

@@ -54,7 +54,7 @@ MUTANTS = {
         ("**2 «+→-» slope *", "gaussian_process::covariances_of_gradients_are_derivatives_of_those_of_the_free_energy"),
         (
             "square = «(2 * radius * np.sin(away / (2 * radius))) ** →away**»2",
-            "gaussian_process::a_period_further_nothing_is_different",
+            "profile::a_period_closes",
         ),
         (
             "axes=1)« + (away.T * self.weights) @ away→»)",

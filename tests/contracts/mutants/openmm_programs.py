@@ -46,7 +46,7 @@ MUTANTS = {
     "openmm/integrator/program.py": [
         ("«*delta(v-v_end)→», v_middle, v", "reported_kinetic_energy::of_velocities_that_others_have_set_it_is_theirs"),
         ("v+per_h*(x-xu)«→+0.5*dt*f/m»", "reported_kinetic_energy::with_noise_the_temperature_of_the_bath_is_reported"),
-        ('«exact+→»1-between != 0", "kicks need it")', "isokinetic_ensemble::calls_of_any_length_make_the_same_motion"),
+        ('«exact+→»1-between != 0", "kicks need it")', "every_ensemble::calls_of_any_length_make_the_same_motion"),
         ('", "good_steps+«delta(failed)→1»", "count it")', "steps::a_failed_step_is_taken_back_and_not_counted"),
         (
             '"failed > 0", "a solve failed"):\n        p.each("x", "x«_last→»"',
@@ -68,11 +68,11 @@ MUTANTS = {
         ("[«-1→0»] += operation.fraction", "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
     ],
     "openmm/ensembles/isokinetic_ensemble.py": [
-        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "every_ensemble::a_run_has_the_temperature"),
+        ("(count« - 1→») * GAS_CONSTANT * self.temperature", "openmm_replay::temperature"),
         ('"max(qq«-wq→», wq^2/ww)"', "isokinetic_ensemble::two_sums_do_where_velocities_are_not_read"),
         (
             'program.set("exact", «float(precision == "double" and not rigid)→0.0»)',
-            "isokinetic_ensemble::calls_of_any_length_make_the_same_motion",
+            "every_ensemble::calls_of_any_length_make_the_same_motion",
         ),
         (
             '"«select(behind, exact, 1)→exact» != 0"',
@@ -106,7 +106,7 @@ MUTANTS = {
             "«groups_of(force)→{force.getForceGroup()}» - set(known)",
             "langevin_ensemble::forces_in_reciprocal_space_have_a_number_of_steps_too",
         ),
-        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "every_ensemble::a_run_has_the_temperature"),
+        ("sqrt(«2*→»kT*kept_share*sinh(friction*{h}))", "openmm_replay::temperature"),
     ],
     "openmm/ensembles/nose_hoover_ensemble.py": [
         ('(name, «f"{name}_last"→name», "the', "nose_hoover_ensemble::a_step_that_fails_leaves_the_chain_where_it_was"),

@@ -150,6 +150,10 @@ MUTANTS = {
         ("_HALF = 0.«5 - 1e-9→6»", "images::atoms_that_nothing_ties_raise_before_their_image_flips"),
         ("np.maximum(1e-«10→8» * self.scale, 8 * np.finfo(float)", "certificate::what_is_allowed_scales_with_rounding"),
         ("self.masses = «read_only(m)→m»", "constraint_set::masses_cannot_be_changed"),
+        (
+            "extent(«x[np.isfinite(x).all(axis=1)]→x») or 1.0",
+            "constraint_set::scale_is_the_length_held_or_one_radian_or_the_size_of_the_positions",
+        ),
         ("«read_only(self.masses)→pass»  # a copy", "constraint_set::masses_cannot_be_changed"),
     ],
 }

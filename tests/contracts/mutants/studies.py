@@ -42,7 +42,7 @@ MUTANTS = {
         ("gradient[:, j] += mixed[:, «s→j»]", "held_coordinates::mean_force_is_the_one_of_the_definition"),
         ("d * d«] @ shares.swapaxes(1, 2)→, -d:]»", "held_coordinates::mean_force_is_the_one_of_the_definition"),
         ("bent[:, 1 + d * d :].sum(axis=1) «-→+» traces)", "held_coordinates::mean_force_is_the_one_of_the_definition"),
-        ("(respond @ b[:, :, None] «-→+» pull)", "held_coordinates::multipliers_are_those_of_the_engine"),
+        ("(respond @ b[:, :, None] «-→+» pull)", "held_coordinates::mean_force_is_the_one_of_the_definition"),
         ("np.isfinite(before)« and abs(after - before) < _SAME→»", "torsion_force::other_rows_must_not_change"),
         (
             "arms = x[..., self.group, :]« - x[..., self.axis[1:], :]→»",

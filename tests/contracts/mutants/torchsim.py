@@ -20,6 +20,14 @@ MUTANTS = {
         ("(1 - keep**«2→1»)", "torchsim/torchsim_dynamics::short_runs_have_the_temperature_of_the_bath[langevin]"),
         ("- 3 * «_free(self)→1»", "torchsim/torchsim_states::fixed_atoms_are_taken_over"),
         ("constraints_of(state).«check→batch»(state)", "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"),
+        (
+            "is not held.left[0] «or state.positions._version != held.left[1]→»",
+            "torchsim/torchsim_refusals::positions_that_are_edited_between_steps_are_refused",
+        ),
+        (
+            '«_check_forces(state, output["forces"])→pass»',
+            "torchsim/torchsim_dynamics::forces_that_are_not_finite_are_named[nve]",
+        ),
         ("state.__dict__.update(«before→{}»)", "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"),
     ],
 }

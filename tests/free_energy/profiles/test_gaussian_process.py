@@ -47,14 +47,6 @@ def test_covariances_of_gradients_are_derivatives_of_those_of_the_free_energy(na
             assert prior(y, q, x, p) == pytest.approx(prior(x, p, y, q).T, rel=1e-12)
 
 
-def test_a_period_further_nothing_is_different():
-    known = process([AXES["warped circle"]], n=6)
-    x = np.linspace(-1.0, 2.0, 8)[:, None]
-    here, there = (known.posterior((z, [-1, 0])) for z in (x, x + 3.0))
-    assert there[0] == pytest.approx(here[0], abs=1e-9 * np.abs(here[0]).max())
-    assert there[1] == pytest.approx(here[1], abs=1e-8 * np.abs(here[1]).max())
-
-
 def test_lengths_are_learned():
     """A function that is quick on one side: u' is larger there, and the likelihood higher than with one length."""
     x = np.linspace(0.0, 4.0, 25)[:, None]

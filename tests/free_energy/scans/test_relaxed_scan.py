@@ -137,12 +137,6 @@ def test_one_failed_point_does_not_stop_the_others():
         found.structure((4,))
 
 
-def test_a_failed_point_is_leapt_over():
-    atoms = chain(4, threefold, lambda phi: RuntimeError("no") if 1.2 < phi[0] < 1.3 else None, turns=[1.0])
-    found = scan(atoms, TURN, [1.0, 1.25, 1.5, 1.6])
-    assert set(found.failed) == {(1,)} and np.isfinite(found.energies[2:]).all()
-
-
 def test_where_nothing_succeeds_the_first_error_is_raised():
     atoms = chain(4, threefold, lambda phi: ValueError("broken"))
     with pytest.raises(CalculatorError, match="broken") as raised:
@@ -245,14 +239,6 @@ def test_python_functions_need_no_folder(tmp_path):
         scan(chain(4, threefold), row, [-1.0], folder=tmp_path / "new")
     assert not (tmp_path / "new").exists()
     assert not scan(chain(4, threefold), row, [-1.0]).failed
-
-
-def test_a_value_that_cannot_be_reached_is_a_failure_of_its_point():
-    """Two bonds are held: beyond their sum there is no distance between the ends."""
-    atoms = chain(4, threefold)
-    found = scan(atoms, Distance([[0, 2]]), [2.2, 2.4, 3.5], held=Distance([[0, 1], [1, 2]], 1.4))
-    assert set(found.failed) == {(2,)}
-    assert found.failed[2,].startswith("Distance(0, 2) = 3.5: InfeasibleError")
 
 
 def test_large_structures_need_no_table(monkeypatch):

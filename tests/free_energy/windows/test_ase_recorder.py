@@ -10,7 +10,7 @@ from ase.calculators.lj import LennardJones
 from ase.constraints import Hookean
 from ase.md.verlet import VelocityVerlet
 
-from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, MultipleTimeSteps, constrain, draw_velocities
+from kcons.ase import ConstrainedDynamics, MultipleTimeSteps, constrain, draw_velocities
 from kcons.ase.binding import applied_forces
 from kcons.constraints import Dihedral, Distance, MovingTarget
 from kcons.errors import UnsupportedError
@@ -27,20 +27,6 @@ def rows():
     """The torsion, and the bonds that it turns about."""
     turn = Dihedral([[2, 0, 1, 3]])
     return turn, [Distance([[0, 1], [1, 3], [0, 2]])]
-
-
-def test_kcons_dynamics():
-    atoms = methanol()
-    turn, bonds = rows()
-    how = {"temperature_K": 300, "friction": 0.02, "constraints": [turn, *bonds], "rng": np.random.default_rng(1)}
-    dynamics = ConstrainedLangevin(atoms, 0.5 * units.fs, **how)
-    recorder = AseRecorder(dynamics, {"turn": turn})
-    dynamics.attach(recorder, interval=5)
-    dynamics.run(20)
-    series, state = recorder.series, dynamics.state
-    assert len(series) == 5 and series.off.max() < 1e-10
-    direct = dynamics.motion.multipliers(state.positions, state.velocities, state.forces)
-    assert direct[0] == pytest.approx(series.multiplier[-1, 0], abs=1e-10)
 
 
 def test_a_dynamics_of_ase_under_kcons_constraints():

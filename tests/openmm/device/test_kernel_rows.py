@@ -194,6 +194,22 @@ def test_targets_move_with_time_and_with_a_parameter():
     assert y[1, 2] == pytest.approx(x[1, 2] + 0.01, abs=1e-10)
 
 
+@pytest.mark.parametrize("platform", SINGLE)
+def test_targets_move_late_in_a_long_run(platform):
+    """When single numbers of the time are a step apart."""
+    system, x = waters(2)
+    length, begun = np.linalg.norm(x[3] - x[0]), 2e4
+    pull = Distance([[0, 3]], lambda t: length + 0.05 * (t - begun))
+    integrator = ProjectedIntegrator(0.002, parts=[pull], device=True, tolerance=1e-6)
+    context = started(system, integrator, x, platform=platform)
+    context.setTime(begun)
+    for steps in (7, 8):
+        integrator.step(steps)
+        state = context.getState(positions=True)
+        y, time = state.getPositions(asNumpy=True)._value, state.getTime()._value
+        assert np.linalg.norm(y[3] - y[0]) == pytest.approx(length + 0.05 * (time - begun), abs=2e-6)
+
+
 @pytest.mark.parametrize("platform", ["CPU", *MIXED])
 def test_rows_across_faces_and_places_in_a_box_that_openmm_sorts(platform):
     """Molecules scattered over many boxes are moved back and sorted by OpenMM; rows mean what State gives."""

@@ -1,4 +1,7 @@
-"""Every ensemble has its temperature, also beside rows that parts hold, and a barostat of another is told of."""
+"""Every ensemble beside rows that parts hold; a barostat of another temperature is told of.
+
+That it has its temperature: tests/contracts/test_openmm_replay.py.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,9 @@ import warnings
 import numpy as np
 import openmm
 import pytest
-from ensemble_runs import on_their_rows, run, twice_kinetic, two_parts, warm
+from ensemble_runs import in_calls_of_any_length, on_their_rows, run, twice_kinetic, two_parts, warm
 from openmm_ensembles import ENSEMBLES
-from openmm_systems import field, loose_alanine, started, state_of, water_box
+from openmm_systems import loose_alanine, started, state_of, water_box
 
 from kcons.errors import InputError
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, hold
@@ -20,26 +23,6 @@ from kcons.openmm.quantities import GAS_CONSTANT
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
 #: Noise differs between programs.
 WITHOUT_NOISE = [name for name, make in ENSEMBLES.items() if not make(300).noisy]
-
-
-@pytest.mark.parametrize("bath", ENSEMBLES)
-def test_a_run_has_the_temperature(bath):
-    """From 200 K to 300 K, within three standard errors: rigid waters in a weak well, none of whose momenta last."""
-    system, x = water_box(8)
-    system.addForce(field("20*(x^2+y^2+1.5*z^2)", range(0, 24, 3)))
-    integrator = ProjectedIntegrator(2e-3, ensemble=ENSEMBLES[bath](300.0, 50.0))
-    integrator.setRandomNumberSeed(3)
-    context = started(system, integrator, x)
-    integrator.setVelocitiesToTemperature(context, 200, 1)
-    integrator.step(1000)
-    values = []
-    for _ in range(400):
-        integrator.step(10)
-        values.append(integrator.computeSystemTemperature()._value)
-    blocks = np.reshape(values, (20, -1)).mean(axis=1)
-    error = blocks.std(ddof=1) / np.sqrt(20)
-    assert error < 6
-    assert abs(blocks.mean() - 300) <= max(3 * error, 1e-6)
 
 
 @pytest.mark.parametrize("bath", WITHOUT_NOISE)
@@ -63,6 +46,12 @@ def test_rows_that_are_carried_move_as_those_of_the_system(bath):
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=3e-12)
     np.testing.assert_allclose(ends[0][1], ends[1][1], atol=3e-9)
     assert ends[0][2] == pytest.approx(ends[1][2], rel=1e-7)
+
+
+@pytest.mark.parametrize("bath", WITHOUT_NOISE)
+def test_calls_of_any_length_make_the_same_motion(bath):
+    """Within a call two half kicks at one place are a whole one, and so are halves of a chain: nobody looks at K."""
+    in_calls_of_any_length(lambda: ENSEMBLES[bath](300.0, 20.0))
 
 
 @pytest.mark.parametrize("bath", ["Isokinetic", "NoseHoover"])

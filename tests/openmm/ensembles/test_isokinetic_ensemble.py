@@ -48,11 +48,6 @@ def test_one_bond_as_the_core_stepper(scheme):
         assert np.abs(u - state.velocities).max() <= 100 * limit
 
 
-def test_calls_of_any_length_make_the_same_motion():
-    """Two half kicks at one place are a whole one: in between, K and the pseudo-energy need not be looked at."""
-    in_calls_of_any_length(lambda: Isokinetic(300.0))
-
-
 def waters():
     """Rigid waters at rest as a whole: system, x, v."""
     system, x = water_box(8)

@@ -5,7 +5,7 @@ import copy
 import numpy as np
 import openmm
 import pytest
-from ensemble_runs import in_calls_of_any_length, run
+from ensemble_runs import run
 from openmm import unit
 from openmm_systems import alanine, dumbbell, field, loose_alanine, masses_of, particles, started, state_of
 
@@ -62,11 +62,6 @@ def test_one_bond_as_the_core_stepper(options):
         place = state.thermostat[2 * n] * state.thermostat[0] + state.thermostat[1:n].sum()
         assert integrator.getGlobalVariableByName("chain_place") == pytest.approx(place, rel=1e3 * limit)
         assert ensemble.conserved_energy(integrator) == pytest.approx(stepper.conserved_energy(core, state), rel=1e-11)
-
-
-def test_calls_of_any_length_make_the_same_motion():
-    """Two halves of the chain at one place need one sum: in between, nobody looks at K."""
-    in_calls_of_any_length(lambda: NoseHoover(300.0, 20.0))
 
 
 # -- the chain in the middle of a step -------------------------------------------------------------------

@@ -9,7 +9,6 @@ import openmm
 import pytest
 from collective_cases import bond, dihedral, points, with_variable
 from ensemble_runs import run
-from openmm import unit
 from openmm_systems import (
     PLATFORMS,
     alanine,
@@ -31,7 +30,6 @@ from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, Proje
 from kcons.openmm.integrator import guard
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
-PS = unit.picosecond
 
 
 # -- its Context ------------------------------------------------------------------------------------
@@ -237,17 +235,6 @@ def test_checks_that_would_take_too_long_come_later(monkeypatch, given, number):
     # Of the first it is not known how long it takes; after it, a hundred are put off each time.
     assert len(checks) == number
     assert context.getStepCount() == 10400
-
-
-def test_clock_follows_the_step_size():
-    """OpenMM's own clock goes on with the first step size on Reference and CPU."""
-    system, x, v = dumbbell()
-    integrator = ProjectedIntegrator(1e-3)
-    context = run(system, integrator, x, v, 3)
-    integrator.setStepSize(5e-4)
-    integrator.step(4)
-    assert context.getTime() / PS == pytest.approx(0.005, rel=1e-12)
-    assert context.getStepCount() == 7
 
 
 #: With motion removers, which meet complete velocities: half a kick has momentum where forces add up to something.

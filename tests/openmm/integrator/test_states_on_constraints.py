@@ -6,11 +6,8 @@ import numpy as np
 import openmm
 import pytest
 from collective_cases import CHAIN, angle, bond, chain_system, held_chain
-from openmm import app, unit
+from openmm import unit
 from openmm_systems import (
-    DATA,
-    PLATFORMS,
-    alanine,
     context_of,
     forces_at,
     holding,
@@ -85,21 +82,6 @@ def test_degrees_of_freedom_are_counted_by_rank():
 
 
 # -- minimization -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("platform", PLATFORMS)
-def test_minimizer_of_openmm_keeps_the_constraints(platform):
-    system, _, _ = alanine()
-    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
-    made = app.Simulation(
-        pdb.topology, system, integrator := ProjectedIntegrator(1e-3), openmm.Platform.getPlatformByName(platform)
-    )
-    made.context.setPositions(pdb.positions)
-    made.minimizeEnergy()
-    made.step(1)
-    assert residuals(system, made.context)[0] < 1e-9
-    integrator.minimizeEnergy(tolerance=1.0)
-    assert residuals(system, made.context)[0] < 1e-9
 
 
 def test_minimizer_keeps_parts():

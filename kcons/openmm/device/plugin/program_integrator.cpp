@@ -171,6 +171,7 @@ void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int step
     const Vec3 before[] = {numbers.box[0], numbers.box[1], numbers.box[2]};
     c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
     for (int k = 0; k < 3; k++) if (numbers.box[k] != before[k]) valid = false;
+    const Shared& shared = integrator.shared;
     bool ended = true;                         // whether velocities are those of the end of a step
     for (int k = 0; k < steps; k++) {
         if (c.updateContextState()) {          // barostats have moved positions
@@ -183,19 +184,18 @@ void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int step
             for (int part : {0, 1}) for (auto& action : plan.parts[part])
                 if (action.kernel.empty() && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
         }
-        run(c, ended ? 0 : 1);
-        c.setTime(numbers.time+numbers.dt);
+        run(c, shared, ended ? 0 : 1);
+        c.setTime(c.getTime()+numbers.dt);
         c.setStepCount(c.getStepCount()+1);
-        const Shared& shared = integrator.shared;
         bool recorded = shared.every > 0 && (c.getStepCount()-shared.since) % shared.every == 0;
         ended = k == steps-1 || shared.whole || recorded;
-        if (ended) run(c, 2);
+        if (ended) run(c, shared, 2);
         if (recorded) launch("record");
     }
     lookBack();
 }
-void StepKernel::run(ContextImpl& c, int part) {
-    numbers.time = c.getTime();
+void StepKernel::run(ContextImpl& c, const Shared& shared, int part) {
+    numbers.time = c.getTime()-shared.origin;
     numbers.step = (int) c.getStepCount();
     bool moved = false;
     for (auto& action : plan.parts[part]) {

@@ -45,6 +45,7 @@ struct Shared {
     int noisy = 0;                 // whether the kinetic energy is that of the middle of the last step
     int every = 0, since = 0;      // steps from one record to the next, 0 for none, and the step that they count from
     int moved = 0;                 // whether others have set positions or velocities since the last step
+    double origin = 0;             // time that kernels count from
     double told[7] = {};           // by the kernel `look`, at the end of the last call
 };
 
@@ -105,7 +106,7 @@ protected:
     virtual void positionsMoved() {}           // before the first evaluation at new positions
     virtual void keepForces(int slot) = 0;     // where there are several groups
 private:
-    void run(OpenMM::ContextImpl& c, int part);
+    void run(OpenMM::ContextImpl& c, const Shared& shared, int part);
     void evaluate(OpenMM::ContextImpl& c, const Action& action);
 };
 
