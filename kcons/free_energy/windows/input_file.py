@@ -122,7 +122,7 @@ class Coordinate:
         if self.values is None:
             assert self.begin is not None and self.to is not None
             turn = self.family == "dihedral" and abs(self.to - self.begin) >= 360 - 1e-9
-            places = np.linspace(self.begin, self.to, self.count, endpoint=not turn)
+            places = np.linspace(float(self.begin), float(self.to), self.count, endpoint=not turn)
         low, high = _RANGES.get(self.family, (-math.inf, math.inf))
         for place in places[(places <= low) | (places >= high)].tolist():
             raise InputError(

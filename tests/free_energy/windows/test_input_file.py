@@ -85,7 +85,7 @@ def test_a_difference_of_distances(folder):
     """In angstrom and of either sign; beside a torsion in degrees, with a pull along both."""
     text = INPUT.replace("rng = 4", "approach = [6, 0.2]").replace("[2, 0, 1, 3]", "[3, 1, 2, 4]").replace(IMPROVE, "")
     text = text.replace('methanol.xyz"', 'methanol.xyz"\ncount_from = 1')
-    text += "\n[[coordinate]]\ndifference = [1, 2, 4, 2]\nfrom = -0.5\nto = 0.5\nwindows = 3\n"
+    text += "\n[[coordinate]]\ndifference = [1, 2, 4, 2]\nfrom = -0.5\nto = 0.5\nwindows = 3.0\n"
     found = read(folder, text + "[pulls]\nto = [90.0, 0.4]\n")
     assert found.sampler.names == ("turn", "difference-1-2-4-2")
     assert found.targets[:3, 1].tolist() == [-0.5, 0.0, 0.5]
@@ -97,7 +97,7 @@ def test_a_difference_of_distances(folder):
 
 def test_pulls(folder):
     assert read(folder).pulls is None
-    found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8\nsteps = 300\n")
+    found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8.0\nsteps = 300\n")
     assert found.pulls["start"] == pytest.approx([-np.pi / 3])
     assert found.pulls["end"] == pytest.approx(found.targets[-1])
     assert found.pulls["count"] == 8 and found.pull_steps == 300
@@ -180,6 +180,7 @@ def before_improve(text):
         (LJ, f'{LJ}\nplatform = "CPU"', "platform of .forces. says nothing to a calculator"),
         ("windows = 12", 'windows = "x"', r"windows of \[coordinate\] is 'x'; give a number"),
         (TURN, "dihedral = [2.5, 0, 1, 3]", "give whole numbers"),
+        (f"{TURN}\nfrom = -180", f"angle = [2, 0, 1]\nfrom = 1{ZEROS[:30]}", r"there is no angle of 1e\+30"),
         ("both_sides = false", 'both_sides = "no"', "give true or false"),
         ("most = 20", "", r"\[improve\] has no most; write most = "),
         ("error = 0.5", 'error = "x"', r"error of \[improve\] is 'x'; give a number"),
