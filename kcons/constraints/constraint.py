@@ -371,7 +371,7 @@ class Constraint:
         """
         if factor == 1.0:
             return self
-        powers = dict(self.held.exponents or {"unknown": 1})
+        powers = {"unknown": 1} if self.held.exponents is None else dict(self.held.exponents)
         if self.moving or not powers.keys() <= {"length", "angle"}:
             what = "a target that moves" if self.moving else "own functions or velocities"
             raise UnsupportedError(

@@ -1,13 +1,15 @@
 """Constraint objects of kcons in a System of OpenMM: PythonForces carry positions to the engine, corrections back.
 
-A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three of
-them, each in a force group of its own, serve one set of rows:
+A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three or
+four of them, each in a force group of its own, serve one set of rows:
 
 * `remember`: the positions at the start of a drift, where gradients are taken. Returns no force. Left out where the
   last drift has ended there for sure.
 * `land`: positions after free flight. Its 'force' is the change that brings them onto the rows, x = x + f.
 * `project`: positions x + v/1024 ps. Its 'force' is the change of v that makes it tangent to the rows at x. What
   rounding takes from v on this way follows in a second call, except for thermostats.
+* `turn`: where all rows are spheres, drifts may be great circles. `land` computes them, and this tells what they do to
+  v, times their length.
 
 Each returns an 'energy' of 0, or 1 where the engine raised an error: nothing may be raised through OpenMM, so the
 error is kept and the integrator told to take the step back. Outside of steps they return nothing to speak of: rows
@@ -66,6 +68,7 @@ from kcons.openmm.quantities import (
     with_massless_atoms,
 )
 from kcons.openmm.topology import bonds_of
+from kcons.steppers.packed_system import spheres_of
 
 #: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbor list, and v is rounded to
 #: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
@@ -80,7 +83,7 @@ CARRY_SCALE = 2.0**20
 #: What GPUs multiply forces with, and what CustomIntegrator divides them by.
 _TO_WHOLE, _FROM_WHOLE = 2.0**32, 2.0**32 - 1
 
-PHASES = ("remember", "land", "project")
+PHASES = ("remember", "land", "project", "turn")
 #: Name of the force whose bonds of no strength keep molecules together.
 TIES = "kcons molecules"
 
@@ -293,6 +296,11 @@ class CallbackEngine(Engine):
         fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
         #: Which of the carried particles do not move.
         self._fixed = np.searchsorted(self.atoms, fixed)
+        #: Center and radius of each carried particle, where all of them are on resting spheres.
+        spheres = spheres_of(self.motion)
+        self.spheres = None if spheres is None or len(fixed) else spheres[self.atoms]
+        #: Whether drifts are great circles on these, and what the last one has done to v times its length.
+        self.exact, self._turned = False, np.zeros(local)
         self._integrator: Callable[[], Integrator | None] = lambda: None
         #: Whether an integrator of kcons knows of the rows; where none does, the step count at the last evaluation.
         self.served, self._count = False, -1
@@ -312,7 +320,7 @@ class CallbackEngine(Engine):
 
     def follow(self, p: Program) -> None:
         """Take times and step sizes from the integrator of this program."""
-        self.served = True
+        self.exact, self.served = p.exact, True
         self._integrator = weakref.ref(p.integrator)
         self.carries_rest = not p.integrator.thermostatted
         self._within, self._fractions = p.halves, p.drifts
@@ -393,6 +401,7 @@ class CallbackEngine(Engine):
     def _begin_drift(self) -> None:
         self._landing, self._begun = None, True
         self._start[self._held] = self._x
+        self._turned.fill(0.0)
 
     def land(self, state: openmm.State) -> FloatArray | None:
         there, read = self._there, self._read
@@ -404,17 +413,20 @@ class CallbackEngine(Engine):
         if not self._begun:
             self._begin_drift()  # where the last drift ended: nobody has moved x since
         self._begun = False
-        there[self._held] = read
-        then, now, h = self._times(self._stage)
-        # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
-        moved = self._moved
-        moved.fill(0.0)
-        self.motion.project_positions(
-            there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, flight=h, out=there
-        )
-        change = np.array(moved[self._held])
-        fixed = self._fixed
-        change[fixed] = there[self.atoms[fixed]] - read[fixed]
+        if self.exact:
+            change, self._turned = great_circles(self._x, read, cast(FloatArray, self.spheres))
+        else:
+            there[self._held] = read
+            then, now, h = self._times(self._stage)
+            # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
+            moved = self._moved
+            moved.fill(0.0)
+            self.motion.project_positions(
+                there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, flight=h, out=there
+            )
+            change = np.array(moved[self._held])
+            fixed = self._fixed
+            change[fixed] = there[self.atoms[fixed]] - read[fixed]
         change, arriving = self.carried(change)
         np.add(read, arriving, out=self._x)
         self._landing = (read.copy(), change)
@@ -434,6 +446,9 @@ class CallbackEngine(Engine):
         self._rest_to_come = self.carries_rest
         read *= SPEED_SCALE
         return self.carried(self._tangent(read) - read)[0]
+
+    def turn(self, state: openmm.State) -> FloatArray | None:
+        return None if self._between_steps else self.carried(self._turned)[0]
 
     def _project_rest(self, read: FloatArray) -> FloatArray:
         """The same for what was too small to be carried with v, as large as it comes: any factor will do."""
@@ -522,6 +537,21 @@ class CallbackEngine(Engine):
         return cast(KconsError, error)
 
 
+def great_circles(x: FloatArray, there: FloatArray, spheres: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What takes particles from where they flew freely to the ends of great circles, and changes v, times the time.
+
+    d = x - c turns in the plane of d and u, the way that is tangent, by w = |u|/R: it becomes d cos(w) + u sin(w)/w,
+    and u becomes u cos(w) - d w sin(w). d is brought to the length R on the way, so that rounding does not add up.
+    Centers and radii are the rows of `spheres`, shape (n, 4).
+    """
+    radius, d, way = spheres[:, 3:], x - spheres[:, :3], there - x
+    d *= radius / np.sqrt(np.einsum("ij,ij->i", d, d))[:, None]
+    u = way - d * (np.einsum("ij,ij->i", d, way)[:, None] / radius**2)
+    w = np.sqrt(np.einsum("ij,ij->i", u, u))[:, None] / radius
+    end = spheres[:, :3] + d * np.cos(w) + u * np.sinc(w / np.pi)
+    return end - there, u * np.cos(w) - d * (w * np.sin(w)) - way
+
+
 # -- the part -------------------------------------------------------------------------------------
 
 
@@ -564,8 +594,10 @@ class CarriedConstraints(Part):
         refuse_virtual_sites(system, self.atoms, masses)
         #: The constraints as they were given, with targets that were found.
         self.given: Sequence[Constraint] = self.motion.sources[0].constraints
-        groups = free_groups(system, len(PHASES), "rows")[-len(PHASES) :][::-1]
-        self._groups, self.groups = dict(zip(PHASES, groups, strict=True)), frozenset(groups)
+        self.flies_exactly = self._engine.spheres is not None
+        phases = PHASES if self.flies_exactly else PHASES[:3]
+        groups = free_groups(system, len(phases), "rows")[-len(phases) :][::-1]
+        self._groups, self.groups = dict(zip(phases, groups, strict=True)), frozenset(groups)
         #: How the names of its forces begin.
         self._name = f"{ROW_NAME}s {uuid.uuid4().hex}"
 
@@ -790,9 +822,14 @@ class CarriedConstraints(Part):
         group = self._groups["land"]
         program.each("x", f"x+{h}*{u}", "move freely (drift)")
         self._guard(program, "land", "carried rows: solve for positions")
+        onto = f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them"
+        if program.exact:
+            program.each("x", *onto)
+            group = self._groups["turn"]
         # Force and energy come from one evaluation, for this moves no x.
         program.each("v", f"{u}+{1 / CARRY_SCALE!r}*f{group}/{h}", "the constraint forces act on v as well")
-        program.each("x", f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them")
+        if not program.exact:
+            program.each("x", *onto)
 
     def project(self, program: Program) -> None:
         change = f"f{self._groups['project']}"

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from kcons.constraints.arguments import Count, checked
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers.interpreter import Interpreted, Interpreter
-from kcons.steppers.operations import mirrored, splitting
+from kcons.steppers.operations import Operation, mirrored, splitting
 from kcons.steppers.program import Program
 from kcons.steppers.state import State, System
 
@@ -61,6 +61,23 @@ def fractions_of(values: Sequence[float], item: str) -> tuple[float, ...]:
     return g
 
 
+def require_order(g: tuple[float, ...], order: int, item: str) -> None:
+    """Raise `InputError` where RATTLE steps or drifts of these lengths in turn do not have an order."""
+    said = f"{item} {g} do not have order {order}"
+    for power in range(3, order, 2):
+        if abs(math.fsum(x**power for x in g)) > 1e-14:
+            raise InputError(f"{said}: their powers of {power} do not cancel", item=item)
+    # The other condition of order 6, which is not the same for the same fractions in another order.
+    middles = (sum(g[:k]) + 0.5 * x for k, x in enumerate(g))
+    if order > 5 and abs(math.fsum(x**3 * c**2 for x, c in zip(g, middles, strict=True))) > 1e-14:
+        raise InputError(f"{said}: their powers cancel, but not in this sequence", item=item)
+
+
+def _rattle_kicks(drifts: Sequence[float]) -> tuple[float, ...]:
+    """The kicks of RATTLE steps of these lengths, merged where they meet."""
+    return tuple(a + b for a, b in itertools.pairwise(0.5 * x for x in (0.0, *drifts, 0.0)))
+
+
 class Splitting(Interpreted):
     """Base of the steppers made of kicks and drifts: reversible, and symplectic for position rows and potentials.
 
@@ -70,14 +87,16 @@ class Splitting(Interpreted):
         Palindromes of fractions of the step. One kick more than drifts: the step begins and ends with a kick, and
         the last force is the first of the next step. One drift more than kicks: it begins and ends with a drift.
     flight : sequence of float
-        Each drift is this symmetric composition of RATTLE drifts.
+        Each drift is this symmetric composition of RATTLE drifts, such as `SUZUKI_4`. On constraints a stepper has no
+        order above that of its drifts.
     exact_flight : bool
         Whether to fly along great circles instead where every row allows it.
 
     Raises
     ------
     InputError
-        What is no palindrome with the sum 1; kicks and drifts that are not in turn.
+        What is no palindrome with the sum 1; kicks and drifts that are not in turn; a `flight` of lower order than
+        the class says.
     """
 
     order: int = 2
@@ -99,6 +118,8 @@ class Splitting(Interpreted):
                 item="kicks",
             )
         self.kick_first = len(self.kicks) > len(self.drifts)
+        if self.kicks != _rattle_kicks(self.drifts):  # which `Composition` looks at
+            require_order(self.flight, self.order, "flight")
         self._by_form: dict[tuple[bool, bool], Program] = {}
 
     @property
@@ -108,16 +129,20 @@ class Splitting(Interpreted):
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
 
+    def _form(self, system: System | None) -> tuple[bool, bool]:
+        """Whether drifts are along great circles, and whether velocities are iterated because forces depend on them."""
+        if system is None:
+            return False, False
+        return self.exact_flight and system.great_circles is not None, system.velocity_dependent
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        exact, settled = self._form(system)
+        return splitting(self.kicks, self.drifts, (1.0,) if exact else self.flight, exact=exact, settled=settled)
+
     def program(self, system: System | None) -> Program:
-        exact = settled = False
-        if system is not None:
-            exact = self.exact_flight and system.great_circles is not None
-            settled = system.velocity_dependent
-        form = exact, settled
+        form = self._form(system)
         if form not in self._by_form:
-            flight = (1.0,) if exact else self.flight
-            listed = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled)
-            self._by_form[form] = Program(listed)
+            self._by_form[form] = Program(self.operations(system))
         return self._by_form[form]
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
@@ -233,20 +258,8 @@ class Composition(Splitting):
     def __init__(self, fractions: Sequence[float], order: int, name: str = "") -> None:
         self.fractions = g = fractions_of(fractions, "fractions")
         self.order, self.name = order, name
-        for power in range(3, order, 2):
-            if abs(math.fsum(x**power for x in g)) > 1e-14:
-                raise InputError(
-                    f"fractions {g} do not have order {order}: their powers of {power} do not cancel", item="fractions"
-                )
-        # The other condition of order 6, which is not the same for the same fractions in another order.
-        middles = (sum(g[:k]) + 0.5 * x for k, x in enumerate(g))
-        if order > 5 and abs(math.fsum(x**3 * c**2 for x, c in zip(g, middles, strict=True))) > 1e-14:
-            raise InputError(
-                f"fractions {g} do not have order {order}: their powers cancel, but not in this sequence",
-                item="fractions",
-            )
-        halves = [0.5 * x for x in (0.0, *g, 0.0)]
-        super().__init__(kicks=[a + b for a, b in itertools.pairwise(halves)], drifts=g)
+        require_order(g, order, "fractions")
+        super().__init__(kicks=_rattle_kicks(g), drifts=g)
 
     def __repr__(self) -> str:
         return self.name or f"Composition({self.fractions}, order={self.order})"

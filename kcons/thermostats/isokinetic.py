@@ -27,7 +27,7 @@ from kcons.solvers.addressable_solvers import MORE, packed_tangents
 from kcons.solvers.kernels.array_views import flat, integers, table_array
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compiled_operations import SUMS, all_finite, check_finite, square_sum
-from kcons.steppers.interpreter import Interpreter
+from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
 from kcons.steppers.program import Program, Row
 from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
@@ -320,6 +320,8 @@ class Isokinetic(Splitting):
         if self.convention != "exact":
             given.append(f"convention={self.convention!r}")
         return f"Isokinetic({', '.join(given)})"
+
+    operations = Interpreted.operations  # its kicks are its own
 
     def program(self, system: System | None) -> Program:
         return self._programs[system is not None and system.packed is None]

@@ -89,7 +89,8 @@ def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = T
             sums = sums.index_add(0, state.system_idx, torch.cat([given, masses], dim=1))
             given = given - masses * (_free(state)[:, None] * sums[:, :3] / sums[:, 3:])[state.system_idx]
     momenta = masses * held.tangent(start, given / masses)
-    output = _output(start, model)
+    output = model(start)
+    _check_forces(state, output["forces"])
     made = MDState.from_state(start, momenta=momenta, energy=output["energy"], forces=output["forces"])
     made.store_model_extras(output)
     return made
@@ -108,12 +109,6 @@ def _placed(state: SimState, held: Constraints) -> torch.Tensor:
             item="state",
         )
     return found
-
-
-def _output(state: SimState, model: ModelInterface) -> dict[str, torch.Tensor]:
-    output = model(state)
-    _check_forces(state, output["forces"])
-    return output
 
 
 def _check_forces(state: SimState, forces: torch.Tensor) -> None:
@@ -188,7 +183,9 @@ def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
 def _evaluate(state: MDState, model: ModelInterface) -> None:
     """Forces at the end of a step, at positions that are on the constraints: looked at here, once a step."""
     constraints_of(state).check(state)
-    output = _output(state, model)
+    output = model(state)
+    if state.device.type == "cpu":  # elsewhere looking waits for the device: the next step tells
+        _check_forces(state, output["forces"])
     constraints_of(state).left = state.positions, state.positions._version
     state.energy, state.forces = output["energy"], output["forces"]
     state.store_model_extras(output)

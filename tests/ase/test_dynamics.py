@@ -160,23 +160,6 @@ def test_masses_of_free_atoms_changed_between_steps_are_taken(change):
         np.testing.assert_array_equal(one, two)
 
 
-def test_another_calculator_gives_another_energy():
-    """At once: a proposal begins with an energy that is known from before."""
-    atoms, _ = water()
-    dyn = ConstrainedMonteCarlo(atoms, 0.1 * FS, 300, 3, rng=1)
-    dyn.run(2)
-    before = dyn.state.copied()
-    atoms.calc = Field(5.0)
-    dyn.run(1)
-    again, _ = water()
-    again.positions, again.calc = before.positions, Field(5.0)
-    before.thermostat[0] = np.nan  # the energy
-    other = ConstrainedMonteCarlo(again, 0.1 * FS, 300, 3, rng=1, state=before)
-    other.run(1)
-    for one, two in zip(state(atoms), state(again), strict=True):
-        np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-12)
-
-
 # -- time steps -------------------------------------------------------------------------------------
 
 

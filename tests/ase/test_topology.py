@@ -1,4 +1,4 @@
-"""Atoms as molecules with names, residues, bonds and elements, and back."""
+"""Atoms as molecules with names, residues, bonds and elements, and back; what is water, and what only looks like it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import ase.io
 import numpy as np
 import pytest
 from ase import Atoms
-from ase.build import molecule
+from ase.build import bulk, molecule
 
-from kcons.ase import constrain, constraints_of, repartition_hydrogen_mass
+from kcons.ase import constrain, constraints_of, repartition_hydrogen_mass, rigid_water
 from kcons.ase.topology import atoms_of, bonds_of, kinetic_energy_of, repair_elements, snapshot_of, velocities_of
 from kcons.errors import InputError
 
@@ -130,26 +130,12 @@ def test_held_by_name():
     assert len(caught) == 1
     assert sum(item.n_rows for item in held.constraints) == 6
     assert atoms.get_number_of_degrees_of_freedom() == 27 - 6
-    counts, atoms.info["bonds"] = {}, bonds_of(atoms)
+    atoms.info["bonds"] = bonds_of(atoms)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for name in ("hbonds", "allbonds", "hangles", "allangles"):
+        for name, expected in (("allbonds", [("Distance", 8)]), ("hangles", [("Distance", 8), ("Angle", 5)])):
             atoms.set_constraint()
-            held = constrain(atoms, name)
-            counts[name] = [(item.family, item.n_rows) for item in held.constraints]
-            assert [item.atoms.tolist() for item in held.constraints] == [
-                item.atoms.tolist() for item in constraints_of(atoms, name)
-            ]
-    assert counts["hbonds"] == [("Distance", 6)] and counts["allbonds"] == [("Distance", 8)]
-    # Four H-C-H of the methyl and methylene groups, and H-O-C.
-    assert counts["hangles"] == [("Distance", 8), ("Angle", 5)]
-
-
-def test_a_name_that_is_none_changes_nothing():
-    atoms = molecule("CH3CH2OH")
-    with pytest.raises(InputError, match=r"cannot constrain 'hbond'.*hangles"):
-        constrain(atoms, "hbond")
-    assert atoms.constraints == [] and "bonds" not in atoms.info
+            assert [(item.family, item.n_rows) for item in constrain(atoms, name).constraints] == expected
 
 
 def test_bonds_that_are_far_too_long_are_not_held():
@@ -201,9 +187,56 @@ def test_masses_that_cannot_be_are_refused():
     before = atoms.get_masses()
     with pytest.raises(InputError, match=r"leave 0.043 to atom 0 \(C\).*smaller mass"):
         repartition_hydrogen_mass(atoms, 4)
-    for bad in (0, -1, np.nan, "3"):
-        with pytest.raises(InputError, match="mass is"):
-            repartition_hydrogen_mass(atoms, bad)
-    with pytest.raises(InputError, match="atoms must be"):
-        repartition_hydrogen_mass([atoms])
     assert np.array_equal(atoms.get_masses(), before)
+
+
+# -- rigid water -----------------------------------------------------------------------------------
+
+
+def test_rigid_water_finds_water_only():
+    atoms = molecule("H2O") + molecule("CH3CH2OH") + molecule("OH") + bulk("Cu") + molecule("H2O")
+    n = len(atoms)
+    atoms.positions[:3] += 20
+    atoms.positions[n - 3 :] -= 20
+    rows = rigid_water(atoms).atoms
+    assert np.array_equal(rows, [[0, 1], [0, 2], [1, 2], [n - 3, n - 2], [n - 3, n - 1], [n - 2, n - 1]])
+
+
+def test_what_is_no_water():
+    hydronium = Atoms("OH3", positions=[[0, 0, 0], [0.98, 0, 0], [-0.49, 0.85, 0], [-0.49, -0.85, 0]])
+    for atoms in (hydronium, molecule("CH4"), molecule("CH3OH"), Atoms("OH2", np.full((3, 3), np.nan))):
+        with pytest.raises(InputError, match="no water found"):
+            rigid_water(atoms)
+
+
+def test_water_in_another_order_is_held_too():
+    atoms = molecule("H2O") + molecule("H2O")[[1, 0, 2]] + molecule("CH3OH")
+    atoms.positions[3:] += 10
+    atoms.positions[6:] += 10
+    atoms = atoms[[0, 3, 4, 1, 2, 5, *range(6, 12)]]
+    assert rigid_water(atoms).atoms.tolist() == [[0, 3], [0, 4], [3, 4], [2, 1], [2, 5], [1, 5]]
+    assert constraints_of(atoms, "none", guess_bonds=True).constraint_set.n_rows == 6
+
+
+def test_rigid_water_across_a_boundary():
+    atoms = molecule("H2O")
+    atoms.set_cell([8, 8, 8])
+    atoms.pbc = True
+    atoms.positions -= atoms.positions[0]
+    atoms.wrap()
+    assert rigid_water(atoms).n_rows == 3
+
+
+def test_rigid_water_geometry():
+    atoms = molecule("H2O")
+    assert rigid_water(atoms, "spc").target[:2] == pytest.approx([1.0, 1.0])
+    assert rigid_water(atoms, (1.0, 90.0)).target == pytest.approx([1.0, 1.0, np.sqrt(2)])
+    assert rigid_water(atoms).target is None
+
+
+def test_waters_in_nanometers():
+    water = molecule("H2O")
+    water.positions *= 0.1
+    with pytest.raises(InputError, match="multiply by 10 where these are in nm") as raised:
+        rigid_water(water, "tip3p")
+    assert list(raised.value.atoms) == [0]

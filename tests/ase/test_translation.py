@@ -12,7 +12,6 @@ import pytest
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.lj import LennardJones
-from ase.calculators.tip3p import TIP3P
 from ase.constraints import (
     FixAtoms,
     FixBondLengths,
@@ -30,7 +29,7 @@ from ase.io import read, write
 from ase.md.verlet import VelocityVerlet
 from ase_systems import AS_ASE, loose_waters, rigid
 
-from kcons.ase import ConstrainedDynamics, Constraints, attach, constrain, from_ase_constraints, rigid_water
+from kcons.ase import Constraints, attach, constrain, from_ase_constraints, rigid_water
 from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, ImplicitSurface, LinearCombination, Sphere
 from kcons.errors import UnsupportedError
 
@@ -237,22 +236,6 @@ def test_attach_keeps_objects_that_add_forces_and_refuses_unknown_ones():
     with pytest.raises(UnsupportedError, match=r"MirrorForce.*Custom"):
         attach(atoms)
     assert atoms.constraints == before
-
-
-def test_a_restart_from_a_file_that_ase_can_open_is_exact(tmp_path):
-    """The object of ASE has the rows and the targets of kcons to the last bit."""
-    atoms, held = rigid(2)
-    path = tmp_path / "run.traj"
-    dynamics = ConstrainedDynamics(atoms, units.fs, trajectory=str(path))
-    dynamics.run(2)
-    again = read(path)
-    assert isinstance(again.constraints[0], FixBondLengths)
-    assert attach(again).todict() == held.todict()
-    again.calc = TIP3P(rc=6.0)
-    ConstrainedDynamics(again, units.fs, time=dynamics.get_time()).run(3)
-    dynamics.run(3)
-    assert np.array_equal(again.positions, atoms.positions)
-    assert np.array_equal(again.get_momenta(), atoms.get_momenta())
 
 
 def test_function_rows_are_left_out_of_files_with_a_warning(tmp_path):

@@ -164,21 +164,6 @@ def test_forces_cannot_move_the_atoms(stepper, chains: bool, far: bool) -> None:
         run(System(motion, careless), start, 0.001, 3, stepper=stepper)
 
 
-def test_what_a_force_function_keeps_stays_as_it_was(motion: Motion) -> None:
-    """Rooms are never used twice, whatever a function does with what it was lent."""
-    kept: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def force(x, t):
-        kept.append((x, x.copy()))
-        return PULL
-
-    system = System(held([Distance([[0, 1], [1, 2]])]), force)
-    end = run(system, State(X, 0 * X), 0.01, 300, stepper=Suzuki4())
-    assert len(kept) > 1400
-    assert all(np.array_equal(a, b) and not a.flags.writeable for a, b in kept)
-    assert not any(np.shares_memory(end.positions, a) for a, _ in kept[-3:])
-
-
 def of_velocities(motion, force, stepper) -> None:
     run(System(motion, force, velocity_dependent=True), State(X, 0 * X), 0.01, 3, stepper=stepper)
 

@@ -204,7 +204,7 @@ def test_a_family_of_ones_own_is_compiled_kept_in_files_and_takes_quantities():
 POWERS = {
     name: dict(item.held.exponents).get("length", 0)
     for name, make in CASES.items()
-    if (item := make()).held.exponents and item.holonomic and not item.moving
+    if (item := make()).held.exponents is not None and item.holonomic and not item.moving
 }
 
 

@@ -120,14 +120,6 @@ def test_positions_and_masses_of_constrained_atoms(bad):
     ConstraintSet([Distance([[0, 1]])], x, m)  # other atoms are not looked at
 
 
-def test_arrays_of_the_wrong_shape_are_named_later_too():
-    held = ConstraintSet([Distance([[0, 1]])], scattered(0), MASSES)
-    with pytest.raises(InputError, match=r"positions must have shape \(8, 3\)"):
-        held.value(np.zeros((7, 3)))
-    with pytest.raises(InputError, match=r"velocities must have shape \(8, 3\)"):
-        held.acceleration_target(scattered(0), np.zeros((7, 3)))
-
-
 def test_what_was_given_may_be_changed_afterwards():
     target, center, coefficients = np.array([1.0]), np.array([[0.0, 0.0, 3.0]]), np.ones((1, 2, 3))
     x, masses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([1.0, 2.0])
@@ -153,36 +145,30 @@ def test_masses_cannot_be_changed(made):
 # -- targets that exclude each other ------------------------------------------------------------------
 
 
-def test_one_pair_at_two_lengths():
-    x = scattered(0)
-    with pytest.raises(
-        ContradictionError, match=r"constraints #0 and #1 on atoms \(0, 1\) have different targets 1.0, 1.001"
-    ) as caught:
-        ConstraintSet([Distance([[0, 1], [1, 0]], [1.0, 1.001])], x, MASSES)
+#: Rows of which two exclude each other, and what is said of them.
+EXCLUDING = [
+    ([Distance([[0, 1], [1, 0]], [1.0, 1.001])], r"#0 and #1 on atoms \(0, 1\) have different targets 1.0, 1.001"),
+    ([Distance([[1, 2], [0, 1]]), Distance([[1, 0]], 1.2)], r"#1 and #2 on atoms \(0, 1\) have .* targets 1.5, 1.2"),
+    ([Angle([[0, 1, 2], [2, 1, 0]], [1.0, 1.1])], r"atoms \(0, 1, 2\) have different targets 1.0, 1.1"),
+    ([Dihedral([[0, 1, 2, 3], [3, 2, 1, 0]], [1.0, 1.1])], r"atoms \(0, 1, 2, 3\) have different targets 1.0, 1.1"),
+]
+
+
+@pytest.mark.parametrize(("rows", "words"), EXCLUDING)
+def test_one_coordinate_at_two_values(rows, words):
+    """Also across objects, and against the length that is found."""
+    x = np.array([[0.0, 0, 0], [1.5, 0, 0], [0, 2.0, 0], [0.3, 1.0, 1.0]])
+    with pytest.raises(ContradictionError, match=words) as caught:
+        ConstraintSet(rows, x, np.ones(4))
     assert isinstance(caught.value, ValueError)
-    assert (caught.value.rows, caught.value.atoms) == ((0, 1), (0, 1))
+    assert caught.value.rows == ((1, 2) if len(rows) > 1 else (0, 1))
+    assert set(caught.value.atoms) == set(rows[0].atoms[-1])
 
 
-def test_across_objects_and_against_an_initial_length():
-    x = np.array([[0.0, 0, 0], [1.5, 0, 0], [0, 2.0, 0]])
-    with pytest.raises(ContradictionError, match=r"#1 and #2 on atoms \(0, 1\) have different targets 1.5, 1.2"):
-        ConstraintSet([Distance([[1, 2], [0, 1]]), Distance([[1, 0]], 1.2)], x, np.ones(3))
-
-
-def test_the_same_length_twice_is_accepted():
+def test_the_same_value_twice_and_other_vertices_axes_and_images_are_accepted():
     x = scattered(0)
-    held = ConstraintSet([Distance([[0, 1], [1, 0], [0, 1]])], x, MASSES)
-    assert held.n_rows == 3
+    assert ConstraintSet([Distance([[0, 1], [1, 0], [0, 1]])], x, MASSES).n_rows == 3
     ConstraintSet([Distance([[0, 1], [1, 0]], [1.0, 1.0 + 1e-12])], x, MASSES)
-
-
-def test_angles_and_dihedrals_at_two_values():
-    x = scattered(0)
-    with pytest.raises(ContradictionError, match=r"atoms \(0, 1, 2\) have different targets 1.0, 1.1"):
-        ConstraintSet([Angle([[0, 1, 2], [2, 1, 0]], [1.0, 1.1])], x, MASSES)
-    with pytest.raises(ContradictionError, match=r"atoms \(0, 1, 2, 3\) have different targets 1.0, 1.1"):
-        ConstraintSet([Dihedral([[0, 1, 2, 3], [3, 2, 1, 0]], [1.0, 1.1])], x, MASSES)
-    # Other vertices, other axes and other images are no contradiction.
     ConstraintSet([Angle([[0, 1, 2], [0, 2, 1]], [1.0, 1.1])], x, MASSES)
     ConstraintSet([Dihedral([[0, 1, 2, 3], [3, 2, 1, 0], [0, 2, 1, 3]], [1.0, 1.0 + 2 * np.pi, 1.1])], x, MASSES)
 

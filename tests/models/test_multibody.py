@@ -139,43 +139,6 @@ def test_no_time_and_no_times():
 # -- the same motion in other coordinates ------------------------------------------------------------
 
 
-def test_a_linear_change_of_coordinates_changes_nothing():
-    """M = T^T D T, g(T y): the same steps, projections in the metric of M included, to rounding."""
-    rng = np.random.default_rng(5)
-    T, D = rng.normal(size=(3, 3)) + 2 * np.eye(3), np.array([1.0, 3.0, 0.5])
-
-    def force(x, v, t):
-        return np.array([0.0, -1.0, 0.3]) - 0.1 * v + np.sin(x)
-
-    def sphere(x):
-        return np.array([x @ x - 1.0, x[0] * x[1] - 0.1 * x[2]])
-
-    def gradient(x):
-        return np.array([2 * x, [x[1], x[0], -0.1]])
-
-    def bend(x, v):
-        return np.array([2 * v @ v, 2 * v[0] * v[1]])
-
-    plain = Multibody(D, force, sphere, gradient, curvature=bend)
-    full = Multibody(
-        T.T @ np.diag(D) @ T,
-        lambda y, w, t: T.T @ force(T @ y, T @ w, t),
-        lambda y: sphere(T @ y),
-        lambda y: gradient(T @ y) @ T,
-        curvature=lambda y, w: bend(T @ y, T @ w),
-    )
-    x, v = plain.project([0.9, 0.2, 0.4], [0.3, 0.5, -0.4])
-    one = plain.solve(x, v, (0, 2), **steps_of(0.05))
-    other = full.solve(np.linalg.solve(T, x), np.linalg.solve(T, v), (0, 2), **steps_of(0.05))
-    np.testing.assert_allclose(other.q[-1] @ T.T, one.q[-1], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(other.multipliers[-1], one.multipliers[-1], rtol=0, atol=1e-10)
-    start = [x + np.array([0.1, -0.2, 0.1]), v + np.array([0.2, 0.0, 0.3])]
-    there, speed = plain.project(*start)
-    here, pace = full.project(*(np.linalg.solve(T, part) for part in start))
-    np.testing.assert_allclose(T @ here, there, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(T @ pace, speed, rtol=0, atol=1e-13)
-
-
 # -- the theory --------------------------------------------------------------------------------------
 
 

@@ -227,15 +227,6 @@ def test_periodic_equals_unwrapped(case, cell):
     np.testing.assert_allclose(z, y, atol=1e-12)
 
 
-def test_slab_is_periodic_in_two_directions():
-    c = clusters("small-star2")
-    lattice = lattice_of(np.diag([9.0, 8.0, 1.0]))
-    lattice[1, 2] = lattice[1, :, 2] = 0.0
-    x, z = c.x_new.copy(), c.x_new.copy()
-    assert c.positions(x).converged and c.positions(z, lattice=lattice).converged
-    np.testing.assert_allclose(z, x, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("case", "pinned"),
     [("triangles-10", [0]), ("small-chain3", [0, 3]), ("chains-no multiple-free", [0, 5, 6, 36]), ("sparse-comb", [3])],
@@ -354,9 +345,6 @@ def test_ten_thousand_bonds(shape, monkeypatch):
     bonds = np.diff(c.x_ref[c.atoms[0]], axis=0)
     speed = (bonds * np.diff(y[c.atoms[0]], axis=0)).sum(axis=1) / np.linalg.norm(bonds, axis=1)
     assert np.abs(speed).max() <= 5e-15 * np.sqrt(3)
-
-
-# -- any connection -------------------------------------------------------------------------------------------
 
 
 # -- order and pattern of the sparse elimination ----------------------------------------------------

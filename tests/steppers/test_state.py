@@ -18,12 +18,6 @@ from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, Reversibi
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, IsokineticSpheres, Langevin, NoseHooverChain
 
 
-@pytest.mark.parametrize("mass", [0.0, -1.0, np.nan, np.inf])
-def test_bad_mass_of_a_free_atom(mass):
-    with pytest.raises(InputError, match="atom 2 has mass"):
-        system_of([Distance([0, 1])], np.eye(3), [1, 1, mass])
-
-
 def test_start_off_the_constraints():
     """What is within rounding is taken as given, also in single precision."""
     system, state = rotor()
@@ -71,18 +65,6 @@ def test_states_are_changed_by_replace_only(stepper):
         run(system, replace(after, positions=1.2 * after.positions), 0.01, 1, stepper=stepper)
 
 
-def test_start_with_forbidden_velocities():
-    system, state = rotor(omega=1.0)
-    stretching = state.velocities + np.array([[0.5, 0, 0], [0, 0, 0]])
-    with pytest.raises(InputError, match="initial velocities violate"):
-        system.initial_state(state.positions, stretching)
-    projected = system.initial_state(state.positions, stretching, project=True)
-    relative = projected.velocities[0] - projected.velocities[1]
-    assert abs(relative[0]) <= 1e-15
-    assert system.kinetic_energy(projected.velocities) < system.kinetic_energy(stretching)
-    assert np.abs(system.masses @ (projected.velocities - stretching)).max() <= 1e-15
-
-
 @pytest.mark.parametrize("time", [1e-300, 1e-16, -1e-16, 0.0, 1e-3])
 def test_velocities_of_a_rod_that_grows(time):
     """What an atom can have moved since time 0 says nothing of where it will go; without velocities, the rod's own."""
@@ -115,17 +97,6 @@ def test_a_run_goes_on_from_a_file_bit_for_bit(stepper, make, tmp_path: Path) ->
     run(system, state, 0.1, 10, stepper=stepper).save(tmp_path / "half.npz")
     again, _ = make()
     assert_same(run(again, State.load(tmp_path / "half.npz"), 0.1, 10, stepper=stepper), whole)
-
-
-@pytest.mark.parametrize("content", [b"", b"no archive at all", b"PK\x03\x04 torn", None])
-def test_what_is_no_state_is_refused(content: bytes | None, tmp_path: Path) -> None:
-    path = tmp_path / "x.npz"
-    if content is None:
-        np.savez(path, positions=np.zeros((1, 3)), charges=np.zeros(1))
-    else:
-        path.write_bytes(content)
-    with pytest.raises(InputError, match="holds no state"):
-        State.load(path)
 
 
 def whole_state() -> State:
@@ -179,6 +150,7 @@ IMPOSSIBLE = {
     "step": [0.5, -3],
     "barostat": [np.ones(5), np.full(9, np.inf)],
     "thermostat": [np.array([np.nan])],
+    "charges": [np.zeros(1)],
 }
 
 
@@ -192,11 +164,6 @@ def test_arrays_that_no_step_can_take_are_refused(name: str, tmp_path: Path) -> 
 
 
 # -- time, and whose forces -------------------------------------------------------------------------
-
-
-def test_time_adds_up_exactly() -> None:
-    system, state = rotor(omega=0.0)
-    assert run(system, state, 0.1, 1000).time == 100.0
 
 
 def pendulum(g: float) -> tuple[System, State, list[float]]:
@@ -328,11 +295,8 @@ def test_what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place(stepper
     np.testing.assert_array_equal(found.velocities, expected.velocities)
 
 
-@pytest.mark.parametrize("far", [0.0, -1.0, np.nan, "far"])
-def test_far_may_be_switched_off_and_has_to_be_a_number(far) -> None:
+def test_far_may_be_switched_off() -> None:
     assert rotor(offset=1e6, far=np.inf)[1].remainder is None and rotor(offset=1e6)[1].remainder is not None
-    with pytest.raises(InputError, match="far is"):
-        rotor(far=far)
 
 
 # -- what every stepper does; runs ------------------------------------------------------------------
@@ -352,21 +316,6 @@ def assert_untouched(state: State, before: list[np.ndarray | None]) -> None:
 
 
 # -- forces -----------------------------------------------------------------------------------------
-
-
-@REVERSIBLE
-def test_force_evaluations_are_as_declared(stepper) -> None:
-    calls = []
-
-    def force(x, t):
-        calls.append(t)
-        return -x
-
-    system, state = rotor(force=force)
-    state = run(system, state, 0.05, 1, stepper=stepper)
-    calls.clear()
-    run(system, state, 0.05, 7, stepper=stepper)
-    assert len(calls) == 7 * stepper.force_evaluations
 
 
 # -- purity and failure -----------------------------------------------------------------------------
@@ -423,9 +372,6 @@ def test_steps_are_taken_back(stepper, make) -> None:
         assert np.abs(state.positions - start.positions).max() <= allowed
         assert np.abs(state.velocities - start.velocities).max() <= 2e-14
         assert state.time == pytest.approx(0, abs=1e-16)
-
-
-# -- invariance -------------------------------------------------------------------------------------
 
 
 def test_reprs_build_the_stepper_again() -> None:

@@ -106,8 +106,7 @@ def worst(integrator, context):
 
 
 def core_run(kind, stepper, dt, steps, atoms=(0, 1, 2)):
-    """The same motion by kcons' own steppers, without great circles: positions and velocities."""
-    stepper.exact_flight = False
+    """The same motion by kcons' own steppers: positions and velocities."""
     atoms = np.array(atoms)
     rows = KINDS[kind](atoms, POSITIONS[atoms])
     motion = Motion(ConstraintSet(rows, POSITIONS, MASSES), POSITIONS)

@@ -114,6 +114,9 @@ def test_steps_and_systems_that_cannot_be(name):
             stepper.step(System(held.motion, ForceGroups(broken)), state, 0.1)
         with pytest.raises((ConvergenceError, InputError), match="step 1: "):
             stepper.step(held, state, 900.0)
+    if name == "NoseHooverChain":
+        with pytest.raises(NonFiniteError, match="non-finite velocity at step 1 on atom 0"):
+            stepper.step(held, replace(state, velocities=np.nan * state.velocities), 0.1)
     if name in NOISY:
         with pytest.raises(InputError, match="noise cannot be taken back"):
             stepper.step(held, state, -0.1)
@@ -126,6 +129,7 @@ def test_steps_and_systems_that_cannot_be(name):
 
 RESPA = {"": {"steps": TWO}, ", three": {"steps": {"slow": 1, "medium": 2, "fast": 6}}}
 RESPA[", middle"] = {"steps": TWO, "slow_kicks": "middle"}
+MIDDLE = IsokineticSpheres(0.5, 1e-32, 3, steps=TWO, slow_kicks="middle"), IsokineticSpheres(0.5, 1e-32, 3)
 SPHERES = [{"spheres": kind} for kind in ("split", "axes", "cluster", "global")]
 #: Without noise, and what they come near to: one step for all forces.
 SILENT = {
@@ -133,6 +137,7 @@ SILENT = {
     "Langevin": (Langevin(0.5, 0.0, 3, substeps=4), Rattle()),
     **{f"Respa{key}": (LangevinRespa(0.5, 0.0, 3, **more), Langevin(0.5, 0.0, 3)) for key, more in RESPA.items()},
     **{k["spheres"]: [IsokineticSpheres(0.5, 1e-32, 3, **k, **more) for more in ({"steps": TWO}, {})] for k in SPHERES},
+    "spheres, middle": MIDDLE,
 }
 
 

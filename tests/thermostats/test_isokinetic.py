@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference import cases
-from scipy.integrate import solve_ivp
 from thermostat_systems import (
     ROWS,
     distance,
@@ -108,22 +107,6 @@ def test_against_the_force(tilt, z):
             assert cosine == pytest.approx(-1, abs=1e-3)
     elif q > 1e-9 or z < 20:
         assert cosine == pytest.approx(math.tanh(z - begin), abs=1e-6)
-
-
-def test_the_equation_itself():
-    u, pace = RNG.standard_normal((2, 4, 3))
-    uu = kick.square_sum(u, MASSES)
-
-    def slope(t, y):
-        v = y[:-1].reshape(4, 3)
-        alpha = (MASSES * v * pace).sum() / uu
-        return np.append((pace - alpha * v).ravel(), alpha)
-
-    for t in (0.7, 5.0, -3.0):
-        found = solve_ivp(slope, (0, t), np.append(u.ravel(), 0.0), method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
-        after, growth = kicked(u, pace, t)
-        np.testing.assert_allclose(after.ravel(), found[:-1], atol=1e-10)
-        assert growth == pytest.approx(found[-1], abs=1e-10)
 
 
 ORDERS = pytest.mark.parametrize("order", [2, 4, 6])

@@ -164,17 +164,6 @@ def test_many_auxiliary_variables_are_langevin_dynamics():
     assert values[1] == pytest.approx(values[400] * 5 / 6, rel=0.03)
 
 
-def test_great_circles_are_flown_exactly():
-    x = np.array([[1.0, 0, 0], [0, 0, 2.0], [3.0, 1, 1]])
-    held = system([Sphere([0], [0, 0, 0], 1.0), Sphere([1], [0, 0, 0], 2.0)], x, [1.0, 2.0, 3.0], waves)
-    stepper = IsokineticSpheres(0.5, 1.0, 3)
-    end = run(held, held.initial_state(x), 0.3, 20, stepper=stepper)
-    assert np.abs(held.motion.constraint_set.value(end.positions)).max() <= 1e-14
-    assert "along great circles" in stepper.listing(held)
-    has, wanted = lengths(stepper, held, end)
-    np.testing.assert_allclose(has, wanted, rtol=1e-13)
-
-
 def test_noise_is_a_function_of_seed_step_and_part():
     held, state = molecules("bent", 2)
     split = grouped(held.motion)
@@ -253,15 +242,6 @@ def test_degrees_of_freedom_by_sphere(rows, kind, wanted):
     assert layout.freedom.tolist() == wanted
     fixed = held.motion.fixed_atoms
     assert np.flatnonzero(layout.cluster < 0).tolist() == fixed.tolist() and not layout.masses[fixed].any()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_spheres_share_out_all_degrees_of_freedom(kind):
-    for name in ("bent", "triangles", "tetrahedra"):
-        held, state = molecules(name, 3, ions=2)
-        layout = SphereLayout.of(held, state.positions, kind)
-        assert layout.freedom.sum() == held.motion.degrees_of_freedom
-        assert layout.totals.sum() == pytest.approx(held.masses.sum())
 
 
 def test_dependent_rows_count_by_rank():

@@ -1,4 +1,4 @@
-"""Geodesic BAOAB: exact friction and noise on the constraints, momentum, moving targets; numbers drawn in kernels."""
+"""Geodesic BAOAB: moving targets, noise of each exchange, numbers drawn in kernels, forces in groups."""
 
 from __future__ import annotations
 
@@ -8,31 +8,17 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from thermostat_systems import dumbbells, quartic, quartic_potential, system, waves
+from thermostat_systems import dumbbells, system, waves
 
 from kcons.constraints import Distance, FixedAtoms, MovingTarget, Sphere
-from kcons.steppers import State, System, run
-from kcons.thermostats import Langevin, thermal_velocities
+from kcons.steppers import System, run
+from kcons.thermostats import ForceGroups, Langevin, LangevinRespa, thermal_velocities
 from kcons.thermostats.noise import fill_normal, noise_generator
 
 
 def started(n=2, **options):
     held, x = dumbbells(n, **options)
     return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
-
-
-def test_free_flight_forgets_its_velocity_at_the_rate_asked_for():
-    """Without forces and rows a step is the exact Ornstein-Uhlenbeck process: <v(t)> = e^{-gamma t} v(0)."""
-    n, kt, gamma, dt = 20_000, 0.7, 0.8, 0.5
-    held = system([], np.zeros((n, 3)), np.full(n, 2.0))
-    v = np.tile([1.0, -0.5, 0.2], (n, 1))
-    state = State(np.zeros((n, 3)), v)
-    for k in range(1, 4):
-        state = Langevin(kt, gamma, 7).step(held, state, dt)
-        keep = math.exp(-gamma * dt * k)
-        spread = math.sqrt(kt / 2 * (1 - keep**2))
-        np.testing.assert_allclose(state.velocities.mean(axis=0), keep * v[0], atol=4.5 * spread / math.sqrt(n))
-        np.testing.assert_allclose(state.velocities.std(axis=0), spread, rtol=4.5 / math.sqrt(2 * n))
 
 
 def test_moving_targets_are_followed_and_friction_knows_their_speed():
@@ -43,29 +29,6 @@ def test_moving_targets_are_followed_and_friction_knows_their_speed():
     d = after.positions[1] - after.positions[0]
     assert np.linalg.norm(d) == pytest.approx(2.0, rel=1e-13)
     assert d @ (after.velocities[1] - after.velocities[0]) / 2 == pytest.approx(0.5, rel=1e-12)
-
-
-def test_heat_is_counted():
-    """Total energy less the heat stays, to the order of the scheme."""
-    drifts = []
-    for dt in (0.02, 0.01):
-        held, x = dumbbells(2, force=quartic, potential=quartic_potential)
-        x = x - 1.2
-        held = System(held.motion, quartic, potential=quartic_potential)
-        thermostat = Langevin(0.5, 1.0, 3)
-        values = []
-        run(
-            held,
-            State(x, thermal_velocities(held, x, 0.5, 4)),
-            dt,
-            round(20 / dt),
-            stepper=thermostat,
-            observers=[lambda s, h=held, t=thermostat, v=values: v.append(t.conserved_energy(h, s))],
-        )
-        drifts.append(np.std(values))
-        assert np.abs(np.diff(values)).max() <= 20 * dt**2
-    assert drifts[0] <= 0.05
-    assert drifts[1] <= 0.5 * drifts[0]
 
 
 def test_threads_share_a_bath():
@@ -105,3 +68,52 @@ def test_numbers_are_those_of_numpy_to_the_last_bit(seed, number, part) -> None:
     fill_normal(np.uint64(seed), np.uint64(number), np.uint64(part), found)
     np.testing.assert_array_equal(found, noise_generator((seed, 0), number, part).standard_normal(20_001))
     assert np.abs(found).max() > 3.66  # beyond the last layer
+
+
+# -- several time steps ----------------------------------------------------------------------------
+
+
+X = np.random.default_rng(0).normal(size=(4, 3))
+
+
+def test_a_difference_does_not_trust_an_array_that_is_used_again():
+    shared = np.empty_like(X)
+
+    def one(x, t):
+        shared[...] = x
+        return shared
+
+    def two(x, t):
+        shared[...] = 2 * x
+        return shared
+
+    np.testing.assert_array_equal(ForceGroups.difference(one, two).of("slow", X, 0.0), X)
+
+
+TWO = {"slow": 1, "fast": 4}
+
+
+def grouped(motion, **groups):
+    return System(motion, ForceGroups(groups))
+
+
+def test_slow_kicks_in_the_middle_are_made_once():
+    held, x = dumbbells(2)
+    split = grouped(held.motion, fast=lambda x, t: -3.0 * x, slow=waves)
+    state = held.initial_state(x, 0.3 * np.random.default_rng(1).normal(size=x.shape), project=True)
+    stepper = LangevinRespa(0.5, 0.0, 3, steps=TWO, slow_kicks="middle")
+    assert run(split, state, 0.1, 3, stepper=stepper).forces is None
+    assert split.force.evaluations == {"fast": 3 * 5, "slow": 3}
+
+
+def test_each_exchange_of_a_step_has_noise_of_its_own():
+    """Drawn for the seed, the step and its place in it, also where several steps are made at once."""
+    held = system([], np.eye(3)[:2], [1.0, 3.0])
+    split = grouped(held.motion, fast=lambda x, t: 0 * x, slow=lambda x, t: 0 * x)
+    thermostat, v = LangevinRespa(0.5, 1.0, 3, steps=TWO), np.ones((2, 3))
+    end = thermostat.march(split, split.initial_state(np.eye(3)[:2], v), 0.1, 3)
+    keep, spread = math.exp(-0.1 / 4), math.sqrt(-math.expm1(-2 * 0.1 / 4) * 0.5)
+    for number in (1, 2, 3):
+        for part in range(4):
+            v = keep * v + spread * thermostat.drawn(number, v.shape, part) * split.root_weights
+    np.testing.assert_allclose(end.velocities, v, rtol=1e-13)

@@ -20,7 +20,7 @@ from MDAnalysis.lib.mdamath import triclinic_vectors
 from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import ANGLE
+from kcons.constraints.arguments import ANGLE, LENGTH
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -32,7 +32,7 @@ from kcons.mdanalysis.topology import NARROWEST
 from kcons.solvers.kernels.lattices import NO_LATTICE, TRICLINIC, lattice_numbers, minimum_image
 
 #: Natural units of rows, in this order.
-UNITS = ("Å", "rad")
+UNITS = ("Å", "rad", "own units")
 #: What second order adds to the error of rows other than distances, at most.
 SECOND_ORDER = 1.1
 _ROOT_THREE = np.sqrt(3.0)
@@ -124,11 +124,13 @@ class RowTable:
         lattice, limit = self._cell_of(ts.dimensions)
         x = precision.stored(ts.positions)
         self.set = held = ConstraintSet(given, x, masses, cell=lattice[0] if limit < np.inf else None, time=time)
-        #: By row: whether its target is that of this frame, or of the mean of all; which of `UNITS` it has (one's own
-        #: coordinates count as lengths); what a tolerance is a part of: the length held, 1 rad.
+        #: By row: whether its target is that of this frame, or of the mean of all; which of `UNITS` it has; what a
+        #: tolerance is a part of: the length held, 1 rad.
         self.measured = _by_row(given, [item.target is None for item in given])
         angular = _by_row(given, [item.period is not None for item in given])
-        self.units = _by_row(given, [int(i.period is not None or i.held is ANGLE) for i in given])
+        angles = [item.period is not None or item.held is ANGLE for item in given]
+        others = [2 * (item.held is not LENGTH) for item in given]
+        self.units = _by_row(given, np.where(angles, 1, others).tolist())
         self.sizes = np.where(angular, 1.0, held.scale)
         # Compiled code takes nearest images; whole rows may be longer than half the cell, and are for the set.
         plain = [

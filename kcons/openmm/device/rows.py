@@ -35,7 +35,7 @@ from kcons.openmm.device.clusters import (
     large_clusters,
 )
 from kcons.openmm.integrator.guard import SystemRows, settled_rows
-from kcons.openmm.integrator.part import Precision
+from kcons.openmm.integrator.part import SINGLE, Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import accepted, masses_of, positions_of
 from kcons.plan.clusters_alike import alike
@@ -46,6 +46,7 @@ TURNS, CHORD = 30, 4
 KNOTS, BLOCK, BEYOND = 2, 500, 2
 #: Arrays of impulses, and of what rounding has taken from their sums.
 SUMS = ("rows_sums", "rows_lost")
+_NONE = np.zeros(0, np.int64)
 #: A pivot of a dependent row below this part of its diagonal is none.
 PIVOT, PIVOT_SINGLE = 1e-10, 1e-4
 
@@ -358,6 +359,12 @@ class KernelRows(CarriedConstraints):
         moving = (masses[pairs] > 0).any(axis=1)  # between others OpenMM holds nothing
         pairs, lengths = pairs[moving], lengths[moving]
         lengths = np.where(settled_rows(pairs, lengths, len(masses)), lengths.astype(np.float32), lengths)
+        # Between atoms that stay where single numbers have put them a length is what it is there.
+        fixed = np.concatenate([_NONE, *(item.atoms.ravel() for item in self.given if item.fixes_atoms)])
+        ends = positions[pairs]
+        here, rounding = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), 4 * SINGLE * np.abs(ends).max(axis=(1, 2))
+        rounded = (ends == ends.astype(np.float32)).all(axis=(1, 2)) & (np.abs(here - lengths) <= rounding)
+        lengths = np.where(np.isin(pairs, fixed).all(axis=1) & rounded, here, lengths)
         made_of = tuple(array.tobytes() for array in (masses, pairs, lengths))
         if self._bound is None or self._of != made_of:
             cell = None if self._wraps is False else cell

@@ -173,6 +173,8 @@ class Part(ABC):
     lands_last: bool = False
     #: Force groups that carry rows, not forces.
     groups: frozenset[int] = frozenset()
+    #: Whether `land_alone` can fly exactly, as it does where the program is `exact`.
+    flies_exactly: bool = False
     #: Whether it is known that the System has no constraints: without other parts, `land_alone` is the whole drift.
     alone: bool = False
     #: Whether x is still a place where forces can be computed after a failure; set-up is faster then.

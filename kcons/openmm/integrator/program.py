@@ -309,13 +309,14 @@ class Program:
         verlet, plain = isinstance(scheme, Rattle), type(ensemble) is ConstantEnergy
         #: Whether parts stand beside virtual sites.
         self.sited = any(part.sited for part in self.parts)
-        #: Whether there is one part, whose rows are all there is.
+        #: Whether there is one part, whose rows are all there is; whether it flies exactly, as the scheme asks.
         self.single = len(self.parts) == 1 and self.parts[0].alone and not self.sited
-        self.operations = ensemble.operations(scheme)
+        self.exact = self.single and plain and scheme.exact_flight and self.parts[0].flies_exactly
+        self.operations = ensemble.operations(Splitting(scheme.kicks, scheme.drifts) if self.exact else scheme)
         self.drifts, self.kicks = stages_of(self.operations)
         #: Whether a bath acts between two halves of the only drift.
         self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
-        self.one_drift = len(self.drifts) == 1 or self.halves
+        self.one_drift = (len(self.drifts) == 1 and not self.exact) or self.halves
         #: Executions of the program in a step where virtual sites are placed at the end of each only.
         self.phases = 2 if self.halves or self.parts else len(self.drifts) + 1
         #: Whether velocity Verlet with parts leaves out what only a reader of velocities needs.

@@ -50,25 +50,6 @@ def gas():
     return dumbbells(N, side=SIDE)
 
 
-@made
-@pytest.mark.parametrize("which", ["monte carlo", "rescaling"])
-def test_a_run_goes_on_bit_for_bit(name, which):
-    barostat = barostats(every=3, kind="semi-isotropic")[which]
-    atoms, _ = gas()
-    other = atoms.copy()
-    whole = MADE[name](atoms, barostat=barostat)
-    whole.run(7)
-    middle = whole.state.copied()
-    whole.run(8)
-    other.calc = Free()
-    again = MADE[name](other, barostat=barostat, state=middle)
-    again.run(8)
-    assert other.cell.array.tolist() == atoms.cell.array.tolist() != CUBE
-    assert np.array_equal(other.positions, atoms.positions)
-    assert np.array_equal(other.get_momenta(), atoms.get_momenta())
-    assert np.array_equal(again.state.barostat, whole.state.barostat)
-
-
 def test_a_run_goes_on_without_its_barostat_in_its_cell():
     """Also where it is refused, the cell of the atoms is their own."""
     atoms, _ = gas()

@@ -1,4 +1,4 @@
-"""Formulas: read, written as code, exact, kept in files; as rows, and what is refused."""
+"""Formulas: read, written as code, exact, kept in files; as rows, and what is refused. Rows of Python functions."""
 
 from __future__ import annotations
 
@@ -9,12 +9,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from constraint_cases import TIME
+from constraint_cases import MASSES, TIME, saddle, scattered, spread
 
-from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Formula, KnifeEdge, Rolling, Sphere, VelocityFormula, from_dict
+from kcons import ConstraintSet, Motion
+from kcons.constraints import (
+    Custom,
+    Dihedral,
+    Distance,
+    Formula,
+    ImplicitSurface,
+    KnifeEdge,
+    Rolling,
+    Sphere,
+    VelocityFormula,
+    from_dict,
+)
 from kcons.constraints.functions import formula as formulas
-from kcons.constraints.functions.formula import FUNCTIONS, code_of, parsed, undefined_part
+from kcons.constraints.functions.formula import FUNCTIONS, code_of
 from kcons.errors import InputError, SingularGeometryError
 
 
@@ -148,16 +159,6 @@ def test_every_function_is_differentiated_exactly():
         np.testing.assert_allclose(found, bend, rtol=1e-7, atol=1e-7, err_msg=name)
 
 
-def test_smallest_undefined_part():
-    tree = parsed("x1 + log(sqrt(1 - x1**2) - 2)/y1", ())[0]
-    half, two = np.float64(0.5), np.float64(2.0)
-    assert undefined_part(tree, {"x1": half, "y1": two}).startswith("log(sqrt(1 - x1 ** 2) - 2) is nan where ")
-    assert undefined_part(tree, {"x1": two, "y1": two}) == "sqrt(1 - x1 ** 2) is nan where 1 - x1 ** 2 = -3"
-    tree = parsed("1/x1", ())[0]
-    assert undefined_part(tree, {"x1": 0.0 * two}) == "1 / x1 is inf"
-    assert undefined_part(tree, {"x1": two}) is None
-
-
 PROGRAM = """
 import numpy as np
 from kcons import ConstraintSet, Motion
@@ -202,19 +203,6 @@ def test_a_file_that_is_damaged_is_written_anew(tmp_path, monkeypatch):
 
 
 # -- as rows -----------------------------------------------------------------------------------------------
-
-
-def test_a_moving_formula_is_followed():
-    """A bead on a wave that runs; its height and its speed are those of the wave."""
-    wave = Formula("z1 - a*sin(k*x1 - t)", 0, {"a": 0.1, "k": 2.0})
-    x = np.array([[0.3, 0.0, 0.1 * np.sin(0.6)]])
-    motion = Motion(ConstraintSet(wave, x, [1.0]), x)
-    v = motion.project_velocities(x, np.array([[0.2, 0.1, 0.0]]))
-    end = run(System(motion, lambda x, t: np.array([[0.0, 0.0, -1.0]])), State(x, v), 0.01, 100)
-    (px, _, pz), (vx, _, vz) = end.positions[0], end.velocities[0]
-    phase = 2 * px - end.time
-    assert pz == pytest.approx(0.1 * np.sin(phase), abs=1e-14)
-    assert vz == pytest.approx(0.1 * np.cos(phase) * (2 * vx - 1), abs=1e-13)
 
 
 def test_a_period_goes_the_shorter_way():
@@ -324,3 +312,123 @@ def test_coefficients_that_vanish_or_do_not_exist():
         ConstraintSet(VelocityFormula("x1*vy1 - y1*vx1", 0), np.zeros((1, 3)), [1.0])
     with pytest.raises(SingularGeometryError, match="1 / x1 is inf"):
         ConstraintSet(VelocityFormula("vy1/x1", 0), np.zeros((1, 3)), [1.0])
+
+
+# -- Python functions: checks of what was given, accuracy of what was not --------------------------
+
+
+def gap(r):
+    return float(np.linalg.norm(r[0] - r[1]))
+
+
+def gap_gradient(r):
+    u = (r[0] - r[1]) / gap(r)
+    return np.array([u, -u])
+
+
+#: The same coordinates as formulas, which are differentiated exactly.
+SQUARES = "((x{0} - x{1})**2 + (y{0} - y{1})**2 + (z{0} - z{1})**2)"
+SADDLE = "z1 - (x1**2 - y1**2)/4 - x1**3/9"
+SPREAD = f"exp(-{SQUARES.format(1, 2)}/8) + {SQUARES.format(2, 3)}/5*cos(t)"
+
+
+@pytest.mark.parametrize(
+    ("make", "formula", "atoms"),
+    [(saddle, SADDLE, [0, 3, 5]), (spread, SPREAD, [[0, 1, 2], [5, 3, 4]])],
+    ids=["surface", "custom"],
+)
+def test_differenced_curvature_has_ten_digits(make, formula, atoms):
+    x, v = scattered(0), 10 * scattered(1)
+    exact, differenced = Formula(formula, atoms), make(atoms)
+    r, u = x[exact.atoms], v[exact.atoms]
+    found = differenced.curvature(r, u, TIME)
+    expected = exact.curvature(r, u, TIME)
+    assert np.abs(found - expected).max() < 1e-10 * np.einsum("kai,kai->k", u, u).max()
+
+
+def test_differenced_curvature_does_not_depend_on_the_unit_of_time():
+    item = spread([[0, 1, 2]])
+    r, v = scattered(0)[item.atoms], scattered(1)[item.atoms]
+    slow, fast = item.curvature(r, 1e-6 * v, TIME), item.curvature(r, 1e6 * v, TIME)
+    assert slow * 1e24 == pytest.approx(fast, rel=1e-9)
+    assert item.curvature(r, 0 * v, TIME).tolist() == [0.0]
+
+
+def test_a_wrong_gradient_is_found_before_it_moves_anything():
+    with pytest.raises(InputError, match=r"row 1, Custom\(0, 1\): gradient gives .* but differences .* give"):
+        ConstraintSet([Distance([2, 3]), Custom([0, 1], gap, lambda r: 2 * gap_gradient(r))], scattered(0), MASSES)
+    with pytest.raises(InputError, match=r"row 0, ImplicitSurface\(0\): gradient gives"):
+        ConstraintSet(
+            [ImplicitSurface(0, lambda r: r[:, 2] + r[:, 0] ** 2, lambda r: np.eye(3)[[2] * len(r)])],
+            scattered(0),
+            MASSES,
+        )
+
+
+def test_a_gradient_that_vanishes_is_refused():
+    flat = ImplicitSurface([0, 1], lambda r: r[:, 0] ** 2, lambda r: 2 * r * [1.0, 0.0, 0.0], target=None)
+    x = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    with pytest.raises(SingularGeometryError, match=r"row 1, ImplicitSurface\(1\): .*the gradient not zero"):
+        ConstraintSet([flat], x, np.ones(2))
+
+
+def test_results_of_the_wrong_shape_are_named():
+    x = scattered(0)
+    with pytest.raises(InputError, match=r"Custom: gradient returned shape \(3,\) for row 0; it must return \(2, 3\)"):
+        ConstraintSet([Custom([0, 1], gap, lambda r: gap_gradient(r)[0])], x, MASSES)
+    with pytest.raises(
+        InputError, match=r"Custom: function returned shape \(3,\) for row 0; it must return one number"
+    ):
+        ConstraintSet([Custom([0, 1], lambda r: r[0], gap_gradient)], x, MASSES)
+    with pytest.raises(InputError, match=r"ImplicitSurface: function returned shape \(\).*it must return \(2,\)"):
+        ConstraintSet([ImplicitSurface([0, 1], lambda r: 1.0, lambda r: r)], x, MASSES)
+
+
+TRANS = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, -1.0, 0.0]])
+
+
+def _torsion(r):
+    return float(Dihedral([0, 1, 2, 3]).measure(r[None], 0.0)[0])
+
+
+@pytest.mark.parametrize("gradient", [None, lambda r: Dihedral([0, 1, 2, 3]).gradient(r[None], 0.0)[0]])
+def test_differences_where_the_value_jumps_by_its_period(gradient):
+    v = scattered(2)[:4]
+    ours = ConstraintSet([Custom([0, 1, 2, 3], _torsion, gradient, period=2 * np.pi)], TRANS, np.ones(4))
+    theirs = ConstraintSet([Dihedral([0, 1, 2, 3])], TRANS, np.ones(4))
+    assert ours.jacobian(TRANS).toarray() == pytest.approx(theirs.jacobian(TRANS).toarray(), abs=1e-10)
+    assert ours.acceleration_target(TRANS, v) == pytest.approx(theirs.acceleration_target(TRANS, v), rel=1e-8)
+    kept = Motion(ours, TRANS).project_positions(TRANS + 0.01 * v, TRANS)
+    assert kept == pytest.approx(Motion(theirs, TRANS).project_positions(TRANS + 0.01 * v, TRANS), abs=1e-9)
+
+
+@pytest.mark.parametrize("make", [ImplicitSurface, Custom])
+def test_a_gradient_that_vanishes_is_refused_when_it_is_differenced(make) -> None:
+    """Differences leave rounding of it, in whose direction the atom was held."""
+    row = make([0], lambda r: (np.sum(r * r, axis=-1 if make is ImplicitSurface else None) - 1) ** 2, target=0.0)
+    with pytest.raises(SingularGeometryError, match="it vanishes, or the function varies faster"):
+        ConstraintSet([row], np.array([[0.6, 0.0, 0.8]]), np.ones(1))
+
+
+CUT = np.array([[0.2, 0.3, 0.4], [4.8, 0.1, 0.6], [0.5, 1.0, 0.2]])
+
+
+@pytest.mark.parametrize("gradient", [None, gap_gradient])
+def test_atoms_cut_by_a_face_of_the_cell_are_refused_unless_it_is_said_what_is_meant(gradient):
+    """Their value was taken where they lie, and another one held than the nearest images have."""
+    cell, masses = np.diag([5.0, 6.0, 6.0]), np.ones(3)
+    with pytest.raises(InputError, match=r"row 0.* cut by a face .* differs by -4\.\d+ .* translation_invariant=True"):
+        ConstraintSet(Custom([0, 1], gap, gradient), CUT, masses, cell=cell)
+    held = ConstraintSet(Custom([0, 1], gap, gradient, translation_invariant=True), CUT, masses, cell=cell)
+    assert held.value(CUT)[0] == 0 and held.constraints[0].target[0] == pytest.approx(np.sqrt(0.4**2 + 0.2**2 + 0.2**2))
+
+
+def test_functions_that_know_their_images_or_a_place_may_be_cut():
+    cell, masses = np.diag([5.0, 6.0, 6.0]), np.ones(3)
+
+    def nearest(r):
+        d = r[0] - r[1]
+        return float(np.linalg.norm(d - np.diag(cell) * np.round(d / np.diag(cell))))
+
+    for function, atoms in ((nearest, [0, 1]), (lambda r: float(r[0] @ r[1]), [0, 1]), (gap, [0, 2])):
+        assert ConstraintSet(Custom(atoms, function), CUT, masses, cell=cell).value(CUT)[0] == 0

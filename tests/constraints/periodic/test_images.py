@@ -8,7 +8,7 @@ from rows_in_cells import CHAIN, MASSES, ROWS
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, FixedAtoms, LinearCombination, MovingTarget
-from kcons.constraints.periodic.one_piece import follow_parents, lattice_of, make_whole, minimum_image, spanning_tree
+from kcons.constraints.periodic.one_piece import follow_parents, lattice_of, make_whole, spanning_tree
 from kcons.errors import ContradictionError, ImageError, InputError
 
 CELLS = {
@@ -280,26 +280,6 @@ def test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell():
 # -- what hangs together in one piece ---------------------------------------------------------------------
 
 LATTICE = np.array([[7.0, 0, 0], [2.0, 8.0, 0], [-1.0, 3.0, 9.0]])
-
-
-@pytest.mark.parametrize("pbc", [(True, False, False), (True, True, False), (False, True, True)])
-def test_directions_without_periodicity_never_count(pbc):
-    cell = LATTICE.copy()
-    cell[~np.array(pbc)] = 0.0  # as engines write it
-    full, inverse = lattice_of(cell, pbc)
-    open_vectors = full[~np.array(pbc)]
-    np.testing.assert_allclose(open_vectors @ full[np.array(pbc)].T, 0.0, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(open_vectors, axis=1), 1.0)
-    assert not inverse[:, ~np.array(pbc)].any()
-    np.testing.assert_array_equal(
-        minimum_image(0.4 * open_vectors + 50 * open_vectors, np.stack([full, inverse])),
-        0.4 * open_vectors + 50 * open_vectors,
-    )
-
-
-def test_cells_that_are_none_are_refused():
-    with pytest.raises(InputError, match="zero or not independent"):
-        lattice_of(np.ones((3, 3)), True)
 
 
 def test_a_tree_is_walked_breadth_first_from_its_roots():

@@ -56,8 +56,8 @@ MUTANTS = {
             "«not (changed or elsewhere or differ(self._positions, x))→self._cell is not None»",
             "ase/edits::an_edit_between_runs_is_refused",
         ),
-        ("        if «along < stayed→False»:", "virial::filters_beside_atoms_that_stay_are_refused"),
-        ("if «self._again and self._repeats→False»:", "respect::classes_that_move_atoms_past_constraints_are_found"),
+        ("        if «along < stayed→False»:", "reporter::filters_beside_atoms_that_stay_are_refused"),
+        ("if «self._again and self._repeats→False»:", "ase/edits::classes_that_move_atoms_past_constraints_are_found"),
     ],
     "ase/logger.py": [
         ("row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)", "logger::multipliers_by_name"),

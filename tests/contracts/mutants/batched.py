@@ -20,7 +20,7 @@ MUTANTS = {
     ],
     "batched/batch.py": [
         ("«group.worst→size», size / group.scale", "batched/batch::a_failure_names_copy_and_row_when_it_is_looked_for"),
-        ("if «getattr(self, item)._version→False»:", "batched/batch::what_is_refused"),
+        ("if «getattr(self, item) is not own or own._version→False»:", "batched/batch::what_is_refused"),
         (
             "torch.where(self._is_position, held, «flight→1.0» * middle)",
             "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-LinearVelocity]",

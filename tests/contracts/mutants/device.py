@@ -9,6 +9,10 @@ MUTANTS = {
     ],
     "openmm/device/rows.py": [
         ("if «not item.n_rows→False»:", "rows::constraints_of_no_rows_hold_nothing"),
+        (
+            "np.isin(pairs, fixed).all(axis=1) «& rounded→»",
+            "kernel_rows::fixed_atoms_of_rigid_water_in_single_precision",
+        ),
         ("#define ROWS_PIVOT ((mixed) {«PIVOT_SINGLE→PIVOT»})", "kernel_rows::multipliers_in_single_precision"),
         ("{volatile mixed y_ = -(impulse)«-rows_lost[row]→», t_", "kernel_rows::multipliers_in_single_precision"),
         (

@@ -48,7 +48,7 @@ MUTANTS = {
         ),
         (
             "«self._refuse_cut(item, r, time, int(start))→pass»",
-            "custom::atoms_cut_by_a_face_of_the_cell_are_refused_unless_it_is_said_what_is_meant",
+            "formula::atoms_cut_by_a_face_of_the_cell_are_refused_unless_it_is_said_what_is_meant",
         ),
         (
             "r if together is y else self.gather(item, x, «together→y»)",

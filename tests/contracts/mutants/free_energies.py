@@ -39,7 +39,7 @@ MUTANTS = {
     "constraints/target.py": [
         (
             "    return difference« - period * np.round(difference / whole)→»",
-            "custom::differences_where_the_value_jumps_by_its_period "
+            "formula::differences_where_the_value_jumps_by_its_period "
             "target::a_target_that_jumps_by_its_period_does_not_move_faster_there",
         ),
     ],

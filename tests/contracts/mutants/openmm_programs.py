@@ -147,6 +147,8 @@ MUTANTS = {
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
             "part::integrators_in_turn_hold_the_same_part",
         ),
+        ("u * np.cos(w) - d * (w * np.sin(w))« - way→»", "surface_integrator::great_circles_at_any_time_step"),
+        ('"ij,ij->i", d, way)[:, None] / radius«**2→»)', "surface_integrator::the_steps_are_those_of_the_core"),
         ("self.motion.rank« - 3 * fixed→»", "hold::particles_without_mass_take_no_degree_of_freedom"),
     ],
 }

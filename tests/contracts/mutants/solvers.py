@@ -83,7 +83,7 @@ MUTANTS = {
         ("«→-»(hx * gx + hy * gy + hz * gz) / (", "constraint::gradient_and_curvature_by_taylor_remainder[Dihedral-0]"),
     ],
     "solvers/addressable_solvers.py": [
-        ("_call_apply(words[k + 2], (v, «inv_dt→1.0», mine))", "addressable_solvers::the_same_as_from_python"),
+        ("_call_apply(words[k + 2], (v, «inv_dt→1.0», mine))", "single_rows::the_same_as_from_python"),
     ],
     "constraints/surface.py": [
         ("f, g = h / «(rho * q)→rho», up / q", "constraint::gradient_and_curvature_by_taylor_remainder[Torus-0]"),

@@ -49,7 +49,7 @@ MUTANTS = {
     "thermostats/monte_carlo.py": [
         ("velocities=«-→»begin.velocities)", "monte_carlo::every_decision_follows_from_the_energies[0.7]"),
         ("ACCEPTED if threshold < «-→»", "monte_carlo::every_decision_follows_from_the_energies[0.0]"),
-        ("np.sqrt((1 - self.keep«**2→»)", "monte_carlo::velocities_are_those_of_the_temperature"),
+        ("np.sqrt((1 - self.keep«**2→»)", "monte_carlo::every_decision_follows_from_the_energies[0.7]"),
         ("(1 / kt[k«] - 1 / kt[k + 1→ + 1] - 1 / kt[k»])", "monte_carlo::the_rule_and_what_changes_places"),
     ],
     "thermostats/nose_hoover.py": [
@@ -65,7 +65,7 @@ MUTANTS = {
     ],
     "thermostats/noise.py": [
         ("«stream[3] += 1.0→pass»", "isokinetic_spheres::noise_is_a_function_of_seed_step_and_part"),
-        ("«stream[3] = 0.0→pass»", "several_time_steps::each_exchange_of_a_step_has_noise_of_its_own"),
+        ("«stream[3] = 0.0→pass»", "langevin::each_exchange_of_a_step_has_noise_of_its_own"),
     ],
     "steppers/compiled_operations.py": [
         ("room[FAR] = «1.0 if far else →»0.0", "interpreter::a_march_ends_where_remainders_begin"),

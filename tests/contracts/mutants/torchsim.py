@@ -25,7 +25,7 @@ MUTANTS = {
             "torchsim/torchsim_refusals::positions_that_are_edited_between_steps_are_refused",
         ),
         (
-            '«_check_forces(state, output["forces"])→pass»',
+            'if «state.device.type == "cpu"→False»:',
             "torchsim/torchsim_dynamics::forces_that_are_not_finite_are_named[nve]",
         ),
         ("state.__dict__.update(«before→{}»)", "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"),

@@ -41,25 +41,6 @@ def test_states_of_the_reference(name):
         assert -mu @ bound.velocity(t, x) == pytest.approx(reference["T_sigma"][k], abs=1e-12)
 
 
-def test_limit_cycle():
-    given = case("A11_hypercycle_limit_cycle")
-    start = np.array(given["state_at_section_x1_eq_0.2_upward"])
-
-    def section(t, x):
-        return x[0] - 0.2
-
-    section.direction = 1
-    model = Hypercycle()
-    found = solve(
-        model.with_fixed_total(), (0.0, 20.0), start, events=section, rtol=1e-11, atol=1e-12, dense_output=True
-    )
-    assert found.t_events[0][-1] == pytest.approx(given["period"], abs=1e-8)
-    assert found.y_events[0][-1] == pytest.approx(start, abs=1e-8)
-    dense = found.sol(np.linspace(0.0, 20.0, 8001))
-    assert dense.max() == pytest.approx(given["x_max"], abs=2e-6)
-    assert dense.min() == pytest.approx(given["x_min"], abs=2e-6)
-
-
 @pytest.mark.parametrize("n", [3, 5, 8])
 @pytest.mark.parametrize("total", [1.0, 2.0])
 def test_closed_form_is_the_general_code(n, total):

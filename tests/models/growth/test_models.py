@@ -11,7 +11,6 @@ from kcons.models.flows import jacobian_by_differences
 from kcons.models.growth import (
     ConstrainedGrowth,
     GrowthModel,
-    HolonomicRow,
     Hypercycle,
     Logistic,
     LotkaVolterra,
@@ -101,21 +100,6 @@ def test_lotka_volterra_reference():
     a, c = model.alpha1, model.beta2
     constant = a * np.log(model.equilibrium[1]) + c * np.log(model.equilibrium[0])
     assert model.invariant(x0) - constant == pytest.approx(given["conserved_G"]["value"], rel=1e-12)
-
-
-def test_row_that_is_conserved_anyway_does_nothing():
-    model, x0 = lotka_volterra(), np.array([10.0, 5.0])
-
-    def slope(t, x):
-        return [model.alpha2 - model.beta2 / x[0], model.beta1 - model.alpha1 / x[1]]
-
-    row = HolonomicRow(lambda t, x: model.invariant(x), slope, name="G")
-    held = ConstrainedGrowth(model, row)
-    assert abs(held.constraint_rates(0.0, x0)).max() < 1e-12
-    found = solve(held, (0.0, 50.0), x0, rtol=1e-6, atol=1e-6)
-    assert abs(found.residuals()).max() < 1e-13
-    free = solve(ConstrainedGrowth(model), (0.0, 50.0), x0, rtol=1e-6, atol=1e-6)
-    assert np.ptp(model.invariant(free.y)) > 1e-6  # what the row is good for
 
 
 def test_lotka_volterra_with_four_different_parameters():

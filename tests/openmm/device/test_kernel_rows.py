@@ -11,8 +11,8 @@ from openmm_systems import GPUS, masses_of, particles, rows_of, started
 from openmm_systems import field as on_each
 
 from kcons import ConstraintSet, Motion, State, System
-from kcons.constraints import Angle, Dihedral, Distance, Formula, LinearRelation, Plane, Sphere
-from kcons.errors import ConvergenceError
+from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, Formula, LinearRelation, Plane, Sphere
+from kcons.errors import ContradictionError, ConvergenceError
 from kcons.openmm import Langevin, ProjectedIntegrator, hold
 from kcons.openmm.device import build
 from kcons.steppers import Rattle
@@ -208,6 +208,19 @@ def test_targets_move_late_in_a_long_run(platform):
         state = context.getState(positions=True)
         y, time = state.getPositions(asNumpy=True)._value, state.getTime()._value
         assert np.linalg.norm(y[3] - y[0]) == pytest.approx(length + 0.05 * (time - begun), abs=2e-6)
+
+
+@pytest.mark.parametrize("platform", SINGLE)
+def test_fixed_atoms_of_rigid_water_in_single_precision(platform):
+    """Their distances are off what the System says by the rounding of their positions."""
+    system, x = waters(3)
+    fixed = FixedAtoms([0, 1, 2, 3, 4])
+    found, context = run(system, x, start(system, x), platform, 20, [fixed, Distance([[0, 6]])], tolerance=1e-6)
+    np.testing.assert_allclose(found[:5], x[:5], atol=1e-7)
+    assert context.getIntegrator().parts[0].worst_violation(context) is None
+    system.setConstraintParameters(0, 0, 1, 0.0958)
+    with pytest.raises(ContradictionError, match="lies between fixed atoms"):
+        run(system, x, start(system, x), platform, 1, [fixed], tolerance=1e-6)
 
 
 @pytest.mark.parametrize("platform", ["CPU", *MIXED])

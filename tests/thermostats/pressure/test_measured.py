@@ -99,29 +99,6 @@ def test_a_rod_that_is_made_longer():
     assert np.trace(found) * SIDE**3 == pytest.approx(mu * (rate**2 + length * acceleration), rel=1e-12)
 
 
-def test_means_agree():
-    """Along a run at constant volume, of molecules made of two rigid pieces and a spring."""
-    system, state = started()
-    pairs = np.arange(0, 36, 6)
-    pieces = find_pieces(system, state.positions, np.ones(3, bool), np.stack([pairs, pairs + 3], axis=1))
-    assert len(pieces) == 6
-    with pytest.raises(InputError, match=r"not of those of atoms.*leave it out, or take virial='molecular'"):
-        instantaneous_pressure(system, state, "atomic", thermal_energy=1.0)
-    seen = []
-
-    def see(now):
-        ways = {"pieces": pieces}, {"virial": "atomic"}
-        seen.append([np.trace(instantaneous_pressure(system, now.copied(), **way)) / 3 for way in ways])
-
-    state = run(system, state, 0.05, 200, stepper=Langevin(1.0, 1.0, rng=1))
-    run(system, state, 0.05, 1200, stepper=Langevin(1.0, 1.0, rng=1), observers=[see], every=6)
-    values = np.transpose(seen)
-    blocks = (values[0] - values[1])[1:].reshape(20, -1).mean(axis=1)
-    error = blocks.std(ddof=1) / np.sqrt(20)
-    assert abs(blocks.mean()) < 3.5 * error
-    assert error < 0.2 * np.abs(values[0] - values[1]).max()
-
-
 @pytest.mark.parametrize("kind", ["isotropic", "anisotropic"])
 def test_the_mean_stress_along_each_axis_is_the_pressure(kind):
     """The slope of ln of the distribution that trials sample is V (P_kk - P)/kT + 1, along each axis.

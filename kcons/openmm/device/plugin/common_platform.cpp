@@ -141,7 +141,7 @@ class CommonFactory : public KernelFactory {
         // PlatformData of OpenCL, CUDA and HIP alike begin with the Context and the vector of their contexts, each of
         // which has ComputeContext as its first base.
         auto* data = reinterpret_cast<OpenCLPlatform::PlatformData*>(c.getPlatformData());
-        if (data->contexts.size() != 1) throw OpenMMException("kcons: steps on the device run on one device; give one DeviceIndex");
+        if (data->contexts.size() != 1) throw OpenMMException("kcons: steps on the device run on one device; give one DeviceIndex, or device=False");
         return new CommonStep(name, platform, *reinterpret_cast<ComputeContext*>(data->contexts[0]));
     }
 };
