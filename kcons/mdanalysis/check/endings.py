@@ -20,6 +20,9 @@ from MDAnalysis.lib.util import anyopen
 from kcons.errors import NonFiniteError
 from kcons.mdanalysis.loading import READ_ERRORS, format_of
 
+#: Bytes of a file that are mapped into memory at a time.
+MAPPED = 1 << 25
+
 
 @dataclass(frozen=True)
 class Break:
@@ -109,19 +112,16 @@ def _damage(reader: Any, path: str) -> Break | None:
     n_frames = min(reader.n_frames - 1, (os.path.getsize(path) - begin) // file._framesize)
     if n_frames < 1 or (records + 8).sum() != file._framesize:
         return None
-    # Records are framed by their lengths. Where one ends the next begins, so that both lengths are read at once.
-    lengths = np.repeat(records, 2).astype(_order(path) + "i4").tobytes()
-    joints = [(0, 4), *((int(end) - 4, 8) for end in np.cumsum(records + 8)[:-1]), (file._framesize - 4, 4)]
-    with open(path, "rb", buffering=0) as opened:
-
-        def read(place: int, size: int) -> bytes:
-            opened.seek(place)
-            return opened.read(size)
-
-        for k in range(n_frames):
-            start = begin + k * file._framesize
-            if b"".join([read(start + at, size) for at, size in joints]) != lengths:
-                return Break(1 + k, "its records are damaged")
+    # Records are framed by their lengths.
+    ends = np.cumsum(records + 8)
+    places = np.concatenate([ends - records - 8, ends - 4]) // 4
+    at_once = max(MAPPED // file._framesize, 1)
+    for first in range(0, n_frames, at_once):
+        shape = min(at_once, n_frames - first), file._framesize // 4
+        words = np.memmap(path, _order(path) + "i4", "r", begin + first * file._framesize, shape)
+        wrong = (words[:, places] != np.tile(records, 2)).any(axis=1)
+        if wrong.any():
+            return Break(1 + first + int(np.argmax(wrong)), "its records are damaged")
     return None
 
 
