@@ -182,14 +182,15 @@ def lines_on_arrays(imports: str, last: str) -> str:
 _BY_DYNAMICS = """\
 from ase import units
 
-from kcons.ase import ConstrainedDynamics
+from kcons.ase import ConstrainedDynamics, constrain
 from kcons.comparison import test_systems
 from kcons.steppers import $stepper
 
 test_system = $made_by
 atoms = test_system.atoms()  # yours, with a calculator and velocities
 held = test_system.constraint_set.constraints  # yours, such as [Distance([[0, 1], [1, 2]])]
-dynamics = ConstrainedDynamics(atoms, $step * units.fs, $stepper(), constraints=held)
+constrain(atoms, held)
+dynamics = ConstrainedDynamics(atoms, $step * units.fs, $stepper())
 dynamics.run($steps)
 """
 

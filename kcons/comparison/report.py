@@ -107,7 +107,8 @@ def sentence(table: pd.DataFrame, found: Ranking | None) -> str:
         remedy = " Longer runs (--budget) make errors smaller." if "what" in about else ""
         return f"No method makes {limit}; the least is {best.error:.2g}, by {best.title} at {at}.{remedy}"
     first = found.table.iloc[0]
-    spent = f"the least {COSTS[found.cost]} {_per(about)}, {_spent(first.cost, found.cost)}"
+    least = "the least" if first.cost <= found.table.cost.min() else "nearly the least"
+    spent = f"{least} {COSTS[found.cost]} {_per(about)}, {_spent(first.cost, found.cost)}"
     words = f"Use {first.title} at {shown_setting(first, about)}: {spent}, for {limit}"
     if first.steps < FEW_STEPS and not first.adaptive:
         words += f" (it made {first.steps:.0f} steps only: see how a longer run goes before you rely on it)"

@@ -114,4 +114,5 @@ def _beside(asked: float, found: list[tuple[str, Estimate]]) -> str:
     ]
     if not wrong:
         return f"none can be told from {asked:g} K: all are within {DOUBT:g} standard errors"
-    return f"not {asked:g} K: {', '.join(wrong)}; the step is too long, or the thermostat keeps another temperature"
+    causes = "the step is too long, the run is not yet in equilibrium, or the thermostat keeps another temperature"
+    return f"not {asked:g} K: {', '.join(wrong)}; {causes}"

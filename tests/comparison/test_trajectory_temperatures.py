@@ -64,8 +64,8 @@ def test_what_is_said_beside_the_temperature_of_the_thermostat():
     kelvin = units.kB * np.array([300.6, 1.2, 312.0, 2.0])
     found = SplitTemperatures(Estimate(*kelvin[:2]), Estimate(*kelvin[2:]), None, 60, 60, 0.1, 0.2, 50, ())
     assert trajectory_temperatures.sentences(found, 300.0)[1:] == [
-        "not 300 K: turns of whole clusters 4.0% too warm (6.0 standard errors); the step is too long, or the "
-        "thermostat keeps another temperature"
+        "not 300 K: turns of whole clusters 4.0% too warm (6.0 standard errors); the step is too long, the run is not "
+        "yet in equilibrium, or the thermostat keeps another temperature"
     ]
     rough = SplitTemperatures(Estimate(units.kB * 300, units.kB * 30), None, None, 60, 0, 0.1, 0.0, 50, ())
     assert trajectory_temperatures.sentences(rough)[1:] == ["errors of 1% take some 5,000 frames as far apart as these"]
