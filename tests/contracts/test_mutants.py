@@ -33,7 +33,7 @@ def copied(folder: Path) -> Path:
     """The package with its compiled kernels, and its tests, where lines can be changed."""
     shutil.copytree(PACKAGE, folder / "kcons")
     shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copytree(ROOT / "examples" / "studies", folder / "examples" / "studies")
+    shutil.copytree(ROOT / "examples", folder / "examples")
     shutil.copy(ROOT / "pyproject.toml", folder)
     return folder
 
