@@ -26,6 +26,7 @@ DOCS = Path(__file__).resolve().parent
 STUDIES = DOCS.parent / "examples" / "studies"
 sys.path[:0] = [str(DOCS.parent / "tests"), str(STUDIES), str(DOCS)]
 
+import drawn_pictures  # noqa: E402
 import harness  # noqa: E402
 import result_pictures  # noqa: E402
 import result_tables  # noqa: E402
@@ -183,7 +184,7 @@ def main() -> None:
             page.write_text(new, encoding="utf-8")
             print(page.relative_to(DOCS))
     front().savefig(DOCS / "figures" / "front.png", dpi=110)
-    for name, picture in result_pictures.PICTURES.items():
+    for name, picture in {**result_pictures.PICTURES, **drawn_pictures.PICTURES}.items():
         picture().savefig(DOCS / "figures" / f"{name}.png", dpi=110)
     result_pictures.hard_cases(results("hard_cases")[1]["verdicts"]).savefig(
         DOCS / "figures" / "hard-cases.png", dpi=110
