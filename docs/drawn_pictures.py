@@ -109,7 +109,8 @@ def rounding_in_files() -> Figure:
         axes.plot(unit.largest, k, "o", color=BLUE, markersize=8, label=None if k else "largest deviation found")
     axes.axvline(1e-4, color=ORANGE, linewidth=1.5, label="default tolerance (1 Å)")
     axes.set_yticks(range(len(found)), list(found), fontsize=11)
-    axes.set(xscale="log", xlim=(1e-6, 0.1), ylim=(len(found) - 0.5, -0.5), xlabel="deviation of a bond length / Å")
+    axes.set(xscale="log", xlim=(1e-6, 0.1), ylim=(len(found) - 0.5, -0.5))
+    axes.set_xlabel("deviation / Å, water that is exactly rigid")
     axes.legend(loc="lower right", fontsize=10)
     return drawn
 

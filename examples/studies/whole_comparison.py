@@ -286,7 +286,9 @@ def figures(table: pd.DataFrame) -> dict[str, Figure]:
     for key in SHOWN:
         part = table[table.part == key].reset_index(drop=True)
         if len(part):
-            part.attrs = {**part.iloc[0][list(ABOUT)].to_dict(), "length": part.error_unit[0]}
+            # `title` is that of a method here.
+            about = part.iloc[0][list(ABOUT)].to_dict()
+            part.attrs = {**about, "title": part.heading[0], "length": part.error_unit[0]}
             pictures[f"report-{key}"] = figure(part)
     return pictures
 

@@ -44,7 +44,9 @@ def test_the_committed_tables_and_figures_are_made_from_the_file():
     shown = study.tables(table)["winners"]
     assert set(shown.engine) == {"arrays", "ASE", "OpenMM", "all engines"} and len(shown) > 30
     few = table[table.part == "dumbbells"]
-    assert set(study.figures(few)) == {"who-wins-where", "report-dumbbells"}
+    made = study.figures(few)
+    assert set(made) == {"who-wins-where", "report-dumbbells"}
+    assert made["report-dumbbells"].axes[0].get_title(loc="left") == few.heading.iloc[0]
 
 
 def test_a_part_runs_and_is_kept(tmp_path, monkeypatch, capsys):
