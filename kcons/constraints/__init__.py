@@ -3,9 +3,8 @@
 - `compilation`: compiled kernels, and where they are kept
 - `arguments`, `target`, `vectors`: arrays and Quantities from outside, targets and their derivatives, arithmetic
 - `constraint`: the contract of a family
-- `internal`: distances and their differences, angles, dihedrals
-- `linear`: fixed atoms, linear relations
-- `surface`, `collective`: surfaces, groups
+- `surface`: fixed atoms, linear relations, surfaces
+- `internal`: distances and their differences, angles, dihedrals, groups
 - `functions`: functions of one's own
 - `velocity`: rows linear in the velocities
 - `periodic`: which images rows mean
@@ -18,21 +17,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from kcons.constraints import collective, internal, linear, surface, velocity
-from kcons.constraints.collective import *
+from kcons.constraints import internal, surface, velocity
 from kcons.constraints.constraint import FAMILIES, Constraint, RowKind
 from kcons.constraints.functions import custom, formula
 from kcons.constraints.functions.custom import *
 from kcons.constraints.functions.formula import *
 from kcons.constraints.internal import *
-from kcons.constraints.linear import *
 from kcons.constraints.surface import *
 from kcons.constraints.target import MovingTarget
 from kcons.constraints.velocity import *
 from kcons.errors import InputError
 
 __all__ = ["Constraint", "MovingTarget", "RowKind", "from_dict"]
-__all__ += internal.__all__ + linear.__all__ + surface.__all__ + collective.__all__ + velocity.__all__
+__all__ += internal.__all__ + surface.__all__ + velocity.__all__
 __all__ += custom.__all__ + formula.__all__
 
 

@@ -132,11 +132,6 @@ def atom_array(atoms: Any, name: str, item: str = "atoms") -> NDArray[Any]:
         ) from None
 
 
-def atom_column(atoms: Any, item: str) -> NDArray[Any]:
-    """One atom a row, shape (n, 1)."""
-    return atom_array(atoms, item).reshape(-1, 1)
-
-
 def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") -> IntArray:
     """Different atoms, a row of them for each row, shape (n, width); `item` is at fault where they are none.
 

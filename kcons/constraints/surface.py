@@ -1,4 +1,4 @@
-"""Atoms held on surfaces and curves.
+"""Atoms held at places: fixed, in linear relations, on planes, lines and surfaces.
 
 Every surface takes one atom or many; each atom is a row of its own (two rows on a line). Coordinates are
 lengths: the distance from a point, an axis, a plane or a circle, so that gradients have norm 1. They are
@@ -20,19 +20,159 @@ from kcons.constraints.arguments import (
     Lengths,
     PositiveLengths,
     as_float_array,
-    atom_column,
+    atom_array,
+    atom_table,
     check_range,
     read_only,
     unit,
 )
 from kcons.constraints.constraint import Constraint, Fault, RowKind
-from kcons.constraints.linear import LinearRows
-from kcons.constraints.target import Target
+from kcons.constraints.target import MovingTarget, Target
 from kcons.errors import InputError
 
-__all__ = ["Cylinder", "Ellipsoid", "Line", "Plane", "Sphere", "Torus"]
+__all__ = [
+    "Cylinder",
+    "Ellipsoid",
+    "FixedAtoms",
+    "Line",
+    "LinearCombination",
+    "LinearRelation",
+    "Plane",
+    "Sphere",
+    "Torus",
+]
 
 _VECTOR = (3,)
+
+
+class LinearRows(Constraint, base=True):
+    """Rows q = sum_a c_a . r_a with constant coefficients, shape (n_rows, width, 3), which are their parameters.
+
+    They have no curvature. Minimum images apply if a common shift of all atoms leaves every row of the
+    object unchanged (coefficients that sum to zero); otherwise the positions are taken as they are.
+    """
+
+    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
+    kind = RowKind.LINEAR
+    coefficients: FloatArray
+
+    def _settle(self) -> None:
+        c = self.coefficients
+        self.translation_invariant = bool(
+            self.width > 1 and np.all(np.abs(c.sum(axis=1)) <= 1e-12 * np.abs(c).sum(axis=1).max(initial=0.0))
+        )
+        self.refuse_zero(c)
+
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        slope = self.parameters().reshape(r.shape)
+        return np.asarray(np.einsum("kai,kai->k", slope, r)), slope
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        return np.zeros(self.n_rows)
+
+    def parameters(self) -> FloatArray:
+        return self.coefficients.reshape(self.n_rows, 3 * self.width)
+
+
+class LinearCombination(LinearRows):
+    """A combination of Cartesian coordinates, q = sum_a c_a . r_a, one row.
+
+    Parameters
+    ----------
+    atoms : array_like of int, shape (n_rows, width) or (width,)
+        Atoms of each row.
+    coefficients : array_like, shape (width, 3) or (n_rows, width, 3)
+        What each coordinate is multiplied with.
+    target : float, array_like, callable of time, MovingTarget or None
+        Value held.
+
+    Examples
+    --------
+    Two atoms kept at the same height:
+
+    >>> level = LinearCombination([0, 1], [[0, 0, 1], [0, 0, -1]], target=0.0)
+    >>> level.n_rows
+    1
+    """
+
+    def __init__(self, atoms: ArrayLike, coefficients: ArrayLike, target: Target = None) -> None:
+        super().__init__(atoms, target, coefficients=coefficients)
+
+
+class LinearRelation(LinearRows):
+    """An atom at a fixed combination of others, r_a = sum_i w_i r_i: three rows (x, y, z) an atom.
+
+    What holds a linear rigid group (two bases) or a planar one (three bases) where distances alone would
+    be singular: hold the distances between the bases and tie every other atom to them.
+
+    Parameters
+    ----------
+    atoms : int or array_like of int, shape (n,)
+        The dependent atoms.
+    bases : array_like of int, shape (n_bases,) or (n, n_bases)
+        Atoms they are tied to.
+    weights : array_like, shape (n_bases,) or (n, n_bases)
+        w_i. With weights that sum to 1 the relation is independent of the origin, and minimum images apply.
+    target : array_like of shape (n, 3), callable of time, MovingTarget, or None
+        What r_a - sum_i w_i r_i is held at; zero by default, None takes the initial value.
+
+    Examples
+    --------
+    The carbon of CO2 in the middle of its oxygens:
+
+    >>> relation = LinearRelation(0, [1, 2], [0.5, 0.5])
+    >>> relation.n_rows, relation.translation_invariant
+    (3, True)
+    """
+
+    def __init__(self, atoms: ArrayLike, bases: ArrayLike, weights: ArrayLike, target: Target = 0.0) -> None:
+        dependent = atom_table(atoms, self.family, 1)
+        base, w = np.atleast_2d(atom_array(bases, self.family)), as_float_array(weights, "weights")
+        try:
+            base = np.broadcast_to(base, (len(dependent), base.shape[-1]))
+            w = np.broadcast_to(w, base.shape)
+        except ValueError:
+            raise InputError(
+                f"LinearRelation: {len(dependent)} atoms, bases of shape {np.shape(bases)} and weights of shape "
+                f"{np.shape(weights)} do not fit; give n_bases bases and as many weights, for all atoms or for each",
+                item="weights",
+            ) from None
+        factors = np.hstack([np.ones((len(w), 1)), -w])
+        super().__init__(
+            np.repeat(np.hstack([dependent, base]), 3, axis=0),
+            target,
+            coefficients=np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, factors.shape[1], 3),
+        )
+
+
+class FixedAtoms(LinearRows):
+    """Atoms held at given points: three rows (x, y, z) an atom, in the order of `atoms`.
+
+    The engine gives them infinite mass; their multipliers are the reaction forces. Each may be named once.
+
+    Parameters
+    ----------
+    atoms : int or array_like of int, shape (n,)
+        The atoms.
+    target : array_like of shape (n, 3), callable of time returning (n, 3), MovingTarget, or None
+        Where they are held; None takes the initial positions.
+    """
+
+    row_width = 1
+    fixes_atoms = True
+
+    def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
+        column = atom_table(atoms, self.family, 1)
+        if not callable(target) and not isinstance(target, MovingTarget | None):
+            place = as_float_array(target, "target")
+            target = np.tile(place, len(column)) if place.shape == (3,) else place
+        super().__init__(
+            np.repeat(column, 3, axis=0), target, coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :]
+        )
+        values, counts = np.unique(column, return_counts=True)
+        if len(values) < len(column):
+            atom = int(values[np.argmax(counts > 1)])
+            raise InputError(f"FixedAtoms names atom {atom} twice; name it once", item="atoms", atoms=[atom])
 
 
 class Surface(Constraint, base=True):
@@ -171,16 +311,12 @@ class Ellipsoid(Surface):
     """
 
     positive = ""
-    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {
-        "center": _VECTOR,
-        "inverse_axes": _VECTOR,
-        "rotation": (3, 3),
-    }
-    length_powers = {"center": 1, "inverse_axes": -1}
+    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"size": (), "center": _VECTOR, "matrix": (3, 3)}
+    length_powers = {"size": 1, "center": 1, "matrix": -1}
     singular = "atom {atom} lies at the center of the ellipsoid: gradient undefined; move the atom"
-    center: FloatArray
-    inverse_axes: FloatArray
-    rotation: FloatArray
+    #: s, and B with y = B (r - c), whose rows are e_i/a_i.
+    size: FloatArray
+    matrix: FloatArray
 
     def __init__(
         self,
@@ -190,28 +326,24 @@ class Ellipsoid(Surface):
         rotation: ArrayLike | None = None,
         target: Target = 0.0,
     ) -> None:
-        super().__init__(
-            atoms,
-            target,
-            center=center,
-            inverse_axes=1.0 / np.asarray(semi_axes),
-            rotation=np.eye(3) if rotation is None else rotation,
-        )
-
-    def _settle(self) -> None:
-        error = self.rotation.transpose(0, 2, 1) @ self.rotation - np.eye(3)
-        if np.any(np.abs(error) > 1e-10):
+        super().__init__(atoms, target)
+        inverse = self._of_each_row("semi_axes", 1.0 / np.asarray(semi_axes), _VECTOR)
+        axes = self._of_each_row("rotation", np.eye(3) if rotation is None else rotation, (3, 3)).transpose(0, 2, 1)
+        if np.any(np.abs(axes @ axes.transpose(0, 2, 1) - np.eye(3)) > 1e-10):
             raise InputError(
                 "Ellipsoid: the columns of rotation are not orthonormal; give unit vectors at right angles",
                 item="rotation",
             )
-        finite = self.inverse_axes > 0
-        if np.any(self.inverse_axes < 0) or not np.all(finite.any(axis=1)):
+        finite = inverse > 0
+        if not np.all(finite.any(axis=1)):
             raise InputError("Ellipsoid: a row has no finite positive semi-axis", item="semi_axes")
+        logs = np.log(np.where(finite, inverse, 1.0)).sum(axis=1)
+        size = np.exp(-logs / finite.sum(axis=1))
+        self._keep(size=size, center=center, matrix=axes * inverse[:, :, None])
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        # y = B (r - c); p holds s, c and the rows of B = D^-1 R^T.
+        # p holds s, c and the rows of B.
         x, y, z = r[0] - p[1], r[1] - p[2], r[2] - p[3]
         a = p[4] * x + p[5] * y + p[6] * z
         b = p[7] * x + p[8] * y + p[9] * z
@@ -224,20 +356,14 @@ class Ellipsoid(Surface):
         out[2] = p[5] * a + p[8] * b + p[11] * c
         out[3] = p[6] * a + p[9] * b + p[12] * c
 
-    def parameters(self) -> FloatArray:
-        matrix = self.rotation.transpose(0, 2, 1) * self.inverse_axes[:, :, None]
-        return np.hstack([self.scale()[:, None], self.center, matrix.reshape(self.n_rows, 9)])
-
     def scale(self, time: float = 0.0) -> FloatArray:
-        finite = self.inverse_axes > 0
-        logs = np.log(np.where(finite, self.inverse_axes, 1.0)).sum(axis=1)
-        return np.asarray(np.exp(-logs / finite.sum(axis=1)))
+        return self.size
 
     def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
         yield from super().faults(r, time)
         if self.target is not None:
             target, words = self.target_at(time), "lies beyond the center of the ellipsoid; use 0 for its surface"
-            yield ~(target > -self.scale()), lambda k: f"target {target[k]:g} {words}", "target"
+            yield ~(target > -self.size), lambda k: f"target {target[k]:g} {words}", "target"
 
 
 class Plane(LinearRows):
@@ -289,7 +415,7 @@ class Line(LinearRows):
     row_width = 1
 
     def __init__(self, atoms: ArrayLike, point: Lengths | None, direction: Directions) -> None:
-        column = atom_column(atoms, self.family)
+        column = atom_table(atoms, self.family, 1)
         along = _for_each(direction, len(column), "direction")
         # Normal to the line and to the coordinate axis it is farthest from.
         first = unit(np.cross(along, np.eye(3)[np.argmin(np.abs(along), axis=1)]), "direction")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy import sqrt
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import SPEED, Directions, FloatArray, PositiveLengths, atom_array, unit
+from kcons.constraints.arguments import SPEED, Directions, FloatArray, PositiveLengths, atom_table, unit
 from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.target import Target
 from kcons.constraints.vectors import dot, norm
@@ -211,7 +211,7 @@ class Rolling(VelocityRows):
 
 
 def _pairs(first: ArrayLike, second: ArrayLike, family: str) -> ArrayLike:
-    a, b = atom_array(first, family), atom_array(second, family)
-    if a.shape != b.shape or a.ndim != 1:
-        raise InputError(f"{family}: {a.shape} and {b.shape} atoms are given; give one pair a row", item="atoms")
-    return np.stack([a, b], axis=1)
+    a, b = atom_table(first, family, 1), atom_table(second, family, 1)
+    if len(a) != len(b):
+        raise InputError(f"{family}: {len(a)} and {len(b)} atoms are given; give one pair a row", item="atoms")
+    return np.hstack([a, b])

@@ -27,8 +27,8 @@ import scipy.sparse as sp
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet, whole_bodies
 from kcons.constraints.internal import Distance
-from kcons.constraints.linear import LinearRelation
 from kcons.constraints.periodic.one_piece import BoolArray
+from kcons.constraints.surface import LinearRelation
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.constraints.vectors import extent, row_norms
 from kcons.errors import SingularGeometryError

@@ -470,6 +470,7 @@ REFUSED = [
     (lambda: Ellipsoid(0, ORIGIN, [np.inf] * 3), "no finite positive semi-axis"),
     (lambda: Line([0, 1], [ORIGIN] * 3, UP), r"point has shape \(3, 3\); give \(3,\) or \(2, 3\)"),
     (lambda: FixedAtoms([True, False, True]), r"integers, not bool; of a mask give np\.flatnonzero"),
+    (lambda: FixedAtoms([[0, 1]]), "a row has 1 atom, but atoms has shape"),
     (lambda: LinearCombination([[0, 1], [2, 3]], [[UP] * 2, [[0, 0, 0]] * 2]), "coefficients of row 1 are"),
     (lambda: LinearRelation(0, [1, 2], [0.5, 0.3, 0.2]), "do not fit"),
     (lambda: CenterOfMass([0, 1]).measure(np.zeros((3, 2, 3)), 0.0), "needs the masses of its atoms"),

@@ -19,10 +19,6 @@ from kcons.errors import UnsupportedError
 #: A number; or a position 'r', a parameter 'p', the time 't', or the result of a step 'k', and which one.
 Operand: TypeAlias = float | tuple[str, int]
 
-#: NumPy's functions of one or two numbers that rows may use.
-ELEMENTARY = {"sqrt", "sin", "cos", "tan", "arcsin", "arccos", "arctan", "arctan2", "sinh", "cosh", "tanh", "exp"}
-ELEMENTARY |= {"log", "absolute", "copysign", "rint", "add", "subtract", "multiply", "divide", "negative", "power"}
-
 
 class Tape(NamedTuple):
     """What a function does, operation by operation: names as in `ELEMENTARY`, operands, and what it puts out."""
@@ -118,8 +114,8 @@ def record(function: Callable[..., Any], known: Sequence[float] = (), remedy: st
     return Tape(tuple(steps), results)
 
 
-#: What operations change by with each of their operands; y is their result.
-_PARTIALS: dict[str, Callable[..., tuple[Any, ...]]] = {
+#: NumPy's functions of one or two numbers that rows may use: what they change by with each; y is their result.
+ELEMENTARY: dict[str, Callable[..., tuple[Any, ...]]] = {
     "add": lambda y, a, b: (1.0, 1.0),
     "subtract": lambda y, a, b: (1.0, -1.0),
     "multiply": lambda y, a, b: (b, a),
@@ -165,7 +161,7 @@ def differentiated(function: Callable[[Any, Any, Any], Any], places: int) -> Tap
         if ("k", k) not in slopes:
             continue
         slope = slopes["k", k]
-        for operand, part in zip(operands, _PARTIALS[name](number(("k", k)), *map(number, operands)), strict=True):
+        for operand, part in zip(operands, ELEMENTARY[name](number(("k", k)), *map(number, operands)), strict=True):
             if isinstance(operand, tuple):
                 own = _times(slope, part)
                 slopes[operand] = slopes[operand] + own if operand in slopes else own
