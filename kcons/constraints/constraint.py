@@ -271,14 +271,9 @@ class Constraint:
         if not isinstance(self.target, MovingTarget):
             return self.target
         target = self.target.at(time, self.n_rows)
-        if self.positive and not (target > 0).all():
-            k = int(np.argmin(target))
-            raise InputError(
-                f"{self.row_name(k)}: {self.positive} {target[k]:g} is not positive at t = {time:g}; give a function "
-                "that stays above zero, or end the run before",
-                item="target",
-                atoms=self.atoms[k].tolist(),
-            )
+        if self.positive:
+            words = f"is not positive at t = {time:g}; give a function that stays above zero, or end the run before"
+            self.refuse(~(target > 0), 0, lambda k: f"{self.positive} {target[k]:g} {words}", "target")
         return target
 
     def sigma(self, r: FloatArray, time: float) -> FloatArray:

@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.periodic.one_piece import BoolArray, connected, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 
 #: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbors in the list.
 ALL_PAIRS_WIDTH = 12
@@ -266,27 +265,23 @@ class _Links:
         """Rows beside the tree: in a body they have its images, in a framework they are local."""
         closing = self._closing | (frameworks[component[self.item.atoms[:, 0]]] & self._local)
         if self.held and self.item.target is None:
-            self._refuse_doubtful(self.cell_offsets.any(axis=(1, 2)) & ~closing, held)
+            # Lengths that are to be found, of rows that may as well close through the boundary as span a body; in a
+            # body that is held by distances they are one side of a triangle of such.
+            doubtful = self.cell_offsets.any(axis=(1, 2)) & ~closing & self._local
+            for k in np.flatnonzero(doubtful):
+                a, b = (held[[atom]] for atom in self.item.atoms[k])
+                doubtful[k] = not a.multiply(b).nnz
+            words = "apart across the boundary, and farther along the rows that tie them together. Give its target"
+            apart = self._nearest[:, 0]
+            self.item.refuse(
+                doubtful,
+                self.start,
+                lambda k: f"its periodic image is ambiguous: its atoms are {apart[k]:g} {words}",
+                "target",
+            )
         if self.held:
             self.whole |= self.unsure & ~closing & (self.cell_offsets.any(axis=(1, 2)) | self._long)
         self.cell_offsets[~closing] = 0
-
-    def _refuse_doubtful(self, beside: BoolArray, held: sp.csr_array) -> None:
-        """Lengths that are to be found, of rows that may as well close through the boundary as span a body.
-
-        In a body that is held by distances they are one side of a triangle of such.
-        """
-        for k in np.flatnonzero(beside & self._local):
-            a, b = (int(atom) for atom in self.item.atoms[k])
-            if held[[a]].multiply(held[[b]]).nnz:
-                continue
-            raise InputError(
-                f"row {self.start + k}, {self.item.row_name(int(k))}: its periodic image is ambiguous: atoms {a} and "
-                f"{b} are {self._nearest[k, 0]:g} apart across the boundary, and farther along the rows that tie them "
-                "together. Give the target of this row",
-                item="target",
-                atoms=[a, b],
-            )
 
     def marked(self, needed: BoolArray) -> Constraint:
         """A copy that knows its whole rows, and the cell_offsets of all rows whose atoms are made whole."""
@@ -341,12 +336,10 @@ def _tree(
 
 def _refuse_long(tables: Sequence[_Links], row: int, pair: IntArray, length: float, half_width: float) -> None:
     table = next(table for table in tables if 0 <= row - table.start < table.item.n_rows)
-    item, atoms = table.item, pair.tolist()
-    what = f"target {length:g}" if item.holds_length else f"distance {length:g} of atoms {atoms[0]} and {atoms[1]}"
-    raise InputError(
-        f"row {row}, {item.row_name(row - table.start)}: {what} is not shorter than half the box ({half_width:g}), and "
-        "no shorter rows tie these atoms together; its minimum image is ambiguous. Use a larger cell, no cell, or list "
-        "the atoms so that neighbors in the row are neighbors in space",
-        item="target" if item.holds_length else "positions",
-        atoms=atoms,
-    )
+    item, (a, b), half = table.item, pair, f"half the box ({half_width:g})"
+    what = f"target {length:g}" if item.holds_length else f"distance {length:g} of atoms {a} and {b}"
+    remedy = "Use a larger cell, no cell, or list the atoms so that neighbors in the row are neighbors in space"
+    words = f"{what} is not shorter than {half}, and no shorter rows tie these atoms together; its minimum image is"
+    here = table.start + np.arange(item.n_rows) == row
+    at_fault = "target" if item.holds_length else "positions"
+    item.refuse(here, table.start, lambda k: f"{words} ambiguous. {remedy}", at_fault)
