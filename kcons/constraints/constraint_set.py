@@ -160,11 +160,7 @@ class ConstraintSet:
 
     def _reach(self, x: FloatArray, time: float) -> FloatArray:
         """sum |dq/dx_i| |x_i| of each row."""
-
-        def reach(c: Constraint, r: FloatArray, t: float) -> FloatArray:
-            return np.sum(norm(c.gradient(r, t)) * norm(x[c.atoms]), axis=1)
-
-        return self._of_rows(x, time, reach)
+        return self._of_rows(x, time, lambda c, r, t: np.sum(norm(c.gradient(r, t)) * norm(x[c.atoms]), axis=1))
 
     # -- rows -----------------------------------------------------------------------------------
 
@@ -233,9 +229,7 @@ class ConstraintSet:
 
     def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
-        time, x = finite_number(time, "time"), self._positions(x)
-        y, pattern = self.whole(x), self.incidence
-        data = joined([c.gradient(self.gather(c, x, y), time).ravel() for c in self.constraints])
+        data, pattern = self._of_rows(x, time, lambda c, r, t: c.gradient(r, t).ravel()), self.incidence
         columns = (3 * pattern.indices[:, None] + np.arange(3)).ravel()
         return sp.csr_array((data, columns, 3 * pattern.indptr), shape=(self.n_rows, 3 * self.n_atoms))
 
@@ -362,10 +356,8 @@ class ConstraintSet:
         matrix = as_float_array(cell, "cell")
         if matrix.shape == (3,):
             matrix = np.diag(matrix)
-        if matrix.shape != (3, 3):
-            raise InputError(f"cell must have shape (3, 3) or (3,), not {matrix.shape}", item="cell")
-        if not np.all(np.isfinite(matrix)):
-            raise InputError("cell has a NaN or infinity", item="cell")
+        if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+            raise InputError(f"cell must be finite, of shape (3, 3) or (3,); it has {matrix.shape}", item="cell")
         if np.shape(pbc) not in ((), (3,)):
             raise InputError(f"pbc is {pbc!r:.60}; give True, False, or one for each lattice vector", item="pbc")
         self.lattice = lattice_of(matrix, pbc)

@@ -167,19 +167,13 @@ class Code:
 
     def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool = False) -> None:
         tree, atoms = parsed(formula, parameters, speeds)
-        if not atoms:
-            raise InputError(
-                f"Formula: {formula!r} names no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of "
-                "the second",
-                item="formula",
-            )
-        width = max(atoms)
-        if len(atoms) < width:
-            raise InputError(
-                f"Formula: {formula!r} names atom {width} of a row and not atom "
-                f"{min({*range(1, width)} - atoms)}; number them from 1 on",
-                item="formula",
-            )
+        width = max(atoms, default=0)
+        if len(atoms) < max(width, 1):
+            least = min({*range(1, width + 1)} - atoms, default=0)
+            what = f"atom {width} of a row and not atom {least}; number them from 1 on"
+            if not atoms:
+                what = "no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of the second"
+            raise InputError(f"Formula: {formula!r} names {what}", item="formula")
         self.tree, self.width, n = tree, width, 3 * width
         names = [f"{kind}{axis}{atom}" for kind in ["", "v"] for atom in range(1, width + 1) for axis in "xyz"]
 
@@ -356,11 +350,8 @@ class Formula(Constraint):
     """
 
     held = ANY
-    kind = RowKind.FUNCTION
     shared: ClassVar[tuple[str, ...]] = ("formula", "names", "period")
     per_row: Mapping[str, tuple[int, ...]] = {"values": ()}  # type: ignore[misc]
-    #: Whether it is linear in velocities, which have names too.
-    of_speeds: ClassVar[bool] = False
     values: FloatArray
 
     def __init__(
@@ -398,7 +389,7 @@ class Formula(Constraint):
 
     def code(self) -> Code:
         """What is computed of the formula."""
-        return code_of(self.formula, tuple(self.names), self.of_speeds)
+        return code_of(self.formula, tuple(self.names), not self.holonomic)
 
     @property
     def row(self) -> Any:  # type: ignore[override]
@@ -465,7 +456,6 @@ class VelocityFormula(Formula):
     holonomic = False
     kind = RowKind.VELOCITY
     shared: ClassVar[tuple[str, ...]] = ("formula", "names")
-    of_speeds = True
 
     def __init__(
         self,
