@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from functools import partial
 
 import numpy as np
@@ -17,7 +16,6 @@ from kcons.constraints import (
     ImplicitSurface,
     LinearRelation,
     LinearVelocity,
-    MovingTarget,
     Plane,
     Sphere,
 )
@@ -34,9 +32,9 @@ from kcons.constraints.arguments import (
 )
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-from kcons.motion import Motion, minimize
+from kcons.motion import Motion
 from kcons.steppers import BlanesMoan6, BlanesMoan6a, Geodesic, Rattle, State, Suzuki4, System, run
-from kcons.thermostats import CellSystem, ForceGroups, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 
 X = np.array([[0.9, 0.0, -0.4], [1.5, 0.0, 0.1], [2.0, 0.3, -0.2]])
 MASSES = np.array([1.0, 0.7, 2.0])
@@ -228,77 +226,6 @@ def test_numbers(words):
             rule(value, "length")
         assert caught.value.item == "length"
     assert [rule(good, "length") for good in (3, 3.0, np.int32(3), np.float32(3))] == [3] * 4
-
-
-#: Methods that take a time, and how many arrays before it.
-OF_A_SET = {"target": 0, "measure": 1, "value": 1, "jacobian": 1, "velocity_target": 1, "acceleration_target": 2}
-OF_A_SET |= {"tolerance": 1, "residuals": 1}
-OF_A_MOTION = {"project_positions": 2, "project_velocities": 2, "restore_positions": 1, "acceleration": 3}
-OF_A_MOTION |= {"multipliers": 3, "constraint_force": 3, "project_forces": 2, "certify": 1, "report": 1}
-#: Calls that take a time, or other numbers of everyday use, and what these are called.
-NUMBERS = {
-    "time of a set": (lambda m, bad: ConstraintSet(Distance([[0, 1]]), X, MASSES, time=bad), "time"),
-    "time of a motion": (lambda m, bad: Motion(m.constraint_set, X, time=bad), "time"),
-    "time of a state": (lambda m, bad: run(System(m), State(X, 0 * X, bad), 0.01, 1), "time"),
-    **{
-        f"time of {name}": (lambda m, bad, name=name, n=n: getattr(m.constraint_set, name)(*[X] * n, time=bad), "time")
-        for name, n in OF_A_SET.items()
-    },
-    **{
-        f"time of {name}": (lambda m, bad, name=name, n=n: getattr(m, name)(*[X] * n, time=bad), "time")
-        for name, n in OF_A_MOTION.items()
-    },
-    "reference_time": (lambda m, bad: m.project_positions(X, X, reference_time=bad), "reference_time"),
-    "dt of velocities": (lambda m, bad: m.project_positions(X, X, velocities=0 * X, dt=bad), "dt"),
-    "dt of a run": (lambda m, bad: run(System(m, lambda x, t: 0 * x), State(X, 0 * X), bad, 1), "dt"),
-    "time_step of Custom": (lambda m, bad: Custom([0], lambda r: 1.0, time_step=bad), "time_step"),
-    "period of Custom": (lambda m, bad: Custom([0], lambda r: 1.0, period=bad), "period"),
-}
-
-
-@pytest.mark.parametrize("call", NUMBERS)
-def test_times_that_are_no_numbers_are_refused(call, motion):
-    make, item = NUMBERS[call]
-    for bad in ([1.0], 1j, "1", np.nan):
-        with pytest.raises(InputError) as caught:
-            make(motion, bad)
-        assert caught.value.item == item
-
-
-NONE = Motion(ConstraintSet([], X, MASSES), X)
-OTHER_ARGUMENTS = {
-    "force takes (x, v, t), but is called with (x, t); velocity_dependent says": (
-        lambda: System(NONE, lambda x, v, t: -v)
-    ),
-    "force takes (x, t), but is called with (x, v, t)": (
-        lambda: System(NONE, lambda x, t: -x, velocity_dependent=True)
-    ),
-    "potential takes (x), but is called with (x, t)": lambda: System(NONE, lambda x, t: -x, potential=lambda x: 0.0),
-    "the force of group 'fast' takes (x)": lambda: ForceGroups({"fast": lambda x: x}),
-    "force takes (y), but is called with (x, t)": lambda: minimize(NONE, lambda y: y, X, tolerance=1.0, longest=1.0),
-    "stress takes (x, t), but is called with (x, t, cell)": (
-        lambda: CellSystem(
-            Motion(ConstraintSet([], X, MASSES, cell=[9.0] * 3), X),
-            lambda x, t, cell: x,
-            lambda x, t, cell: 0.0,
-            lambda x, t: np.eye(3),
-        )
-    ),
-    "Custom: function takes (r, t), but is called with (r); say time_dependent": lambda: Custom([0], lambda r, t: 1.0),
-    "Custom: gradient takes (), but is called with (r)": lambda: Custom([0], lambda r: 1.0, lambda: 1.0),
-    "CustomVelocity: coefficients takes (r, v), but is called with (r)": lambda: CustomVelocity(0, lambda r, v: r),
-    "the rate of the target takes (x, t), but": lambda: Distance([[0, 1]], MovingTarget(lambda t: t, lambda x, t: 1.0)),
-    "observers takes (), but is called with (state)": (
-        lambda: run(System(NONE), State(X, 0 * X), 0.1, 1, observers=[lambda: None])
-    ),
-}
-
-
-@pytest.mark.parametrize("words", OTHER_ARGUMENTS)
-def test_functions_that_take_other_arguments_are_refused_where_they_are_given(words):
-    with pytest.raises(InputError, match=re.escape(words)) as caught:
-        OTHER_ARGUMENTS[words]()
-    assert caught.value.item in words
 
 
 def test_what_may_be_called_so_or_does_not_say_is_accepted():

@@ -36,6 +36,7 @@ from kcons.constraints import (
     Rolling,
     Sphere,
     Torus,
+    VelocityFormula,
     from_dict,
 )
 from kcons.constraints.constraint_set import rows_like
@@ -463,62 +464,23 @@ def test_no_rows_hold_nothing(item):
     assert held.jacobian(CROSS).shape == (0, 3 * len(CROSS))
 
 
-DIFFERENCE = DistanceDifference(TRANSFER).todict()
-#: What is no such row, and what is said of it.
-REFUSED = [
-    (lambda: Plane(0, [0.0, np.nan, 0.0], 0.0), "normal has a vector that is zero or not finite"),
-    (lambda: Ellipsoid(0, ORIGIN, [np.inf] * 3), "no finite positive semi-axis"),
-    (lambda: Line([0, 1], [ORIGIN] * 3, UP), r"point has shape \(3, 3\); give \(3,\) or \(2, 3\)"),
-    (lambda: FixedAtoms([True, False, True]), r"integers, not bool; of a mask give np\.flatnonzero"),
-    (lambda: FixedAtoms([[0, 1]]), "a row has 1 atom, but atoms has shape"),
-    (lambda: LinearCombination([[0, 1], [2, 3]], [[UP] * 2, [[0, 0, 0]] * 2]), "coefficients of row 1 are"),
-    (lambda: LinearRelation(0, [1, 2], [0.5, 0.3, 0.2]), "do not fit"),
-    (lambda: CenterOfMass([0, 1]).measure(np.zeros((3, 2, 3)), 0.0), "needs the masses of its atoms"),
-    *(
-        (lambda axes=axes: CenterOfMass([0, 1], axes=axes), "axes must be some of 0, 1, 2")
-        for axes in (0, (0.0, 1.0), (0, 0))
-    ),
-    (lambda: CenterDistance([0, 1], np.zeros((1, 0), int)), "a group has no atoms"),
-    (lambda: KnifeEdge([0, 1], [2], UP), "give one pair a row"),
-    (lambda: DistanceDifference([0, 1, 2]), "pairs of atoms"),
-    (lambda: DistanceDifference([[0.0, 1.0], [1.0, 2.0]]), "pairs of atoms"),
-    (lambda: DistanceDifference([]), "pairs of atoms"),
-    (lambda: DistanceDifference([[0, 1], [2, 2]]), "atom 2 twice"),
-    (lambda: DistanceDifference([[0, 1], [1, 0]]), "add the weights"),
-    (lambda: DistanceDifference([[[0, 1], [1, 2]], [[3, 4], [5, 6]]]), "rows 0 and 1 share atoms"),
-    (lambda: from_dict(DIFFERENCE | {"slots": [[0, 1], [1, 3]]}), "do not belong"),
-    (lambda: from_dict(RadiusOfGyration([0, 1]).todict() | {"mass_weighted": "false"}), "give True or False"),
-    (lambda: from_dict(DIFFERENCE | {"slots": 3}), "slots are pairs"),
-    (lambda: from_dict(DIFFERENCE | {"weights": ["a", 1]}), "numbers"),
-]  # fmt: skip
+#: What is refused in `contracts/test_refusals.py`, and what to do about it.
+REMEDIES = [
+    (lambda: FixedAtoms([True, False]), r"of a mask give np\.flatnonzero"),
+    (lambda: Formula("x1^2", 0), r"a power is written \*\*"),
+    (lambda: Formula("z1 = x1**2", 0), "write what is held at zero, the left side less the right one"),
+    (lambda: Formula("x1 - y", 0), "known are x1, y1, z1, x2, ..., t, pi. Give it as a parameter"),
+    (lambda: VelocityFormula("vx1 - x1*t", 0), "at rest it is not 0: what the sum is held at is the target"),
+    (lambda: CustomVelocity(0, lambda r, t: r), r"takes \(r, t\), but is called with \(r\); say time_dependent=True"),
+    (lambda: Angle([0, 1, 2], 109.5).check(bent(90.0)[None], 0.0, 0), "targets are in radian"),
+    (lambda: Dihedral([0, 1, 2, 3], 60.0).check(twisted(30.0)[None], 0.0, 0), r"give np\.radians\(60\)"),
+]
 
 
-@pytest.mark.parametrize(("make", "words"), REFUSED)
-def test_what_is_no_such_row_is_refused(make, words):
+@pytest.mark.parametrize(("make", "words"), REMEDIES)
+def test_remedies(make, words):
     with pytest.raises(InputError, match=words):
         make()
-
-
-#: Targets, masses and cells that do not go with the positions.
-OUT_OF_PLACE = [
-    (Angle([0, 1, 2], 109.5), {}, "target 109.5 is no angle between 0 and pi; targets are in radian"),
-    (Dihedral([0, 1, 2, 3], 60.0), {}, r"60 is over three turns, and in radian; give np\.radians"),
-    (Dihedral([0, 1, 2, 3], -60.0), {}, "-60 is over three turns, and in radian"),
-    (Distance([[0, 1], [2, 3]], [1.0, -1.0]), {}, r"row 1, Distance\(2, 3\): target -1 is not positive"),
-    (Sphere([0, 1], [9.0, 9.0, 9.0], [1.0, -1.0]), {}, r"row 1, Sphere\(1\): radius -1 is not positive"),
-    (DistanceDifference(TRANSFER, -1.0, weights=[1, 1]), {}, "not positive"),
-    (Ellipsoid(0, ORIGIN, [1.0, 1.0, 1.0], target=-1.5), {}, "lies beyond the center of the ellipsoid"),
-    (LinearCombination([2, 3], [UP, [0, 0, -1]]), {"masses": [1, 1, 0, 1]}, "atom 2 has mass 0; constrained"),
-    *(([FixedAtoms([0, 1]), row], {"masses": [0, 0, 1, 1]}, "all atoms of a group have mass 0; give one")
-      for row in (CenterOfMass([0, 1]), CenterDistance([2], [0, 1]), RadiusOfGyration([0, 1]))),
-    (RadiusOfGyration([1, 3]), {"cell": [3.0] * 3}, "distance .* of atoms 1 and 3 is not shorter than half the box"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("rows", "others", "words"), OUT_OF_PLACE)
-def test_what_does_not_go_with_the_positions_is_refused(rows, others, words):
-    with pytest.raises(InputError, match=words):
-        ConstraintSet(rows, twisted(30.0), **({"masses": np.ones(4)} | others))
 
 
 def test_what_may_be():

@@ -8,7 +8,7 @@ import pytest
 from kcons import ConstraintSet, Motion
 from kcons import constraints as held
 from kcons.constraints import Dihedral, Distance
-from kcons.constraints.target import MovingTarget, as_target
+from kcons.constraints.target import MovingTarget
 from kcons.errors import InputError
 
 
@@ -18,24 +18,6 @@ def test_derivatives_given_or_differenced(given):
     for time in (0.0, 0.7, 3.0, 1e3, 1e6, 1e9):  # late times are rounded, and steps of differences made for it
         assert target.rate_at(time, 2) == pytest.approx([np.cos(time)] * 2, abs=1e-13)
         assert target.acceleration_at(time, 2) == pytest.approx([-np.sin(time)] * 2, abs=1e-11)
-
-
-MOVED = MovingTarget(lambda t: [1.0, 2.0, 3.0])
-BAD = [
-    (lambda: as_target([1.0, 2.0], 3), r"target has shape \(2,\); give one number or 3"),
-    (lambda: as_target(np.zeros((2, 2)), 3), r"target has shape \(2, 2\)"),
-    (lambda: as_target([1.0, np.nan, 2.0], 3), "the target of row 1 is not finite"),
-    (lambda: as_target([[1.0], [1.0, 2.0]], 3), "target is no array of numbers"),
-    (lambda: MovingTarget(lambda t: np.nan).at(2.0, 1), "target of row 0 at t = 2 is not finite"),
-    (lambda: MOVED.at(2.0, 2), r"target at t = 2 has shape \(3,\); give one number or 2"),
-    (lambda: MovingTarget(np.sin, acceleration=np.sin).rate_at(0.0, 1), "also needs its rate"),
-]
-
-
-@pytest.mark.parametrize(("make", "message"), BAD)
-def test_bad_targets_are_named(make, message):
-    with pytest.raises(InputError, match=message):
-        make()
 
 
 HUGE = {
