@@ -39,9 +39,10 @@ from kcons.errors import (
     NonFiniteError,
     SingularGeometryError,
 )
-from kcons.models.growth.model import GrowthModel, Populations
-from kcons.models.growth.rows import EntropyRow, Row
-from kcons.models.integration import check_run, integrate
+from kcons.models.growth.model import EntropyRow, GrowthModel, Populations, Row
+from kcons.models.integration import called, check_run, integrate
+
+__all__ = ["ConstrainedGrowth", "GrowthSolution", "entropy_balance", "solve"]
 
 Event = Callable[[float, FloatArray], float]
 EPSILON = float(np.finfo(np.float64).eps)
@@ -127,6 +128,10 @@ class ConstrainedGrowth:
     @property
     def n(self) -> int:
         return self.model.n
+
+    @property
+    def entropy_row(self) -> EntropyRow | None:
+        return next((row for row in self.rows if isinstance(row, EntropyRow)), None)
 
     def bind(self, p: Populations) -> Self:
         """The same system with all targets set by the start `p`; refused if that is off a row, or rows contradict."""
@@ -374,7 +379,9 @@ def solve(
         settled_time = None if motion is None else t
         return motion
 
-    options |= {"t_eval": times, "dense_output": dense_output, "events": _of_logarithms(events)}
+    given = events if events is None or isinstance(events, Iterable) else [events]
+    wrapped = None if given is None else [_of_logarithms(event) for event in given]
+    options |= {"t_eval": times, "dense_output": dense_output, "events": wrapped}
     with np.errstate(all="ignore"):  # ln x may be -1e300, and trial steps go too far
         found = integrate(slope, span, placed(span[0], p0.log_x), solver, placed, settled, **options)
         for row in bound.rows:  # derivatives of what depends on time may be wrong later only
@@ -387,24 +394,16 @@ def solve(
     return GrowthSolution(found, settled_time=settled_time, system=bound)
 
 
-def _of_logarithms(events: Event | Sequence[Event] | None) -> list[Event] | None:
-    """The events as functions of ln x, their attributes kept."""
-    if events is None:
-        return None
-    wrapped: list[Event] = []
-    for event in events if isinstance(events, Iterable) else [events]:
-        check_call("event", event, ("t", "x"))
+def _of_logarithms(event: Event) -> Event:
+    """An event as a function of ln x, with its attributes."""
+    check_call("event", event, ("t", "x"))
 
-        def of_logarithms(t: float, y: FloatArray, event: Event = event) -> float:
-            value = as_float_array(event(t, np.exp(y)), "event")
-            if value.size != 1:
-                raise InputError(f"an event returned shape {value.shape}; it must return a number", item="event")
-            return float(value.item())
+    def of_logarithms(t: float, y: FloatArray) -> float:
+        return float(called("event", event, (), t, np.exp(y)))
 
-        for name in ("terminal", "direction"):
-            setattr(of_logarithms, name, getattr(event, name, 0))
-        wrapped.append(of_logarithms)
-    return wrapped
+    for name in ("terminal", "direction"):
+        setattr(of_logarithms, name, getattr(event, name, 0))
+    return of_logarithms
 
 
 class EntropyBalance(NamedTuple):
@@ -434,7 +433,7 @@ def entropy_balance(solution: GrowthSolution) -> EntropyBalance:
         Of a system with an `EntropyRow`, with dense_output=True.
     """
     system = solution.system
-    row = next((r for r in system.rows if isinstance(r, EntropyRow)), None)
+    row = system.entropy_row
     if row is None:
         raise InputError("the system of this solution has no row of entropy production", item="solution")
     if solution.sol is None:

@@ -25,8 +25,9 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import FloatArray, positive, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.growth.constrained import ConstrainedGrowth
-from kcons.models.growth.model import GrowthModel, Mixture, Populations
-from kcons.models.growth.rows import EntropyRow, TotalPopulation
+from kcons.models.growth.model import EntropyRow, GrowthModel, Mixture, Populations, TotalPopulation
+
+__all__ = ["ConstrainedHypercycle", "Hypercycle"]
 
 #: A motion may count as settled where ln(x/x_eq) is this small and the direction turns this slowly, in parts of the
 #: other times; it does within so many times the tolerance, since so far do integrators stray.
@@ -99,10 +100,6 @@ class ConstrainedHypercycle(ConstrainedGrowth):
     """A hypercycle with a fixed sum of populations and, perhaps, a law of entropy production."""
 
     model: Hypercycle
-
-    @property
-    def entropy_row(self) -> EntropyRow | None:
-        return next((row for row in self.rows if isinstance(row, EntropyRow)), None)
 
     def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[float], FloatArray] | None:
         """The slow motion from here on, once the state is on it to `tolerance`; None before.

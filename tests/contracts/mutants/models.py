@@ -13,8 +13,6 @@ MUTANTS = {
     ],
     "models/growth/model.py": [
         ("self.alpha1 / self.beta«1→2»])", "models::lotka_volterra_with_four_different_parameters"),
-    ],
-    "models/growth/rows.py": [
         ('return «-→»float(called(f"time der', "constrained::values_stay_along_the_velocity_of_the_rows"),
         ("lambda t, x: «-→»moved(t)[1]", "constrained::values_stay_along_the_velocity_of_the_rows"),
     ],
