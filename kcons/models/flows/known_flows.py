@@ -13,10 +13,11 @@ from scipy.special import ellipj, ellipkinc
 
 from kcons.constraints.arguments import FloatArray, NotNegative, Positive, as_float_array, check_call, checked, positive
 from kcons.errors import InputError
-from kcons.models.flows.flow import Flow, phase_volume
+from kcons.models.flows.flow import Flow, HamiltonianFlow, phase_volume
 from kcons.models.flows.linear import JordanBlocks, JordanForm, LinearFlow, jordan_block
-from kcons.models.flows.mechanics import HamiltonianFlow
 from kcons.models.integration import called
+
+__all__ = ["Compression", "DampedOscillator", "HarmonicOscillator", "ParticleOnSphere", "Pendulum", "Thermostat"]
 
 #: Part of the energy of the separatrix, within which elliptic functions of double precision lose their digits.
 NEAR_SEPARATRIX = 1e-9

@@ -35,6 +35,9 @@ from kcons.constraints.arguments import FloatArray, Rng, as_float_array, generat
 from kcons.errors import InputError, with_extra
 from kcons.models.flows.flow import Flow
 
+__all__ = ["Classification", "Equilibrium", "JordanBlocks", "JordanForm", "Kind", "LinearFlow", "Stability", "classify"]
+__all__ += ["equilibrium_at", "find_equilibria", "jordan_block", "jordan_block_propagator", "jordan_form"]
+
 ComplexArray: TypeAlias = NDArray[np.complex128]
 EPSILON = float(np.finfo(np.float64).eps)
 #: Singular values below this many times the noise of a block count as zero.

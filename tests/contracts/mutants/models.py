@@ -31,7 +31,7 @@ MUTANTS = {
         ("«p.quo(common) * →»once", "linear::eigenvalues_on_the_axis_are_counted_in_integers"),
         ("certain = «closer == 1.0 and →»kept", "linear::neighbors_that_rounding_joins_are_told_as_uncertain"),
     ],
-    "models/flows/mechanics.py": [
+    "models/flows/flow.py": [
         ("concatenate([slope[self.f :], «-→»slope[: self", "mechanics::friction_by_a_hamiltonian_that_depends_on_time"),
     ],
     "constraints/projection.py": [
