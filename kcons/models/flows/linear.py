@@ -22,6 +22,7 @@ Wilkinson, SIAM Review 18, 578 (1976). Kagstrom and Ruhe, ACM Trans. Math. Softw
 from __future__ import annotations
 
 from enum import Enum
+from importlib.util import find_spec
 from itertools import product
 from typing import NamedTuple, TypeAlias
 
@@ -32,7 +33,7 @@ from scipy.optimize import root
 from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints.arguments import FloatArray, Rng, as_float_array, generator_of, whole_number
-from kcons.errors import InputError, with_extra
+from kcons.errors import InputError
 from kcons.models.flows.flow import Flow
 
 __all__ = ["Classification", "Equilibrium", "JordanBlocks", "JordanForm", "Kind", "LinearFlow", "Stability", "classify"]
@@ -305,7 +306,8 @@ class Stability(Enum):
     ASYMPTOTIC = "asymptotically stable"
     STABLE = "stable"
     UNSTABLE = "unstable"
-    #: No eigenvalue is known to lie to the right of the axis, and not all are known to lie left of it or on it.
+    #: No eigenvalue is known to lie to the right of the axis, and not all are known to lie left of it or on it; SymPy,
+    #: which would tell those on it from others, may be missing.
     UNKNOWN = "cannot be told"
 
 
@@ -323,13 +325,11 @@ class Classification(NamedTuple):
     hyperbolic: bool
     #: How far each eigenvalue may be off.
     errors: FloatArray
-    #: What to install for an answer where there is none.
-    remark: str = ""
 
     def __str__(self) -> str:
         name = self.detail if self.detail == "saddle-focus" else f"{self.detail} {self.kind.value}".strip()
         if self.stability is Stability.UNKNOWN:
-            return f"{name} whose stability cannot be told{self.remark and ': '}{self.remark}"
+            return f"{name} whose stability {self.stability.value}"
         return f"{self.stability.value} {name}"
 
 
@@ -366,29 +366,26 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
         if len(blocks) == 1:
             detail = "star" if blocks[0].sizes[0] == 1 else "improper"
     stability = Stability.UNSTABLE if 1 in present else Stability.ASYMPTOTIC if present == {-1} else Stability.UNKNOWN
-    axis, remark = None, ""
     if stability is Stability.UNKNOWN and not np.any(error):
-        try:
-            axis = (2, True) if len(A) == 2 and not zero and np.trace(A) == 0.0 else on_axis(A)
-        except ModuleNotFoundError as missing:
-            remark = str(with_extra(missing, "to decide in rational numbers"))
-    if axis is not None and axis[0] == np.sum(signs == 0):
-        stability = Stability.STABLE if axis[1] else Stability.UNSTABLE
+        axis = (2, True) if len(A) == 2 and not zero and np.trace(A) == 0.0 else on_axis(A)
+        if axis is not None and axis[0] == np.sum(signs == 0):
+            stability = Stability.STABLE if axis[1] else Stability.UNSTABLE
     order = np.lexsort((-found.values.imag, -found.values.real))
-    return Classification(kind, stability, detail, found.values[order], 0 not in present, found.errors[order], remark)
+    return Classification(kind, stability, detail, found.values[order], 0 not in present, found.errors[order])
 
 
 def on_axis(matrix: FloatArray) -> tuple[int, bool] | None:
     """How many eigenvalues lie on the imaginary axis exactly, and whether all their Jordan blocks have size 1.
 
     Entries count as they stand, as doubles are rational numbers. Eigenvalues on the axis are common roots of the
-    characteristic polynomials of A and -A. None where common roots lie off the axis, or with too many variables.
+    characteristic polynomials of A and -A. None where common roots lie off the axis, with too many variables, or
+    without SymPy.
     """
+    if len(matrix) > LARGEST or not find_spec("sympy"):
+        return None
     from sympy import QQ, Poly, Symbol
     from sympy.polys.matrices import DomainMatrix
 
-    if len(matrix) > LARGEST:
-        return None
     x, shape = Symbol("x"), matrix.shape
     A = DomainMatrix([[QQ(*float(v).as_integer_ratio()) for v in row] for row in matrix], shape, QQ)
     p = Poly(A.charpoly(), x, domain=QQ)

@@ -37,7 +37,6 @@ from kcons.errors import (
     ConvergenceError,
     InputError,
     NonFiniteError,
-    SingularGeometryError,
 )
 from kcons.models.growth.model import EntropyRow, GrowthModel, Populations, Row
 from kcons.models.integration import called, check_run, integrate
@@ -158,7 +157,13 @@ class ConstrainedGrowth:
             rows, right = [row.gradient(p) for row in self.rows], [row.rate(p) for row in self.rows]
             z, missing = constraint_rates(p.x, rows, right, drift)
         if np.any(missing > SOLVABILITY_TOLERANCE):
-            self._refuse(missing, p)
+            number = int(np.argmax(missing > SOLVABILITY_TOLERANCE))
+            raise ContradictionError(
+                f"row {number} ({self.rows[number].name}) depends on the rows before it at t = {p.time:.8g} and "
+                f"contradicts them: its right side is off by {missing[number]:.3g} of its terms. Remove one of them or "
+                "change its rate; if they are independent elsewhere, stop before this time (an event)",
+                rows=[number],
+            )
         if np.all(np.isfinite(z)) and np.all(np.isfinite(drift)):
             return z
         there = f"not finite at t = {p.time:.8g}; end the run before (an event), or mend the function"
@@ -172,24 +177,6 @@ class ConstrainedGrowth:
                     f"row {number} ({self.rows[number].name}) has a coefficient or a rate that is {there}", item="rows"
                 )
         return z
-
-    def _refuse(self, missing: FloatArray, p: Populations) -> None:
-        """Raise where the rank is lost and the rows ask for the impossible."""
-        row = int(np.argmax(missing > SOLVABILITY_TOLERANCE))
-        message = (
-            f"row {row} ({self.rows[row].name}) depends on the rows before it at t = {p.time:.8g} and contradicts "
-            f"them: its right side is off by {missing[row]:.3g} of its terms"
-        )
-        # The same rows at a state some way off: dependent everywhere, or only here?
-        shift = 0.1 * np.cos(np.arange(1.0, self.n + 1))
-        away = Populations.from_logarithms(p.time, np.maximum(p.log_x, -30.0) + shift)
-        if projection.rank(np.array([r.gradient(away) for r in self.rows])) < len(self.rows):
-            raise ContradictionError(message + "; remove one of the rows or change its rate", rows=[row])
-        raise SingularGeometryError(
-            message + "; the rows are independent elsewhere: stop before this time (an event), or prescribe a rate "
-            "that fades as the rank does",
-            rows=[row],
-        )
 
     def logarithmic_velocity(self, p: Populations) -> FloatArray:
         """d ln x/dt = phi + z + Psi/x, shape (n,); what `solve` integrates. NaN where x is beyond all numbers."""
@@ -350,7 +337,7 @@ def solve(
     ------
     ConstraintError, BudgetError
         A start off the constraints, or a prescription that cannot be met from it.
-    ContradictionError, SingularGeometryError
+    ContradictionError
         Rows that contradict each other, at the start or where their rank is lost on the way.
     NonFiniteError
         Rates, sources or rows that are not finite where the run has come to.

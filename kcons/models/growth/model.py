@@ -609,17 +609,12 @@ class EntropyRow(Row):
                 consistent=0.0,
                 time=0.0,
             )
-        if budget is None or abs(budget / excess0 - 1.0) <= BUDGET_TOLERANCE:
-            return
-        if budget > excess0:
-            time = -self.tau * math.log1p(-excess0 / budget)
-            said = f"more than the start can produce: equilibrium would be reached at t = {time:.6g}, with"
-        else:
-            time, said = math.inf, "less than what lies between the start and equilibrium: it would stop with"
-        raise BudgetError(
-            f"T(s_eq - s_0) = {budget:.10g} is {said} {abs(excess0 - budget):.6g} still to be produced. Leave the "
-            f"budget out; it is then computed, g(x_0) - g_eq = {excess0:.10g}",
-            budget=budget,
-            consistent=excess0,
-            time=time,
-        )
+        if budget is not None and abs(budget / excess0 - 1.0) > BUDGET_TOLERANCE:
+            time = -self.tau * math.log1p(-excess0 / budget) if budget > excess0 else math.inf
+            raise BudgetError(
+                f"T(s_eq - s_0) = {budget:.10g}, but {excess0:.10g} is left to produce until equilibrium, which would be "
+                f"reached at t = {time:.6g}. Leave the budget out; it is then computed",
+                budget=budget,
+                consistent=excess0,
+                time=time,
+            )

@@ -1,7 +1,5 @@
 """Linear flows: exp(At), eigenvalues with their errors, Jordan structure, and stability that is told, or cannot be."""
 
-import sys
-
 import numpy as np
 import pytest
 import scipy.linalg
@@ -21,6 +19,7 @@ from kcons.models.flows import (
     jordan_block,
     jordan_block_propagator,
     jordan_form,
+    linear,
 )
 from kcons.models.flows.linear import on_axis, spectrum
 
@@ -338,9 +337,7 @@ def test_eigenvalues_on_the_axis_are_counted_in_integers(blocks, wanted):
     assert on_axis(in_skew_basis(np.random.default_rng(0), blocks)) == wanted
 
 
-def test_without_sympy_the_answer_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "sympy", None)
+def test_without_sympy_it_cannot_be_told(monkeypatch):
+    monkeypatch.setattr(linear, "find_spec", lambda name: None)
     assert str(classify(R)) == "stable center"
-    said = str(classify(scipy.linalg.block_diag(R, 3 * R)))
-    assert said.startswith("center whose stability cannot be told: to decide in rational numbers needs sympy")
-    assert "kcons[models]" in said
+    assert str(classify(scipy.linalg.block_diag(R, 3 * R))) == "center whose stability cannot be told"

@@ -201,18 +201,11 @@ def test_budget_is_computed_from_the_start():
     assert same.law_excess(1e4) == pytest.approx(BUDGET * np.exp(-1e4 / 30), rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("factor", "time", "words"),
-    [
-        (1.1, 71.94, r"more than the start can produce: .* t = 71\.9"),
-        (1.5, 32.96, r"more than the start can produce: .* t = 32\.9"),
-        (0.5, np.inf, "less than what lies between the start and equilibrium"),
-    ],
-)
-def test_another_budget_is_refused_with_its_time(factor, time, words):
-    with pytest.raises(BudgetError, match=words) as caught:
+@pytest.mark.parametrize(("factor", "time"), [(1.1, 71.9369), (1.5, 32.9584), (0.5, np.inf)])
+def test_another_budget_is_refused_with_its_time(factor, time):
+    with pytest.raises(BudgetError, match=rf"but 0\.3344\d* .* t = {str(time)[:4]}.*\. Leave the") as caught:
         solve(Hypercycle().with_entropy_production(30.0, factor * BUDGET), (0.0, 1.0), X0)
-    assert caught.value.time == pytest.approx(time, abs=0.005)
+    assert caught.value.time == pytest.approx(time, abs=1e-4)
     assert caught.value.consistent == pytest.approx(BUDGET)
 
 
