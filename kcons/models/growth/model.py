@@ -610,10 +610,11 @@ class EntropyRow(Row):
                 time=0.0,
             )
         if budget is not None and abs(budget / excess0 - 1.0) > BUDGET_TOLERANCE:
-            time = -self.tau * math.log1p(-excess0 / budget) if budget > excess0 else math.inf
+            more = budget > excess0
+            time = -self.tau * math.log1p(-excess0 / budget) if more else math.inf
             raise BudgetError(
-                f"T(s_eq - s_0) = {budget:.10g}, but {excess0:.10g} is left to produce until equilibrium, which would be "
-                f"reached at t = {time:.6g}. Leave the budget out; it is then computed",
+                f"T(s_eq - s_0) = {budget:.10g} is {'more' if more else 'less'} than the start can produce, "
+                f"{excess0:.10g}; it would be used up at t = {time:.6g}. Leave the budget out; it is then computed",
                 budget=budget,
                 consistent=excess0,
                 time=time,
