@@ -406,14 +406,6 @@ class HolonomicRow(Row):
 
     def check_derivatives(self, p: Populations) -> None:
         """Refuse derivatives that differences of sigma contradict: a wrong one moves off the row without a sign."""
-        given = None if self._gradient is None else self.gradient(p) * p.x
-        coarse, fine = (self._by_differences(p, h) for h in (STEP, STEP / 2))
-        rounding = 1e-12 * abs(self.measure(p))
-        check_derivative("gradient", f"{self.name}, times x,", given, coarse, fine, rounding=rounding, smooth=SMOOTH)
-        self._check_rate(p)
-
-    def _check_rate(self, p: Populations) -> None:
-        """Compare the derivative in time with differences, slow and fast ones, where these are smooth."""
         size = self.size(p)
 
         def rate(t: float) -> FloatArray:
@@ -422,6 +414,10 @@ class HolonomicRow(Row):
         def value(t: float) -> FloatArray:
             return np.array([self.measure(Populations(t, p.x, p.log_x)) + size])
 
+        given = None if self._gradient is None else self.gradient(p) * p.x
+        coarse, fine = (self._by_differences(p, h) for h in (STEP, STEP / 2))
+        rounding = 1e-12 * abs(self.measure(p))
+        check_derivative("gradient", f"{self.name}, times x,", given, coarse, fine, rounding=rounding, smooth=SMOOTH)
         for step in (1e-2, 1e-8):
             found = contradiction(rate, value, p.time, step)
             if found is None:
@@ -483,9 +479,6 @@ class LinearRow(HolonomicRow):
                 item="coefficients",
             )
         return self.coefficients
-
-    def check_derivatives(self, p: Populations) -> None:
-        self._check_rate(p)
 
 
 class TotalPopulation(LinearRow):
