@@ -4,8 +4,8 @@ A stepper never changes its input. Where it raises, nothing has happened.
 
 - `state`: where a system is, and what acts on it
 - `files`: its files, and folders of results that belong to one run
-- `operations`: a time step as data
-- `program`, `interpreter`: operations as rows of numbers, and who makes them
+- `operations`: a time step as data, and as rows of numbers
+- `interpreter`: who makes them
 - `compiled_operations`: as many as there are in one compiled call
 - `packed_system`: what compiled operations know of a system
 - `stepper`: what a stepper is, and a check that each step can be taken back

@@ -1,7 +1,7 @@
 """Operations of a time step in one compiled call, as many as there are until Python is needed.
 
 A call from Python to a kernel costs as much as the kernel's work on ten molecules of water or more. `perform` therefore
-goes through a program, a row of numbers for each operation (`kcons.steppers.program`), and comes back where forces are
+goes through a program, a row of numbers for each operation (`operations.Program`), and comes back where forces are
 to be evaluated, where an operation is one of Python, or where rows are left to the engine: those that kernels do not
 know, and those that a kernel found no solution for, where the engine has more means, and names the row.
 
@@ -13,6 +13,7 @@ of a step remains.
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numba
@@ -54,6 +55,7 @@ _call, _fly_circles = caller_of(FUNCTION), caller_of(CIRCLES)
 _PERFORM = (*(numba.int64, numba.boolean, numba.float64, _POINTS, _POINTS, _POINTS, _POINTS, _NUMBERS, _NUMBERS),)
 
 
+@cache
 def kernel() -> Any:
     """`perform` without Numba's dispatcher.
 
@@ -63,6 +65,7 @@ def kernel() -> Any:
     return perform.compile(_PERFORM)
 
 
+@cache
 def tangents() -> Any:
     """`packed_tangents` in the same way."""
     return packed_tangents.compile((_POINTS, _POINTS, _NUMBERS))

@@ -9,7 +9,6 @@ are those that need more means.
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import Any
 from weakref import ref
 
@@ -28,14 +27,12 @@ from kcons.steppers.compiled_operations import (
     kernel,
     tangents,
 )
-from kcons.steppers.operations import Operation
-from kcons.steppers.program import Program, Row
+from kcons.steppers.operations import Operation, Program, Row
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Listed, explained, stays
 
 _FLOAT = np.dtype(np.float64)
 _EMPTY = np.empty(0)
-_compiled, _tangents = cache(kernel), cache(tangents)
 
 
 class Interpreted(Listed):
@@ -189,7 +186,7 @@ class Interpreter:
             self.low, self.push, self.spare = room[begin:first].reshape(3, *shape)
         sets, lists = system.motion.sources, (program.rows, program.shown, program.ends, program.flies)
         simple, end = self.simple and not system.velocity_dependent, len(program.rows) - 1
-        self.unchanging = _compiled(), system, dt, room, shape, *sets, *lists, simple, end
+        self.unchanging = kernel(), system, dt, room, shape, *sets, *lists, simple, end
         self.then, self.left_over_then = start.time, start.time_remainder
         self.made, self.number = -1, start.step
         self._next_step()
@@ -338,7 +335,7 @@ class Interpreter:
     def along(self, v: FloatArray, x: FloatArray, time: float) -> FloatArray:
         """v itself, made tangent to the constraints at x."""
         packed = self.system.packed
-        if packed is None or not _tangents()(x, v, packed.tables):
+        if packed is None or not tangents()(x, v, packed.tables):
             if packed is not None:
                 packed.refuse()
             self.system.motion.project_velocities(x, v, time=time, out=v)

@@ -13,8 +13,7 @@ from collections.abc import Callable, Sequence
 from kcons.constraints.arguments import Count, checked
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers.interpreter import Interpreted, Interpreter
-from kcons.steppers.operations import Operation, mirrored, splitting
-from kcons.steppers.program import Program
+from kcons.steppers.operations import Program, mirrored, splitting
 from kcons.steppers.state import State, System
 
 __all__ = ["BlanesMoan4", "BlanesMoan6", "BlanesMoan6a", "Composition", "Geodesic", "KahanLi6", "Rattle"]
@@ -129,21 +128,15 @@ class Splitting(Interpreted):
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
 
-    def _form(self, system: System | None) -> tuple[bool, bool]:
-        """Whether drifts are along great circles, and whether velocities are iterated because forces depend on them."""
-        if system is None:
-            return False, False
-        return self.exact_flight and system.great_circles is not None, system.velocity_dependent
-
-    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        exact, settled = self._form(system)
-        return splitting(self.kicks, self.drifts, (1.0,) if exact else self.flight, exact=exact, settled=settled)
-
     def program(self, system: System | None) -> Program:
-        form = self._form(system)
-        if form not in self._by_form:
-            self._by_form[form] = Program(self.operations(system))
-        return self._by_form[form]
+        # Whether drifts are along great circles, and whether velocities are iterated because forces depend on them.
+        exact = self.exact_flight and system is not None and system.great_circles is not None
+        settled = system is not None and system.velocity_dependent
+        if (exact, settled) not in self._by_form:
+            flight = (1.0,) if exact else self.flight
+            step = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled)
+            self._by_form[exact, settled] = Program(step)
+        return self._by_form[exact, settled]
 
     def begun(self, system: System, state: State, dt: float, steps: int) -> Interpreter:
         if (state is not system.last or state.forces is None) and (self.kick_first or system.velocity_dependent):

@@ -28,8 +28,7 @@ from kcons.solvers.kernels.array_views import flat, integers, table_array
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compiled_operations import SUMS, all_finite, check_finite, square_sum
 from kcons.steppers.interpreter import Interpreted, Interpreter
-from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
-from kcons.steppers.program import Program, Row
+from kcons.steppers.operations import Evaluate, Kick, Operation, Program, Project, Row, Turn, mirrored, splitting
 from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
 from kcons.thermostats.freedom import (
     LOOK_AT,

@@ -16,8 +16,7 @@ from kcons.solvers.kernels.array_views import flat
 from kcons.steppers import State, System
 from kcons.steppers.compiled_operations import square_sum
 from kcons.steppers.interpreter import Interpreted, Interpreter
-from kcons.steppers.operations import Evaluate, Exchange, Operation, Project
-from kcons.steppers.program import Program, Row
+from kcons.steppers.operations import Evaluate, Exchange, Operation, Program, Project, Row
 from kcons.thermostats.force_groups import GroupedForces, SlowKicks, group_names, levels_of, middle_of, nested
 from kcons.thermostats.freedom import carried, refuse_dissipation
 from kcons.thermostats.noise import fill_next, noise_generator

@@ -16,8 +16,7 @@ from kcons.solvers.kernels.array_views import flat
 from kcons.steppers import Rattle, State, System
 from kcons.steppers.compiled_operations import check_finite, square_sum
 from kcons.steppers.interpreter import Interpreted, Interpreter
-from kcons.steppers.operations import Chain
-from kcons.steppers.program import Program, Row
+from kcons.steppers.operations import Chain, Program, Row
 from kcons.steppers.splitting import SUZUKI_4
 from kcons.thermostats.freedom import (
     AT_REST,

@@ -29,8 +29,7 @@ from kcons.solvers.rank_revealing import rank
 from kcons.steppers import State, System
 from kcons.steppers.compiled_operations import check_finite
 from kcons.steppers.interpreter import Interpreter
-from kcons.steppers.operations import Operation, Project
-from kcons.steppers.program import Program, Row
+from kcons.steppers.operations import Operation, Program, Project, Row
 from kcons.thermostats import sphere_kernels as kernels
 from kcons.thermostats.force_groups import SlowKicks
 from kcons.thermostats.freedom import MARK, carried, placed_rows, refuse_driven

@@ -31,9 +31,8 @@ from kcons.solvers.addressable_solvers import packed_positions, packed_tangents
 from kcons.solvers.tolerances import MANY_ITERATIONS
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Rattle, ReversibilityCheck, Splitting, State, Suzuki4, System, run
 from kcons.steppers.interpreter import Interpreter
-from kcons.steppers.operations import Evaluate, Kick, Project, drifts_of
+from kcons.steppers.operations import Evaluate, Kick, Program, Project, drifts_of
 from kcons.steppers.packed_system import MOST_ROWS
-from kcons.steppers.program import Program
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
 
 PAIRS = [[0, 1], [0, 2], [1, 2]]

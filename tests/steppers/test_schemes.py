@@ -38,8 +38,7 @@ from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Composition, Geodesic, Rattle, Splitting, State, Stepper, run
 from kcons.steppers import compiled_operations as compiled
 from kcons.steppers.interpreter import Interpreter
-from kcons.steppers.operations import Fly
-from kcons.steppers.program import Program
+from kcons.steppers.operations import Fly, Program
 from kcons.steppers.splitting import KAHAN_LI_6, SRKN_6B, SUZUKI_4
 
 GlobalError = Callable[[Stepper, float], float]

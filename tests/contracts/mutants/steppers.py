@@ -41,11 +41,6 @@ MUTANTS = {
     "constraints/velocity.py": [
         ("half = «→-»0.5 * (bx *", "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]"),
     ],
-    "steppers/program.py": [
-        ("kick.fraction, group, time, «end→1.0»", "langevin::each_substep_meets_targets_at_its_own_time"),
-        ('row.name == "evaluate"« and row.here == 1→»', "interpreter::kicks_in_succession_and_before_other_operations"),
-        ("«met[verb] += 1→pass»", "isokinetic_spheres::noise_is_a_function_of_seed_step_and_part"),
-    ],
     "thermostats/monte_carlo.py": [
         ("velocities=«-→»begin.velocities)", "monte_carlo::every_decision_follows_from_the_energies[0.7]"),
         ("ACCEPTED if threshold < «-→»", "monte_carlo::every_decision_follows_from_the_energies[0.0]"),
@@ -57,6 +52,9 @@ MUTANTS = {
         ("if «not state.is_of(system)→False»:", "state::another_system_begins_a_thermostat_anew"),
     ],
     "steppers/operations.py": [
+        ("kick.fraction, group, time, «end→1.0»", "langevin::each_substep_meets_targets_at_its_own_time"),
+        ('row.name == "evaluate"« and row.here == 1→»', "interpreter::kicks_in_succession_and_before_other_operations"),
+        ("«met[verb] += 1→pass»", "isokinetic_spheres::noise_is_a_function_of_seed_step_and_part"),
         ("math.fsum(flat[:k]) for k in range(«1, len(flat))] + [1.0→len(flat))»", "listings::fractions_share_the_step"),
         (
             "done += [Kick(«0.5 * fraction), stage, Settle(0.5 * fraction)→fraction), stage»]",
