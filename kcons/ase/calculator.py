@@ -12,10 +12,9 @@ from ase.calculators.calculator import Calculator, PropertyNotImplementedError, 
 from numpy.typing import NDArray
 
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.respect import VOIGT, refuse_taken_along
+from kcons.ase.respect import refuse_taken_along
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import as_float_array
-from kcons.thermostats.cells import constraint_virial
 
 #: Residual, in units of what double precision can reach, up to which positions are taken as they are.
 _ON_SURFACE = 4.0
@@ -92,7 +91,9 @@ class ConstrainedCalculator(Calculator):
         super().calculate(atoms, list(properties), list(system_changes))
         assert self.atoms is not None
         work = self.atoms.copy()
-        work.set_constraint()
+        work.arrays.pop("momenta", None)
+        work.calc = self.inner
+        work.set_constraint([self.constraints])
         motion = self.constraints.engine(work)
         held = motion.constraint_set
         x = work.arrays["positions"]
@@ -102,30 +103,20 @@ class ConstrainedCalculator(Calculator):
                 refuse_taken_along(motion, *before, *self._stressed)
         if held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
             motion.project_positions(x, x.copy(), out=x)
-        wanted = set(properties)
-        if "stress" in wanted:
-            wanted.add("forces")
-        results: dict[str, Any] = {}
-        for name in sorted(wanted):
-            results[name] = self.inner.get_property(name, work)
+        found = {name: self.inner.get_property(name, work) for name in sorted({*properties})}
         known = getattr(self.inner, "results", {})
         for name in ("energy", "free_energy", "forces"):
-            if name not in results and name in known and not self.inner.calculation_required(work, [name]):
-                results[name] = known[name]
-        if "forces" in results:
-            forces = np.array(as_float_array(results["forces"], "forces of the calculator"))
-            results["forces"] = forces.copy()
-            self.constraints.adjust_forces(work, results["forces"])
-            if "stress" in results:
-                stress = np.array(as_float_array(results["stress"], "stress of the calculator"))
-                if stress.shape == (3, 3):
-                    stress = stress[VOIGT]
-                virial = constraint_virial(motion, x, np.zeros_like(x), forces)
-                results["stress"] = stress - virial[VOIGT] / work.get_volume()
-        if any(value is None for value in results.values()):
-            missing = sorted(name for name, value in results.items() if value is None)
+            if name not in found and name in known and not self.inner.calculation_required(work, [name]):
+                found[name] = known[name]
+        missing = [name for name, value in found.items() if value is None]
+        if missing:
             raise PropertyNotImplementedError(f"{type(self.inner).__name__} has no {', '.join(missing)}")
-        self.results = {**self.results, **results}
+        if "forces" in found:
+            found["forces"] = np.array(as_float_array(found["forces"], "forces of the calculator"))
+            self.constraints.adjust_forces(work, found["forces"])
+        if "stress" in found:
+            found["stress"] = work.get_stress()
+        self.results |= found
         self._known = self._asked()
 
     def restore(self, atoms: Atoms) -> None:

@@ -151,15 +151,7 @@ class ConstrainedDynamics(MolecularDynamics):
 
     def _check_timestep(self, timestep: float) -> None:
         """Refuse what is no time; ask where the steps that move the atoms are as long as from a slip of units."""
-        try:
-            good = math.isfinite(timestep)
-        except TypeError:
-            good = False
-        if not good:
-            raise InputError(
-                f"the time step is {timestep!r}; give a finite number in ASE's unit of time", item="timestep"
-            )
-        shortest = abs(timestep) / self._parts
+        shortest = abs(finite_number(timestep, "timestep")) / self._parts
         if shortest > LONGEST:
             warnings.warn(
                 f"the atoms move in steps of {shortest / units.fs:.4g} fs. Is that meant? ASE's unit of time is "

@@ -132,8 +132,8 @@ class _Stack:
         if doubtful.any() and not doubtful.all():
             doubtful[doubtful] = self.chosen(doubtful).suspects(x)
         elif doubtful.any():
-            extent = np.ptp(x[self.atoms], axis=1).max(axis=1)
-            doubtful = unsolvable(unit, curvature, np.where(extent > 0, extent, 1.0))
+            size = np.ptp(x[self.atoms], axis=1).max(axis=1)
+            doubtful = _unsolvable(unit, curvature, np.where(size > 0, size, 1.0))
         return doubtful
 
     def dense(self, x: FloatArray) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
@@ -258,13 +258,8 @@ def _sparse_rank(block: LocalRows, x: FloatArray) -> int:
 # -- one block ----------------------------------------------------------------------------------------------
 
 
-def unsolvable(unit: FloatArray, curvature: Callable[[FloatArray], FloatArray], extent: FloatArray) -> BoolArray:
-    """Whether A a = -v^T (d2sigma/dx2) v has no solution for some v with A v = 0 (notes eqs. 92, 95), of several
-    blocks.
-
-    `unit` is A with rows of unit norm, shape (n_blocks, n_rows, n_coordinates), `curvature` maps v, shape (n_blocks,
-    n_coordinates), to the curvatures of these rows, and `extent` is the length scale of each block.
-    """
+def _unsolvable(unit: FloatArray, curvature: Callable[[FloatArray], FloatArray], extent: FloatArray) -> BoolArray:
+    """Whether A a = -v^T (d2sigma/dx2) v has no solution for some v with A v = 0 (notes eqs. 92, 95), of each block."""
     u, s, vt = np.linalg.svd(unit, full_matrices=True)
     cut = LOST * s[:, :1]
     lost = np.ones(unit.shape[:2], bool)
@@ -300,17 +295,18 @@ class LocalRows:
         self.part, self.atoms = constraint_set.subset(rows)
         self.x = positions[self.atoms]
         self.pinned: BoolArray = np.isin(self.atoms, fixed_atoms(constraint_set)) if pinned is None else pinned
+        every = np.arange(self.part.n_rows)[None], np.arange(len(self.atoms))[None]
+        self.alone = _Stack(self.part, time, *every, np.flatnonzero(self.pinned))
 
     def inside(self, atoms: IntArray) -> IntArray:
         """Rows (block numbering) that a rigid group of `atoms` (block numbering) makes superfluous."""
         rows = [np.isin(item.atoms, atoms).all(axis=1) & item.reversible for item in self.part.constraints]
         return np.flatnonzero(np.concatenate(rows))
 
-    def linear(self, x: FloatArray) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
-        """Row-normalized A without the columns of fixed atoms, its norms, and the curvatures of the same rows."""
-        every = np.arange(self.part.n_rows)[None], np.arange(len(self.atoms))[None]
-        unit, norms, curvature = _Stack(self.part, self.time, *every, np.flatnonzero(self.pinned)).dense(x)
-        return unit[0], norms[0], lambda v: curvature(v[None])[0]
+    def linear(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Row-normalized A without the columns of fixed atoms, and its norms."""
+        unit, norms, _ = self.alone.dense(x)
+        return unit[0], norms[0]
 
     def decomposed(self, x: FloatArray, rows: IntArray | slice = slice(None)) -> tuple[FloatArray, int]:
         """v^T of these rows (all by default), with all singular vectors, and their rank."""
@@ -319,11 +315,8 @@ class LocalRows:
 
     def singular(self, x: FloatArray, rows: IntArray | None = None) -> bool:
         """Whether these rows (all by default) are singular at second order at `x`."""
-        rows = np.arange(self.part.n_rows) if rows is None else rows
-        if len(rows) < 2:
-            return False
-        unit, _, curvature = self.linear(x)
-        return bool(unsolvable(unit[None, rows], lambda v: curvature(v[0])[None, rows], np.array([extent_of(x)]))[0])
+        some = self.alone if rows is None else replace(self.alone, rows=rows[None])
+        return some.rows.size > 1 and bool(some.suspects(x)[0])
 
     def restored(self) -> LocalRows:
         """The same block at positions that fulfil its targets, as nearly as Gauss-Newton gets there."""
@@ -334,7 +327,7 @@ class LocalRows:
             # Towards a flat geometry the singular value is the square root of this, 1e-7: lost by any measure.
             if np.max(np.abs(sigma) / self.part.scale) < 1e-14:
                 break
-            unit, norms, _ = self.linear(x)
+            unit, norms = self.linear(x)
             step = np.linalg.lstsq(unit[held], -(sigma / norms)[held], rcond=STEP_CUT)[0]
             x = x + step.reshape(x.shape)
         other = copy.copy(self)
@@ -345,7 +338,7 @@ class LocalRows:
         """Positions of the movable atoms displaced at random, by less than rows are long."""
         wide = [c for c in self.part.constraints if c.width > 1 and c.n_rows]
         sides = [np.linalg.norm(np.diff(self.part.gather(c, self.x), axis=1), axis=2).min() for c in wide]
-        step = DISPLACEMENT * min(sides, default=extent_of(self.x))
+        step = DISPLACEMENT * min(sides, default=extent(self.x) or max(float(np.abs(self.x).max()), 1.0))
         return self.x + step * rng.standard_normal(self.x.shape) * ~self.pinned[:, None]
 
     def rigid_pairs(self) -> tuple[BoolArray, int]:
@@ -373,12 +366,6 @@ class LocalRows:
         """Positions made whole across the boundary, following the rows."""
         found = [item.with_target(None) for item in self.part.constraints]
         return whole_bodies(found, self.part.whole(x), self.part.lattice)
-
-
-def extent_of(x: FloatArray) -> float:
-    """Length scale of a group of points."""
-    size = extent(x)
-    return size if size > 0 else max(float(np.max(np.abs(x))), 1.0)
 
 
 # -- linear and planar groups -------------------------------------------------------------------------------
