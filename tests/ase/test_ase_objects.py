@@ -12,7 +12,6 @@ from ase.build import bcc100, molecule
 from ase.calculators.emt import EMT
 from ase.constraints import FixAtoms, Hookean
 from ase.io import read, write
-from ase.vibrations import Vibrations
 from ase_systems import AS_ASE
 
 from kcons.ase import Constraints, ConstraintsWithFixedAtoms, constrain, from_ase_constraints, to_ase_constraints
@@ -118,14 +117,6 @@ def test_atoms_can_be_deleted_as_with_fix_atoms():
     constrain(bound, Distance([[0, 1]]))
     with pytest.raises(RuntimeError, match="Remove constraint"):
         del bound[2]
-
-
-@pytest.mark.filterwarnings("ignore:Vibrations displaces")
-def test_vibrations_leave_out_the_fixed_atoms_alone(tmp_path):
-    atoms = slab()
-    atoms.calc = EMT()
-    constrain(atoms, HELD["with others"])
-    assert Vibrations(atoms, name=str(tmp_path / "v")).indices.tolist() == list(range(4, 14))
 
 
 # -- plain objects -----------------------------------------------------------------------------------------

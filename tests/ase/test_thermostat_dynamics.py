@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ase import Atoms, units
-from ase.build import molecule
-from ase.calculators.calculator import Calculator, all_changes
+from ase.calculators.calculator import all_changes
 from ase.constraints import ExternalForce, FixAtoms
 from ase.io import read
-from ase_systems import Field, equal, state
+from ase_systems import FS, Field, equal, rigid, state
 
 from kcons.ase import (
     ConstrainedLangevin,
@@ -18,9 +17,7 @@ from kcons.ase import (
     Constraints,
     IsokineticDynamics,
     MultipleTimeSteps,
-    constrain,
     draw_velocities,
-    rigid_water,
 )
 from kcons.constraints import Distance, FixedAtoms
 from kcons.errors import InputError, UnsupportedError
@@ -28,58 +25,38 @@ from kcons.motion import Motion
 from kcons.steppers import BlanesMoan4, State, System, run
 from kcons.thermostats import ForceGroups, HamiltonianMonteCarlo, IsokineticSpheres, LangevinRespa
 
-FS = units.fs
 KT = 300 * units.kB
 K = np.array([1.0, 1.3, 0.7])
 TWO = {"temperature_K": 300, "friction": 0.01 / FS, "fast_steps": 4, "rng": 3}
 
 
-class Waves(Calculator):
-    """A field that is the same nowhere, of some strength; from call `bad` on NaN."""
+class Waves(Field):
+    """A field that is the same nowhere, of some strength."""
 
-    implemented_properties = ("energy", "forces")
-
-    def __init__(self, size=0.2, bad=None):
-        super().__init__()
-        self.size, self.bad, self.calls = size, bad, 0
+    def __init__(self, size=0.2):
+        super().__init__(size)
 
     def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):
         super().calculate(atoms, properties, system_changes)
         phase = K * atoms.positions + [0.1, 0.5, 0.9]
-        forces = self.size * np.sin(phase)
-        if self.bad is not None and self.calls >= self.bad:
-            forces[1, 1] = np.nan
-        self.calls += 1
-        self.results = {"energy": float((self.size * np.cos(phase) / K).sum()), "forces": forces}
+        energy = float((self.stiffness * np.cos(phase) / K).sum())
+        self.results = {"energy": energy, "forces": self.stiffness * np.sin(phase)}
 
 
-class Pairs(Calculator):
-    """Pairs, with a twist where there is one: adds up to nothing, knows no place; energies without a twist."""
-
-    implemented_properties = ("energy", "forces")
-
-    def __init__(self, twist=0.05):
-        super().__init__()
-        self.twist = twist
+class Pairs(Field):
+    """Pairs with a twist: forces add up to nothing and know no place."""
 
     def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):
         super().calculate(atoms, properties, system_changes)
         x = atoms.positions - atoms.positions.mean(axis=0)
-        turning = self.twist * np.cross([0.2, 0.1, 1.0], x)
-        self.results = {"energy": 0.05 * float((x * x).sum()), "forces": -0.1 * x + turning}
+        self.results["forces"] = -0.1 * x + 0.05 * np.cross([0.2, 0.1, 1.0], x)
 
 
-def waters(n=3, calc=None, temperature=300.0, momenta=True, zero_momentum=False) -> Atoms:
-    atoms = Atoms()
-    for k in range(n):
-        one = molecule("H2O")
-        one.rotate(40 * k, [1.0, k, 2.0])
-        one.translate([3.1 * k, 0.3 * k, 0])
-        atoms += one
+def waters(n=3, calc=None, momenta=True, zero_momentum=False) -> Atoms:
+    atoms, _ = rigid(n, temperature=None)
     atoms.calc = Waves() if calc is None else calc
-    constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
     if momenta:
-        draw_velocities(atoms, temperature, 1, zero_momentum=zero_momentum)
+        draw_velocities(atoms, 300.0, 1, zero_momentum=zero_momentum)
     return atoms
 
 

@@ -7,8 +7,11 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from ase.build import molecule
+from ase.collections import g2
 from numpy.typing import NDArray
 
+from kcons.ase.topology import bonds_of
 from kcons.constraints import (
     Angle,
     Constraint,
@@ -24,6 +27,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import SingularGeometryError
 from kcons.motion import Motion
 from kcons.plan.second_order import without_second_order_rows
+from kcons.topology import bond_angles
 
 Array = NDArray[np.float64]
 
@@ -333,30 +337,19 @@ def test_many_molecules_are_found_one_by_one() -> None:
 @pytest.mark.parametrize("what", ["bonds and angles", "all distances"])
 def test_molecules_of_the_g2_set(what: str) -> None:
     """159 real geometries, flat ones and symmetric ones: none is refused, and what was asked for is held."""
-    build = pytest.importorskip("ase.build")
-    names = pytest.importorskip("ase.collections").g2.names
-    neighbors = pytest.importorskip("ase.neighborlist")
     rng = np.random.default_rng(0)
     converted_sets = 0
-    for name in names:
-        atoms = build.molecule(name)
-        x = atoms.positions.copy()
-        near = neighbors.neighbor_list("ij", atoms, neighbors.natural_cutoffs(atoms, mult=1.15))
-        bonds = [(int(i), int(j)) for i, j in zip(*near, strict=True) if i < j]
-        if len(x) < 3 or not bonds:
+    for name in g2.names:
+        atoms = molecule(name)
+        x, bonds = atoms.positions.copy(), bonds_of(atoms)
+        angles = bond_angles(bonds, len(x))
+        if len(x) < 3 or not len(bonds):
             continue
-        links: list[list[int]] = [[] for _ in x]
-        for i, j in bonds:
-            links[i].append(j)
-            links[j].append(i)
-        angles = [(i, j, k) for j in range(len(x)) for i, k in combinations(sorted(links[j]), 2)]
-        rows: list[Constraint]
+        rows: list[Constraint] = [Distance(pairs_of(len(x)))]
         if what == "bonds and angles":
-            if any(abs(atoms.get_angle(*t)) > 179.99 for t in angles) or not angles:
+            if any(abs(atoms.get_angle(*t)) > 179.99 for t in angles) or not len(angles):
                 continue
             rows = [Distance(bonds), Angle(angles)]
-        else:
-            rows = [Distance(pairs_of(len(x)))]
         given = ConstraintSet(rows, x, atoms.get_masses())
         motion = Motion(given, x)
         converted_sets += motion.constraint_set is not given
