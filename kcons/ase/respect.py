@@ -12,6 +12,7 @@ from kcons.constraints.compilation import njit
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.motion.certificate import off_row
 from kcons.motion.motion import Motion
 from kcons.thermostats.cells import constraint_virial, rows_open
 
@@ -103,8 +104,7 @@ class AcceptedPositions:
         good = not (changed or elsewhere or differ(self._positions, x))
         if not good:
             scaled = changed and self._scaled(motion, x, cell)
-            worst = _worst_row(motion.constraint_set, x)
-            good = worst is None
+            good = _worst_row(motion.constraint_set, x)[0] < 0
             if good:
                 self.know(x, cell)
             elif not scaled:
@@ -175,14 +175,11 @@ class AcceptedPositions:
 UNKNOWN = AcceptedPositions(0)
 
 
-def _worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[int, float] | None:
-    """The row that `x` violates most beyond START_TOLERANCE, and by how much; None if there is none."""
+def _worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[int, float]:
+    """The row that `x` violates most beyond START_TOLERANCE, -1 if there is none, and by how much."""
     miss = np.abs(held.value(x, time))
-    allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
-    if np.all(miss <= allowed):
-        return None
-    row = int(np.argmax(np.where(np.isnan(miss), np.inf, miss / allowed)))
-    return row, float(miss[row])
+    row = off_row(miss, np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time)))
+    return row, float(miss[row]) if row >= 0 else 0.0
 
 
 def require_on_surface(
@@ -192,9 +189,8 @@ def require_on_surface(
 
     With `UnsupportedError` where a dynamics class moved them there.
     """
-    worst = _worst_row(held, x, time)
-    if worst is not None:
-        row, miss = worst
+    row, miss = _worst_row(held, x, time)
+    if row >= 0:
         finite_array(x, held.n_atoms, "position")
         said = f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target(time)[row]:.6g}): {why}"
         raise UnsupportedError(said) if by_class else InputError(said, item="positions", atoms=held.row_atoms(row))
@@ -258,7 +254,7 @@ def refuse_taken_along(
 
 def fulfilled(held: ConstraintSet, x: FloatArray) -> bool:
     """Whether positions fulfill the rows: to rounding, or to the digits that they come with."""
-    if _worst_row(held, x) is None:
+    if _worst_row(held, x)[0] < 0:
         return True
     for digits in DIGITS:
         written = x[held.touched] * 10.0**digits
