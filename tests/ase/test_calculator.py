@@ -12,8 +12,7 @@ from ase.calculators.lj import LennardJones
 from ase.optimize import BFGS, FIRE
 
 from kcons.ase import ConstrainedCalculator, Constraints, constrain
-from kcons.constraints import Angle, Distance, LinearVelocity
-from kcons.errors import UnsupportedError
+from kcons.constraints import Angle, Distance
 
 ROWS = [Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2], [1, 0, 3]])]
 
@@ -91,23 +90,6 @@ def test_new_masses_and_settings_are_noticed():
         assert np.array_equal(seen[-1], fresh(inner, masses))
 
 
-def test_off_the_constraints_energy_and_forces_belong_to_one_function():
-    atoms, _ = ethanol()
-    atoms.get_forces()
-    x = atoms.get_positions()
-    direction = np.random.default_rng(1).normal(size=(9, 3))
-    for distance in (0.0, 1e-4):
-        atoms.positions = x + distance * direction
-        forces = atoms.get_forces()
-        energies = []
-        for h in (1e-5, -1e-5):
-            atoms.positions = x + (distance + h) * direction
-            energies.append(atoms.get_potential_energy())
-        # Exact on the constraints; of first order in the distance off them.
-        slope = (energies[0] - energies[1]) / 2e-5
-        assert -float(np.vdot(forces, direction)) == pytest.approx(slope, abs=1e-6 + 100 * distance)
-
-
 @pytest.mark.parametrize("optimizer", [BFGS, FIRE])
 def test_optimizer_without_a_constraint_object(optimizer):
     peer = molecule("CH3CH2OH")
@@ -144,13 +126,6 @@ def test_other_properties_are_passed_on():
     assert atoms.get_potential_energies().shape == (9,)
     with pytest.raises(PropertyNotImplementedError):
         atoms.get_dipole_moment()
-
-
-def test_rows_that_need_time_or_velocities():
-    atoms = molecule("H2O")
-    atoms.calc = ConstrainedCalculator(EMT(), LinearVelocity(0, [[1, 0, 0]]))
-    with pytest.raises(UnsupportedError, match="constrains velocities"):
-        atoms.get_forces()
 
 
 class Unnamed(EMT):

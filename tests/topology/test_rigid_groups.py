@@ -16,7 +16,6 @@ from kcons.topology.rigid_groups import (
     body_rows,
     find_waters,
     listed_bodies,
-    residue_bodies,
     water_rows,
 )
 
@@ -87,20 +86,6 @@ def test_bodies_that_share_an_edge_hold_it_once():
     assert sum(r.n_rows for r in rows) == 5
 
 
-@pytest.mark.parametrize(
-    ("bodies", "said"),
-    [([[0]], "two atoms or more"), ([[0, 9]], "names atom 9; there are atoms 0 to 2"), ([[0, 1, 0]], "atom 0 twice")],
-)
-def test_impossible_bodies_are_named(bodies, said):
-    with pytest.raises(InputError, match=said):
-        listed_bodies(snapshot(["O", "H", "H"], WATER), bodies)
-
-
-def test_unknown_residue_is_named_with_near_misses():
-    with pytest.raises(InputError, match=r"no residue is called BNZZ \(did you mean 'BNZ'\?\); there are ALA, BNZ"):
-        residue_bodies(snapshot(["C", "C"], WATER[:2], residues=[0, 1], residue_names=["BNZ", "ALA"]), ["BNZZ"])
-
-
 def test_four_site_water_with_its_site_placed():
     m = 0.15 * (WATER[1] + WATER[2]) / np.linalg.norm(WATER[1] + WATER[2])
     molecule = np.vstack([WATER, m])
@@ -169,11 +154,6 @@ def test_sites_that_cannot_be_placed_are_refused(atom, place, what):
     with pytest.raises(InputError, match=what) as caught:
         find_waters(made)
     assert caught.value.item == "positions"
-
-
-def test_hydrogens_may_come_before_the_oxygen():
-    made = snapshot(["H", "O", "H"], WATER[[1, 0, 2]], residue_names=["HOH"])
-    assert find_waters(made).triples.tolist() == [[1, 0, 2]]
 
 
 def test_particles_with_mass_are_no_sites():
