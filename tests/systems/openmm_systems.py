@@ -12,11 +12,16 @@ import pytest
 from openmm import app, unit
 from openmm_parts import HeldCoordinates
 
+from kcons.openmm.device import build
+
 DATA = Path(__file__).resolve().parents[1] / "data"
 #: What every test that is parametrised by platform runs on: they carry exact doubles and are on every machine.
 #: Platforms of a GPU, or OpenCL on the CPU, may be there as well; no test depends on whether they are.
 PLATFORMS = ("Reference", "CPU")
 LONG = pytest.mark.validation
+#: By the plugin, where there can be one: 'device' in the name of a test lets it have one, see tests/conftest.py.
+DEVICE = pytest.param(True, id="device", marks=pytest.mark.skipif(bool(build.refusal()), reason=build.refusal()))
+with_and_without_device = pytest.mark.parametrize("device", [False, DEVICE])
 #: With several threads, forces are summed in any order, and no run is like another.
 PROPERTIES = {"CPU": {"Threads": "1", "DeterministicForces": "true"}}
 

@@ -1,15 +1,18 @@
 """Eight particles tied by springs, and integrators that move them."""
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import openmm
+import pytest
 from collective_cases import bond
 from openmm_systems import field, pairs_force, particles, started
 
 from kcons.constraints import Distance
-from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
+from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row, hold
+from kcons.openmm.device import build
 
 X = np.random.default_rng(3).random((8, 3)) * 0.3
 
@@ -41,30 +44,29 @@ class Made:
 
 
 def thermostatted(ensemble, **options):
-    def make(strength=200.0):
-        integrator = ProjectedIntegrator(0.002, ensemble=ensemble, **options)
-        return begun(cluster(strength, bonded=True), integrator)
-
-    return make
+    return lambda strength=200.0: begun(cluster(strength, bonded=True), ensemble=ensemble, **options)
 
 
-def begun(system, integrator, restore=None, part=None):
+def begun(system, part=None, **options):
+    if options.get("device") and (why := build.refusal()):
+        pytest.skip(why)
+    integrator = ProjectedIntegrator(0.002, parts=[part] if part else [], **options)
     context = started(system, integrator, X, 0.3 * np.random.default_rng(1).normal(size=X.shape))
-    if restore is not None:
-        restore(context)
+    if part:
+        integrator.applyConstraints()
+        integrator.applyVelocityConstraints()
     return Made(integrator, context, part)
 
 
-def row_at(target=0.30, strength=200.0, **options):
+def row_at(target=0.30, strength=200.0, rate=0.0, **options):
     system = cluster(strength)
-    rows = CollectiveRows(system, [Row(bond(0, 7), target)], positions=X)
-    return begun(system, ProjectedIntegrator(0.002, parts=[rows], **options), rows.restore, rows)
+    rows = CollectiveRows(system, [Row(bond(0, 7), target, rate)], positions=X)
+    return begun(system, rows, **options)
 
 
 def carried_at(target=0.30, strength=200.0, **options):
     system = cluster(strength)
-    part = hold(system, [Distance([[0, 7]], target)], X)
-    return begun(system, ProjectedIntegrator(0.002, parts=[part], **options), part.apply_positions, part)
+    return begun(system, hold(system, [Distance([[0, 7]], target)], X), **options)
 
 
 #: Every class and ensemble, each as often as wanted.
@@ -79,4 +81,13 @@ KINDS = {
     "carried": carried_at,
     "carried, Langevin": lambda **given: carried_at(ensemble=Langevin(300, 1.0), **given),
     "carried, suzuki4": lambda **given: carried_at(scheme="suzuki4", **given),
+}
+
+
+#: The same by the plugin, where there can be one.
+ON_DEVICE = {
+    "device": thermostatted(None, device=True),
+    "device, Langevin": thermostatted(Langevin(300, 1.0), device=True),
+    "device, NoseHoover": thermostatted(NoseHoover(300, 5.0), device=True),
+    "device, carried": functools.partial(carried_at, device=True),
 }

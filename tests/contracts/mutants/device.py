@@ -51,6 +51,6 @@ MUTANTS = {
             "part if part.program is None «else copy.deepcopy(part)→else part»",
             "kernel_rows::parts_serve_integrators_of_other_systems",
         ),
-        ("if told[_FAILED]«→ and False»:", "device_integrator::rows_without_solution_are_told_and_taken_back"),
+        ("if told[_FAILED]«→ and False»:", "device_integrator::a_failure_leaves_the_state_before_the_step"),
     ],
 }

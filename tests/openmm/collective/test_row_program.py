@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import math
 
@@ -12,7 +11,7 @@ import pytest
 from collective_cases import CHAIN, angle, bond, dihedral, dipeptide, energy_of, held_chain
 from ensemble_runs import run
 from openmm import app, unit
-from openmm_systems import loose_alanine, pairs_force, particles, started, state_of
+from openmm_systems import loose_alanine, pairs_force, particles, state_of
 
 from kcons.constraints import Dihedral
 from kcons.errors import ConstraintError, ConvergenceError
@@ -179,20 +178,3 @@ def test_products_are_summed_only_where_rows_meet():
     integrator = ProjectedIntegrator(0.002, parts=[part])
     sums = [integrator.getComputationStep(k)[2] for k in range(integrator.getNumComputations())]
     assert sum(text.startswith("m*row1_") for text in sums) == 3 * 4  # where a call begins, in it, where it ends
-
-
-@pytest.mark.parametrize("steps", [1, 2])
-def test_copies_of_an_integrator_have_its_clock(steps):
-    """Also after a single step."""
-    x = np.array([[0, 0, 0], [0.3, 0, 0]])
-    system = particles([12.0, 12.0])
-    part = CollectiveRows(system, [Row(bond(0, 1), 0.3, rate=1.0)])
-    integrator = ProjectedIntegrator(1e-3, parts=[part])
-    context = started(system, integrator, x)
-    part.restore(context)
-    integrator.step(steps)
-    again = copy.copy(integrator)
-    other = started(system, again, state_of(context)[0])
-    again.parts[0].restore(other)
-    again.step(1)
-    assert again.parts[0].values(other) == pytest.approx(0.3 + 1e-3 * (steps + 1), abs=1e-12)

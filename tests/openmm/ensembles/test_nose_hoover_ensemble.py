@@ -3,7 +3,6 @@
 import copy
 
 import numpy as np
-import openmm
 import pytest
 from ensemble_runs import run
 from openmm import unit
@@ -180,22 +179,3 @@ def test_step_sizes_that_the_chain_cannot_follow_are_refused_in_a_run():
     integrator.setStepSize(1.3e-3)
     integrator.step(1)
     assert context.getStepCount() == 2
-
-
-@pytest.mark.usefixtures("without_device")
-def test_the_chain_belongs_to_the_state_and_temperature_to_the_integrator():
-    system, x, v = alanine()
-    first = ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 20.0))
-    context = run(system, first, x, v, 20)
-    chain = first.program.remembered()
-    kept = context.getState(positions=True, velocities=True, parameters=True, integratorParameters=True)
-    text = openmm.XmlSerializer.serialize(kept)
-    other = ProjectedIntegrator(1e-3, ensemble=NoseHoover(350.0, 10.0))
-    there = started(system, other, x, v)
-    there.setState(openmm.XmlSerializer.deserialize(text))
-    assert other.program.remembered() == chain
-    other.step(1)
-    assert other.getTemperature() == 350 * unit.kelvin
-    assert other.getGlobalVariableByName("frequency") == 10.0
-    twin = copy.copy(first)
-    assert all(value == 0 for value in twin.program.remembered().values())

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from collective_cases import bond
 from openmm import unit
-from openmm_systems import PLATFORMS, field, masses_of, on_gpus, particles, started, state_of
+from openmm_systems import (
+    DEVICE,
+    PLATFORMS,
+    field,
+    masses_of,
+    on_gpus,
+    particles,
+    started,
+    state_of,
+    with_and_without_device,
+)
 
 from kcons.constraints import Distance
 from kcons.openmm import (
@@ -69,11 +79,11 @@ def kelvins(integrator, context, platform):
     return (*blocks.mean(axis=0), blocks[:, 0].std(ddof=1) / np.sqrt(20))
 
 
-def bath(ensemble, step=STEP, parts=lambda system, x: (x, [])):
+def bath(ensemble, step=STEP, parts=lambda system, x: (x, []), **options):
     def make(platform):
         system, x = oscillators()
         x, held = parts(system, x)
-        integrator = ProjectedIntegrator(step * unit.picosecond, parts=held, ensemble=ensemble)
+        integrator = ProjectedIntegrator(step * unit.picosecond, parts=held, ensemble=ensemble, **options)
         integrator.setRandomNumberSeed(11)
         return integrator, started(system, integrator, x, platform=platform)
 
@@ -84,6 +94,8 @@ BATHS = {
     "Langevin": bath(Langevin(300, 10.0)),
     "collective": bath(Langevin(300, 10.0), parts=collective),
     "carried": bath(Langevin(300, 10.0), parts=carried),
+    "device": bath(Langevin(300, 10.0), device=True),
+    "device at high friction": bath(Langevin(300, 100.0), device=True),
 }
 
 
@@ -92,6 +104,10 @@ BATHS = {
     [
         *((name, "Reference") for name in BATHS),
         ("Langevin", "CPU"),
+        *(
+            pytest.param(*each, marks=DEVICE.marks)
+            for each in (*((name, "Reference") for name in ON_DEVICE), ("device", "CPU"))
+        ),
         *(pytest.param("Langevin", *p.values, id=p.id, marks=p.marks) for p in on_gpus("mixed")),
     ],
 )
@@ -159,10 +175,11 @@ def test_of_velocities_that_others_have_set_it_is_theirs(parts):
     assert energy_of(fresh) == pytest.approx(6.0 * np.sum(v**2), rel=1e-12)
 
 
+@with_and_without_device
 @pytest.mark.parametrize("platform", PLATFORMS)
-def test_checkpoints_and_states_bring_it_along(platform):
+def test_checkpoints_and_states_bring_it_along(platform, device):
     system, x = oscillators(5)
-    integrators = [ProjectedIntegrator(STEP, ensemble=Langevin(300, 10.0)) for _ in range(3)]
+    integrators = [ProjectedIntegrator(STEP, ensemble=Langevin(300, 10.0), device=device) for _ in range(3)]
     ours, second, third = (started(system, one, x, platform=platform) for one in integrators)
     integrators[0].step(4)
     second.loadCheckpoint(ours.createCheckpoint())

@@ -11,12 +11,20 @@ import openmm
 import pytest
 from ensemble_runs import run
 from openmm import unit
-from openmm_systems import holding, loose_alanine, potential_energy, started, state_of
-from tied_cluster import EVERYTHING, KINDS, MASSES, X, carried_at, cluster, row_at, thermostatted
+from openmm_systems import field, holding, particles, potential_energy, started, state_of
+from tied_cluster import EVERYTHING, KINDS, MASSES, ON_DEVICE, X, carried_at, cluster, row_at, thermostatted
 
 from kcons.constraints import Plane
 from kcons.errors import KconsError, OverdeterminedError, UnsupportedError
-from kcons.openmm import HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
+from kcons.openmm import (
+    HamiltonianMonteCarlo,
+    Isokinetic,
+    Langevin,
+    NoseHoover,
+    NoseHooverMiddle,
+    ProjectedIntegrator,
+    hold,
+)
 from kcons.openmm.quantities import GAS_CONSTANT
 
 #: The trap of `cluster` is round.
@@ -32,32 +40,36 @@ PAIRS = {
         "suzuki4": {"scheme": "suzuki4"},
     }.items()
     if (held, name) != ("collective", "suzuki4")  # whose program takes OpenMM ten seconds
-}
+} | {"collective, moving": functools.partial(row_at, rate=1.0), **ON_DEVICE}
 
 
 @pytest.mark.parametrize(
-    ("kind", "way"), [*((kind, "State") for kind in KINDS), *((kind, "checkpoint") for kind in KINDS | PAIRS)]
+    ("kind", "way"),
+    [
+        *((kind, "State") for kind in (*KINDS, "collective, moving", *ON_DEVICE)),
+        *((kind, "checkpoint") for kind in KINDS | PAIRS),
+    ],
 )
 def test_a_run_goes_on_bit_for_bit(kind, way):
     """In another Context with an integrator of the same settings, and again in its own; noise aside."""
-    if "Langevin" in kind and way != "checkpoint":
+    noisy = "Langevin" in kind and kind not in ON_DEVICE  # where noise belongs to particle, step and seed
+    if noisy and way != "checkpoint":
         pytest.skip("a State does not carry random numbers")
     made, other = ((KINDS | PAIRS)[kind]() for _ in range(2))
-    made.run(7)
-    state, checkpoint = made.context.getState(**EVERYTHING), made.context.createCheckpoint()
+    state, checkpoint = made.run(7), made.context.createCheckpoint()
     if way == "checkpoint":
         other.run(2)
         other.context.loadCheckpoint(checkpoint)
-        if "Langevin" in kind:  # random numbers of the Reference platform belong to the process
-            other.run(5)
-            made.run(1)
-            made.context.loadCheckpoint(checkpoint)
-            made.run(5)
-            np.testing.assert_array_equal(state_of(other.context), state_of(made.context))
-            return
     else:
         other.context.setState(openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(state)))
     assert other.context.getStepCount() == 7
+    if noisy:  # random numbers of the Reference platform belong to the process
+        other.run(5)
+        made.run(1)
+        made.context.loadCheckpoint(checkpoint)
+        made.run(5)
+        np.testing.assert_array_equal(state_of(other.context), state_of(made.context))
+        return
     made.run(5)
     other.run(5)
     end = state_of(made.context)
@@ -73,83 +85,83 @@ def test_a_run_goes_on_bit_for_bit(kind, way):
 # -- settings stay ------------------------------------------------------------------------------------
 
 
-def give(made, other, way):
-    """Load what `made` has into the Context of `other`."""
+def given(made, other, way):
+    """What `made` has, in the Context of `other`, and a step there."""
     if way == "checkpoint":
         other.context.loadCheckpoint(made.context.createCheckpoint())
     else:
         other.context.setState(made.context.getState(**EVERYTHING))
+    other.run()
 
 
-ways = pytest.mark.parametrize("way", ["State", "checkpoint"])
+def kelvins(made):
+    """The temperature at which Isokinetic keeps its kinetic energy."""
+    twice = MASSES @ np.sum(state_of(made.context)[1] ** 2, axis=1)
+    return twice / ((made.integrator.ensemble.count(made.integrator) - 1) * GAS_CONSTANT)
 
 
-@ways
-@pytest.mark.parametrize("part", [False, True])
-def test_friction_and_temperature_stay(way, part):
-    def make(temperature, friction):
-        ensemble = Langevin(temperature, friction)
-        return row_at(ensemble=ensemble) if part else thermostatted(ensemble)()
+def length(made):
+    x = state_of(made.context)[0]
+    return np.linalg.norm(x[0] - x[7])
 
-    made, other = make(300, 1.0), make(400, 50.0)
-    read = other.integrator.getGlobalVariableByName
+
+def bath(made, rate="friction"):
+    read = made.integrator.getGlobalVariableByName
+    return [read(rate), read("kT") / GAS_CONSTANT]
+
+
+def chain(made):
+    return bath(made, "frequency")
+
+
+@pytest.mark.parametrize("way", ["State", "checkpoint"])
+@pytest.mark.parametrize(
+    ("make", "one", "two", "kept", "read"),
+    [
+        (lambda bath: thermostatted(bath)(), Langevin(300, 1.0), Langevin(400, 50.0), [50.0, 400], bath),
+        (lambda bath: row_at(ensemble=bath), Langevin(300, 1.0), Langevin(400, 50.0), [50.0, 400], bath),
+        (lambda bath: thermostatted(bath)(), Isokinetic(300), Isokinetic(400), 400, kelvins),
+        (lambda bath: thermostatted(bath)(), NoseHoover(300, 5.0), NoseHoover(350, 2.0), [2.0, 350], chain),
+        (lambda bath: thermostatted(bath, device=True)(), Langevin(300, 1.0), Langevin(400, 50.0), [50.0, 400], bath),
+        (row_at, 0.20, 0.22, 0.22, length),
+        (carried_at, 0.20, 0.22, 0.22, length),
+    ],
+    ids=["Langevin", "collective, Langevin", "Isokinetic", "NoseHoover", "device, Langevin", "collective", "carried"],
+)
+def test_settings_stay(make, one, two, kept, read, way):
+    """A State of another target is put right in the next step, for it is nearer than a tenth of the length."""
+    made, other = make(one), make(two)
     made.run(3)
+    other.run(2)
     for _ in range(2):
-        give(made, other, way)
-        other.run()
-        assert (read("friction"), read("kT")) == (50.0, GAS_CONSTANT * 400)
+        given(made, other, way)
+        assert read(other) == pytest.approx(kept, rel=1e-12)
+    if read is not bath:
+        return
     other.integrator.setFriction(2 / unit.picosecond)
     other.integrator.setTemperature(350 * unit.kelvin)
-    give(made, other, way)
-    other.run()
-    assert (read("friction"), read("kT")) == (2.0, GAS_CONSTANT * 350)
+    given(made, other, way)
     assert other.integrator.ensemble == Langevin(350, 2.0)
-    for preserved in (True, False):
-        other.context.reinitialize(preserveState=preserved)
-        other.context.setPositions(X)
-        other.run()
-        assert (read("friction"), read("kT")) == (2.0, GAS_CONSTANT * 350)
-
-
-@ways
-def test_the_kinetic_energy_of_isokinetic_stays(way):
-    made, other = thermostatted(Isokinetic(300))(), thermostatted(Isokinetic(400))()
-    made.run(3)
-    other.run(1)
-    give(made, other, way)
-    other.run(2)
-    count = other.integrator.ensemble.count(other.integrator)
-    found = MASSES @ np.sum(state_of(other.context)[1] ** 2, axis=1)
-    assert abs(found / ((count - 1) * GAS_CONSTANT * 400) - 1) < 1e-12
+    for preserved in (None, True, False):
+        if preserved is not None:
+            other.context.reinitialize(preserveState=preserved)
+            other.context.setPositions(X)
+            other.run()
+        assert bath(other) == pytest.approx([2.0, 350], rel=1e-12)
 
 
 def test_a_temperature_that_is_refused_changes_nothing():
     """Of one degree of freedom there is none, and its run goes on."""
-    system, field = openmm.System(), openmm.CustomExternalForce("5*x")
-    field.addParticle(system.addParticle(20.0), [])
-    system.addForce(field)
+    system = particles([20.0], field("5*x", 1))
     part = hold(system, [Plane([0], [0, 1, 0], 0.0), Plane([0], [0, 0, 1], 0.0)], np.zeros((1, 3)))
-    bath = Isokinetic()
-    integrator = ProjectedIntegrator(0.002, parts=[part], ensemble=bath)
+    kept = Isokinetic()
+    integrator = ProjectedIntegrator(0.002, parts=[part], ensemble=kept)
     context = run(system, integrator, np.zeros((1, 3)), np.array([[np.sqrt(0.2), 0, 0]]), 1)
     with pytest.raises(OverdeterminedError, match="g - 1 = 0"):
         integrator.setTemperature(300)
-    assert integrator.ensemble is bath
+    assert integrator.ensemble is kept
     integrator.step(1)
     assert 10 * np.sum(state_of(context)[1] ** 2) == pytest.approx(2.0)
-
-
-@ways
-@pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective", "carried"])
-def test_targets_stay(make, way):
-    """A State of another target is put right in the next step, for it is nearer than a tenth of the length."""
-    made, other = make(0.20), make(0.22)
-    made.run(3)
-    other.run(2)
-    give(made, other, way)
-    other.run(1)
-    x = state_of(other.context)[0]
-    assert abs(np.linalg.norm(x[0] - x[7]) - 0.22) < 1e-12
 
 
 def test_set_target_outlives_a_state():
@@ -164,20 +176,20 @@ def test_set_target_outlives_a_state():
     made.part.restore(made.context)
     made.run()
     assert abs(made.part.values(made.context)[0] - 0.35) < 1e-12
-    assert copy.copy(made.integrator).program.settings == made.integrator.program.settings
 
 
 def test_a_setting_has_a_method_of_its_own():
     """Written by its number, as programs do that copy all variables, it has its value again in the next step."""
-    made = thermostatted(Langevin(300, 1.0))()
-    made.run(2)
-    integrator = made.integrator
-    with pytest.raises(UnsupportedError, match="setting of the integrator"):
-        integrator.setGlobalVariableByName("kT", 3.0)
-    for k in range(integrator.getNumGlobalVariables()):
-        integrator.setGlobalVariable(k, 0.0)
-    made.run()
-    assert integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
+    for ensemble, name in ((Langevin(300, 1.0), "kT"), (Isokinetic(300), "two_k")):
+        made = thermostatted(ensemble)()
+        made.run(2)
+        integrator, kept = made.integrator, made.integrator.getGlobalVariableByName(name)
+        with pytest.raises(UnsupportedError, match="setting of the integrator"):
+            integrator.setGlobalVariableByName(name, 3.0)
+        for k in range(integrator.getNumGlobalVariables()):
+            integrator.setGlobalVariable(k, 0.0)
+        made.run()
+        assert integrator.getGlobalVariableByName(name) == kept > 1
 
 
 def test_zero_kelvin_brings_to_rest():
@@ -253,49 +265,61 @@ def test_a_long_time_step_without_a_unit_is_asked_about(make, step):
 
 # -- copies and files ---------------------------------------------------------------------------------
 
-copies = pytest.mark.parametrize("how", [copy.copy, lambda i: pickle.loads(pickle.dumps(i))], ids=["copy", "pickle"])
+COPIES = {"copy": copy.copy, "pickle": lambda one: pickle.loads(pickle.dumps(one)), "text": openmm.XmlSerializer.clone}
 
 
-@copies
-@pytest.mark.parametrize("kind", KINDS)
-def test_copies_have_the_settings_of_now(kind, how):
-    made = KINDS[kind]()
-    if kind.startswith("carried") and how is not copy.copy:
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize("kind", [*KINDS, "collective, moving", *ON_DEVICE])
+def test_copies_have_the_settings_of_now_and_make_the_same_steps(kind, how):
+    """The text is the bare program with all that it was made with, which runs without Python."""
+    made, again = ((KINDS | PAIRS)[kind]() for _ in range(2))
+    integrator = again.integrator
+    if "carried" in kind and how == "pickle":
         with pytest.raises(UnsupportedError, match="belong to their System"):
-            how(made.integrator)
+            COPIES[how](integrator)
         return
-    if "Langevin" in kind:
-        made.integrator.setTemperature(310)
-        made.integrator.setFriction(3)
-    if kind.startswith("collective"):
-        made.part.set_target(made.integrator, 0, 0.31)
-    again = how(made.integrator)
-    assert type(again) is type(made.integrator)
-    assert again.program.settings == made.integrator.program.settings
-    assert again.ensemble == made.integrator.ensemble
-    for name, value in again.program.settings.items():
-        assert again.getGlobalVariableByName(name) == value
-    assert again.getStepSize() == made.integrator.getStepSize()
+    for one in (made, again):
+        if "Langevin" in kind:
+            one.integrator.setTemperature(310)
+            one.integrator.setFriction(0)
+        if kind.startswith("collective"):
+            one.part.set_target(one.integrator, 0, 0.31)
+            one.part.restore(one.context)
+        one.run(2)
+    for name in made.integrator.program.memory:  # what belongs to a state a copy starts without
+        made.integrator.setGlobalVariableByName(name, 0.0)
+    other = COPIES[how](integrator)
+    if how == "text":
+        assert type(other) is (openmm.Integrator if kind in ON_DEVICE else openmm.CustomIntegrator)
+    else:
+        assert type(other) is type(integrator)
+        assert other.program.settings == integrator.program.settings
+        assert other.ensemble == integrator.ensemble
+        for name, value in other.program.settings.items():
+            assert other.getGlobalVariableByName(name) == value
+    context = started(again.context.getSystem(), other, *state_of(made.context))
+    for part in getattr(other, "parts", ()):
+        assert part is not again.part or "carried" in kind
+    if (kind, how) == ("device, carried", "text"):
+        with pytest.raises(openmm.OpenMMException, match="keep a reference to it"):
+            other.step(1)
+        return
+    other.step(6)
+    made.run(6)
+    np.testing.assert_allclose(state_of(context), state_of(made.context), rtol=0, atol=1e-9)
+    assert context.getStepCount() == 6
 
 
-@copies
-@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6"])
-def test_copies_make_the_same_steps(scheme, how):
-    system, x, v = loose_alanine()
-    integrator = ProjectedIntegrator(1e-3, scheme, parts=[holding()], tolerance=1e-11, check_every=17)
+@pytest.mark.parametrize("how", ["copy", "pickle"])
+def test_copies_are_made_with_the_same(how):
+    integrator = ProjectedIntegrator(1e-3, "blanes-moan6", parts=[holding()], tolerance=1e-11, check_every=17)
     integrator.setRandomNumberSeed(3)
     integrator.setIntegrationForceGroups({0, 1, 2})
-    context = run(system, integrator, x, v, 3)
-    again = how(integrator)
+    again = COPIES[how](integrator)
     assert again.program.lines == integrator.program.lines
     assert (again.getConstraintTolerance(), again.check_every, again.getRandomNumberSeed()) == (1e-11, 17, 3)
-    assert again.getIntegrationForceGroups() == 7
+    assert again.getIntegrationForceGroups() == 7 and again.getStepSize() == integrator.getStepSize()
     assert again.parts[0] is not integrator.parts[0]
-    other = started(system, again, *state_of(context))
-    integrator.step(3)
-    again.step(3)
-    np.testing.assert_allclose(state_of(context), state_of(other), rtol=1e-9, atol=1e-12)
-    assert other.getStepCount() == 3
 
 
 def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context():
@@ -310,23 +334,3 @@ def test_the_temperature_of_a_copy_can_be_changed_before_it_has_a_context():
     found, before = (MASSES @ np.sum(state_of(each)[1] ** 2, axis=1) for each in contexts)
     assert found / before == pytest.approx(310 / 300, rel=1e-12)
     np.testing.assert_allclose(state_of(contexts[1]), state_of(made.context), rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["constant energy", "suzuki4", "Isokinetic", "Langevin", "carried", "collective"])
-def test_the_bare_program_makes_the_same_steps(kind):
-    """Of an integrator that has run, with all that it was made with, and without Python."""
-    made, again = KINDS[kind](), KINDS[kind]()
-    for one in (made, again) if "Langevin" in kind else ():
-        one.integrator.setFriction(0)
-    made.run(2)
-    again.run(2)
-    text = openmm.XmlSerializer.serialize(again.integrator)
-    assert "kcons" not in text
-    bare = openmm.XmlSerializer.deserialize(text)
-    assert type(bare) is openmm.CustomIntegrator
-    context = openmm.Context(again.context.getSystem(), bare, openmm.Platform.getPlatformByName("Reference"))
-    context.setPositions(state_of(made.context)[0])
-    context.setVelocities(state_of(made.context)[1])
-    bare.step(6)
-    made.run(6)
-    np.testing.assert_allclose(state_of(context), state_of(made.context), rtol=0, atol=1e-9)
