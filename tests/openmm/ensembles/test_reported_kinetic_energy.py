@@ -102,12 +102,8 @@ BATHS = {
 @pytest.mark.parametrize(
     ("name", "platform"),
     [
-        *((name, "Reference") for name in BATHS),
-        ("Langevin", "CPU"),
-        *(
-            pytest.param(*each, marks=DEVICE.marks)
-            for each in (*((name, "Reference") for name in ON_DEVICE), ("device", "CPU"))
-        ),
+        *(pytest.param(name, "Reference", marks=DEVICE.marks if "device" in name else ()) for name in BATHS),
+        *(("Langevin", "CPU"), pytest.param("device", "CPU", marks=DEVICE.marks)),
         *(pytest.param("Langevin", *p.values, id=p.id, marks=p.marks) for p in on_gpus("mixed")),
     ],
 )
