@@ -45,8 +45,8 @@ def driven():
     return system, hold(system, Distance([[0, 1]], _longer), x), x
 
 
-def begun(system, part, x):
-    integrator = ProjectedIntegrator(0.01, parts=[part])
+def begun(system, part, x, **options):
+    integrator = ProjectedIntegrator(0.01, parts=[part], **options)
     context = started(system, integrator, x)
     integrator.applyVelocityConstraints(context)
     return integrator, context

@@ -47,20 +47,20 @@ def thermostatted(ensemble, **options):
     return lambda strength=200.0: begun(cluster(strength, bonded=True), ensemble=ensemble, **options)
 
 
-def begun(system, part=None, **options):
+def begun(system, part=None, platform="Reference", **options):
     if options.get("device") and (why := build.refusal()):
         pytest.skip(why)
     integrator = ProjectedIntegrator(0.002, parts=[part] if part else [], **options)
-    context = started(system, integrator, X, 0.3 * np.random.default_rng(1).normal(size=X.shape))
+    context = started(system, integrator, X, 0.3 * np.random.default_rng(1).normal(size=X.shape), platform)
     if part:
         integrator.applyConstraints()
         integrator.applyVelocityConstraints()
     return Made(integrator, context, part)
 
 
-def row_at(target=0.30, strength=200.0, rate=0.0, **options):
-    system = cluster(strength)
-    rows = CollectiveRows(system, [Row(bond(0, 7), target, rate)], positions=X)
+def row_at(target=0.30, strength=200.0, rate=0.0, bonded=False, **options):
+    system = cluster(strength, bonded)
+    rows = CollectiveRows(system, [Row(bond(0, 7), target, rate, name="my bond")], positions=X)
     return begun(system, rows, **options)
 
 

@@ -50,9 +50,9 @@ MUTANTS = {
         ('", "good_steps+«delta(failed)→1»", "count it")', "steps::a_failed_step_is_taken_back_and_not_counted"),
         (
             '"failed > 0", "a solve failed"):\n        p.each("x", "x«_last→»"',
-            "collective_rows::a_step_too_large_is_taken_back",
+            "steps::a_step_without_a_solution_is_taken_back",
         ),
-        ('p.each("v", "v«_last→»", "back to where the step began")', "collective_rows::a_step_too_large_is_taken_back"),
+        ('p.each("v", "v«_last→»", "back to where the step began")', "steps::a_step_without_a_solution_is_taken_back"),
         ('"«select(looked, v_last, u-0.5*dt*f/m)→v_last»"', "steps::failure_where_nobody_looked"),
         ('middle(p, f"«→v+»(x-x_start)/', "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),
         ('kick(p, "«kick→0.5»*dt", tangent', "langevin_ensemble::langevin_without_friction_is_the_drift_in_two_halves"),

@@ -11,12 +11,10 @@ import numpy as np
 import openmm
 import pytest
 from carried_systems import begun, driven, off_target, peptide
-from ensemble_runs import run
-from openmm import unit
 from openmm_systems import context_of, particles, started, state_of
 
 from kcons.constraints import Custom, Distance
-from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import CarriedConstraints, ProjectedIntegrator, hold
 from kcons.openmm.integrator.part import Precision
 
@@ -81,24 +79,6 @@ def test_callbacks_keep_no_memory():
     before = sys.getrefcount(nothing)
     integrator.step(50)
     assert sys.getrefcount(nothing) == before
-
-
-@pytest.mark.parametrize("platform", ["Reference", "CPU"])
-@pytest.mark.usefixtures("without_device")
-def test_a_step_too_large_is_taken_back(platform):
-    part = hold(system := particles([1.0, 1.0]), Distance([[0, 1]]), [[-0.5, 0, 0], [0.5, 0, 0]])
-    integrator = ProjectedIntegrator(0.1 * unit.picosecond, parts=[part])
-    context = run(system, integrator, [[-0.5, 0, 0], [0.5, 0, 0]], [[0, -0.5, 0], [0, 0.5, 0]], 3, platform)
-    integrator.setStepSize(1.5 * unit.picosecond)  # no solution where angle would be asin(1.5)
-    before = state_of(context)
-    with pytest.raises(ConvergenceError, match="step 4: time step too large") as caught:
-        integrator.step(5)
-    assert caught.value.step == 4
-    assert caught.value.atoms == (0, 1)
-    assert all(np.array_equal(a, b) for a, b in zip(before, state_of(context), strict=True))
-    integrator.setStepSize(0.1 * unit.picosecond)
-    integrator.step(3)
-    part.check(context)
 
 
 # -- copies -----------------------------------------------------------------------------------------

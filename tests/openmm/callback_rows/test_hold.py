@@ -8,7 +8,7 @@ import pytest
 from carried_systems import PEPTIDE, begun, driven, off_target, start
 from collective_cases import dihedral
 from openmm import app, unit
-from openmm_systems import context_of, field, particles, started, state_of
+from openmm_systems import context_of, field, particles, started, state_of, with_and_without_device
 
 from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, FixedAtoms, Plane, RadiusOfGyration, Sphere
 from kcons.errors import ContradictionError, InputError, UnsupportedError
@@ -231,9 +231,10 @@ def test_particles_without_mass_take_no_degree_of_freedom():
     assert integrator.computeSystemTemperature() / unit.kelvin == pytest.approx(twice / unit.kelvin, rel=1e-12)
 
 
-def test_time_that_is_set_is_no_way_of_moving_targets():
+@with_and_without_device
+def test_time_that_is_set_is_no_way_of_moving_targets(device):
     """What a step would have to go is made into velocity of all that hangs on the rows."""
-    integrator, context = begun(*driven())
+    integrator, context = begun(*driven(), device=device)
     integrator.step(2)
     context.setTime(3.0)
     with pytest.raises(InputError, match="positions are off row"):

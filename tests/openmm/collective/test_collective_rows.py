@@ -21,8 +21,7 @@ from collective_cases import (
     some_velocities,
     spring_forces,
 )
-from openmm import unit
-from openmm_systems import GPUS, PLATFORMS, field, pairs_force, particles, residuals, started, state_of
+from openmm_systems import GPUS, field, pairs_force, particles, residuals, started, state_of
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, RadiusOfGyration
@@ -106,28 +105,6 @@ def test_dihedral_held_across_its_jump(target):
 
 
 # -- failures -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
-@pytest.mark.parametrize("constrained", [False, True], ids=["free", "constrained"])
-@pytest.mark.parametrize("platform", PLATFORMS)
-def test_a_step_too_large_is_taken_back(platform, constrained, scheme):
-    context, integrator, part = held_chain(
-        [Row(bond(0, 3), name="my bond")], scheme, platform=platform, constrained=constrained
-    )
-    integrator.step(3)
-    x, v = state_of(context)
-    integrator.setStepSize(1.0 * unit.picosecond)
-    with pytest.raises(ConvergenceError, match=r"step 4: row 0 \(my bond\) is off by .* iterations") as caught:
-        integrator.step(2)
-    assert caught.value.row == 0
-    assert caught.value.iterations > 1
-    assert caught.value.residual > part.tolerance
-    assert np.array_equal(state_of(context)[0], x)
-    assert np.array_equal(state_of(context)[1], v)
-    integrator.setStepSize(0.002)
-    integrator.step(3)
-    assert np.abs(part.residuals(context)).max() <= 1e-12
 
 
 def test_velocities_that_are_no_numbers_are_refused():

@@ -257,23 +257,6 @@ def test_virtual_sites_follow(rows):
     assert difference(*contexts) < 1e-10
 
 
-def test_compound_integrators_run_it():
-    system, x, v = waters()
-    compound = openmm.CompoundIntegrator()
-    member = ProjectedIntegrator(0.001, device=True)
-    compound.addIntegrator(member)
-    compound.addIntegrator(openmm.VerletIntegrator(0.001))
-    context = started(system, compound, x, v)
-    alone = run(ProjectedIntegrator(0.001, device=True), system, x, v, calls=(10,))
-    compound.step(10)
-    assert difference(context, alone) < 1e-8  # each step ends there, so that tolerances come in more often
-    compound.setCurrentIntegrator(1)
-    compound.step(2)
-    compound.setCurrentIntegrator(0)
-    compound.step(2)
-    assert residuals(system, context)[0] < 1e-9
-
-
 def test_reinitialize_keeps_what_belongs_to_the_state():
     system, x, v = waters()
     bath = NoseHoover(300.0, 10.0)

@@ -12,7 +12,7 @@ from openmm_systems import field as on_each
 
 from kcons import ConstraintSet, Motion, State, System
 from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, Formula, LinearRelation, Plane, Sphere
-from kcons.errors import ContradictionError, ConvergenceError
+from kcons.errors import ContradictionError
 from kcons.openmm import Langevin, ProjectedIntegrator, hold
 from kcons.openmm.device import build
 from kcons.steppers import Rattle
@@ -324,33 +324,3 @@ def test_noise_is_in_no_multiplier():
     integrator.step(100_000)
     wanted = -2 * 8.314462618e-3 * 300 / 0.15
     assert integrator.parts[0].mean_multipliers(integrator)[0] == pytest.approx(wanted, rel=0.1)
-
-
-# -- failures ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("platform", ["CPU", *MIXED])
-@pytest.mark.parametrize("large", [False, True])
-def test_a_row_without_a_solution_is_told_and_the_state_put_back(platform, large):
-    """A particle that is kicked far away within one step."""
-    n = 12 if large else 3
-    system = particles([12.0] * n, on_each("select(step(x-0.01), -1e9*z, 0)", [1]))
-    x = 0.1 * np.stack([np.arange(n) * 1.2, np.arange(n) % 2 * 0.9, np.zeros(n)], axis=1)
-    x -= x[1]
-    v = np.zeros_like(x)
-    v[:, 0] = 1.0
-    rows = Distance(np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
-    integrator = ProjectedIntegrator(0.002, parts=rows, device=True)
-    context = started(system, integrator, x, v, platform)
-    integrator.step(3)
-    before = context.getState(positions=True).getPositions(asNumpy=True)._value.copy()
-    with pytest.raises(
-        ConvergenceError, match=r"step \d+: row #\d+ Distance.* on the device; the step was taken"
-    ) as told:
-        integrator.step(10)
-    assert told.value.row in range(n - 1) and 4 <= told.value.step <= 13
-    after = context.getState(positions=True).getPositions(asNumpy=True)._value
-    assert np.isfinite(after).all()
-    assert context.getStepCount() == told.value.step - 1
-    assert np.abs(rows.with_target(None).measure(after[rows.atoms], 0.0) - 0.15).max() < 1e-5
-    assert np.abs(after - before).max() < 0.01 * (told.value.step - 3)

@@ -13,16 +13,83 @@ import numpy as np
 import openmm
 import pytest
 from ensemble_runs import in_calls_of_any_length, on_their_rows, run, twice_kinetic, two_parts, warm
+from openmm import unit
 from openmm_ensembles import ENSEMBLES
-from openmm_systems import loose_alanine, started, state_of, water_box
+from openmm_systems import dumbbell, loose_alanine, masses_of, started, state_of, water_box
 
+from kcons import ConstraintSet, Motion, State, System, thermostats
+from kcons import run as steps_of
+from kcons.constraints import Distance
 from kcons.errors import InputError
-from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator, hold
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold
 from kcons.openmm.quantities import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
 #: Noise differs between programs.
 WITHOUT_NOISE = [name for name, make in ENSEMBLES.items() if not make(300).noisy]
+
+
+#: Of each: the ensemble, its stepper on arrays, the scheme, and how close both are after so many steps.
+ROUNDING = ((1, 1e-12), (1, 1e-12), (48, 1e-12), (250, 2e-11))
+ON_ARRAYS = {
+    **{
+        f"isokinetic, order {order}": (
+            Isokinetic(momentum="free"),
+            thermostats.Isokinetic(order=order, momentum="free"),
+            scheme,
+            # Order 6 has 90 drifts a step, whose velocities are differences of positions.
+            ROUNDING if order < 6 else ((50, 2e-11),),
+        )
+        for order, scheme in ((2, "rattle"), (4, "isokinetic4"), (6, "isokinetic6"))
+    },
+    **{
+        f"chain of {n}": (
+            NoseHoover(300 * unit.kelvin, 20.0, length=n),
+            thermostats.NoseHooverChain(300 * GAS_CONSTANT, np.pi / 10, momentum="free", length=n),
+            "rattle",
+            ((1, 1e-12), (1, 1e-12), (48, 1e-12), (250, 1e-12)),
+        )
+        for n in (1, 10)
+    },
+}
+
+
+@pytest.mark.parametrize("name", ON_ARRAYS)
+def test_one_bond_as_the_stepper_on_arrays(name):
+    """The same motion of atoms and chain, to rounding, in calls of any length."""
+    ensemble, stepper, scheme, calls = ON_ARRAYS[name]
+    system, x, v = dumbbell()
+    dt, k, c = 0.5e-3, 50.0, 500.0
+    motion = Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x)
+    v = motion.project_velocities(x, v)
+    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14, ensemble=ensemble)
+    assert integrator.operations() == stepper.operations()
+    assert all(f"  {operation}\n" in integrator.listing() for operation in stepper.operations())
+    context = started(system, integrator, x, v)
+
+    def force(r, t):
+        x, y, z = r.T
+        return -np.stack([2 * k * x + c * y**3, 2.6 * k * y + 3 * c * x * y**2, 1.4 * k * z], axis=1)
+
+    def potential(r, t):
+        x, y, z = r.T
+        return float(np.sum(k * (x**2 + 1.3 * y**2 + 0.7 * z**2) + c * x * y**3))
+
+    core, state = System(motion, force, potential=potential), State(x, v)
+    for steps, limit in calls:
+        state = steps_of(core, state, dt, steps, stepper=stepper)
+        integrator.step(steps)
+        r, u = state_of(context)
+        assert np.abs(r - state.positions).max() <= limit
+        assert np.abs(u - state.velocities).max() <= 100 * limit
+        if name.startswith("chain"):
+            n, near, kept = ensemble.length, 1e3 * limit, state.thermostat
+            links = [integrator.getGlobalVariableByName(f"link{i + 1}") for i in range(n)]
+            np.testing.assert_allclose(links, kept[n : 2 * n], rtol=near, atol=near)
+            place = kept[2 * n] * kept[0] + kept[1:n].sum()
+            assert integrator.getGlobalVariableByName("chain_place") == pytest.approx(place, rel=near)
+            wanted = stepper.conserved_energy(core, state)
+            assert ensemble.conserved_energy(integrator) == pytest.approx(wanted, rel=1e-11)
 
 
 @pytest.mark.parametrize("bath", WITHOUT_NOISE)

@@ -6,46 +6,11 @@ import pytest
 from ensemble_runs import in_calls_of_any_length, run, twice_kinetic, warm
 from openmm_systems import alanine, dumbbell, field, masses_of, on_gpus, particles, started, state_of, water_box
 
-from kcons import ConstraintSet, Motion, State
-from kcons import System as CoreSystem
-from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
-from kcons.thermostats import Isokinetic as CoreIsokinetic
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
-
-
-ORDERS = {"rattle": 2, "isokinetic4": 4, "isokinetic6": 6}
-
-
-# -- isokinetic: trajectories -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("scheme", ORDERS)
-def test_one_bond_as_the_core_stepper(scheme):
-    system, x, v = dumbbell()
-    dt = 0.5e-3
-    v = Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x).project_velocities(x, v)
-    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14, ensemble=Isokinetic(momentum="free"))
-    context = started(system, integrator, x, v)
-    k, c = 50.0, 500.0
-
-    def force(r, t):
-        x, y, z = r.T
-        return -np.stack([2 * k * x + c * y**3, 2.6 * k * y + 3 * c * x * y**2, 1.4 * k * z], axis=1)
-
-    core = CoreSystem(Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x), force)
-    stepper, state = CoreIsokinetic(order=ORDERS[scheme], momentum="free"), State(x, v)
-    # Order 6 has 90 drifts a step, whose velocities are differences of positions.
-    for steps, limit in ((50, 1e-12), (250, 2e-11)) if scheme != "isokinetic6" else ((50, 2e-11),):
-        for _ in range(steps):
-            state = stepper.step(core, state, dt)
-        integrator.step(steps)
-        r, u = state_of(context)
-        assert np.abs(r - state.positions).max() <= limit
-        assert np.abs(u - state.velocities).max() <= 100 * limit
 
 
 def waters():

@@ -6,61 +6,12 @@ import numpy as np
 import pytest
 from ensemble_runs import run
 from openmm import unit
-from openmm_systems import alanine, dumbbell, field, loose_alanine, masses_of, particles, started, state_of
+from openmm_systems import alanine, dumbbell, field, loose_alanine, particles, state_of
 
-from kcons import ConstraintSet, Motion, State
-from kcons import System as CoreSystem
-from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
 from kcons.openmm import NoseHoover, NoseHooverMiddle, ProjectedIntegrator, hold, positions_of
-from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
-from kcons.thermostats import NoseHooverChain
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
-
-
-# -- trajectories ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("options", [{"length": 1}, {"length": 10}])
-def test_one_bond_as_the_core_stepper(options):
-    """The same motion of atoms and chain, to rounding, in calls of any length."""
-    system, x, v = dumbbell()
-    dt, frequency = 0.5e-3, 20.0
-    motion = Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x)
-    v = motion.project_velocities(x, v)
-    ensemble = NoseHoover(300 * unit.kelvin, frequency, **options)
-    integrator = ProjectedIntegrator(dt, tolerance=1e-14, ensemble=ensemble)
-    context = started(system, integrator, x, v)
-    k, c = 50.0, 500.0
-
-    def force(r, t):
-        x, y, z = r.T
-        return -np.stack([2 * k * x + c * y**3, 2.6 * k * y + 3 * c * x * y**2, 1.4 * k * z], axis=1)
-
-    def potential(r, t):
-        x, y, z = r.T
-        return float(np.sum(k * (x**2 + 1.3 * y**2 + 0.7 * z**2) + c * x * y**3))
-
-    core = CoreSystem(motion, force, potential=potential)
-    stepper = NoseHooverChain(300 * GAS_CONSTANT, 2 * np.pi / frequency, momentum="free", **options)
-    assert integrator.operations() == stepper.operations()
-    listed = "\n".join(f"  {operation}" for operation in stepper.operations())
-    assert listed in integrator.listing()
-    state, n = State(x, v), ensemble.length
-    limit = 1e-12
-    for steps in (1, 1, 48, 250):
-        for _ in range(steps):
-            state = stepper.step(core, state, dt)
-        integrator.step(steps)
-        r, u = state_of(context)
-        assert np.abs(r - state.positions).max() <= limit
-        assert np.abs(u - state.velocities).max() <= 100 * limit
-        links = [integrator.getGlobalVariableByName(f"link{i + 1}") for i in range(n)]
-        np.testing.assert_allclose(links, state.thermostat[n : 2 * n], rtol=1e3 * limit, atol=1e3 * limit)
-        place = state.thermostat[2 * n] * state.thermostat[0] + state.thermostat[1:n].sum()
-        assert integrator.getGlobalVariableByName("chain_place") == pytest.approx(place, rel=1e3 * limit)
-        assert ensemble.conserved_energy(integrator) == pytest.approx(stepper.conserved_energy(core, state), rel=1e-11)
 
 
 # -- the chain in the middle of a step -------------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 import openmm
 import pytest
 from ensemble_runs import run
-from openmm_systems import started, state_of, water_box
+from openmm_systems import potential_energy, started, state_of, water_box
 from tied_cluster import ON_DEVICE, X, carried_at, cluster, row_at, thermostatted
 
 from kcons.errors import CertificateError, InputError, KconsError
@@ -115,9 +115,16 @@ def test_positions_off_the_rows_are_not_pulled_back_in_silence(make, scheme, cap
 def test_the_minimizer_of_openmm_does_not_know_rows(make):
     made = make(0.5)
     made.run(1)
+    x, _ = state_of(made.context)
     openmm.LocalEnergyMinimizer.minimize(made.context)
     with pytest.raises(KconsError, match=r"OpenMM.s minimizer is one: take integrator\.minimizeEnergy"):
         made.run(1)
+    made.context.setPositions(x)
+    before = potential_energy(made.context)
+    made.integrator.minimizeEnergy(made.context, maxIterations=5)
+    assert potential_energy(made.context) < before
+    assert length_of(made.context) == pytest.approx(0.5, abs=1e-12)
+    made.run(3)
 
 
 # -- the start --------------------------------------------------------------------------------------------

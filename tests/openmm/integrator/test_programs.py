@@ -11,7 +11,7 @@ from tied_cluster import KINDS
 
 from kcons import thermostats
 from kcons.errors import InputError
-from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
+from kcons.openmm import Langevin, ProjectedIntegrator
 from kcons.openmm.integrator.program import SCHEMES, VARIABLES, to_scheme
 from kcons.steppers import Geodesic, Rattle
 
@@ -97,6 +97,3 @@ def test_steps_are_those_of_the_steppers_on_arrays(scheme):
 def test_thermostats_are_those_on_arrays():
     langevin = ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1.0)).operations()
     assert langevin == thermostats.Langevin(1.0, 1.0, 1, substeps=1).operations()
-    for order, scheme in ((2, "rattle"), (4, "isokinetic4"), (6, "isokinetic6")):
-        isokinetic = ProjectedIntegrator(1e-3, scheme, ensemble=Isokinetic(300)).operations()
-        assert isokinetic == thermostats.Isokinetic(1.0, order=order).operations()

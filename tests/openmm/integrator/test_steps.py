@@ -6,10 +6,11 @@ import numpy as np
 import openmm
 import pytest
 from collective_cases import bond
-from ensemble_runs import run
+from ensemble_runs import in_calls, run
 from openmm import unit
 from openmm_parts import HeldCoordinates
 from openmm_systems import (
+    DEVICE,
     alanine,
     context_of,
     dumbbell,
@@ -25,7 +26,7 @@ from openmm_systems import (
     state_of,
     water_box,
 )
-from tied_cluster import KINDS
+from tied_cluster import KINDS, carried_at, row_at
 
 from kcons.constraints import KnifeEdge, Plane
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
@@ -78,6 +79,48 @@ def test_a_failed_step_is_taken_back_and_not_counted(scheme, how):
     undisturbed, other = begun()
     undisturbed.step(12)
     np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-12)
+
+
+#: Kinds whose steps of a picosecond fail, and the platform.
+FAIL = {
+    "collective": (row_at, {}),
+    "collective, CPU": (row_at, {"platform": "CPU"}),
+    "collective beside a constraint": (row_at, {"bonded": True, "scheme": "suzuki4"}),
+    "collective, moving, beside a constraint": (row_at, {"bonded": True, "rate": 0.2}),
+    "collective, moving": (row_at, {"rate": 0.2}),
+    "carried": (carried_at, {}),
+    "carried, CPU": (carried_at, {"platform": "CPU"}),
+}
+
+
+@pytest.mark.parametrize("kind", FAIL)
+def test_a_step_without_a_solution_is_taken_back(kind):
+    """With clocks of targets, which constraints alone do not move, either."""
+    make, options = FAIL[kind]
+    made = make(**options)
+    integrator, context, part = made.integrator, made.context, made.part
+
+    made.run(3)
+    before, target = state_of(context), part.targets(context) if make is row_at else None
+    integrator.setStepSize(1.0 * PS)
+    with pytest.raises(ConvergenceError, match="step 4: ") as caught:
+        integrator.step(2)
+    assert caught.value.step == 4
+    if make is row_at:
+        assert "row 0 (my bond) is off by" in str(caught.value) and "iterations" in str(caught.value)
+        assert caught.value.row == 0 and caught.value.iterations > 1 and caught.value.residual > part.tolerance
+    else:
+        assert "time step too large" in str(caught.value) and caught.value.atoms == (0, 7)
+    np.testing.assert_array_equal(state_of(context), before)
+    assert context.getStepCount() == 3
+    integrator.setStepSize(0.002)
+    integrator.applyVelocityConstraints(context)
+    integrator.applyConstraints(context)
+    assert target is None or part.targets(context) == target
+    integrator.step(3)
+    integrator.check()
+    ends = state_of(context)[0][[0, 7]]
+    assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.3 + options.get("rate", 0.0) * 0.012, abs=1e-12)
 
 
 def test_change_of_the_box():
@@ -147,17 +190,8 @@ def held(kind, **arguments):
 @pytest.mark.parametrize("kind", LEAN)
 def test_calls_of_any_length_make_the_same_motion(kind):
     """Within a call steps leave out what only a reader of velocities needs."""
-    ends, parts = [], []
-    for blocks in ([12], [5, 7], [1] * 12, [3, 1, 8]):
-        integrator, context, part = held(kind)
-        for steps in blocks:
-            integrator.step(steps)
-        ends.append(state_of(context))
-        parts.append((integrator, context, part))
-    for x, v in ends[1:]:
-        np.testing.assert_allclose(x, ends[0][0], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(v, ends[0][1], rtol=0, atol=3e-11)
-    (one, there, ours), (other, _, theirs) = parts[0], parts[2]
+    made = in_calls(lambda: held(kind), ([12], [5, 7], [1] * 12, [3, 1, 8]), v=3e-11)
+    (one, there, ours), (other, _, theirs) = made[0], made[2]
     if kind.endswith("row"):
         np.testing.assert_allclose(ours.work(one), theirs.work(other), rtol=1e-7, atol=1e-6)
         assert np.abs(ours.rates(there)).max() <= 1e-12
@@ -253,13 +287,12 @@ def test_checks_that_come_more_often_make_no_step_more(before):
 # -- a look where a call ends ------------------------------------------------------------------------
 
 LOOKING = {
-    "rattle": lambda step: ProjectedIntegrator(step, check_every=0),
-    "suzuki4": lambda step: ProjectedIntegrator(step, "suzuki4", check_every=0),
-    "Langevin": lambda step: ProjectedIntegrator(step, check_every=0, ensemble=Langevin(300, 1.0)),
-    "LangevinRespa": lambda step: ProjectedIntegrator(
-        step, check_every=0, ensemble=LangevinRespa(300, 1.0, {0: 1, 1: 2})
-    ),
-    "Isokinetic": lambda step: ProjectedIntegrator(step, check_every=0, ensemble=Isokinetic(300)),
+    "rattle": {},
+    "suzuki4": {"scheme": "suzuki4"},
+    "Langevin": {"ensemble": Langevin(300, 1.0)},
+    "LangevinRespa": {"ensemble": LangevinRespa(300, 1.0, {0: 1, 1: 2})},
+    "device": {"device": True},
+    "device, Langevin": {"device": True, "ensemble": Langevin(300, 1.0)},
 }
 
 
@@ -277,14 +310,15 @@ def springs(n=8):
     ("name", "call", "platform"),
     [
         ("rattle", 1, "Reference"),
-        *((name, 10, "Reference") for name in LOOKING if name != "Isokinetic"),
+        *(pytest.param(name, 10, "Reference", marks=DEVICE.marks if "device" in name else ()) for name in LOOKING),
         *(pytest.param("rattle", 10, *p.values, id=p.id, marks=p.marks) for p in on_gpus("mixed")),
+        *(pytest.param("device", 10, *p.values, id=f"device-{p.id}", marks=p.marks) for p in on_gpus("mixed")),
     ],
 )
 def test_an_explosion_is_told_where_its_call_ends(name, call, platform):
     """Without any check but the first: lengths do not become 1e62 nm without a word."""
     system, x, v = springs()
-    integrator = LOOKING[name](20 * unit.femtosecond)
+    integrator = ProjectedIntegrator(20 * unit.femtosecond, check_every=0, **LOOKING[name])
     context = started(system, integrator, x, v, platform)
     x, v = state_of(context)
     with pytest.raises(NonFiniteError, match="take a smaller time step") as caught:
@@ -301,7 +335,7 @@ def test_an_explosion_is_told_where_its_call_ends(name, call, platform):
 def test_light_is_the_limit_and_no_smaller_speed():
     """Particles may be fast: 1 dalton at a tenth of the speed of light is no explosion of a System of many."""
     system, x, _ = springs()
-    integrator = LOOKING["rattle"](1e-6 * unit.femtosecond)
+    integrator = ProjectedIntegrator(1e-6 * unit.femtosecond, check_every=0)
     context = run(system, integrator, x, np.eye(8)[:, :3] * 3e4, 1)
     context.setVelocities(np.full((8, 3), 3e5))
     with pytest.raises(NonFiniteError, match=r"particle \d has a velocity of 5.2e\+05 nm/ps at step 2"):
