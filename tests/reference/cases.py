@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,6 @@ from kcons import constraints as held
 
 Array = NDArray[np.float64]
 Spec = Mapping[str, Any]
-Force = Callable[[Array, Array], Array]
-Potential = Callable[[Array], float]
 
 DATA = Path(__file__).parent / "data"
 #: Every case, in order.
@@ -62,8 +60,8 @@ class Case:
         At the stored times, in order of time.
     isokinetic : bool
         Whether the kinetic energy is held as well.
-    velocity_dependent : bool
-        Whether the forces depend on the velocities (friction).
+    friction : float
+        The forces depend on the velocities where it is not 0.
     """
 
     name: str
@@ -72,8 +70,12 @@ class Case:
     initial: Snapshot
     solution: tuple[Snapshot, ...]
     isokinetic: bool
-    velocity_dependent: bool
-    _terms: tuple[tuple[Force, Potential], ...]
+    friction: float
+    _forces: tuple[Spec, ...]
+
+    @property
+    def velocity_dependent(self) -> bool:
+        return self.friction > 0
 
     @property
     def snapshots(self) -> tuple[Snapshot, ...]:
@@ -83,13 +85,16 @@ class Case:
 
     def force(self, x: Array, v: Array) -> Array:
         """Applied forces, without the thermostat, shape (n_atoms, 3)."""
-        total = np.zeros_like(x)
-        for force, _ in self._terms:
-            total += force(x, v)
-        return total
+        shifted = x + 1e-30j * np.eye(x.size).reshape(x.size, *x.shape)
+        slopes = self._potential(shifted).imag.reshape(x.shape) / 1e-30
+        return -slopes - self.friction * self.masses[:, None] * v
 
     def potential(self, x: Array) -> float:
-        return float(sum(potential(x) for _, potential in self._terms))
+        return float(self._potential(x))
+
+    def _potential(self, x: Array) -> Array:
+        nothing = np.zeros(x.shape[:-2], x.dtype)
+        return sum((POTENTIALS[spec["type"]](x, spec, self.masses) for spec in self._forces), nothing)
 
     def energy(self, x: Array, v: Array) -> float:
         return self.potential(x) + 0.5 * float(np.sum(self.masses[:, None] * v**2))
@@ -101,23 +106,19 @@ def load(name: str) -> Case:
     data = json.loads((DATA / f"{name}.json").read_text(encoding="utf-8"))
     assert data["schema"] == "kcons-ref-1" and data["kind"] == "mechanics"
     masses = np.array(data["masses"], dtype=np.float64)
-    terms = tuple(FORCES[spec["type"]](spec, masses) for spec in data["forces"])
-
-    def force(x: Array, v: Array) -> Array:
-        return sum((f(x, v) for f, _ in terms), np.zeros_like(x))
-
-    times = data["times"]
-    solution = [_snapshot(data, k, masses, force) for k in range(len(times))]
-    return Case(
+    forces = [spec for spec in data["forces"] if spec["type"] != "friction"]
+    case = Case(
         name=name,
         constraints=tuple(constraint for spec in data["constraints"] for constraint in CONSTRAINTS[spec["type"]](spec)),
         masses=masses,
         initial=_initial(data),
-        solution=tuple(sorted(solution, key=lambda s: s.time)),
+        solution=(),
         isokinetic=bool(data["isokinetic"]),
-        velocity_dependent=any(spec["type"] == "friction" for spec in data["forces"]),
-        _terms=terms,
+        friction=sum(spec["gamma"] for spec in data["forces"] if spec["type"] == "friction"),
+        _forces=tuple(forces),
     )
+    solution = [_snapshot(data, k, masses, case.force) for k in range(len(data["times"]))]
+    return replace(case, solution=tuple(sorted(solution, key=lambda s: s.time)))
 
 
 def _initial(data: Spec) -> Snapshot:
@@ -137,7 +138,7 @@ def _initial(data: Spec) -> Snapshot:
     )
 
 
-def _snapshot(data: Spec, k: int, masses: Array, force: Force) -> Snapshot:
+def _snapshot(data: Spec, k: int, masses: Array, force: Callable[[Array, Array], Array]) -> Snapshot:
     reference, quality = data["reference"], data.get("quality") or {}
     x, v = (np.array(reference[item][k], dtype=np.float64) for item in ("positions", "velocities"))
     if "accelerations" in reference:
@@ -169,19 +170,9 @@ def _or_nan(value: float | None) -> float:
 # -- constraints ------------------------------------------------------------------------------------
 
 
-def _sphere(spec: Spec) -> list[held.Constraint]:
-    return [held.Sphere(spec["atom"], spec["point"], spec["target"])]
-
-
 def _ellipse_xz(spec: Spec) -> list[held.Constraint]:
     weights = np.array([1 / spec["a"] ** 2, 0.0, 1 / spec["b"] ** 2])
-    return [
-        held.ImplicitSurface(
-            spec["atom"],
-            lambda x: x**2 @ weights - 1,
-            lambda x: 2 * weights * x,
-        )
-    ]
+    return [held.ImplicitSurface(spec["atom"], lambda x: x**2 @ weights - 1, lambda x: 2 * weights * x)]
 
 
 def _rotating_plane(spec: Spec) -> list[held.Constraint]:
@@ -197,7 +188,7 @@ def _rotating_ellipse(spec: Spec) -> list[held.Constraint]:
 
 CONSTRAINTS: dict[str, Callable[[Spec], list[held.Constraint]]] = {
     "distance": lambda spec: [held.Distance(spec["atoms"], spec["target"])],
-    "distance_to_point": _sphere,
+    "distance_to_point": lambda spec: [held.Sphere(spec["atom"], spec["point"], spec["target"])],
     "angle_cos": lambda spec: [held.Angle(spec["atoms"], spec["angle_rad"])],
     "plane": lambda spec: [held.Plane(spec["atom"], spec["normal"], spec["target"])],
     "ellipse_xz": _ellipse_xz,
@@ -208,121 +199,44 @@ CONSTRAINTS: dict[str, Callable[[Spec], list[held.Constraint]]] = {
 }
 
 
-# -- forces: each gives (force of x and v, potential of x) ------------------------------------------
+# -- potentials, which must be analytic: forces are steps of positions into the complex plane -----------
 
 
-def _uniform_acceleration(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    f = masses[:, None] * np.array(spec["g"], dtype=np.float64)
-    return lambda x, v: f, lambda x: -float(np.sum(f * x))
-
-
-def _uniform_field(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    f = np.array(spec["charges"])[:, None] * np.array(spec["E"], dtype=np.float64)
-    return lambda x, v: f, lambda x: -float(np.sum(f * x))
-
-
-def _uniform_force(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    f = np.zeros((len(masses), 3))
-    f[spec["atom"]] = spec["F"]
-    return lambda x, v: f, lambda x: -float(np.sum(f * x))
-
-
-def _harmonic_site(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    k, center = np.array(spec["k"]), np.array(spec.get("center", np.zeros(3)))
-    return _on_one_atom(spec["atom"], lambda r: -k * (r - center)), lambda x: float(
-        0.5 * k @ (x[spec["atom"]] - center) ** 2
-    )
-
-
-def _quartic_site(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    k4, kxy = np.array(spec["k4"]), spec["kxy"]
-
-    def force(r: Array) -> Array:
-        return -k4 * r**3 - kxy * np.array([r[0] * r[1] ** 2, r[0] ** 2 * r[1], 0.0])
-
-    def potential(x: Array) -> float:
-        r = x[spec["atom"]]
-        return float(0.25 * k4 @ r**4 + 0.5 * kxy * r[0] ** 2 * r[1] ** 2)
-
-    return _on_one_atom(spec["atom"], force), potential
-
-
-def _harmonic_bond(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    k, r0 = spec["k"], spec["r0"]
-    return _between([spec["atoms"]], lambda r: -k * (r - r0), lambda r: 0.5 * k * (r - r0) ** 2)
-
-
-def _lj(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    epsilon, sigma = spec["epsilon"], spec["sigma"]
-    return _between(
-        spec["pairs"],
-        lambda r: 24 * epsilon / r * (2 * (sigma / r) ** 12 - (sigma / r) ** 6),
-        lambda r: 4 * epsilon * ((sigma / r) ** 12 - (sigma / r) ** 6),
-    )
-
-
-def _torsion_cos3(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    """k (1 + cos 3 phi), with the gradient of phi by Blondel and Karplus (1996)."""
-    i, j, k, l = spec["atoms"]
-    strength = spec["k"]
-
-    def parts(x: Array) -> tuple[Array, Array, Array, Array, Array, float]:
-        F, G, H = x[i] - x[j], x[j] - x[k], x[l] - x[k]
-        A, B = np.cross(F, G), np.cross(H, G)
-        phi = np.arctan2(np.cross(B, A) @ G / np.linalg.norm(G), A @ B)
-        return F, G, H, A, B, float(phi)
-
-    def force(x: Array, v: Array) -> Array:
-        F, G, H, A, B, phi = parts(x)
-        g = np.linalg.norm(G)
-        a, b = A / (A @ A), B / (B @ B)
-        middle = (F @ G) / g * a - (H @ G) / g * b
-        f = np.zeros_like(x)
-        f[i], f[j], f[k], f[l] = -g * a, g * a + middle, -g * b - middle, g * b
-        return 3 * strength * np.sin(3 * phi) * f
-
-    return force, lambda x: strength * (1 + float(np.cos(3 * parts(x)[5])))
-
-
-def _friction(spec: Spec, masses: Array) -> tuple[Force, Potential]:
-    return lambda x, v: -spec["gamma"] * masses[:, None] * v, lambda x: 0.0
-
-
-def _on_one_atom(atom: int, force: Callable[[Array], Array]) -> Force:
-    def spread(x: Array, v: Array) -> Array:
-        f = np.zeros_like(x)
-        f[atom] = force(x[atom])
-        return f
-
-    return spread
-
-
-def _between(
-    pairs: list[list[int]], push: Callable[[Array], Array], energy: Callable[[Array], Array]
-) -> tuple[Force, Potential]:
-    """Central forces: `push` is -dU/dr of the distances, positive where the atoms repel."""
+def _lengths(x: Array, pairs: Any) -> Array:
     first, second = np.array(pairs).T
-
-    def force(x: Array, v: Array) -> Array:
-        d = x[first] - x[second]
-        r = np.linalg.norm(d, axis=1)
-        along = (push(r) / r)[:, None] * d
-        f = np.zeros_like(x)
-        np.add.at(f, first, along)
-        np.add.at(f, second, -along)
-        return f
-
-    return force, lambda x: float(np.sum(energy(np.linalg.norm(x[first] - x[second], axis=1))))
+    return np.sqrt(np.sum((x[..., first, :] - x[..., second, :]) ** 2, axis=-1))
 
 
-FORCES: dict[str, Callable[[Spec, Array], tuple[Force, Potential]]] = {
-    "uniform_acceleration": _uniform_acceleration,
-    "uniform_force": _uniform_force,
-    "uniform_field": _uniform_field,
-    "harmonic_site": _harmonic_site,
+def _uniform(x: Array, forces: Any) -> Array:
+    return -np.sum(forces * x, axis=(-1, -2))
+
+
+def _quartic_site(x: Array, spec: Spec, masses: Array) -> Array:
+    r = x[..., spec["atom"], :]
+    return 0.25 * r**4 @ np.array(spec["k4"]) + 0.5 * spec["kxy"] * r[..., 0] ** 2 * r[..., 1] ** 2
+
+
+def _lj(x: Array, spec: Spec, masses: Array) -> Array:
+    s6 = (spec["sigma"] / _lengths(x, spec["pairs"])) ** 6
+    return np.sum(4 * spec["epsilon"] * (s6 * s6 - s6), axis=-1)
+
+
+def _torsion_cos3(x: Array, spec: Spec, masses: Array) -> Array:
+    i, j, k, l = (x[..., atom, :] for atom in spec["atoms"])
+    a, b = np.cross(i - j, j - k), np.cross(l - k, j - k)
+    cosine = np.sum(a * b, axis=-1) / np.sqrt(np.sum(a * a, axis=-1) * np.sum(b * b, axis=-1))
+    return spec["k"] * (1 + 4 * cosine**3 - 3 * cosine)
+
+
+POTENTIALS: dict[str, Callable[[Array, Spec, Array], Array]] = {
+    "uniform_acceleration": lambda x, spec, masses: _uniform(x, masses[:, None] * spec["g"]),
+    "uniform_force": lambda x, spec, masses: _uniform(x[..., [spec["atom"]], :], spec["F"]),
+    "uniform_field": lambda x, spec, masses: _uniform(x, np.outer(spec["charges"], spec["E"])),
+    "harmonic_site": lambda x, spec, masses: (
+        0.5 * (x[..., spec["atom"], :] - spec.get("center", np.zeros(3))) ** 2 @ np.array(spec["k"])
+    ),
     "quartic_site": _quartic_site,
-    "harmonic_bond": _harmonic_bond,
+    "harmonic_bond": lambda x, spec, masses: 0.5 * spec["k"] * (_lengths(x, [spec["atoms"]])[..., 0] - spec["r0"]) ** 2,
     "lj": _lj,
     "torsion_cos3": _torsion_cos3,
-    "friction": _friction,
 }
