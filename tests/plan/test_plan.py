@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
 
 from kcons import constraints as held
-from kcons.constraints import Angle, Distance, FixedAtoms, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ContradictionError
 from kcons.motion import Motion
@@ -185,18 +183,14 @@ def test_multipliers_of_dependent_rows_in_very_different_units(unit: float) -> N
     assert twice[0] == pytest.approx(twice[1], rel=1e-6)
 
 
-# -- rank ---------------------------------------------------------------------------------------------
-
-
 def test_rank_is_that_of_the_dense_matrix() -> None:
     for seed in range(30):
         rng = np.random.default_rng(seed)
         n = 12
         x = rng.normal(size=(n, 3)) * 2
         pairs = [rng.choice(n, 2, replace=False).tolist() for _ in range(int(rng.integers(1, 36)))]
-        constraint_set = ConstraintSet(held.Distance(pairs), x, 10 ** rng.uniform(0, 2, n))
-        plan = make_plan(constraint_set, x, 0.0)
-        A = constraint_set.jacobian(x).toarray()
+        plan = planned(held.Distance(pairs), x, 10 ** rng.uniform(0, 2, n))
+        A = plan.constraint_set.jacobian(x).toarray()
         assert plan.rank == np.linalg.matrix_rank(A / np.linalg.norm(A, axis=1)[:, None], tol=1e-8)
 
 
@@ -231,19 +225,12 @@ def places(n: int, seed: int = 0) -> np.ndarray:
 
 
 def shapes_of(rows, x, masses=None) -> list[Shape]:
-    constraint_set = ConstraintSet(rows, x, np.ones(len(x)) if masses is None else masses)
-    plan = make_plan(constraint_set, x, 0.0)
-    return list(classify(constraint_set, plan.labels, plan.inverse_masses))
+    plan = planned(rows, x, masses)
+    return list(classify(plan.constraint_set, plan.labels, plan.inverse_masses))
 
 
 def copies(pairs, atoms: int, times: int) -> held.Distance:
     return held.Distance(np.concatenate([np.array(pairs) + atoms * k for k in range(times)]))
-
-
-# -- labels -----------------------------------------------------------------------------------------
-
-
-# -- shapes -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", list(np.ndindex(2, 2, 2)))
@@ -312,36 +299,31 @@ def test_every_row_goes_to_exactly_one_shape(seed: int) -> None:
     pairs = {tuple(sorted(rng.choice(n, 2, replace=False).tolist())) for _ in range(90)}
     rows = [held.FixedAtoms([3, 40]), held.Distance(sorted(pairs)), held.Angle([[1, 2, 3], [50, 51, 52]])]
     rows.append(held.CenterOfMass([[7, 8, 9], [60, 61, 62]]))
-    x = places(n, seed)
-    constraint_set = ConstraintSet(rows, x, rng.choice([1.0, 12.0], n))
-    plan = make_plan(constraint_set, x, 0.0)
-    taken = np.concatenate([s.rows.ravel() for s in classify(constraint_set, plan.labels, plan.inverse_masses)])
+    plan = planned(rows, places(n, seed), rng.choice([1.0, 12.0], n))
+    taken = np.concatenate([s.rows.ravel() for s in classify(plan.constraint_set, plan.labels, plan.inverse_masses)])
     np.testing.assert_array_equal(np.sort(taken), np.flatnonzero(plan.labels >= 0))
     assert sum(k.clusters for k in plan.kinds) == plan.labels.max() + 1
 
 
-# -- blocks -----------------------------------------------------------------------------------------
-
-
 def blocks(rows, n_atoms, only=None):
     x = np.random.default_rng(1).normal(size=(n_atoms, 3))
-    held = ConstraintSet(rows, x, np.ones(n_atoms))
-    members, starts = row_blocks(held, lambda item: True, only)
-    return held, x, sorted(members[a:b].tolist() for a, b in itertools.pairwise(starts))
+    rows = ConstraintSet(rows, x, np.ones(n_atoms))
+    members, starts = row_blocks(rows, lambda item: True, only)
+    return rows, x, sorted(members[a:b].tolist() for a, b in pairwise(starts))
 
 
 def test_a_row_of_several_atoms_is_a_cycle_through_them():
-    assert blocks([Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2]])], 4)[2] == [[0, 1, 2]]
-    assert blocks([Distance([[0, 1]]), Angle([[1, 2, 3]])], 4)[2] == []
+    assert blocks([held.Distance([[0, 1], [1, 2]]), held.Angle([[0, 1, 2]])], 4)[2] == [[0, 1, 2]]
+    assert blocks([held.Distance([[0, 1]]), held.Angle([[1, 2, 3]])], 4)[2] == []
 
 
 def test_fixed_atoms_and_space_are_one_vertex():
     """A chain between two fixed atoms, or between a sphere and a fixed atom, is closed."""
-    chain = Distance([[0, 1], [1, 2]])
-    assert blocks([chain, FixedAtoms([0])], 3)[2] == []
-    assert blocks([chain, FixedAtoms([0, 2])], 3)[2] == [[0, 1]]
-    ((_, *rows),) = [[0, *found] for found in blocks([chain, FixedAtoms([0]), Sphere([2], np.zeros(3), None)], 3)[2]]
-    assert rows == [0, 1, 5]  # rows 2 to 4 hold the fixed atom
+    chain = held.Distance([[0, 1], [1, 2]])
+    assert blocks([chain, held.FixedAtoms([0])], 3)[2] == []
+    assert blocks([chain, held.FixedAtoms([0, 2])], 3)[2] == [[0, 1]]
+    # Rows 2 to 4 hold the fixed atom.
+    assert blocks([chain, held.FixedAtoms([0]), held.Sphere([2], np.zeros(3), None)], 3)[2] == [[0, 1, 5]]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -351,8 +333,8 @@ def test_ranks_of_blocks_add_up_to_the_rank_of_all(seed):
     n = 12
     every = np.array([(i, j) for i in range(n) for j in range(i)])
     pairs = every[rng.choice(len(every), 20, replace=False)]
-    held, x, found = blocks([Distance(pairs)], n)
-    jacobian = held.jacobian(x).toarray()
+    rows, x, found = blocks([held.Distance(pairs)], n)
+    jacobian = rows.jacobian(x).toarray()
     single = len(pairs) - sum(map(len, found))
     assert np.linalg.matrix_rank(jacobian) == single + sum(np.linalg.matrix_rank(jacobian[rows]) for rows in found)
     for rows in found:
