@@ -160,10 +160,12 @@ def rows_of(snapshot: Snapshot, holding: Holding, numbers: Callable[[Any], IntAr
     groups = [g[~np.isin(g, waters.triples[:, 0]).any(axis=1)] for g in groups]
     groups = [g for g in groups if len(g)] + listed_bodies(snapshot, bodies)
     _refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))
+    # Some force fields list the H-H of water as a bond; it is not one.
     bonds = snapshot.topology.bonds
     bonds = bonds[~_closing(bonds, topology.hydrogen)]
     _refuse_torn(snapshot, bonds[inside_bodies(snapshot.topology.n_atoms, bonds, groups)])
-    rows = _internal(snapshot, kind, [waters.triples, *groups], selected, holding.angles)
+    rigid = [waters.triples, *groups]
+    rows = [] if kind == "none" else _internal(snapshot, kind, bonds, rigid, selected, holding.angles)
     if len(waters.triples):
         rows.append(water_rows(waters.triples, geometry, snapshot.angstrom))
     rows += body_rows(snapshot, groups)
@@ -268,18 +270,12 @@ def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray |
 
 
 def _internal(
-    snapshot: Snapshot, kind: str, rigid: Sequence[IntArray], selected: BoolArray | None, angles: str
+    snapshot: Snapshot, kind: str, bonds: IntArray, rigid: Sequence[IntArray], selected: BoolArray | None, angles: str
 ) -> list[Constraint]:
     """Bonds, angles, and linear rows for straight angles, outside of rigid groups."""
-    if kind == "none":
-        return []
-    topology = snapshot.topology
-    hydrogen = topology.hydrogen
-    bonds = topology.bonds
+    topology, hydrogen = snapshot.topology, snapshot.topology.hydrogen
     massless = (topology.masses == 0) & (topology.elements == "")
     bonds = bonds[~massless[bonds].any(axis=1)]
-    # Some force fields list the H-H of water as a bond; it is not one.
-    bonds = bonds[~_closing(bonds, hydrogen)]
     held = bonds[hydrogen[bonds].any(axis=1)] if kind == "hbonds" else bonds
     if selected is not None:
         held = held[selected[held].all(axis=1)]
