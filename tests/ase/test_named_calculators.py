@@ -17,43 +17,33 @@ from kcons.ase.named_calculators import LISTED, described, named_calculator, ref
 from kcons.errors import InputError
 
 
-def test_names_and_settings():
-    assert isinstance(named_calculator("emt"), EMT)
-    made = named_calculator("ase.calculators.lj:LennardJones", {"sigma": 2.0})
-    assert isinstance(made, LennardJones) and made.parameters.sigma == 2.0
-    pytest.importorskip("tblite")
-    assert named_calculator("gfn1", {"charge": 1}).parameters.method == "GFN1-xTB"
+@pytest.mark.parametrize("name", ["no", "no.module:thing", "math:sqrt"])
+def test_what_there_is_not_is_said(name):
+    settings = "" if name == "no" else " with these settings"
+    with pytest.raises(InputError, match=f"no calculator '{name}'{settings}.*gfn2, gfn1"):
+        named_calculator(name, {"x": 1})
 
 
-@pytest.mark.parametrize(("name", "settings"), [("no", {}), ("no.module:thing", {}), ("lj", {"nothing of mine": 1})])
-def test_what_there_is_not_is_said(name, settings):
-    if name == "lj":
-        name, settings = "math:sqrt", {"x": 1}
-    with pytest.raises(
-        InputError, match=rf"no calculator '{name}'{'' if name == 'no' else ' with these settings'}.*gfn2, gfn1"
-    ):
-        named_calculator(name, settings)
-
-
-@pytest.mark.parametrize(("name", "typo", "known"), [("lj", "sgima", "sigma"), ("gfn2", "chrge", "charge")])
+@pytest.mark.parametrize(("name", "typo", "known"), [("lj", "sgima", "sigma"), ("gfn1", "chrge", "charge")])
 def test_settings_that_nothing_reads_are_refused(name, typo, known):
-    if name == "gfn2":
+    if name == "gfn1":
         pytest.importorskip("tblite")
     with pytest.raises(InputError, match=rf"{name} has no setting '{typo}' .did you mean '{known}'"):
         named_calculator(name, {typo: 1})
-    assert named_calculator(name, {known: 1}).parameters[known] == 1
+    made = named_calculator(name, {known: 1}).parameters
+    assert made[known] == 1 and made.get("method", "GFN1-xTB") == "GFN1-xTB"
 
 
 def test_what_tells_calculators_from_each_other():
-    made = [
-        LennardJones(epsilon=0.1),
-        LennardJones(epsilon=0.2),
-        EMT(),
-        SumCalculator([EMT(), LennardJones(epsilon=0.1)]),
-        SumCalculator([EMT(), LennardJones(epsilon=0.2)]),
-    ]
-    texts = [json.dumps(described(calculator, Atoms())) for calculator in made]
-    assert len(set(texts)) == len(made)
+    """Also what atoms have that calculators read, and what adds forces."""
+    lj = [LennardJones(epsilon=size) for size in (0.1, 0.2)]
+    made = [(each, Atoms()) for each in (*lj, EMT(), *(SumCalculator([EMT(), each]) for each in lj))]
+    adding = (ExternalForce(0, 1, 0.5), ExternalForce(0, 1, 0.6), Hookean(0, 1, 2.0, 1.0))
+    made += [(EMT(), Atoms("H2", constraint=[FixAtoms([0]), item])) for item in adding]
+    made += [(EMT(), Atoms("H2", magmoms=[1.0, 0.0])), (EMT(), Atoms("H2", charges=[1.0, 0.0]))]
+    assert len({json.dumps(described(*each)) for each in made}) == len(made)
+    for plain in (Atoms("H2", charges=[0.0, 0.0]), Atoms("H2", constraint=FixAtoms([0]))):
+        assert described(EMT(), plain) == described(EMT(), Atoms())
     same = LennardJones(epsilon=np.float64(0.1))
     same.parameters["beside"] = {"b": object, "a": np.arange(2)}
     other = LennardJones(epsilon=0.1)
@@ -71,14 +61,6 @@ def test_weights_in_a_file_belong_to_a_calculator(tmp_path):
     assert described(calculator, Atoms()) == before
     model.write_bytes(b"others!")
     assert described(calculator, Atoms()) != before
-
-
-def test_what_atoms_have_that_calculators_read_and_what_adds_forces_belong_to_them():
-    plain = [Atoms("H2", charges=[0.0, 0.0]), Atoms("H2", constraint=FixAtoms([0]))]
-    others = [Atoms("H2", magmoms=[1.0, 0.0]), Atoms("H2", charges=[1.0, 0.0])]
-    adding = (ExternalForce(0, 1, 0.5), ExternalForce(0, 1, 0.6), Hookean(0, 1, 2.0, 1.0))
-    others += [Atoms("H2", constraint=[FixAtoms([0]), item]) for item in adding]
-    assert len({json.dumps(described(EMT(), atoms)) for atoms in (*plain, *others)}) == 1 + len(others)
 
 
 # -- what names a calculator may be somebody else ---------------------------------------------------
@@ -114,9 +96,10 @@ def module(tmp_path, monkeypatch):
     sys.modules.pop("calculators_of_mine", None)
 
 
-def test_a_class_or_a_function_makes_a_calculator(module):
+def test_a_name_a_class_or_a_function_makes_a_calculator(module):
     name, _ = module
-    assert isinstance(named_calculator(f"{name}:Mine"), EMT)
+    assert isinstance(named_calculator("emt"), EMT) and isinstance(named_calculator(f"{name}:Mine"), EMT)
+    assert named_calculator("ase.calculators.lj:LennardJones", {"sigma": 2.0}).parameters.sigma == 2.0
     assert named_calculator(f"{name}:made", {"asap_cutoff": True}).parameters["asap_cutoff"] is True
 
 

@@ -38,24 +38,21 @@ def test_elements_of_atoms(others):
         assert found[0] == element, (name, residue)
 
 
-def test_masses_that_were_read_decide():
-    names, zeros = np.array(["CLA", "X7", "H1", "MW", "CA"]), np.zeros(5, int)
-    found = elements_of(names, zeros, np.array(["LIG"]), np.array([35.45, 15.999, 3.024, 0.0, 12.011]))
-    assert found.tolist() == ["Cl", "O", "H", "", "C"]  # 3.024: hydrogens made heavier stay hydrogens
-
-
-def test_names_decide_where_hydrogens_took_mass_from_their_neighbors():
-    """Amide N then weighs as much as C, hydroxyl O as N, CH as Be, the oxygen of water as C."""
-    names = np.array(["CB", "HB1", "HB2", "OG", "HG", "N", "HN", "CA", "HA", "OH2"])
-    masses = np.array([7.979, 3.024, 3.024, 13.983, 3.024, 11.991, 3.024, 8.987, 4.032, 11.967])
-    found = elements_of(names, np.zeros(10, int), np.array(["SER"]), masses)
-    assert found.tolist() == ["C", "H", "H", "O", "H", "N", "H", "C", "H", "O"]
-
-
-def test_without_names_everything_lighter_than_helium_is_hydrogen():
-    masses = np.array([15.999, 1.008, 2.014, 3.024, 4.0026, 0.4])
-    found = elements_of(np.array(["1", "2", "3", "4", "5", "6"]), np.zeros(6, int), np.array([""]), masses)
-    assert found.tolist() == ["O", "H", "H", "H", "", ""]
+def test_elements_by_names_and_masses():
+    for names, masses, elements in (
+        # Masses that were read decide; hydrogens made heavier stay hydrogens.
+        ("CLA X7 H1 MW CA", [35.45, 15.999, 3.024, 0.0, 12.011], "Cl O H - C"),
+        # Names, where hydrogens took mass: amide N weighs as much as C, hydroxyl O as N, CH as Be.
+        (
+            "CB HB1 OG HG N HN CA HA OH2",
+            [7.98, 3.024, 13.983, 3.024, 11.991, 3.024, 8.987, 4.0, 12],
+            "C H O H N H C H O",
+        ),
+        # Without names, what is lighter than helium is hydrogen.
+        ("1 2 3 4 5 6", [15.999, 1.008, 2.014, 3.024, 4.0026, 0.4], "O H H H - -"),
+    ):
+        found = elements_of(np.array(names.split()), np.zeros(len(masses), int), np.array(["LIG"]), np.array(masses))
+        assert [element or "-" for element in found] == elements.split()
 
 
 def test_residues_end_where_a_name_comes_again():
@@ -90,11 +87,9 @@ def test_single_precision_gives_back_the_decimals_of_a_file():
 
 
 def test_units_and_numbers_of_atoms():
-    made = snapshot(["O", "H", "H"], WATER, cell=np.eye(3) * 20, velocities=WATER)
+    made = snapshot(["O", "H", "H"], WATER, cell=WATER, velocities=WATER)
     there = made.in_unit(0.1)
-    np.testing.assert_allclose(there.positions, WATER / 10)
-    np.testing.assert_allclose(there.cell, np.eye(3) * 2)
-    np.testing.assert_allclose(there.velocities, WATER / 10)
+    np.testing.assert_allclose([there.positions, there.cell, there.velocities], [WATER / 10] * 3)
     with pytest.raises(InputError, match="3 atoms in the topology, but positions have shape"):
         Snapshot(made.topology, WATER[:2])
 
@@ -117,10 +112,9 @@ def test_cells_that_would_have_to_be_turned():
 
 
 def test_what_is_whole_or_has_no_cell_stays():
-    made = snapshot(["C", "C"], [[0.0, 0, 0], [1.5, 0, 0]], [(0, 1)], cell=np.diag([7.0, 8.0, 9.0]))
-    assert whole_molecules(made) is made
-    free = snapshot(["C", "C"], [[0.0, 0, 0], [6.5, 0, 0]], [(0, 1)])
-    assert whole_molecules(free) is free
+    for length, cell in ((1.5, np.diag([7.0, 8.0, 9.0])), (6.5, None)):
+        made = snapshot(["C", "C"], [[0.0, 0, 0], [length, 0, 0]], [(0, 1)], cell=cell)
+        assert whole_molecules(made) is made
 
 
 def test_groups_lie_where_the_bonds_of_their_molecule_say():
