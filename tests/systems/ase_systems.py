@@ -8,7 +8,7 @@ import pkgutil
 
 import numpy as np
 from ase import Atoms, units
-from ase.build import molecule
+from ase.build import bulk, molecule
 from ase.calculators.calculator import Calculator, all_changes
 from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
@@ -150,6 +150,16 @@ def ethanol() -> tuple[Atoms, Constraints]:
     atoms = molecule("CH3CH2OH")
     atoms.calc = EMT()
     return atoms, constrain(atoms, [Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2], [1, 0, 3]])])
+
+
+def copper() -> Atoms:
+    """A crystal with two bonds held; the forces of EMT tell of volume."""
+    atoms = bulk("Cu", cubic=True) * 2
+    atoms.rattle(0.05, rng=random(3))
+    atoms.calc = EMT()
+    constrain(atoms, Distance([[0, 1], [2, 3]]))
+    draw_velocities(atoms, TEMPERATURE, 1)
+    return atoms
 
 
 # -- measures ---------------------------------------------------------------------------------------

@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ase import units
-from ase.build import bulk
 from ase.calculators.calculator import all_changes
-from ase.calculators.emt import EMT
 from ase.constraints import Hookean
-from ase_systems import FS, TEMPERATURE, Field, Free, dumbbells, follow, state
+from ase_systems import FS, TEMPERATURE, Field, Free, copper, dumbbells, follow, state
 
 from kcons.ase import (
     ConstrainedDynamics,
@@ -21,7 +19,6 @@ from kcons.ase import (
     IsokineticDynamics,
     MultipleTimeSteps,
     constrain,
-    draw_velocities,
 )
 from kcons.constraints import Distance
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
@@ -71,19 +68,9 @@ def test_a_run_goes_on_without_its_barostat_in_its_cell():
 # -- forces, and what moves ---------------------------------------------------------------------------
 
 
-def crystal(calculator=None):
-    """Copper with two bonds held; the forces of EMT tell of volume."""
-    atoms = bulk("Cu", cubic=True) * 2
-    atoms.rattle(0.05, rng=np.random.default_rng(3))
-    atoms.calc = EMT() if calculator is None else calculator
-    constrain(atoms, Distance([[0, 1], [2, 3]]))
-    draw_velocities(atoms, 300, 1)
-    return atoms
-
-
 @pytest.mark.parametrize(("which", "kind"), [("monte carlo", "semi-isotropic"), ("rescaling", "flexible")])
 def test_the_energy_that_trials_bring_is_accounted_for(which, kind):
-    atoms = crystal()
+    atoms = copper()
     if which == "monte carlo":  # forces of ASE's objects count in the energy, and have no stress
         atoms.set_constraint([*atoms.constraints, Hookean(a1=4, a2=5, rt=2.0, k=5.0)])
         made = MonteCarloBarostat(0.0, every=2, kind=kind, width=1e-3)

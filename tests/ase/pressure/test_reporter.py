@@ -13,7 +13,7 @@ from ase.calculators.lj import LennardJones
 from ase.constraints import FixAtoms, Hookean
 from ase.filters import ExpCellFilter, FrechetCellFilter, StrainFilter, UnitCellFilter
 from ase.optimize import BFGS
-from ase_systems import FS, TEMPERATURE, dumbbells, pressure
+from ase_systems import FS, TEMPERATURE, copper, dumbbells, pressure
 
 from kcons.ase import (
     ConstrainedCalculator,
@@ -21,20 +21,10 @@ from kcons.ase import (
     ConstrainedLangevin,
     PressureReporter,
     constrain,
-    draw_velocities,
 )
 from kcons.constraints import Distance, Plane
 from kcons.errors import InputError, UnsupportedError
 from kcons.thermostats import MonteCarloBarostat
-
-
-def copper():
-    atoms = bulk("Cu", cubic=True) * 2
-    atoms.rattle(0.05, rng=np.random.default_rng(3))
-    atoms.calc = EMT()
-    constrain(atoms, Distance([[0, 1], [2, 3]]))
-    draw_velocities(atoms, 300, 1)
-    return atoms
 
 
 def test_atomic_pressure_is_that_of_ase_with_the_constraint_part():
