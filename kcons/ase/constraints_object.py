@@ -26,7 +26,7 @@ from kcons.ase.binding import (
 )
 from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions, fulfilled, virial_of
 from kcons.ase.topology import bonds_of, constraints_of, require_atoms, velocities_of
-from kcons.ase.translation import ase_forms, file_form, translated
+from kcons.ase.translation import ase_forms, translated
 from kcons.constraints import Constraint, FixedAtoms
 from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
@@ -334,11 +334,12 @@ class Constraints(FixConstraint):
         except InputError as error:
             warnings.warn(f"constraints are left out of the file: {error}", stacklevel=3)
             raise AttributeError(f"todict: {error}") from None
-        data, bound = {"name": REGISTERED_NAME, "kwargs": {"constraints": rows}}, self._binding
+        forms, left = ase_forms(self.constraints)
         # ASE counts rows as they are given, also those that depend on others.
-        if bound is None or bound.motion.rank == sum(item.n_rows for item in self.constraints):
-            data = file_form(self.constraints) or data
-        return lambda: data
+        bound, given = self._binding, sum(item.n_rows for item in self.constraints)
+        if len(forms) == 1 and not left and (bound is None or bound.motion.rank == given):
+            return lambda: forms[0]
+        return lambda: {"name": REGISTERED_NAME, "kwargs": {"constraints": rows}}
 
     def __repr__(self) -> str:
         converted = self._binding.motion.conversions if self._binding is not None else ()

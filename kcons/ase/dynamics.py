@@ -345,12 +345,16 @@ class ConstrainedDynamics(MolecularDynamics):
                     "name atoms by their numbers, which are others now; make a new one",
                     item="atoms",
                 )
-            rows = [*_rows(atoms), *self._more]
+            holding = [item for item in atoms.constraints if not isinstance(item, FORCES_ONLY)]
+            for item in holding:
+                if isinstance(item, Constraints):
+                    item.engine(atoms)  # settles targets that are open
+            rows = [*translated(atoms, holding), *self._more]
             bound = bind(rows, atoms, self.time)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, company(atoms.constraints), None
-            self._only_forces = any(isinstance(item, FORCES_ONLY) for item in atoms.constraints)
+            self._only_forces = len(holding) < len(atoms.constraints)
             self._system = self._made(bound.motion)
             self._system.time_unit = ("fs", units.fs)
             self._mover.check(self._system)
@@ -374,14 +378,6 @@ class ConstrainedDynamics(MolecularDynamics):
         if self._only_forces:
             return applied_forces(self.atoms)
         return self.atoms.get_forces(apply_constraint=False)
-
-
-def _rows(atoms: Atoms) -> list[Constraint]:
-    holding = [item for item in atoms.constraints if not isinstance(item, FORCES_ONLY)]
-    for item in holding:
-        if isinstance(item, Constraints):
-            item.engine(atoms)  # settles targets that are open
-    return translated(atoms, holding)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -120,12 +120,6 @@ _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
 }
 
 
-def file_form(rows: Sequence[Constraint]) -> dict[str, Any] | None:
-    """The one constraint of ASE that holds the same, as in `ase_forms`, for a file; None if there is none."""
-    forms, left = ase_forms(rows)
-    return forms[0] if len(forms) == 1 and not left else None
-
-
 def ase_forms(rows: Sequence[Constraint]) -> tuple[list[dict[str, Any]], list[Constraint]]:
     """Constraints of ASE that hold the same, as `ase.constraints.dict2constraint` takes them, and what none holds.
 
