@@ -27,7 +27,7 @@ from kcons.ase.binding import (
 from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions, fulfilled, virial_of
 from kcons.ase.topology import bonds_of, constraints_of, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, translated
-from kcons.constraints import Constraint, FixedAtoms
+from kcons.constraints import Constraint
 from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -287,22 +287,11 @@ class Constraints(FixConstraint):
         return tuple(kept)
 
     def repeat(self, m: Any, n: int) -> Constraints:
-        """Hold the fixed atoms of all replicas of a cell of `n` atoms, `m` times along each axis; returns this object.
-
-        Raises
-        ------
-        UnsupportedError
-            For other rows, whose atoms may be in different replicas; nor does ASE repeat its own bonds and angles.
-        """
-        for item in self.constraints:
-            if not item.fixes_atoms:
-                raise UnsupportedError(
-                    f"{item!r} cannot be repeated; take the constraints off with atoms.set_constraint(), and hold the "
-                    "rows of all replicas afterwards"
-                )
-        copies = int(np.prod(np.broadcast_to(m, 3)))
-        self.constraints = (FixedAtoms((self.touched + n * np.arange(copies)[:, None]).ravel()),)
-        return self
+        """Refuse replicas of a cell: atoms of a row may be in different ones."""
+        raise UnsupportedError(
+            f"{self!r} cannot be repeated; take the constraints off with atoms.set_constraint(), and hold the rows of "
+            "all replicas afterwards"
+        )
 
     # -- copies and files -----------------------------------------------------------------------
 
