@@ -79,6 +79,12 @@ MUTANTS = {
             "isokinetic_ensemble::of_velocities_set_between_calls_only_the_direction_counts",
         ),
     ],
+    "openmm/ensembles/monte_carlo_sampler.py": [
+        (
+            "if «not missed <= self.tolerance→False»:",
+            "monte_carlo_sampler::a_way_back_that_misses_its_start_is_rejected",
+        ),
+    ],
     "constraints/constraint.py": [
         ("self.refuse(«~(target > 0)→target < 0», 0,", "target::a_distance_that_moves_below_zero_is_refused_there"),
     ],

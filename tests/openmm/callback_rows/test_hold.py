@@ -289,26 +289,16 @@ def test_places_of_a_molecule_that_is_stored_in_several_images(platform, tie):
     np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=0, atol=1e-7)
 
 
-def in_frame_of_its_center(ratio):
-    """A chain without forces whose masses are 1 and `ratio` in turn; masses, positions, velocities on the rows."""
-    rng = np.random.default_rng(0)
-    n = 12
-    masses = np.where(np.arange(n) % 2 == 0, 1.0, ratio)
-    k = np.arange(n)
-    x = np.stack([0.1 * k, 0.05 * (k % 2), 0.02 * np.sin(k)], axis=1)
-    x = x @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    x -= masses @ x / masses.sum()
-    v = 0.1 * rng.normal(size=(n, 3)) / np.sqrt(masses)[:, None]
-    v -= masses @ v / masses.sum()
-    return masses, x, v
-
-
 @pytest.mark.parametrize("every", [1, 50])
 @pytest.mark.usefixtures("without_device")
 def test_velocities_are_those_of_the_core(every):
     """To the last digits, also where somebody looks at each step; carried with x they have three digits less."""
-    masses, x, v = in_frame_of_its_center(10.0)
-    rows = Distance([[k, k + 1] for k in range(len(masses) - 1)])
+    rng, k = np.random.default_rng(0), np.arange(12)
+    masses = np.where(k % 2 == 0, 1.0, 10.0)
+    x = np.stack([0.1 * k, 0.05 * (k % 2), 0.02 * np.sin(k)], axis=1) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    v = 0.1 * rng.normal(size=x.shape) / np.sqrt(masses)[:, None]
+    x, v = (each - masses @ each / masses.sum() for each in (x, v))
+    rows = Distance(np.stack([k[:-1], k[1:]], axis=1))
     system = particles(masses)
     part = hold(system, rows, x)
     core = System(part.motion)

@@ -106,29 +106,6 @@ def test_noise_belongs_to_particle_and_step():
     assert np.abs(runs[2] - runs[3]).max() > 1e-4
 
 
-@pytest.mark.parametrize("platform", [pytest.param(*p.values, id=p.id, marks=[*p.marks, LONG]) for p in GPUS])
-def test_atoms_in_other_places_stay_on_their_rows(platform):
-    """Mixed fluid, so that OpenMM sorts its atoms anew every 250 evaluations; pairs that cross the box."""
-    rng = np.random.default_rng(2)
-    force = openmm.NonbondedForce()
-    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
-    force.setCutoffDistance(0.9)
-    x = 0.4 * np.array(list(np.ndindex(5, 5, 4)), dtype=float)
-    for _ in x:
-        force.addParticle(0.0, 0.2, 0.5)
-    system = particles([40.0] * 100, force, held=[(k, k + 1, 0.4) for k in range(0, 100, 2)])
-    system.setDefaultPeriodicBoxVectors(*(2.0 * np.eye(3)))
-    integrator = ProjectedIntegrator(0.004, ensemble=Langevin(300.0, 1.0), device=True)
-    integrator.setRandomNumberSeed(1)
-    context = started(system, integrator, x, 0.8 * rng.normal(size=x.shape), platform)
-    integrator.applyVelocityConstraints(context)
-    before = integrator.read("atoms")
-    integrator.step(3000)
-    assert np.mean(before != integrator.read("atoms")) > 0.5
-    assert np.abs(state_of(context)[0] - x).max() > 2.0
-    assert residuals(system, context)[0] < (1e-4 if platform.endswith("single") else 1e-7)
-
-
 # -- operations -----------------------------------------------------------------------------------------
 
 

@@ -274,16 +274,15 @@ def test_linear_rows_of_a_straight_molecule_are_found():
 # -- multipliers ------------------------------------------------------------------------------------
 
 
+def pulled_apart():
+    return particles([12.0] * 2, on_each("-100*x", [1]), on_each("100*x", [0]))
+
+
 @pytest.mark.parametrize("platform", ["Reference", *MIXED])
 def test_multipliers_are_summed_where_the_rows_are(platform):
     """A pair that is pulled apart by 100 kJ/mol/nm at each end, and a bath that adds nothing on average."""
-    apart = mm.CustomExternalForce("-c*x")
-    apart.addPerParticleParameter("c")
-    for k in range(2):
-        apart.addParticle(k, [200.0 * k - 100.0])
-    system = particles([12.0] * 2, apart)
     x = np.array([[0, 0, 0], [0.15, 0, 0]])
-    _, context = run(system, x, 0 * x, platform, 50, Distance([[0, 1]]))
+    _, context = run(pulled_apart(), x, 0 * x, platform, 50, Distance([[0, 1]]))
     integrator = context.getIntegrator()
     part = integrator.parts[0]
     assert part.mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-5)
@@ -308,8 +307,8 @@ def test_multipliers_in_single_precision(platform):
         _, context = run(system, x, 0 * x, place, 100, rows)
         found.append(context.getIntegrator().parts[0].mean_multipliers(context.getIntegrator()))
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-4 * np.abs(found[0]).max())
-    pair = particles([12.0] * 2, on_each("-100*x", [1]), on_each("100*x", [0]))
-    _, context = run(pair, np.array([[0, 0, 0], [0.15, 0, 0]]), np.zeros((2, 3)), platform, 20_000, Distance([[0, 1]]))
+    x = np.array([[0, 0, 0], [0.15, 0, 0]])
+    _, context = run(pulled_apart(), x, 0 * x, platform, 20_000, Distance([[0, 1]]))
     integrator = context.getIntegrator()
     assert integrator.parts[0].mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-4)
 

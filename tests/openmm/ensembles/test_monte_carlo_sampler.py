@@ -153,17 +153,10 @@ def trimer(steps=(3, 8), dt=0.15, spring=0.0, **options):
     return HamiltonianMonteCarlo(context, 1 / GAS_CONSTANT, steps, 21, **options)
 
 
-def test_a_free_angle_has_the_average_of_its_metric():
-    """P(c) of the cosine is sqrt(1 - (b c)^2), b = 10/11; 1/3 would be the average without the metric."""
+def test_a_way_back_that_misses_its_start_is_rejected():
     sampler = trimer()
-    squares = []
-    for _ in range(600):
-        sampler.step(1)
-        x = state_of(sampler.context)[0]
-        squares.append(float((x[0] - x[1]) @ (x[2] - x[1])) ** 2)
-    error = np.reshape(squares, (20, -1)).mean(axis=1).std(ddof=1) / math.sqrt(20)
-    assert abs(np.mean(squares) - 0.276334992061) < 3 * error < abs(np.mean(squares) - 1 / 3)
-    assert sampler.counts.accepted < 600
+    sampler.step(60)
+    assert sampler.counts.irreversible > 0
 
 
 def test_other_constraints_are_held_and_taken_back():

@@ -36,7 +36,8 @@ platforms = pytest.mark.parametrize("platform", PLATFORMS)
 # -- its Context ------------------------------------------------------------------------------------
 
 
-def test_finds_its_context():
+def test_finds_its_context(monkeypatch):
+    """Looked for once."""
     system, x, v = dumbbell()
     first, second, third = (ProjectedIntegrator(1e-3) for _ in range(3))
     with pytest.raises(UnsupportedError, match="belongs to no Context"):
@@ -47,27 +48,22 @@ def test_finds_its_context():
         assert integrator.context is contexts[k]
     with pytest.raises(InputError, match="another integrator"):
         first.attach(contexts[1])
+    asked, find = [], guard.gc.get_referrers
+    monkeypatch.setattr(guard.gc, "get_referrers", lambda *given: asked.append(1) or find(*given))
+    for _ in range(3):
+        second.step(2)
+        second.degrees_of_freedom()
+        second.check()
+    assert len(asked) <= 3 and contexts[1].getStepCount() == 6
+    asked.clear()
+    second.step(2)
+    assert not asked
     third.attach(contexts[2])
     third.step(1)
     assert contexts[2].getStepCount() == 1
     contexts.pop()
     with pytest.raises(UnsupportedError, match="belongs to no Context"):
         third.step(1)
-
-
-def test_the_context_is_looked_for_once(monkeypatch):
-    system, x, v = dumbbell()
-    asked, find = [], guard.gc.get_referrers
-    monkeypatch.setattr(guard.gc, "get_referrers", lambda *given: asked.append(1) or find(*given))
-    context = started(system, integrator := ProjectedIntegrator(1e-3), x, v)
-    for _ in range(3):
-        integrator.step(2)
-        integrator.degrees_of_freedom()
-        integrator.check()
-    assert len(asked) <= 3 and context.getStepCount() == 6
-    asked.clear()
-    integrator.step(2)
-    assert not asked
 
 
 @with_and_without_device
