@@ -218,6 +218,15 @@ def loose_alanine():
     return system, x, v
 
 
+#: Every kind, for a temperature (K).
+BAROSTATS = {
+    "isotropic": lambda kelvin: openmm.MonteCarloBarostat(1.0, kelvin, 5),
+    "anisotropic": lambda kelvin: openmm.MonteCarloAnisotropicBarostat(openmm.Vec3(1, 1, 1), kelvin),
+    "membrane": lambda kelvin: openmm.MonteCarloMembraneBarostat(1.0, 0.0, kelvin, 0, 0),
+    "flexible": lambda kelvin: openmm.MonteCarloFlexibleBarostat(1.0, kelvin, 25, True),
+}
+
+
 def holding(**arguments):
     """A part that holds z of the atom that no constraint of `loose_alanine` touches."""
     return HeldCoordinates([0], 2, float(alanine()[1][0, 2]), 22, **arguments)

@@ -152,12 +152,18 @@ def barostat():
             openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False),
             "rows are held, and MonteCarloFlexibleBarostat .*let it scale molecules as rigid",
         ),
+        # OpenMM counts atoms as one molecule that a bond joins, also the bond of a row, but not those of an RGForce.
+        (openmm.RGForce([0, 3]), barostat(), "MonteCarloBarostat moves molecules apart"),
+        (field("x", [6]), openmm.CMMotionRemover(), "momentum is not conserved"),
     ],
-    ids=["between molecules", "place", "momentum", "scaled atoms"],
+    ids=["between molecules", "place", "momentum", "scaled atoms", "collective, between", "collective, momentum"],
 )
 def test_agents_that_break_rows_are_refused(rows, force, words):
     system, x = waters(2, force)
-    part = hold(system, rows, x, take="all", keep_water=False)
+    if isinstance(rows, openmm.Force):
+        part = CollectiveRows(system, [rows], positions=x)
+    else:
+        part = hold(system, rows, x, take="all", keep_water=False)
     integrator = ProjectedIntegrator(0.001, parts=[part])
     context = started(system, integrator, x)
     with pytest.raises(UnsupportedError, match=words):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import context_of, particles, started, water_box
+from openmm_systems import BAROSTATS, context_of, particles, started, water_box
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Langevin, ProjectedIntegrator, worst_length
@@ -109,21 +109,13 @@ def test_a_length_that_cannot_be_held_is_refused(length):
         assert caught.value.atoms == (0, 1)
 
 
-BAROSTATS = {
-    "isotropic": lambda: openmm.MonteCarloBarostat(1, 300),
-    "anisotropic": lambda: openmm.MonteCarloAnisotropicBarostat([1, 1, 1], 300),
-    "membrane": lambda: openmm.MonteCarloMembraneBarostat(1, 0, 300, 0, 0),
-    "flexible": lambda: openmm.MonteCarloFlexibleBarostat(1, 300, 25, True),
-}
-
-
 @pytest.mark.parametrize(
     ("one", "two"), [("isotropic", "isotropic"), ("isotropic", "membrane"), ("anisotropic", "flexible")]
 )
 def test_two_barostats_are_refused(one, two):
     system, x = water_box(8)
     for name in (one, two):
-        system.addForce(BAROSTATS[name]())
+        system.addForce(BAROSTATS[name](300))
     context = started(system, integrator := ProjectedIntegrator(2e-3, ensemble=Langevin(300, 1.0)), x)
     with pytest.raises(UnsupportedError, match=r"the System has 2 barostats \(.*Remove all but one"):
         integrator.step(1)
