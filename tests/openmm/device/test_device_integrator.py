@@ -138,18 +138,11 @@ def test_states_of_other_rows_are_refused():
 
     _, many = made([[0, 1], [2, 3], [4, 5]])
     state = many.getState(positions=True, velocities=True, parameters=True, integratorParameters=True)
-    system, few = made([[0, 1]])
+    _, few = made([[0, 1]])
     with pytest.raises(openmm.OpenMMException, match="other steps or rows"):
         few.setState(state)
     with pytest.raises(openmm.OpenMMException, match="other steps or rows"):
         made([[0, 1]], NoseHoover(300.0, 10.0))[1].loadCheckpoint(many.createCheckpoint())
-    # A row more in the same System: the run goes on.
-    before = state_of(few)
-    system.addConstraint(2, 3, float(np.linalg.norm(before[0][2] - before[0][3])))
-    few.reinitialize(True)
-    assert np.abs(np.array(state_of(few)) - before).max() == 0.0
-    few.getIntegrator().step(1)
-    assert residuals(system, few)[0] < 1e-12
 
 
 def test_constraints_that_are_taken_away_before_reinitialize_hold_no_more():
@@ -177,17 +170,8 @@ def test_settings_change_what_is_done():
         assert integrator.getTemperature()._value == 900.0 and integrator.getGlobalVariableByName("link1") != 0
     assert difference(*contexts) < 1e-8
     assert contexts[0].getTime()._value == pytest.approx(0.015)
-    with pytest.raises(UnsupportedError, match="setTemperature"):
-        made[0].setGlobalVariableByName("kT", 1.0)
     made[0].setGlobalVariableByName("link1", 0.25)
     assert made[0].getGlobalVariableByName("link1") == 0.25
-    for integrator in made:  # as openmmtools does: settings have their values again in the next step
-        names = [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
-        k = names.index("kT")
-        assert integrator.getGlobalVariable(k) == integrator.getGlobalVariableByName("kT") > 0
-        integrator.setGlobalVariable(k, 0.0)
-        integrator.step(1)
-        assert integrator.getTemperature()._value == 900.0 and integrator.getGlobalVariable(k) > 0
     assert made[0].getNumPerDofVariables() == made[0].getNumTabulatedFunctions() == 0
     with pytest.raises(UnsupportedError, match="force groups"):
         made[0].setIntegrationForceGroups({0})

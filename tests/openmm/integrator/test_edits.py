@@ -8,7 +8,7 @@ import numpy as np
 import openmm
 import pytest
 from ensemble_runs import run
-from openmm_systems import potential_energy, started, state_of, water_box
+from openmm_systems import potential_energy, started, state_of, water_box, with_and_without_device
 from tied_cluster import ON_DEVICE, X, carried_at, cluster, row_at, thermostatted
 
 from kcons.errors import CertificateError, InputError, KconsError
@@ -23,9 +23,10 @@ everywhere = pytest.mark.parametrize(
 # -- the System is read again ---------------------------------------------------------------------------
 
 
+@with_and_without_device
 @pytest.mark.parametrize("preserved", [True, False])
-def test_rows_after_reinitialize(preserved):
-    system, integrator = cluster(), ProjectedIntegrator(0.002)
+def test_rows_after_reinitialize(preserved, device):
+    system, integrator = cluster(), ProjectedIntegrator(0.002, device=device)
     context = run(system, integrator, X, 0 * X, 3)
     free = integrator.degrees_of_freedom()
     x, v = state_of(context)
@@ -38,6 +39,11 @@ def test_rows_after_reinitialize(preserved):
     assert integrator.degrees_of_freedom() == free - 1
     x = state_of(context)[0]
     assert np.linalg.norm(x[0] - x[1]) == pytest.approx(system.getConstraintParameters(0)[2]._value, rel=1e-9)
+    system.removeConstraint(0)
+    context.reinitialize(preserveState=True)
+    integrator.step(50)
+    assert abs(np.linalg.norm(np.subtract(*state_of(context)[0][:2])) - np.linalg.norm(x[0] - x[1])) > 1e-4
+    system.addConstraint(0, 1, 0.3)
     system.setConstraintParameters(0, 0, 1, 3.0)
     context.reinitialize(preserveState=True)
     integrator.attach(context)  # lengths are read again where somebody says so
@@ -45,8 +51,9 @@ def test_rows_after_reinitialize(preserved):
         integrator.step(1)
 
 
-def test_masses_and_lengths_after_reinitialize():
-    system, integrator = cluster(), ProjectedIntegrator(0.002)
+@with_and_without_device
+def test_masses_and_lengths_after_reinitialize(device):
+    system, integrator = cluster(), ProjectedIntegrator(0.002, device=device)
     length = float(np.linalg.norm(X[0] - X[1]))
     system.addConstraint(0, 1, length)
     context = run(system, integrator, X, np.sin(np.arange(X.size)).reshape(X.shape), 3)

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-import openmm
 import pytest
 from collective_cases import bond
-from openmm_systems import pairs_force, particles, started, state_of
+from openmm_systems import started, state_of
+from tied_cluster import X, cluster
 
 from kcons.constraints import Distance
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
 
 
 def held(kind):
-    """Three particles in a chain, a distance of the first two held."""
-    springs = pairs_force(openmm.HarmonicBondForce(), (1, 2, 0.15, 1e4), (0, 2, 0.2, 1e2))
-    system = particles([12.0, 16.0, 14.0], springs)
-    x = np.array([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.15, 0.15, 0.0]])
+    """A distance of two particles."""
+    system, start = cluster(), float(np.linalg.norm(X[0] - X[7]))
     if kind == "collective":
-        return system, CollectiveRows(system, [Row(bond(0, 1), 0.15)]), x
-    target = (lambda t: 0.15 + 0.03 * t) if kind == "moving" else 0.15
-    return system, hold(system, Distance([[0, 1]], target), x), x
+        return system, CollectiveRows(system, [Row(bond(0, 7), start)])
+    return system, hold(system, Distance([[0, 7]], (lambda t: start + 0.03 * t) if kind == "moving" else start), X)
 
 
 @pytest.mark.parametrize(
@@ -36,12 +33,12 @@ def held(kind):
 )
 def test_integrators_in_turn_hold_the_same_part(kind, first, second):
     """As each does alone: to warm up with one and go on with another is what scripts do."""
-    v = np.array([[0.0, 0.3, 0.1], [0.1, -0.2, 0.3], [-0.1, 0.0, 0.2]])
+    v = 0.3 * np.random.default_rng(1).normal(size=X.shape)
 
     def begun(made, options):
-        system, part, x = made
+        system, part = made
         integrator = ProjectedIntegrator(0.002, parts=[part], **options)
-        return integrator, started(system, integrator, x, v)
+        return integrator, started(system, integrator, X, v)
 
     together, alone = held(kind), [held(kind), held(kind)]
     shared = [begun(together, options) for options in (first, second)]

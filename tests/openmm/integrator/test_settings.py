@@ -11,7 +11,7 @@ import openmm
 import pytest
 from ensemble_runs import run
 from openmm import unit
-from openmm_systems import field, holding, particles, potential_energy, started, state_of
+from openmm_systems import field, holding, particles, potential_energy, started, state_of, with_and_without_device
 from tied_cluster import EVERYTHING, KINDS, MASSES, ON_DEVICE, X, carried_at, cluster, row_at, thermostatted
 
 from kcons.constraints import Plane
@@ -178,18 +178,21 @@ def test_set_target_outlives_a_state():
     assert abs(made.part.values(made.context)[0] - 0.35) < 1e-12
 
 
-def test_a_setting_has_a_method_of_its_own():
+@with_and_without_device
+@pytest.mark.parametrize(("ensemble", "name"), [(Langevin(300, 1.0), "kT"), (Isokinetic(300), "two_k")])
+def test_a_setting_has_a_method_of_its_own(ensemble, name, device):
     """Written by its number, as programs do that copy all variables, it has its value again in the next step."""
-    for ensemble, name in ((Langevin(300, 1.0), "kT"), (Isokinetic(300), "two_k")):
-        made = thermostatted(ensemble)()
-        made.run(2)
-        integrator, kept = made.integrator, made.integrator.getGlobalVariableByName(name)
-        with pytest.raises(UnsupportedError, match="setting of the integrator"):
-            integrator.setGlobalVariableByName(name, 3.0)
-        for k in range(integrator.getNumGlobalVariables()):
-            integrator.setGlobalVariable(k, 0.0)
-        made.run()
-        assert integrator.getGlobalVariableByName(name) == kept > 1
+    made = thermostatted(ensemble, device=device)()
+    made.run(2)
+    integrator, kept = made.integrator, made.integrator.getGlobalVariableByName(name)
+    with pytest.raises(UnsupportedError, match=r"setting of the integrator: use setTemperature"):
+        integrator.setGlobalVariableByName(name, 3.0)
+    for k in range(integrator.getNumGlobalVariables()):
+        value = integrator.getGlobalVariableByName(integrator.getGlobalVariableName(k))
+        assert integrator.getGlobalVariable(k) == value
+        integrator.setGlobalVariable(k, 0.0)
+    made.run()
+    assert integrator.getGlobalVariableByName(name) == kept > 1
 
 
 def test_zero_kelvin_brings_to_rest():

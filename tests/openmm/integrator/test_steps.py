@@ -52,33 +52,20 @@ class Reluctant(HeldCoordinates):
         program.let("failed", f"select(reluctant,{self.code},failed)", "told to")
 
 
-@pytest.mark.parametrize(
-    ("scheme", "how"), [("rattle", "steepest"), ("geodesic", "reluctant"), ("suzuki4", "reluctant")]
-)
-def test_a_failed_step_is_taken_back_and_not_counted(scheme, how):
+@pytest.mark.parametrize("scheme", ["geodesic", "suzuki4"])
+def test_a_failed_step_is_taken_back_and_not_counted(scheme):
+    """Where all its drifts went well."""
     system, x, v = loose_alanine()
-
-    def begun():
-        part = Reluctant([0], 2, x[0, 2], 22)
-        integrator = ProjectedIntegrator(1e-3, scheme, parts=[part], tolerance=1e-13)
-        return integrator, started(system, integrator, x, v)
-
-    integrator, context = begun()
-    integrator.step(7)
+    integrator = ProjectedIntegrator(1e-3, scheme, parts=[Reluctant([0], 2, x[0, 2], 22)], tolerance=1e-13)
+    context = run(system, integrator, x, v, 7)
     before = state_of(context)
-    usual = integrator.getGlobalVariableByName(how)
-    integrator.setGlobalVariableByName(how, 1.0 if how == "reluctant" else -1.0)
-    with pytest.raises(ConvergenceError, match="too steep") as caught:
-        integrator.step(5)
-    assert caught.value.step == 8
+    integrator.setGlobalVariableByName("reluctant", 1.0)
+    for _ in range(2):
+        with pytest.raises(ConvergenceError, match="too steep") as caught:
+            integrator.step(5)
+        assert caught.value.step == 8
     np.testing.assert_array_equal(state_of(context), before)
-    assert context.getStepCount() == 7
-    assert context.getTime() / PS == pytest.approx(0.007, rel=1e-12)
-    integrator.setGlobalVariableByName(how, usual)
-    integrator.step(5)
-    undisturbed, other = begun()
-    undisturbed.step(12)
-    np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-12)
+    assert context.getStepCount() == 7 and context.getTime() / PS == pytest.approx(0.007, rel=1e-12)
 
 
 #: Kinds whose steps of a picosecond fail, and the platform.
@@ -112,7 +99,7 @@ def test_a_step_without_a_solution_is_taken_back(kind):
     else:
         assert "time step too large" in str(caught.value) and caught.value.atoms == (0, 7)
     np.testing.assert_array_equal(state_of(context), before)
-    assert context.getStepCount() == 3
+    assert context.getStepCount() == 3 and context.getTime() / PS == pytest.approx(0.006, rel=1e-12)
     integrator.setStepSize(0.002)
     integrator.applyVelocityConstraints(context)
     integrator.applyConstraints(context)
@@ -121,6 +108,9 @@ def test_a_step_without_a_solution_is_taken_back(kind):
     integrator.check()
     ends = state_of(context)[0][[0, 7]]
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.3 + options.get("rate", 0.0) * 0.012, abs=1e-12)
+    undisturbed = make(**options)
+    undisturbed.run(6)
+    np.testing.assert_allclose(state_of(context), state_of(undisturbed.context), rtol=0, atol=1e-11)
 
 
 def test_change_of_the_box():
