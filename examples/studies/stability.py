@@ -50,7 +50,7 @@ def _moving(problem: Problem, speed: float, seed: int) -> Problem:
     v = speed * np.random.default_rng(seed).standard_normal(problem.x.shape)
     if not len(problem.fixed):
         v -= problem.m @ v / problem.m.sum()
-    return problem.but(velocities=problem.tangent(v))
+    return problem.moving(v)
 
 
 def water(seed: int = 1) -> Problem:
@@ -120,9 +120,8 @@ EXPLOSION = 1.0
 
 
 def _run(method: str, problem: Problem, dt: float, steps: int, watch: Callable[[Frame], Any], every: int = 1) -> Frame:
-    if method in PEERS:
-        return PEERS[method]().run(problem, dt, steps, watch, every=every)
-    return Core().run(problem, dt, steps, watch, every=every, stepper=STEPPERS[method]())
+    program = PEERS[method]() if method in PEERS else Core(STEPPERS[method]())
+    return program.run(problem, dt, steps, watch, every=every)
 
 
 class _Exploded(Exception):

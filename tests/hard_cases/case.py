@@ -11,6 +11,7 @@ import importlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 from hard_cases.programs import PROGRAMS, CannotExpressError, Program, quiet
@@ -54,12 +55,15 @@ class Check(NamedTuple):
         return f"{self.name} {self.value:.3g} (limit {self.limit:.3g})"
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What a case function returns: its checks and a remark. `remark` also says where a run was shortened."""
 
     checks: tuple[Check, ...]
     remark: str = ""
+
+    def named(self, name: str) -> list[Check]:
+        """The checks, of a part of a case."""
+        return [check._replace(name=f"{name}: {check.name}") for check in self.checks]
 
 
 def outcome(*checks: tuple[str, float, float], remark: str = "") -> Outcome:
@@ -67,7 +71,7 @@ def outcome(*checks: tuple[str, float, float], remark: str = "") -> Outcome:
     return Outcome(tuple(Check(name, float(value), float(limit)) for name, value, limit in checks), remark)
 
 
-Function = Callable[["Program", bool], Outcome]
+Function = Callable[[Program, bool], Outcome]
 
 
 @dataclass(frozen=True)
@@ -97,13 +101,17 @@ class Cell:
 _CASES: dict[str, Case] = {}
 
 
-def case(number: str, title: str, limit: str, kind: Kind = "bound", **cannot: str) -> Callable[[Function], Function]:
-    """Register a function as a case; `cannot` takes reasons by program, such as ``ase="no surfaces"``."""
+def case(number: str, title: str, limit: str, kind: Kind = "bound", **more: Any) -> Callable[[Function], Function]:
+    """Register a function as a case.
+
+    `more` are further arguments of the function, and reasons by program, such as ``ase="no surfaces"``.
+    """
 
     def register(function: Function) -> Function:
         assert number not in _CASES, number
-        reasons = {name: reason for key, reason in cannot.items() for name in _NAMES[key]}
-        _CASES[number] = Case(number, title, limit, kind, function, reasons)
+        reasons = {name: more[key] for key in _NAMES if key in more for name in _NAMES[key]}
+        given = {key: value for key, value in more.items() if key not in _NAMES}
+        _CASES[number] = Case(number, title, limit, kind, partial(function, **given), reasons)
         return function
 
     return register
@@ -123,9 +131,8 @@ def judge(case: Case, found: Outcome | BaseException, warned: str = "", program:
     """
     if isinstance(found, BaseException):
         words = " ".join(str(found).split())
-        if isinstance(found, CannotExpressError | ImportError):
-            missing = "" if isinstance(found, CannotExpressError) else "not installed: "
-            return Cell("cannot express", False, missing + words)
+        if isinstance(found, CannotExpressError):
+            return Cell("cannot express", False, words)
         if program in OURS and not isinstance(found, KconsError):
             return Cell("crash/NaN", False, f"untyped {type(found).__name__}: {words}")
         met = case.kind != "bound"

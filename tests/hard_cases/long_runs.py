@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from hard_cases.case import Outcome, case, outcome
-from hard_cases.motions import Seen
 from hard_cases.problem import Array, Problem
-from hard_cases.programs import Core, Program
+from hard_cases.programs import Core, Program, Seen
+from kcons.comparison.projected_equation import ProjectedEquation
 from kcons.errors import KconsError
 
 #: Steps of the pendulum for each program: quick and full.
@@ -36,9 +36,7 @@ def secular_drift(energies: Array) -> float:
 @case("H14", "Pendulum at 2 rad, 1e7 steps", "secular energy 1e-6 over 1e7 steps of 0.01 (rms 2.1e-5); residual 1e-14")
 def long_pendulum(program: Program, quick: bool) -> Outcome:
     steps = STEPS[program.name][0 if quick else 1]
-    problem = pendulum(2.0)
-    seen = Seen(problem)
-    program.run(problem, 0.01, steps, seen, every=5)
+    seen = program.seen(pendulum(2.0), 0.01, steps, every=5)
     drift = 2 * abs(secular_drift(np.array(seen.energies)))
     # The windowed mean of few periods knows the drift no better than the oscillation allows.
     limit = 1e-6 if steps >= 1_000_000 else 1e-6 + 2.1e-5 * 10_000 / steps
@@ -55,21 +53,17 @@ def long_pendulum(program: Program, quick: bool) -> Outcome:
     "not what is done by default: residual 1e-12 at t = 200 for dt 0.005 to 0.04",
 )
 def no_projection(program: Program, quick: bool) -> Outcome:
-    found: list[tuple[str, float, float]] = []
-    problem = pendulum(2.0)
-    horizon = program.pace * (20.0 if quick else 200.0)
-    for dt in (0.005, 0.04):
-        seen = Seen(problem)
-        program.run(problem, dt, round(horizon / dt), seen, every=20)
-        found.append((f"dt {dt:g}: residual", seen.residual, 1e-12))
+    problem, horizon = pendulum(2.0), program.pace * (20.0 if quick else 200.0)
+    found = [
+        (f"dt {dt:g}: residual", program.seen(problem, dt, round(horizon / dt), every=20).residual, 1e-12)
+        for dt in (0.005, 0.04)
+    ]
     remark = f"t = {horizon:g}"
     if isinstance(program, Core):
-        from kcons.comparison.projected_equation import ProjectedEquation
-
-        seen = Seen(problem)
+        seen, failed = Seen(problem), ""
         try:
-            program.run(problem, 0.04, round(horizon / 0.04), seen, stepper=ProjectedEquation())
-            remark += f"; on request, without projection: residual {seen.residual:.2g}"
+            type(program)(ProjectedEquation()).run(problem, 0.04, round(horizon / 0.04), seen)
         except KconsError as error:
-            remark += f"; on request, without projection: {type(error).__name__} at residual {seen.residual:.2g}"
+            failed = f"{type(error).__name__} at "
+        remark += f"; on request, without projection: {failed}residual {seen.residual:.2g}"
     return outcome(*found, remark=remark)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -27,7 +27,7 @@ Numbers: TypeAlias = Any
 class Problem:
     """Atoms, what is held, and forces.
 
-    Without lengths (angles), distances of `pairs` (angles of `triples`, radian) are held at what they are. Forces are a
+    Without lengths, distances of `pairs` are held at what they are, as angles of `triples` always are. Forces are a
     constant `push`, harmonic `springs` (i, j, k, rest length), and springs of the constant `tether` to `anchors`, by
     default the positions. `others` are rows that only kcons knows.
     """
@@ -37,7 +37,6 @@ class Problem:
     pairs: Pairs = ()
     lengths: ArrayLike | None = None
     triples: Sequence[tuple[int, int, int]] = ()
-    angles: ArrayLike | None = None
     fixed: Sequence[int] = ()
     velocities: ArrayLike | None = None
     push: ArrayLike | None = None
@@ -66,32 +65,26 @@ class Problem:
     @property
     def held_lengths(self) -> Array:
         """Lengths of `pairs`, shape (n_pairs,)."""
-        if self.lengths is not None:
-            return np.array(np.broadcast_to(np.asarray(self.lengths, dtype=float), (len(self.pairs),)))
-        return distances(self.x, self.pairs, self.cell)
+        return distances(self.x, self.pairs, self.cell) if self.lengths is None else np.array(self.lengths, dtype=float)
 
     @property
     def held_angles(self) -> Array:
         """Values of `triples` in radian, shape (n_triples,)."""
-        if self.angles is not None:
-            return np.array(np.broadcast_to(np.asarray(self.angles, dtype=float), (len(self.triples),)))
         return bends(self.x, self.triples)
 
     def but(self, **changes: Any) -> Problem:
         """A copy with other attributes."""
         return replace(self, **changes)
 
-    def of_kind(self, kind: type[Problem]) -> Problem:
-        """The same as a `kind`."""
-        return kind(**{item.name: getattr(self, item.name) for item in fields(self)})
+    def moving(self, v: ArrayLike) -> Problem:
+        """A copy with velocities that fit to what is held."""
+        return replace(self, velocities=self.tangent(v))
 
     def rows(self) -> list[Constraint]:
         """The constraints of kcons."""
         found: list[Constraint] = [FixedAtoms(list(self.fixed))] if len(self.fixed) else []
-        if len(self.pairs):
-            found.append(Distance(list(self.pairs), None if self.lengths is None else self.held_lengths))
-        if len(self.triples):
-            found.append(Angle(list(self.triples), None if self.angles is None else self.held_angles))
+        found += [Distance(list(self.pairs), self.lengths)] if len(self.pairs) else []
+        found += [Angle(list(self.triples))] if len(self.triples) else []
         return [*found, *self.others]
 
     @property
@@ -130,13 +123,10 @@ class Problem:
         """Largest relative error of a held length, or error of a held angle in radian; NaN if anything is."""
         if not np.all(np.isfinite(x)):
             return float("nan")
-        worst = 0.0
-        if len(self.pairs):
-            lengths = self.held_lengths
-            worst = float(np.max(np.abs(distances(x, self.pairs, self.cell) - lengths) / lengths))
-        if len(self.triples):
-            worst = max(worst, float(np.max(np.abs(bends(x, self.triples) - self.held_angles))))
-        return worst
+        lengths = self.held_lengths
+        off = [np.abs(distances(x, self.pairs, self.cell) - lengths) / lengths]
+        off.append(np.abs(bends(x, self.triples) - self.held_angles))
+        return float(np.concatenate(off).max(initial=0.0))
 
     def kinetic(self, v: Array) -> float:
         """Kinetic energy of the atoms that are not fixed."""
@@ -170,6 +160,8 @@ def distances(x: Array, pairs: Pairs, cell: ArrayLike | None = None) -> Array:
 
 def bends(x: Array, triples: Sequence[tuple[int, int, int]]) -> Array:
     """Angles at the middle atoms, radian."""
+    if not len(triples):
+        return np.zeros(0)
     i, j, k = np.asarray(triples, dtype=int).reshape(-1, 3).T
     u, w = x[i] - x[j], x[k] - x[j]
     return np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.sum(u * w, axis=1))

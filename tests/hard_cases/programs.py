@@ -8,16 +8,25 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import openmm
+from ase import Atoms
+from ase.calculators.calculator import Calculator, all_changes
+from ase.constraints import FixAtoms, FixBondLengths, FixInternals
+from ase.md.verlet import VelocityVerlet
+from openmm import unit
 
 from hard_cases.problem import Array, Problem
+from kcons.ase import ConstrainedDynamics, Constraints
 from kcons.comparison.runs import InAse, InOpenMM, OnArrays, Run
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion
+from kcons.openmm import ProjectedIntegrator, hold
 from kcons.steppers import Rattle, Stepper, System
 
 
@@ -39,17 +48,21 @@ class Frame:
         return self.kinetic + self.potential
 
 
-Watch = Callable[[Frame], Any]
+class Seen:
+    """A watcher that keeps the largest residual, NaN once anything is, all energies, and the last frame."""
 
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.residual, self.end = problem, 0.0, Frame(problem.x, problem.v, np.nan, np.nan)
+        self.energies: list[float] = []
 
-def together(*watches: Watch) -> Watch:
-    """A watcher that tells several."""
+    def __call__(self, frame: Frame) -> None:
+        self.residual = float(np.maximum(self.residual, self.problem.residual(frame.x)))
+        self.energies.append(frame.energy)
 
-    def watch(frame: Frame) -> None:
-        for one in watches:
-            one(frame)
-
-    return watch
+    @property
+    def energy_off(self) -> float:
+        """Largest relative change from the second on: the first of a leapfrog is of velocities half a step earlier."""
+        return float(np.max(np.abs(np.array(self.energies[1:]) / self.energies[1] - 1)))
 
 
 class NotIntactError(AssertionError):
@@ -59,7 +72,13 @@ class NotIntactError(AssertionError):
 class Program:
     """Something that can run a problem; its name is one of `SYSTEMS`."""
 
-    name = ""
+    name: str
+    #: The engine of a problem, by time step, at its start or, if so, once it was brought onto the constraints.
+    begin: Callable[[Problem, float, bool], Run]
+    #: Gives a run other positions, such as those wrapped into a cell, and leaves the velocities as they are.
+    put: Callable[[Any, Array], None]
+    #: Of a problem, as the program counts them.
+    degrees_of_freedom: Callable[[Problem], int]
     #: How long runs may be, as a part of what a case asks for.
     pace = 1.0
 
@@ -67,73 +86,58 @@ class Program:
         """Steps to run: `short` for a quick look, else `full`; fewer for slow programs."""
         return max(10, round(self.pace * (short if quick else full)))
 
+    def seen(self, problem: Problem, dt: float, steps: int, *watches: Callable[[Frame], Any], **how: Any) -> Seen:
+        """Run and say what was seen of it."""
+        seen = Seen(problem)
+        seen.end = self.run(problem, dt, steps, seen, *watches, **how)
+        return seen
+
     def run(
         self,
         problem: Problem,
         dt: float,
         steps: int,
-        watch: Watch | None = None,
-        *,
+        *watches: Callable[[Frame], Any],
         every: int = 1,
         project: bool = False,
         wrap: bool = False,
-        stepper: Stepper | None = None,
     ) -> Frame:
-        """Run and return the last frame; `watch` sees the start and every `every` steps.
+        """Run and return the last frame; `watches` see the start and every `every` steps.
 
         `project` brings the start onto the constraints by the means the program offers for it, `wrap` puts atoms back
-        into the cell after each step, `stepper` is for the core only.
+        into the cell after each step.
         """
-        run = self.begin(problem, dt, project, stepper)
+        run = self.begin(problem, dt, project)
 
         def frame() -> Frame:
             x, v = run.observe()
             return Frame(x, v, self.kinetic(problem, run, v), problem.potential(x))
 
-        if watch:
-            watch(frame())
         done = 0
-        while done < steps:
+        while True:
+            if watches and done % every == 0:
+                told = frame()
+                for watch in watches:
+                    watch(told)
+                if done and not np.all(np.isfinite(told.x)):
+                    return told
+            if done == steps:
+                return frame()
             block = 1 if wrap else min(every, steps - done)
             run.advance(block)
             done += block
             if wrap:
-                put(run, wrapped(run.observe()[0], problem.cell))
-            if watch and done % every == 0:
-                watch(seen := frame())
-                if not np.all(np.isfinite(seen.x)):
-                    return seen
-        return frame()
-
-    def begin(self, problem: Problem, dt: float, project: bool, stepper: Stepper | None) -> Run:
-        """The engine, at the start."""
-        raise NotImplementedError
+                self.put(run, wrapped(run.observe()[0], problem.cell))
 
     def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
         """Kinetic energy of a run, at velocities v."""
         return problem.kinetic(v)
-
-    def degrees_of_freedom(self, problem: Problem) -> int:
-        """As the program counts them."""
-        raise NotImplementedError
 
 
 def wrapped(x: Array, cell: Any) -> Array:
     """Atoms put into the cell one by one; those inside are not touched."""
     lattice = np.asarray(cell, dtype=float)
     return np.asarray(x - np.floor(x @ np.linalg.inv(lattice)) @ lattice)
-
-
-def put(run: Run, x: Array) -> None:
-    """Other positions, such as those wrapped into a cell, and the velocities as they are."""
-    if isinstance(run, OnArrays):
-        run.state = replace(run.state, positions=x)
-    elif isinstance(run, InAse):  # as atoms.wrap() does it: not through the constraints
-        run.atoms.arrays["positions"][:] = x
-    elif isinstance(run, InOpenMM):
-        run.context.setPositions(x * run.length)
-    else:
-        raise TypeError(type(run).__name__)
 
 
 # -- kcons on arrays -------------------------------------------------------------------------------------
@@ -144,14 +148,13 @@ class Core(Program):
 
     name = "kcons"
 
-    def system(self, problem: Problem, **options: Any) -> System:
+    def __init__(self, stepper: Stepper | None = None) -> None:
+        self.stepper = stepper or Rattle()
+
+    def system(self, problem: Problem) -> System:
         held = ConstraintSet(problem.rows(), problem.x, np.asarray(problem.masses), cell=problem.cell)
-        motion = Motion(held, problem.x, **options)
-        return System(
-            motion,
-            (lambda x, t: problem.forces(x)) if problem.has_forces else None,
-            potential=(lambda x, t: problem.potential(x)) if problem.has_forces else None,
-        )
+        forces = (problem.forces, problem.potential) if problem.has_forces else (None, None)
+        return System(Motion(held, problem.x), forces[0], potential=forces[1])
 
     def run(self, problem: Problem, *args: Any, **options: Any) -> Frame:
         given = (np.asarray(problem.positions), np.asarray(problem.masses))
@@ -162,11 +165,13 @@ class Core(Program):
             if [a.tobytes() for a in given] != before:
                 raise NotIntactError("input arrays were changed")
 
-    def begin(self, problem: Problem, dt: float, project: bool, stepper: Stepper | None) -> Run:
+    def put(self, run: Any, x: Array) -> None:
+        run.state = replace(run.state, positions=x)
+
+    def begin(self, problem: Problem, dt: float, project: bool) -> Run:
         system = self.system(problem)
-        stepper = Rattle() if stepper is None else stepper
-        stepper.check(system)
-        return _Intact(system, system.initial_state(problem.x, problem.v, project=project), stepper, dt)
+        self.stepper.check(system)
+        return _Intact(system, system.initial_state(problem.x, problem.v, project=project), self.stepper, dt)
 
     def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
         return run.system.kinetic_energy(v)
@@ -198,59 +203,41 @@ class PlainAse(Program):
 
     name = "ASE"
     pace = 0.1
+    #: What makes steps, of atoms and a time step.
+    dynamics: Callable[[Any, float], Any] = VelocityVerlet
 
     def atoms(self, problem: Problem, *, project: bool = False) -> Any:
         """Atoms with a calculator and all that is held."""
-        from ase import Atoms
-
-        atoms = Atoms(
-            "X" * problem.n_atoms,
-            positions=problem.positions,
-            masses=problem.masses,
-            cell=problem.cell,
-            pbc=problem.cell is not None,
-        )
-        atoms.calc = _calculator(problem)
-        if project:
-            # As a person does who attaches constraints to a structure that is off them.
+        how = {"masses": problem.masses, "cell": problem.cell, "pbc": problem.cell is not None}
+        atoms = Atoms("X" * problem.n_atoms, positions=problem.positions, **how)
+        atoms.calc = Forces(problem)
+        if project:  # as a person does who attaches constraints to a structure that is off them
             atoms.set_velocities(problem.v)
         self.hold(atoms, problem)
-        if project:
-            self.put(atoms)
-        else:
-            atoms.set_velocities(problem.v)
+        self.restore(atoms) if project else atoms.set_velocities(problem.v)
         return atoms
 
     def hold(self, atoms: Any, problem: Problem) -> None:
-        if problem.others:
-            raise CannotExpressError(f"ASE has no {', '.join(sorted({c.family for c in problem.others}))}")
-        from ase.constraints import FixAtoms, FixBondLengths, FixInternals
-
+        _refuse_others("ASE", problem)
         held: list[Any] = [FixAtoms(list(problem.fixed))] if len(problem.fixed) else []
-        pairs, lengths = np.asarray(problem.pairs).tolist(), np.asarray(problem.held_lengths).tolist()
-        degrees, triples = np.degrees(problem.held_angles).tolist(), np.asarray(problem.triples).tolist()
-        if degrees:
-            bonds, angles = zip(lengths, pairs, strict=True), zip(degrees, triples, strict=True)
-            rows = [list(map(list, bonds)) or None, list(map(list, angles))]
-            held.append(FixInternals(bonds=rows[0], angles_deg=rows[1], epsilon=1e-10))
+        pairs, lengths = np.asarray(problem.pairs).tolist(), problem.held_lengths.tolist()
+        degrees = zip(np.degrees(problem.held_angles).tolist(), np.asarray(problem.triples).tolist(), strict=True)
+        if angles := [list(row) for row in degrees]:
+            bonds = [list(row) for row in zip(lengths, pairs, strict=True)]
+            held.append(FixInternals(bonds=bonds or None, angles_deg=angles, epsilon=1e-10))
         elif pairs:
             held.append(FixBondLengths(pairs, bondlengths=lengths))
         atoms.set_constraint(held)
 
-    def dynamics(self, atoms: Any, dt: float) -> Any:
-        """What makes steps."""
-        from ase.md.verlet import VelocityVerlet
-
-        return VelocityVerlet(atoms, timestep=dt)
-
-    def put(self, atoms: Any) -> None:
+    def restore(self, atoms: Any) -> None:
         """Onto the constraints: setting positions and momenta applies them."""
         atoms.set_positions(atoms.get_positions())
         atoms.set_momenta(atoms.get_momenta())
 
-    def begin(self, problem: Problem, dt: float, project: bool, stepper: Stepper | None) -> Run:
-        if stepper is not None:
-            raise CannotExpressError("one scheme only")
+    def put(self, run: Any, x: Array) -> None:
+        run.atoms.arrays["positions"][:] = x  # as atoms.wrap() does it: not through the constraints
+
+    def begin(self, problem: Problem, dt: float, project: bool) -> Run:
         atoms = self.atoms(problem, project=project)
         return _AsRun(atoms, self.dynamics(atoms, dt), dt)
 
@@ -273,42 +260,32 @@ class KconsInAse(PlainAse):
     name = "kcons in ASE"
     pace = 1.0
 
-    def __init__(self, own_dynamics: bool = True, thermostat: Callable[[Any, float], Any] | None = None) -> None:
-        #: False for ASE's VelocityVerlet.
-        self.own_dynamics = own_dynamics
-        #: Dynamics of atoms and time step, instead of `ConstrainedDynamics`.
-        self.thermostat = thermostat
-
-    def dynamics(self, atoms: Any, dt: float) -> Any:
-        from kcons.ase import ConstrainedDynamics
-
-        if self.thermostat is not None:
-            return self.thermostat(atoms, dt)
-        return ConstrainedDynamics(atoms, dt) if self.own_dynamics else super().dynamics(atoms, dt)
+    def __init__(self, dynamics: Callable[[Any, float], Any] = ConstrainedDynamics) -> None:
+        self.dynamics = dynamics
 
     def hold(self, atoms: Any, problem: Problem) -> None:
-        from kcons.ase import Constraints
-
         atoms.set_constraint(Constraints(problem.rows()))
 
-    def put(self, atoms: Any) -> None:
+    def restore(self, atoms: Any) -> None:
         atoms.constraints[0].restore(atoms)
 
 
-def _calculator(problem: Problem) -> Any:
-    from ase.calculators.calculator import Calculator, all_changes
+class Forces(Calculator):
+    implemented_properties = ["energy", "forces"]
 
-    class Forces(Calculator):
-        implemented_properties = ["energy", "forces"]
+    def __init__(self, problem: Problem) -> None:
+        super().__init__()
+        self.problem = problem
 
-        def calculate(
-            self, atoms: Any = None, properties: Any = ("energy",), system_changes: Any = all_changes
-        ) -> None:
-            super().calculate(atoms, properties, system_changes)
-            x = np.asarray(atoms.get_positions())
-            self.results = {"energy": problem.potential(x), "forces": problem.forces(x)}
+    def calculate(self, atoms: Any = None, properties: Any = ("energy",), system_changes: Any = all_changes) -> None:
+        super().calculate(atoms, properties, system_changes)
+        x = np.asarray(atoms.get_positions())
+        self.results = {"energy": self.problem.potential(x), "forces": self.problem.forces(x)}
 
-    return Forces()
+
+def _refuse_others(program: str, problem: Problem) -> None:
+    if problem.others:
+        raise CannotExpressError(f"{program} has no {', '.join(sorted({c.family for c in problem.others}))}")
 
 
 # -- OpenMM -------------------------------------------------------------------------------------------
@@ -322,8 +299,6 @@ class PlainOpenMM(Program):
 
     def bare_system(self, problem: Problem) -> Any:
         """Particles and forces, nothing held."""
-        import openmm
-
         system = openmm.System()
         for k, mass in enumerate(problem.m):
             system.addParticle(0.0 if k in problem.fixed else float(mass))
@@ -350,11 +325,8 @@ class PlainOpenMM(Program):
 
     def build(self, problem: Problem, dt: float) -> tuple[Any, Any, Any]:
         """System, integrator, and what applies constraints to a context."""
-        import openmm
-
         system = self.bare_system(problem)
-        if problem.others:
-            raise CannotExpressError(f"OpenMM has no {', '.join(sorted({c.family for c in problem.others}))}")
+        _refuse_others("OpenMM", problem)
         pairs = dict(zip([(min(p), max(p)) for p in problem.pairs], problem.held_lengths, strict=True))
         for (i, j), length in zip(problem.pairs, problem.held_lengths, strict=True):
             system.addConstraint(int(i), int(j), float(length))
@@ -369,29 +341,24 @@ class PlainOpenMM(Program):
         return system, integrator, None
 
     def context(self, system: Any, integrator: Any) -> Any:
-        import openmm
-
         return openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+
+    def put(self, run: Any, x: Array) -> None:
+        run.context.setPositions(x)
 
     def start(self, problem: Problem, context: Any, part: Any, dt: float, project: bool) -> None:
         context.setPositions(problem.x)
-        v = problem.v
+        back = np.zeros_like(v := problem.v)
+        # Velocities of the leapfrog belong to half a step earlier.
+        if not project and (np.any(v) or problem.has_forces):
+            with suppress(KconsError, np.linalg.LinAlgError):
+                back = 0.5 * dt * problem.acceleration(problem.x, v)
+        context.setVelocities(v - back)
         if project:
-            context.setVelocities(v)
             context.applyConstraints(self.tolerance)
             context.applyVelocityConstraints(self.tolerance)
-        else:
-            # Velocities of the leapfrog belong to half a step earlier.
-            free = not np.any(v) and not problem.has_forces
-            try:
-                back = np.zeros_like(v) if free else 0.5 * dt * problem.acceleration(problem.x, v)
-            except (KconsError, np.linalg.LinAlgError):
-                back = np.zeros_like(v)
-            context.setVelocities(v - back)
 
-    def begin(self, problem: Problem, dt: float, project: bool, stepper: Stepper | None) -> Run:
-        if stepper is not None:
-            raise CannotExpressError("one scheme only")
+    def begin(self, problem: Problem, dt: float, project: bool) -> Run:
         if dt <= 0:
             raise CannotExpressError("OpenMM takes no steps back and none of zero length")
         system, integrator, part = self.build(problem, dt)
@@ -416,30 +383,22 @@ class KconsInOpenMM(PlainOpenMM):
     name = "kcons in OpenMM"
 
     def __init__(self, ensemble: Any = None) -> None:
-        #: For `ProjectedIntegrator`.
         self.ensemble = ensemble
 
     def build(self, problem: Problem, dt: float) -> tuple[Any, Any, Any]:
-        from openmm import unit
-
-        from kcons.openmm import ProjectedIntegrator, hold
-
-        system, step = self.bare_system(problem.but(fixed=()) if len(problem.fixed) else problem), dt * unit.picosecond
+        system, step = self.bare_system(problem.but(fixed=())), dt * unit.picosecond
         rows = problem.rows()
-        if not rows:
-            return system, ProjectedIntegrator(step, ensemble=self.ensemble), None
-        part = hold(system, rows, problem.x, take="all", keep_water=False)
-        return system, ProjectedIntegrator(step, parts=[part], ensemble=self.ensemble), part
+        parts = [hold(system, rows, problem.x, take="all", keep_water=False)] if rows else []
+        return system, ProjectedIntegrator(step, parts=parts, ensemble=self.ensemble), parts[0] if parts else None
 
     def start(self, problem: Problem, context: Any, part: Any, dt: float, project: bool) -> None:
         context.setPositions(problem.x)
         context.setVelocities(problem.v)
-        if part is not None:
-            if project:
-                part.apply_positions(context)
-                part.apply_velocities(context)
-            else:
-                part.check(context)
+        if part is not None and not project:
+            part.check(context)
+        elif part is not None:
+            part.apply_positions(context)
+            part.apply_velocities(context)
 
     def degrees_of_freedom(self, problem: Problem) -> int:
         system, integrator, _ = self.build(problem, 0.001)

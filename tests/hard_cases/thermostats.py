@@ -5,11 +5,17 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+import openmm
+from ase import units
+from openmm import unit
+from systems.lennard_jones import LennardJones
 
+import kcons.openmm
 from hard_cases.case import Outcome, case, outcome
 from hard_cases.problem import Array, Problem
-from hard_cases.programs import CannotExpressError, Core, KconsInAse, KconsInOpenMM, Program
+from hard_cases.programs import Core, KconsInAse, KconsInOpenMM, Program
 from hard_cases.steps import each_refused
+from kcons.ase import IsokineticDynamics
 from kcons.constraints import Plane, Sphere
 from kcons.steppers import State
 from kcons.thermostats import Isokinetic
@@ -25,21 +31,11 @@ def _step(program: Program, problem: Problem, kt: float | None = None, momentum:
         system = program.system(problem)
         return Isokinetic(kt, momentum=momentum).step(system, State(problem.x, problem.v), DT).velocities
     if isinstance(program, KconsInAse):
-        from ase import units
-
-        from kcons.ase import IsokineticDynamics
-
         kelvin = None if kt is None else kt / units.kB
-        md_engine: Program = KconsInAse(
-            thermostat=lambda atoms, dt: IsokineticDynamics(atoms, dt, kelvin, momentum=momentum)
-        )
+        md_engine: Program = KconsInAse(lambda atoms, dt: IsokineticDynamics(atoms, dt, kelvin, momentum=momentum))
     else:
-        from openmm import unit
-
-        from kcons.openmm import Isokinetic as InOpenMM
-
         given = None if kt is None else kt / unit.MOLAR_GAS_CONSTANT_R._value * 1e3
-        md_engine = KconsInOpenMM(InOpenMM(given, momentum=momentum))
+        md_engine = KconsInOpenMM(kcons.openmm.Isokinetic(given, momentum=momentum))
     return md_engine.run(problem, DT, 1).v
 
 
@@ -56,10 +52,8 @@ def no_kinetic_energy(program: Program, quick: bool) -> Outcome:
 
 @case("H23", "Isokinetic with one degree of freedom", "refused: g - 1 = 0", "raise", peers=NONE)
 def one_freedom(program: Program, quick: bool) -> Outcome:
-    rows = [Plane([0], [0, 0, 1.0]), Sphere([0], [0, 0, 0], 1.0)]
-    problem = Problem(
-        [[1.0, 0, 0]], [1.0], others=rows, tether=0.5, anchors=[[0.3, 0.9, 0.1]], velocities=[[0.0, 0.7, 0.0]]
-    )
+    rows, v = [Plane([0], [0, 0, 1.0]), Sphere([0], [0, 0, 0], 1.0)], [[0.0, 0.7, 0.0]]
+    problem = Problem([[1.0, 0, 0]], [1.0], others=rows, tether=0.5, anchors=[[0.3, 0.9, 0.1]], velocities=v)
     return outcome(("kinetic energy", problem.kinetic(_step(program, problem, 1.0)), 0))
 
 
@@ -109,14 +103,8 @@ def conserved_momentum(program: Program, quick: bool) -> Outcome:
 )
 def long_cutoff(program: Program, quick: bool) -> Outcome:
     if isinstance(program, Core):
-        from systems.lennard_jones import LennardJones
-
         LennardJones(range(4), 1.58, cutoff=1.0)
         return outcome()
-    if program.name != "OpenMM":
-        raise CannotExpressError("no potentials of its own")
-    import openmm
-
     system = openmm.System()
     force = openmm.NonbondedForce()
     for _ in range(4):

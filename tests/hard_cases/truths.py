@@ -48,7 +48,6 @@ def rigid_rattle(x: Array, masses: Array, omega: Array, dt: float, steps: int) -
     turn = np.eye(3)
     for _ in range(steps):
         body = turn.T @ momentum
-
         w = dt * np.linalg.solve(inertia, body)
         for _ in range(100):
             P = _turn(w)
