@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,9 +46,15 @@ def _scan(chosen: argparse.Namespace) -> int:
     held += getattr(atoms.calc, "held", [])
     how: dict[str, Any] = {"held": held, "fmax": chosen.fmax, "both_ways": not chosen.one_way}
     folder: Path = chosen.out or Path(f"scan-{chosen.structure.stem}")
-    with Watcher(shown=True) as watcher, watcher.piece("relaxed scan", 1.0):
-        how["progress"] = lambda done, points, line: watcher.advance(done / points)
-        found = scan(atoms, coordinates, values, folder=folder, **how)
+    begun: list[None] = []
+    with Watcher(shown=True) as watcher, ExitStack() as pieces:
+
+        def progress(done: int, points: int, line: str) -> None:
+            if not begun:  # what is wrong with the input has been found by then
+                begun.append(pieces.enter_context(watcher.piece("relaxed scan", 1.0)))
+            watcher.advance(done / points)
+
+        found = scan(atoms, coordinates, values, folder=folder, progress=progress, **how)
     written = found.write(folder)
     show(found.table(), found.summary())
     say_written(written)
@@ -129,10 +136,10 @@ def _free_energy(chosen: argparse.Namespace) -> int:
     given = read_input(chosen.input, allow_modules=chosen.allow_module or ())
     folder: Path = chosen.out or Path(chosen.input.stem)
     how = {**given.options, "workers": chosen.workers}
-    windows = Windows(given.sampler, folder, given.settings, **how)
-    # A folder belongs to settings, and pulls are slower than the way to a window.
-    slow = replace(given.settings, pull=given.pull_steps)
-    pulls = Windows(given.sampler, folder / "pulls", slow, **how) if given.pulls else None
+    windows, pulls, ways = Windows(given.sampler, folder, given.settings, **how), None, given.pulls
+    if ways:  # a folder belongs to settings, and pulls are slower than the way to a window
+        slow = replace(given.settings, pull=ways.pop("steps"))
+        pulls = Windows(given.sampler, folder / "pulls", slow, **how)
     watcher = Watcher(shown=True)
     with windows.taken(), watcher, watcher.piece(f"{len(given.targets)} windows in {folder}", 1.0):
         for each in filter(None, (windows, pulls)):
@@ -142,9 +149,8 @@ def _free_energy(chosen: argparse.Namespace) -> int:
             found = windows.improve(**given.improve)
         # Before pulls, which may fail.
         written, said = found.write(folder), [found.summary()]
-        if given.pulls is not None and pulls is not None:
-            pulled = pulls.pull(**given.pulls)
-            numbers, beside = found.beside(pulled, given.pulls["start"], given.pulls["end"])
+        if ways and pulls:
+            numbers, beside = found.beside(pulls.pull(**ways), ways["start"], ways["end"])
             written.append(folder / "pulls.json")
             with in_one_piece(written[-1]) as opened:
                 opened.write(text(numbers).encode())

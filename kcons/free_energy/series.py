@@ -35,7 +35,7 @@ def _column(field: str) -> property:
 
 
 class Series(list[Sample]):
-    """Samples of held coordinates; see `Sample` for what they are. A slice is a series of some of them.
+    """Samples of held coordinates; see `Sample` for what they are. A slice is a series of some, a sum one of all.
 
     Parameters
     ----------
@@ -69,11 +69,21 @@ class Series(list[Sample]):
 
     def __getitem__(self, samples: Any) -> Any:
         found = super().__getitem__(samples)
-        if isinstance(samples, slice):
-            part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom)
-            part += found
-            return part
-        return found
+        if not isinstance(samples, slice):
+            return found
+        part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom)
+        part += found
+        return part
+
+    def __add__(self, others: Any) -> Series:  # type: ignore[override]
+        refuse_other(others, Series, "others", "a kcons.free_energy.Series")
+        for name in ("names", "periods", "isokinetic_degrees_of_freedom"):
+            mine, theirs = getattr(self, name), getattr(others, name)
+            if not np.array_equal(mine, theirs):
+                raise InputError(f"{name} are {mine} and {theirs}; add series of the same coordinates", item=name)
+        whole: Series = self[:]
+        whole += others
+        return whole
 
     time, value, multiplier, kinetic, log_det_z, gradient, off, turned, mean_kinetic = map(_column, Sample._fields)
 
@@ -275,17 +285,15 @@ def mean_force(series: Series, kT: float) -> MeanForce:
     refuse_other(series, Series, "series", "a kcons.free_energy.Series")
     value = series.value
     moved = nearest_image(value - value[0], series.periods)
-    allowed = 1e-5 * np.maximum(np.abs(value[0]), 1.0)
-    if not np.all(np.isfinite(moved)):
-        name = series.names[int(np.argmin(np.isfinite(moved).all(axis=0)))]
-        raise InputError(f"values of {name} are not finite; leave these samples out", item=name)
-    if np.any(np.abs(moved) > allowed):
-        name = series.names[int(np.argmax((np.abs(moved) > allowed).any(axis=0)))]
-        raise InputError(
-            f"{name} moved by {np.abs(moved).max():.3g} during the samples; a mean force belongs to coordinates at "
-            "rest (the work of moving ones is Series.work)",
-            item=name,
-        )
+    for name, first, way in zip(series.names, value[0], np.abs(moved).max(axis=0), strict=True):
+        if not np.isfinite(way):
+            raise InputError(f"values of {name} are not finite; leave these samples out", item=name)
+        if way > 1e-5 * max(abs(first), 1.0):
+            raise InputError(
+                f"{name} moved by {way:.3g} during the samples; a mean force belongs to coordinates at rest (the work "
+                "of moving ones is Series.work)",
+                item=name,
+            )
     mean = weighted_mean(_quietest(series, local_mean_force(series, kT)), series.weights)
     return MeanForce(
         series.names,

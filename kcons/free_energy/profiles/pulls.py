@@ -128,27 +128,22 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike | None = None, *, t
 
 def _bar(ahead: FloatArray, back: FloatArray) -> tuple[float, float]:
     """Difference and its error, over kT. Works without a spread, where pymbar finds no bounds, are the difference."""
-    if max(np.ptp(ahead), np.ptp(back)) > _NO_SPREAD:
-        loud = logging.root.manager.disable
-        logging.disable(logging.WARNING)  # general advice at its import
-        try:
-            import pymbar
-        except ModuleNotFoundError:
-            raise UnsupportedError(
-                "BAR is left to pymbar, which is not installed: python -m pip install 'kcons[free-energy]'"
-            ) from None
-        finally:
-            logging.disable(loud)
-        found = pymbar.bar(ahead, back)
-        return float(found["Delta_f"]), float(found["dDelta_f"])
-    lost = float(ahead.mean() + back.mean())
-    if abs(lost) > _NO_SPREAD:
-        raise InputError(
-            f"all works are the same each way, and {lost:g} kT are lost; start each pull from another state of "
-            "equilibrium",
-            item="forward",
-        )
-    return float(ahead.mean() - back.mean()) / 2, 0.0
+    if max(np.ptp(ahead), np.ptp(back)) <= _NO_SPREAD:
+        if abs(lost := float(ahead.mean() + back.mean())) > _NO_SPREAD:
+            said = f"all works are the same each way, and {lost:g} kT are lost"
+            raise InputError(f"{said}; start each pull from another state of equilibrium", item="forward")
+        return float(ahead.mean() - back.mean()) / 2, 0.0
+    loud = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # general advice at its import
+    try:
+        import pymbar
+    except ModuleNotFoundError:
+        remedy = "python -m pip install 'kcons[free-energy]'"
+        raise UnsupportedError(f"BAR is left to pymbar, which is not installed: {remedy}") from None
+    finally:
+        logging.disable(loud)
+    found = pymbar.bar(ahead, back)
+    return float(found["Delta_f"]), float(found["dDelta_f"])
 
 
 def _works(works: ArrayLike, item: str) -> FloatArray:

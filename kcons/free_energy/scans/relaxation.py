@@ -8,7 +8,7 @@ with the distances of the atoms. No bonds need to be known, and weak contacts ha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cache
@@ -77,9 +77,8 @@ class Internals:
         self._images = [lined_up(x[atoms], lattice) - x[atoms] for atoms in self._tables]
         # Two directions across each straight angle, shape (2, n, 3).
         r = self._gathered(x)[-1]
-        axis = (r[:, 2] - r[:, 0]) / norm(r[:, 2] - r[:, 0])[:, None]
-        first = cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)])
-        first /= norm(first)[:, None]
+        axis = _along(r[:, 2] - r[:, 0])
+        first = _along(cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)]))
         self._frames = np.stack([first, cross(axis, first)])
         constants = [
             math.prod((close[*table[:, k : k + 2].T] for k in range(table.shape[1] - 1)), start=size) * units.Hartree
@@ -94,11 +93,10 @@ class Internals:
     def remapped(self, data: FloatArray, terms: Sequence[tuple[int, ...]]) -> FloatArray:
         """Data for other terms, shape (..., m), as data for these; zero for terms that were not among them."""
         place = {term: n for n, term in enumerate(terms) if -1 not in term}
-        mine = [(n, place[term]) for n, term in enumerate(self.terms) if term in place]
         result = np.zeros((*data.shape[:-1], len(self.terms)))
-        if mine:
-            here, there = np.array(mine).T
-            result[..., here] = data[..., there]
+        for n, term in enumerate(self.terms):
+            if term in place:
+                result[..., n] = data[..., place[term]]
         return result
 
     def _gathered(self, x: FloatArray) -> list[FloatArray]:
@@ -114,8 +112,7 @@ class Internals:
         """Angstrom and radian, shape (n,)."""
         *gathered, r = self._gathered(x)
         found = [item.measure(part, 0.0) for item, part in zip(self._families, gathered, strict=True)]
-        u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
-        bow = u / norm(u)[:, None] + w / norm(w)[:, None]
+        bow = _along(r[:, 0] - r[:, 1]) + _along(r[:, 2] - r[:, 1])
         return np.concatenate([*found, *np.einsum("sni,ni->sn", self._frames, bow)])
 
     def change(self, after: FloatArray, before: FloatArray) -> FloatArray:
@@ -137,6 +134,11 @@ class Internals:
                 table[mine, self._tables[-1][:, end]] += slope
                 table[mine, self._tables[-1][:, 1]] -= slope
         return table.reshape(len(table), 3 * self.n_atoms)
+
+
+def _along(r: FloatArray) -> FloatArray:
+    """Vectors of length 1, shape (n, 3)."""
+    return r / norm(r)[:, None]
 
 
 #: Energy in eV and forces in eV/angstrom at positions, shape (n_atoms, 3).
@@ -215,20 +217,18 @@ class Descent:
     """
 
     def __init__(
-        self, motion: Motion, evaluate: Evaluate, internals: Internals, memory: FloatArray | None = None
+        self, motion: Motion, evaluate: Evaluate, internals: Internals, memory: Iterable[FloatArray] = ()
     ) -> None:
         self.motion, self.evaluate, self.internals = motion, evaluate, internals
         #: What was learned, move by move: vectors u and w of internal coordinates and numbers c, see `_learned`.
         self._updates: list[tuple[FloatArray, FloatArray, float]] = []
         self._memory: list[FloatArray] = []
-        for pair in [] if memory is None else memory:
+        for pair in memory:
             self._learn(pair)
         self.evaluations = 0
-        free = np.ones(motion.n_atoms, dtype=bool)
-        for item in motion.constraint_set.constraints:
-            if item.fixes_atoms:
-                free[item.atoms.ravel()] = False
-        self.columns: IntArray = np.flatnonzero(np.repeat(free, 3))
+        fixed = [item.atoms.ravel() for item in motion.constraint_set.constraints if item.fixes_atoms]
+        free = np.setdiff1d(np.arange(motion.n_atoms), np.concatenate([[], *fixed]))
+        self.columns: IntArray = (3 * free[:, None] + np.arange(3)).ravel()
 
     @np.errstate(all="ignore")
     def relaxed(self, x: FloatArray, fmax: float, most: int = 200) -> Relaxed:
@@ -252,15 +252,20 @@ class Descent:
     def _relaxed(self, x: FloatArray, fmax: float, most: int) -> Relaxed:
         here, radius = self._place(x), FIRST
         while here.largest > fmax:
-            if self.evaluations >= most:
-                raise self._given_up(here, fmax, f"{most} evaluations; allow more, or start nearer to the minimum")
-            if radius < LEAST:
-                raise self._given_up(
-                    here,
-                    fmax,
-                    "no step lowers the energy any further: forces are not its gradient, or not so exact; take a "
-                    "larger fmax, or a calculator whose energies are smoother",
+            if self.evaluations >= most or radius < LEAST:
+                why = f"{most} evaluations; allow more, or start nearer to the minimum"
+                if self.evaluations < most:
+                    why = "no step lowers the energy any further: forces are not its gradient, or not so exact; take "
+                    why += "a larger fmax, or a calculator whose energies are smoother"
+                error = ConvergenceError(
+                    f"the largest force along the constraints is {here.largest:.3g} eV/angstrom, and not {fmax:g}, "
+                    f"after {why}",
+                    residual=here.largest,
+                    tolerance=fmax,
+                    iterations=self.evaluations,
                 )
+                error.positions = here.x
+                raise error
             try:
                 with one_thread():
                     step, expected = self._step(here, radius)
@@ -282,18 +287,8 @@ class Descent:
                 radius = min(radius, longest) / (2 if ratio > 0 else 4)
             if gain <= 0 or ratio > 0 or there.largest <= fmax:
                 here = there
-        memory = np.array(self._memory[-MEMORY:])
-        return Relaxed(here.x, here.energy, here.largest, self.evaluations, memory, self.internals.terms)
-
-    def _given_up(self, here: _Place, fmax: float, why: str) -> ConvergenceError:
-        error = ConvergenceError(
-            f"the largest force along the constraints is {here.largest:.3g} eV/angstrom, and not {fmax:g}, after {why}",
-            residual=here.largest,
-            tolerance=fmax,
-            iterations=self.evaluations,
-        )
-        error.positions = here.x
-        return error
+        terms, memory = self.internals.terms, np.array(self._memory[-MEMORY:])
+        return Relaxed(here.x, here.energy, here.largest, self.evaluations, memory.reshape(-1, 2, len(terms)), terms)
 
     def _step(self, here: _Place, radius: float) -> tuple[FloatArray, float]:
         """Along the rows, the longest move of an atom at most `radius`, shape (columns,); what it is to gain."""

@@ -206,9 +206,7 @@ class _Wavefront:
             ) from error
         if not np.isfinite(energy):
             raise NonFiniteError(f"the energy is not finite: {energy}", item="energy")
-        bad = ~np.isfinite(forces).all(axis=1)
-        if bad.any():
-            atom = int(np.argmax(bad))
+        for atom in np.flatnonzero(~np.isfinite(forces).all(axis=1)).tolist():
             raise NonFiniteError(f"the force on atom {atom} is not finite: {forces[atom]}", item="force", atom=atom)
         return energy, forces
 
@@ -216,10 +214,8 @@ class _Wavefront:
         """The minimum at a point, from the structure of another relaxation or from the first one."""
         fmax, evaluations = self.settings["fmax"], self.settings["evaluations"]
         before = self.start if source is None else source.positions
-        reset = getattr(self.atoms.calc, "reset", None)
-        if reset is not None:
-            # What a calculator remembers, such as a density, would make the bits depend on what was done before.
-            reset()
+        # What a calculator remembers, such as a density, would make the bits depend on what was done before.
+        getattr(self.atoms.calc, "reset", list)()
         motion = self._engine(self.grid.held_at(point))
         try:
             x = motion.restore_positions(before, bonds=self._bonds)
@@ -232,19 +228,17 @@ class _Wavefront:
             )
             energy = self.evaluate(found.positions)[0]
             return Relaxed(found.positions, energy, found.largest, found.evaluations)
-        internals, memory = Internals(self.atoms.numbers, x, motion.lattice), None
-        if source is not None and len(source.memory):
-            memory = internals.remapped(source.memory, source.terms)
+        internals = Internals(self.atoms.numbers, x, motion.lattice)
+        memory = () if source is None else internals.remapped(source.memory, source.terms)
         return Descent(motion, self.evaluate, internals, memory).relaxed(x, fmax, evaluations)
 
     # -- from point to point --------------------------------------------------------------------
 
     def run(self) -> Scan:
         for point in sorted(self.grid.points, key=lambda p: self.grid.apart(p, self._measured)):
-            self._queue.append((point, None))
-            self._drain()
-            if self.scan.best:
-                break
+            if not self.scan.best:
+                self._queue.append((point, None))
+                self._drain()
         while self._reach_the_rest() or self._try_again():
             self._drain()
         if not self.scan.best:
@@ -255,14 +249,12 @@ class _Wavefront:
     def _drain(self) -> None:
         while self._queue:
             point, source = self._queue.popleft()
-            if (point, source) in self._tried:
-                continue
-            if source is not None and self._handed[self.scan.attempts[source].point] != source:
-                continue  # a lower one is on its way
-            if not self.settings["both_ways"] and point in self.scan.best:
-                continue
-            self._tried.add((point, source))
-            self._settle(self._made(point, source))
+            # Of a source that was overtaken a lower one is on its way.
+            overtaken = source is not None and self._handed[self.scan.attempts[source].point] != source
+            reached = not self.settings["both_ways"] and point in self.scan.best
+            if not (overtaken or reached or (point, source) in self._tried):
+                self._tried.add((point, source))
+                self._settle(self._made(point, source))
 
     def _kept(self) -> Attempt | None:
         """The next attempt as an earlier run made it; None if there is none."""
@@ -273,9 +265,8 @@ class _Wavefront:
     def _made(self, point: Point, source: int | None) -> Attempt:
         attempts, attempt = self.scan.attempts, self._kept()
         if attempt is not None and (attempt.point, attempt.source) != (point, source):
-            raise UnreadableError(
-                f"relaxation {len(attempts)} in {self.place} is of another scan; take another folder", item="folder"
-            )
+            said = f"relaxation {len(attempts)} in {self.place} is of another scan; take another folder"
+            raise UnreadableError(said, item="folder")
         if attempt is None:
             self._tried_now.add(point)
             attempt = Attempt(number=len(attempts), point=point, source=source)

@@ -226,18 +226,15 @@ class Sampler(ABC):
 
     def at(self, values: ArrayLike) -> list[Constraint]:
         """The coordinates held at `values`."""
-        pairs = zip(self.coordinates.values(), np.asarray(values), strict=True)
-        return [item.with_target([float(value)]) for item, value in pairs]
+        pairs = zip(self.coordinates.values(), np.asarray(values).tolist(), strict=True)
+        return [item.with_target(value) for item, value in pairs]
 
     def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
         """The coordinates moved at a constant rate from time 0 on; at rest where both ends are the same."""
         if tuple(begin) == tuple(end):
             return self.at(begin)
-        rows = zip(self.coordinates.values(), begin, end, strict=True)
-        return [
-            item.with_target(MovingTarget(lambda t, a=a, b=b: a + (b - a) / duration * t))  # type: ignore[misc]
-            for item, a, b in rows
-        ]
+        ways = [lambda t, a=a, b=b: a + (b - a) / duration * t for a, b in zip(begin, end, strict=True)]  # type: ignore[misc]
+        return [item.with_target(MovingTarget(way)) for item, way in zip(self.coordinates.values(), ways, strict=True)]
 
     def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
         """The engine of a window, and the initial structure with groups turned and moved so that it is there.
@@ -251,12 +248,10 @@ class Sampler(ABC):
         except InfeasibleError:
             x = self.positions
             way = nearest_image(np.asarray(values, dtype=np.float64) - self.start, self.periods)
-            for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
-                rows = self._set([*self.held, *self.at(self.start + share * way)])
-                x = Motion(rows, x).restore_positions(x, bonds=[])
+            for place in np.linspace(self.start, self.start + way, _WALK + 1)[1:]:
+                x = Motion(self._set([*self.held, *self.at(place)]), x).restore_positions(x, bonds=[])
             held = {frozenset(row) for item in self.coordinates.values() for row in item.atoms.tolist()}
-            bonds = [pair for pair in self.bonds.tolist() if frozenset(pair) not in held]
-            lengths = self._set([Distance(np.array(bonds).reshape(-1, 2))])
+            lengths = self._set([Distance([pair for pair in self.bonds.tolist() if frozenset(pair) not in held])])
             change = lengths.measure(x) / lengths.measure(self.positions) - 1
             if np.abs(change).max(initial=0.0) >= _STRETCHED:
                 raise

@@ -192,9 +192,7 @@ class InputFile:
     improve : dict or None
         Of `Windows.improve`.
     pulls : dict or None
-        Of `Windows.pull`: start and end in angstrom and radian, count.
-    pull_steps : int
-        Steps of each of these.
+        Of `Windows.pull`: start and end in angstrom and radian, count; and steps, of `Settings.pull`.
     """
 
     sampler: Sampler
@@ -203,7 +201,6 @@ class InputFile:
     options: dict[str, Any]
     improve: dict[str, Any] | None
     pulls: dict[str, Any] | None
-    pull_steps: int
 
 
 def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -> InputFile:
@@ -239,15 +236,14 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     for name, how in (("structure", "[structure] with file = ..."), ("coordinate", "[[coordinate]]")):
         if not tables.get(name):
             raise InputError(f"the input file has no {name}; write {how}", item=name)
-    coordinates: dict[str, Constraint] = {}
-    for entry in tables["coordinate"]:
+    entries, coordinates = tables["coordinate"], {}
+    for entry in entries:
         if entry.called in coordinates:
             raise InputError(f"two coordinates have the name {entry.called}; give each its own", item="coordinate")
         coordinates[entry.called] = entry.constraint(tables["structure"].count_from)
-    count = math.prod(entry.count for entry in tables["coordinate"])
-    if count > MOST_WINDOWS:
+    if (count := math.prod(entry.count for entry in entries)) > MOST_WINDOWS:
         raise InputError(f"the input file has {count:,} windows; give at most {MOST_WINDOWS:,}", item="coordinate")
-    targets = np.array(list(product(*(entry.places() for entry in tables["coordinate"]))))
+    targets = np.array(list(product(*(entry.places() for entry in entries))))
     sampling = {key: value for key, value in vars(tables["sampling"]).items() if value is not None}
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
     if "approach" in options:
@@ -260,22 +256,15 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
         )
         if np.array_equal(start, end):
             raise InputError("[pulls] begin where they end; give from and to", item="pulls")
-        ways = {"start": start, "end": end, "count": pulls.count}
+        ways = {"start": start, "end": end, "count": pulls.count, "steps": pulls.steps}
     if "improve" in data and (len(coordinates) > 1 or count < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
             f"{count} windows: leave it out, or begin with 3 windows or more along one",
             item="improve",
         )
-    return InputFile(
-        _sampler(path.parent, tables, coordinates, allow_modules),
-        Settings(**sampling),
-        targets,
-        options,
-        data.get("improve"),
-        ways,
-        Pulls.steps if pulls is None else pulls.steps,
-    )
+    sampler = _sampler(path.parent, tables, coordinates, allow_modules)
+    return InputFile(sampler, Settings(**sampling), targets, options, data.get("improve"), ways)
 
 
 def _read(kind: Any, name: str, entry: Any) -> Any:

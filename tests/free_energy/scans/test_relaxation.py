@@ -24,7 +24,7 @@ def forces_of(atoms):
     return evaluate
 
 
-def relax(motion, evaluate, internals, x, *, fmax, memory=None, evaluations=200):
+def relax(motion, evaluate, internals, x, *, fmax, memory=(), evaluations=200):
     return Descent(motion, evaluate, internals, memory).relaxed(x, fmax, evaluations)
 
 

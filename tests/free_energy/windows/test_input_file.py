@@ -90,7 +90,7 @@ def test_a_difference_of_distances(folder):
     assert found.sampler.names == ("turn", "difference-1-2-4-2")
     assert found.targets[:3, 1].tolist() == [-0.5, 0.0, 0.5]
     assert found.options["approach"] == pytest.approx([np.radians(6), 0.2])
-    assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4]) and found.pull_steps == 20000
+    assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4]) and found.pulls["steps"] == 20000
     atoms = molecule("CH3OH")
     assert found.sampler.start[1] == pytest.approx(atoms.get_distance(0, 1) - atoms.get_distance(3, 1))
 
@@ -100,7 +100,7 @@ def test_pulls(folder):
     found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8.0\nsteps = 300\n")
     assert found.pulls["start"] == pytest.approx([-np.pi / 3])
     assert found.pulls["end"] == pytest.approx(found.targets[-1])
-    assert found.pulls["count"] == 8 and found.pull_steps == 300
+    assert found.pulls["count"] == 8 and found.pulls["steps"] == 300
 
 
 def test_an_input_for_openmm(folder):
