@@ -131,7 +131,7 @@ OF_FAMILIES = [
 def _free_energy(chosen: argparse.Namespace) -> int:
     from kcons.comparison.progress import Watcher
     from kcons.free_energy import Windows, read_input
-    from kcons.steppers.files import in_one_piece, text
+    from kcons.steppers.files import text, write_files
 
     given = read_input(chosen.input, allow_modules=chosen.allow_module or ())
     folder: Path = chosen.out or Path(chosen.input.stem)
@@ -151,9 +151,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
         written, said = found.write(folder), [found.summary()]
         if ways and pulls:
             numbers, beside = found.beside(pulls.pull(**ways), ways["start"], ways["end"])
-            written.append(folder / "pulls.json")
-            with in_one_piece(written[-1]) as opened:
-                opened.write(text(numbers).encode())
+            written += write_files(folder, {"pulls.json": text(numbers).encode()})
             said.append(beside)
     show(found.table(), "\n".join(said))
     say_written(written)

@@ -69,6 +69,15 @@ def in_one_piece(path: str | PathLike[str]) -> Iterator[BinaryIO]:
         raise
 
 
+def write_files(folder: str | PathLike[str], contents: Mapping[str, bytes]) -> list[Path]:
+    """Put files into a folder, by name, each in one piece; their paths."""
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for name, content in contents.items():
+        with in_one_piece(Path(folder, name)) as file:
+            file.write(content)
+    return [Path(folder, name) for name in contents]
+
+
 class ResultFolder:
     """A folder with the results of one thing, into which one run at a time writes.
 

@@ -61,8 +61,7 @@ def test_weights_mean_what_repetition_means():
 
 
 def test_one_sample_with_all_the_weight_is_warned_of():
-    weights = np.full(1000, 1e-6)
-    weights[7] = 1.0
+    weights = np.where(np.arange(1000) == 7, 1.0, 1e-6)
     with pytest.warns(UserWarning, match=r"worth 1\.0 independent.*heaviest has 100%"):
         weighted_mean(np.random.default_rng(6).standard_normal(1000), weights)
 

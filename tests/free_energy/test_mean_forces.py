@@ -52,9 +52,8 @@ def spring(x):
 def test_a_length_in_a_plane(mass):
     """F' = U' - kT/r, where Z does not change and the raw multipliers are right."""
     r = 1.7
-    series = series_of(
-        {"r": Distance([[0, 1]])}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.array([1.0, mass]), ring(r), spring
-    )
+    beside = [FixedAtoms([0]), Plane([1], (0, 0, 1))]
+    series = series_of({"r": Distance([[0, 1]])}, beside, np.array([1.0, mass]), ring(r), spring)
     result = mean_force(series, KT)
     assert abs(result.force[0] - (0.7**3 + 1 - KT / r)) < 3 * result.error[0] < 0.08
     np.testing.assert_allclose(series.gradient, 0, atol=1e-12)
@@ -79,11 +78,7 @@ def test_weights_take_the_metric_away():
     """<cos^2> of three equal masses with two bonds held: raw 0.321021053874, weighted 1/3."""
     x = trimer(20000)
     cosine = np.einsum("ni,ni->n", x[:, 0], x[:, 2])
-    bonds = {"bonds": Distance([[0, 1], [1, 2]])}
-    held = HeldCoordinates(ConstraintSet([*bonds.values()], x[0], np.ones(3)), bonds, x[0])
-    series = Series(held.names)
-    for point in x[:200]:
-        series.append(held.sample(point, np.zeros((3, 3)), np.zeros((3, 3))))
+    series = series_of({"bonds": Distance([[0, 1], [1, 2]])}, [], np.ones(3), x[:200], np.zeros_like)
     np.testing.assert_allclose(np.exp(series.log_det_z), (4 - cosine**2)[:200], rtol=1e-12)
     log_weights = -0.5 * np.log(4 - cosine**2)
     np.testing.assert_allclose(series.weights, np.exp(log_weights[:200] + 0.5 * series.log_det_z.min()), rtol=1e-12)
@@ -116,23 +111,18 @@ def test_one_end_to_end_length_beside_two_bonds(sphere):
         d = x[0] - x[2]
         return np.array([-0.4 * d, np.zeros(3), 0.4 * d])
 
-    coordinates = {"end to end": Distance([[0, 2]])}
-    series = series_of(
-        coordinates, [Distance([[0, 1], [1, 2]])], masses, np.repeat(shape[None], 3 * SAMPLES, 0), pull, sphere=sphere
-    )
-    if sphere:
-        plain = mean_force(series, KT)
-        series.isokinetic_degrees_of_freedom = 6
-        result = mean_force(series, KT)
-        assert abs(plain.force[0] - exact) > 4 * plain.error[0]
-    else:
-        result = mean_force(series, KT)
+    held = {"end to end": Distance([[0, 2]])}, [Distance([[0, 1], [1, 2]])], masses
+    series = series_of(*held, np.repeat(shape[None], 3 * SAMPLES, 0), pull, sphere=sphere)
+    plain = mean_force(series, KT)
+    series.isokinetic_degrees_of_freedom = 6 * sphere
+    result = mean_force(series, KT)
+    assert not sphere or abs(plain.force[0] - exact) > 4 * plain.error[0]
     assert abs(result.force[0] - exact) < 3 * result.error[0] < 0.06
     assert abs(series.gradient[0, 0]) * KT > 3 * result.error[0]
     # The mean over velocities is known here, and then no velocities matter, of whatever thermostat.
     for given in (KT, 5 * KT):
-        known = series_of(coordinates, [Distance([[0, 1], [1, 2]])], masses, shape[None], pull, kT=given, known=True)
-        known.isokinetic_degrees_of_freedom = 6 if sphere else 0
+        known = series_of(*held, shape[None], pull, kT=given, known=True)
+        known.isokinetic_degrees_of_freedom = 6 * sphere
         np.testing.assert_allclose(local_mean_force(known, KT), [[exact]], rtol=0, atol=1e-8)
 
 

@@ -43,11 +43,19 @@ def test_the_smaller_group_turns_and_its_force_is_the_slope_of_the_energy(bonds)
 
 
 def test_what_cannot_be_turned():
-    ring = np.vstack([BONDS, [[0, 3]]])
-    assert rigid_turn(PHI, ring, X) is None
-    assert rigid_turn(PHI, BONDS[[0, 2, 3]], X) is None
-    assert rigid_turn(Dihedral([[3, 1, 2, 0]]), BONDS, X) is None
-    assert rigid_turn(Angle([[0, 1, 2]]), BONDS, X) is None
+    for row, bonds in (
+        (PHI, np.vstack([BONDS, [[0, 3]]])),  # a ring
+        (PHI, BONDS[[0, 2, 3]]),
+        (Dihedral([[3, 1, 2, 0]]), BONDS),
+        (Angle([[0, 1, 2]]), BONDS),
+    ):
+        assert rigid_turn(row, bonds, X) is None
+
+
+def turned(x=X, f=None, beside=(), bonds=BONDS, **cell):
+    """That of a sample."""
+    held = HeldCoordinates(ConstraintSet([*beside, PHI], x, MASSES, **cell), {"phi": PHI}, x, bonds=bonds)
+    return held.sample(x, np.zeros((6, 3)), -gradient(X) if f is None else f).turned[0]
 
 
 @pytest.mark.parametrize(
@@ -55,26 +63,15 @@ def test_what_cannot_be_turned():
     [
         ([], True),
         ([Distance([[0, 1], [1, 2], [2, 3], [2, 5]])], True),
-        ([Distance([[0, 1], [1, 2], [2, 3], [0, 2]])], False),
+        ([Distance([[0, 1], [1, 2], [2, 3], [0, 2]])], False),  # the measure of the others changes
         ([Angle([[0, 1, 2]]), Distance([[4, 5]])], True),
         ([Distance([[0, 4]])], False),
         ([Dihedral([[0, 1, 2, 5]])], False),
     ],
-    ids=[
-        "alone",
-        "bonds",
-        "the measure of the others changes",
-        "an angle and a distance beyond",
-        "a distance across",
-        "another torsion about the axis",
-    ],
 )
 def test_other_rows_must_not_change(beside, turns):
-    held = HeldCoordinates(ConstraintSet([*beside, PHI], X, MASSES), {"phi": PHI}, X, bonds=BONDS)
-    f = -gradient(X)
-    sample = held.sample(X, np.zeros((6, 3)), f)
-    turn = rigid_turn(PHI, BONDS, X)
-    assert sample.turned[0] == (pytest.approx(turn.force(X, f)) if turns else pytest.approx(np.nan, nan_ok=True))
+    expected = rigid_turn(PHI, BONDS, X).force(X, -gradient(X)) if turns else np.nan
+    assert turned(beside=beside) == pytest.approx(expected, nan_ok=True)
 
 
 def test_rows_that_depend_on_each_other():
@@ -93,8 +90,7 @@ def test_a_molecule_across_a_box_is_not_turned():
     assert np.isfinite(turn.force(X, np.ones((6, 3))))
     there = X.copy()
     there[turn.axis[0]] += 10.0  # cut in the middle: the axis is none
-    assert np.isnan(turn.force(there, np.ones((6, 3))))
-    assert np.isnan(HeldCoordinates(ConstraintSet([PHI], X, MASSES), {"phi": PHI}, X).sample(X, X, X).turned[0])
+    assert np.isnan(turn.force(there, np.ones((6, 3)))) and np.isnan(turned(bonds=None))
 
 
 @pytest.mark.parametrize(("cut", "known"), [(None, True), (5, True), (4, False), (3, False), (2, False)])
@@ -104,10 +100,5 @@ def test_a_molecule_that_a_cell_has_cut_from_the_start_is_not_turned(cut, known)
     assert rigid_turn(PHI, bonds, X).group.tolist() == [3, 4]
     if cut is not None:
         there[cut, 0] += 12.0
-    held = HeldCoordinates(
-        ConstraintSet([PHI], there, MASSES, cell=12 * np.eye(3), pbc=True), {"phi": PHI}, there, bonds=bonds
-    )
-    turned = held.sample(there, np.zeros((6, 3)), -gradient(X)).turned[0]
-    assert turned == (
-        pytest.approx(rigid_turn(PHI, bonds, X).force(X, -gradient(X))) if known else pytest.approx(np.nan, nan_ok=True)
-    )
+    expected = rigid_turn(PHI, bonds, X).force(X, -gradient(X)) if known else np.nan
+    assert turned(there, bonds=bonds, cell=12 * np.eye(3), pbc=True) == pytest.approx(expected, nan_ok=True)

@@ -53,7 +53,7 @@ from kcons.free_energy.held_coordinates import HeldCoordinates, warn_of_gaps
 from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals, Relaxed
 from kcons.motion.minimization import minimize
 from kcons.motion.motion import Motion
-from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, text
+from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, text, write_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -610,8 +610,6 @@ class Scan:
         """Put scan.json, .csv, .png and .extxyz (the minima, as in the grid) into a folder; the paths written."""
         import pandas
 
-        place, table = Path(folder), pandas.DataFrame(self.rows())
-        place.mkdir(parents=True, exist_ok=True)
         data: dict[str, Any] = {
             "kcons": __version__,
             "coordinates": dict(zip(self.grid.keys, self.grid.units, strict=True)),
@@ -623,10 +621,6 @@ class Scan:
         for point in sorted(self.best):
             ase.io.write(frames, self.structure(point), format="extxyz")
         self.plot().savefig(picture, dpi=150, format="png")
-        lines = table.to_csv(index=False, lineterminator="\r\n", na_rep="")
-        written = [place / f"scan.{kind}" for kind in ("json", "csv", "png", "extxyz")]
-        contents = [text(data).encode(), lines.encode(), picture.getvalue(), frames.getvalue().encode()]
-        for path, content in zip(written, contents, strict=True):
-            with in_one_piece(path) as file:
-                file.write(content)
-        return written
+        table = pandas.DataFrame(self.rows()).to_csv(index=False, lineterminator="\r\n", na_rep="")
+        contents = (text(data).encode(), table.encode(), picture.getvalue(), frames.getvalue().encode())
+        return write_files(folder, dict(zip(WRITTEN, contents, strict=True)))

@@ -13,6 +13,7 @@ from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from io import BytesIO
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from os import PathLike
@@ -49,7 +50,7 @@ from kcons.free_energy.profiles.profile import Profile, Surface, fit_surface, in
 from kcons.free_energy.profiles.pulls import MIN_PULLS, Pulled, pull_free_energy
 from kcons.free_energy.series import Collector, MeanForce, Series, mean_force, thermal_multipliers
 from kcons.motion.motion import Motion
-from kcons.steppers.files import ResultFolder, in_one_piece, text
+from kcons.steppers.files import ResultFolder, text, write_files
 from kcons.thermostats import Estimate
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT
 
@@ -475,20 +476,15 @@ class FreeEnergy:
 
     def write(self, folder: Path) -> list[Path]:
         """free_energy.json, and for one coordinate profile.csv and profile.png; returns their paths."""
-        written = [folder / "free_energy.json"]
-        with in_one_piece(written[0]) as opened:
-            opened.write(text(self.numbers()).encode())
-        profile = self._profile()
+        contents, profile = {"free_energy.json": text(self.numbers()).encode()}, self._profile()
         if isinstance(profile, Profile):
-            (name,), (angle,) = self.names, self.angles
-            written += [folder / "profile.csv", folder / "profile.png"]
-            with in_one_piece(written[1]) as opened:
-                opened.write(f"{name} ({_PER[angle]}),F (kJ/mol),error (kJ/mol)\n".encode())
-                np.savetxt(opened, np.column_stack([profile.x, profile.F, profile.error]), fmt="%.8g", delimiter=",")
-            with in_one_piece(written[2]) as opened:
-                figure = plot_profile(profile, coordinate=f"{name} / {_PER[angle]}", energy="(kJ/mol)")
-                figure.savefig(opened, dpi=150, format="png")
-        return written
+            (name,), (angle,), table, picture = self.names, self.angles, BytesIO(), BytesIO()
+            table.write(f"{name} ({_PER[angle]}),F (kJ/mol),error (kJ/mol)\n".encode())
+            np.savetxt(table, np.column_stack([profile.x, profile.F, profile.error]), fmt="%.8g", delimiter=",")
+            figure = plot_profile(profile, coordinate=f"{name} / {_PER[angle]}", energy="(kJ/mol)")
+            figure.savefig(picture, dpi=150, format="png")
+            contents |= {"profile.csv": table.getvalue(), "profile.png": picture.getvalue()}
+        return write_files(folder, contents)
 
 
 def combine_sides(number: int, target: FloatArray, sides: dict[str, MeanForce], sampler: Sampler) -> WindowResult:

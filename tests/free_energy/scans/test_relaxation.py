@@ -16,58 +16,42 @@ from kcons.free_energy.scans import relaxation
 from kcons.free_energy.scans.relaxation import Descent, Internals
 
 
-def forces_of(atoms):
-    def evaluate(x):
-        atoms.positions[:] = x
-        return atoms.get_potential_energy(), atoms.get_forces()
-
-    return evaluate
-
-
-def relax(motion, evaluate, internals, x, *, fmax, memory=(), evaluations=200):
-    return Descent(motion, evaluate, internals, memory).relaxed(x, fmax, evaluations)
-
-
-def setting(rows, n=5):
+def setting(n=5):
+    """A chain with a torsion held: what relaxes it from its structure, and its energy and forces."""
     atoms = chain(n, threefold, turns=[1.0] * (n - 3))
     x = atoms.positions.copy()
-    motion = Motion(ConstraintSet(rows, x, atoms.get_masses()), x)
-    return atoms, motion, motion.restore_positions(x)
+    motion = Motion(ConstraintSet([Dihedral([[0, 1, 2, 3]], 0.9)], x, atoms.get_masses()), x)
+    x = motion.restore_positions(x)
+    internals = Internals(atoms.numbers, x)
+
+    def forces(y):
+        atoms.positions[:] = y
+        return atoms.get_potential_energy(), atoms.get_forces()
+
+    def relax(evaluate=forces, start=x, fmax=1e-3, memory=(), evaluations=200):
+        return Descent(motion, evaluate, internals, memory).relaxed(start, fmax, evaluations)
+
+    return relax, x, forces
 
 
 def test_what_was_learned_goes_along():
-    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=6)
-    internals = Internals(atoms.numbers, x)
-    first = relax(motion, forces_of(atoms), internals, x, fmax=1e-3)
-    assert first.memory.shape == (first.evaluations - 1, 2, len(internals.terms))
-    again = relax(motion, forces_of(atoms), internals, x, fmax=1e-3, memory=first.memory)
-    assert again.evaluations < first.evaluations
+    relax, _, _ = setting(n=6)
+    first = relax()
+    assert first.memory.shape == (first.evaluations - 1, 2, len(first.terms))
+    assert relax(memory=first.memory).evaluations < first.evaluations
 
 
-def test_forces_that_are_no_gradient_are_told():
-    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)])
-    evaluate = forces_of(atoms)
+def test_what_ends_no_relaxation_is_told():
+    relax, x, forces = setting()
     with pytest.raises(ConvergenceError, match="forces are not its gradient") as raised:
-        relax(
-            motion,
-            lambda y: (evaluate(y)[0], -evaluate(y)[1]),
-            Internals(atoms.numbers, x),
-            x,
-            fmax=1e-5,
-            evaluations=500,
-        )
+        relax(lambda y: (forces(y)[0], -forces(y)[1]), fmax=1e-5, evaluations=500)
     assert raised.value.positions.shape == x.shape
     with pytest.raises(ConvergenceError, match="3 evaluations; allow more"):
-        relax(motion, evaluate, Internals(atoms.numbers, x), x, fmax=1e-5, evaluations=3)
-
-
-def test_undefined_internal_coordinates_are_told():
-    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 1.0)])
-    internals = Internals(atoms.numbers, x)
+        relax(fmax=1e-5, evaluations=3)
     met = x.copy()
     met[4] = met[3]
     with pytest.raises(ConvergenceError, match="two atoms met"):
-        relax(motion, lambda y: (0.0, np.ones_like(y)), internals, met, fmax=1e-3)
+        relax(lambda y: (0.0, np.ones_like(y)), met)
 
 
 def threads():
@@ -75,12 +59,12 @@ def threads():
 
 
 def test_calculators_keep_their_threads_and_matrices_have_one(monkeypatch):
-    atoms, motion, start = setting([Dihedral([[0, 1, 2, 3]], 0.9)])
+    relax, _, forces = setting()
     seen, eigh = {"calculator": set(), "matrices": set()}, np.linalg.eigh
 
     def evaluate(y):
         seen["calculator"] |= threads()
-        return forces_of(atoms)(y)
+        return forces(y)
 
     def counted(*given, **named):
         seen["matrices"] |= threads()
@@ -88,7 +72,7 @@ def test_calculators_keep_their_threads_and_matrices_have_one(monkeypatch):
 
     monkeypatch.setattr(relaxation.np.linalg, "eigh", counted)
     with threadpool_limits(2, user_api="blas"):
-        relax(motion, evaluate, Internals(atoms.numbers, start), start, fmax=0.05)
+        relax(evaluate, fmax=0.05)
         assert seen == {"calculator": {2}, "matrices": {1}} and threads() == {2}
 
 

@@ -13,7 +13,10 @@ from kcons.free_energy import SystemCalculator, scan
 openmm = pytest.importorskip("openmm")
 
 
-def four_atoms(constrained=True):
+TURN = Dihedral([[0, 1, 2, 3]])
+
+
+def four_atoms(constrained=True, change=None, barrier=2.0):
     """A chain with one torsion, 2 kJ/mol (1 + cos 3 phi), its bonds held or harmonic, in a zigzag."""
     system = openmm.System()
     for _ in range(4):
@@ -26,16 +29,17 @@ def four_atoms(constrained=True):
             bonds.addBond(k, k + 1, 0.15, 2e5)
     for k in range(2):
         angles.addAngle(k, k + 1, k + 2, 1.9, 400.0)
-    turns.addTorsion(0, 1, 2, 3, 3, 0.0, 2.0)
+    turns.addTorsion(0, 1, 2, 3, 3, 0.0, barrier)
     for force in (bonds, angles, turns):
         system.addForce(force)
+    if change is not None:
+        change(system)
     x = [[0.0, 0, 0], [1.5, 0.1, 0], [2.0, 1.5, 0.1], [3.4, 1.6, 0.3]]
-    return system, Atoms("C4", positions=x)
+    return Atoms("C4", positions=x, calculator=SystemCalculator(system, "Reference"))
 
 
 def test_energy_and_forces():
-    system, atoms = four_atoms(constrained=False)
-    atoms.calc = SystemCalculator(system, "Reference")
+    atoms = four_atoms(constrained=False)
     forces, x, h = atoms.get_forces(), atoms.positions.copy(), 1e-4
     ends = []
     for sign in (1, -1):
@@ -47,10 +51,9 @@ def test_energy_and_forces():
 
 
 def test_a_scan_with_what_the_system_constrains():
-    system, atoms = four_atoms()
-    atoms.calc = SystemCalculator(system, "Reference")
+    atoms = four_atoms()
     values = np.radians(np.arange(-180, 180, 60))
-    found = scan(atoms, Dihedral([[0, 1, 2, 3]]), values, held=atoms.calc.held, fmax=1e-4)
+    found = scan(atoms, TURN, values, held=atoms.calc.held, fmax=1e-4)
     truth = 2.0 * (1 + np.cos(3 * values)) * 0.01036427  # kJ/mol in eV
     np.testing.assert_allclose(found.energies, truth, atol=1e-7)
     for attempt in found.best.values():
@@ -59,35 +62,28 @@ def test_a_scan_with_what_the_system_constrains():
 
 
 def test_bad_systems():
-    system, atoms = four_atoms()
-    atoms.calc = SystemCalculator(system, "Reference")
+    atoms = four_atoms()
     few = atoms[:3]
     few.calc = atoms.calc
     with pytest.raises(InputError, match="4 particles and the structure 3 atoms"):
         few.get_potential_energy()
-    system.addParticle(0.0)
-    system.setVirtualSite(4, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
+
+    def site(system):
+        system.setVirtualSite(system.addParticle(0.0), openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
+
     with pytest.raises(UnsupportedError, match="particle 4 is a virtual site"):
-        SystemCalculator(system)
+        four_atoms(change=site)
 
 
 def test_a_folder_belongs_to_one_system(tmp_path):
     """Energies of another System would be those of the first one."""
-    for count in range(2):
-        system, atoms = four_atoms()
-        system.getForce(2).setTorsionParameters(0, 0, 1, 2, 3, 3, 0.0, 2.0 + count)
-        atoms.calc = SystemCalculator(system, "Reference")
-        how = {"held": atoms.calc.held, "folder": tmp_path}
-        if count:
-            with pytest.raises(OccupiedError, match="other calculator"):
-                scan(atoms, Dihedral([[0, 1, 2, 3]]), [1.0], **how)
-        else:
-            scan(atoms, Dihedral([[0, 1, 2, 3]]), [1.0], **how)
+    one, other = (four_atoms(barrier=barrier) for barrier in (2.0, 3.0))
+    scan(one, TURN, [1.0], held=one.calc.held, folder=tmp_path)
+    with pytest.raises(OccupiedError, match="other calculator"):
+        scan(other, TURN, [1.0], held=other.calc.held, folder=tmp_path)
 
 
 def test_particles_without_mass_stay_where_they_are():
-    system, atoms = four_atoms(constrained=False)
-    system.setParticleMass(0, 0.0)
-    atoms.calc = SystemCalculator(system, "Reference")
-    found = scan(atoms, Dihedral([[0, 1, 2, 3]]), [2.0], held=atoms.calc.held)
+    atoms = four_atoms(constrained=False, change=lambda system: system.setParticleMass(0, 0.0))
+    found = scan(atoms, TURN, [2.0], held=atoms.calc.held)
     np.testing.assert_array_equal(found.structure((0,)).positions[0], atoms.positions[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -24,8 +25,8 @@ PIECES = Distance([[0, 1], [1, 3], [0, 3], [0, 2], [0, 4], [0, 5], [2, 4], [4, 5
 SHORT = Settings(pull=20, equilibration=20, production=320, every=10, relax=3)
 
 
-def sampler(**more):
-    return AseWindows(molecule("CH3OH"), CALCULATOR, {"turn": TURN}, **{"held": [PIECES], **more})
+def sampler(atoms=None, calculator=CALCULATOR, held=(PIECES,)):
+    return AseWindows(molecule("CH3OH") if atoms is None else atoms, calculator, {"turn": TURN}, held)
 
 
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")  # about the fixed atom
@@ -36,7 +37,7 @@ def test_a_window_far_from_the_structure(tmp_path):
     window = Window(0, "up", (1.0,), (np.pi / 3,), 5)
     atoms = molecule("CH3OH")
     atoms.set_constraint(FixAtoms([0]))
-    held = pickle.loads(pickle.dumps(AseWindows(atoms, CALCULATOR, {"turn": TURN}, [PIECES])))
+    held = pickle.loads(pickle.dumps(sampler(atoms)))
     for name in ("one", "two"):
         held.sample(window, SHORT, tmp_path / name)
     series = Series.load(tmp_path / "one")
@@ -47,7 +48,7 @@ def test_a_window_far_from_the_structure(tmp_path):
 
 def test_atoms_that_are_changed_later_change_no_windows():
     atoms = molecule("CH3OH", cell=[20.0] * 3, pbc=True)
-    windows = AseWindows(atoms, CALCULATOR, {"turn": TURN}, [PIECES])
+    windows = sampler(atoms)
     before = windows.placed([1.0])[1]
     atoms.set_cell([2.0] * 3)
     atoms.rattle(0.1)
@@ -55,9 +56,8 @@ def test_atoms_that_are_changed_later_change_no_windows():
 
 
 def test_a_window_without_a_pull(tmp_path):
-    settings = Settings(**{**SHORT.__dict__, "pull": 0})
-    found = Windows(sampler(), tmp_path, settings, both_sides=False, executor=ThreadPoolExecutor(1))
-    result = found.run([np.pi / 3])
+    how = {"both_sides": False, "executor": ThreadPoolExecutor(1)}
+    result = Windows(sampler(), tmp_path, replace(SHORT, pull=0), **how).run([np.pi / 3])
     assert result.failed == {} and len(result.windows) == 1
 
 
@@ -88,8 +88,7 @@ def test_torsions_over_atoms_that_form_no_bonds():
 
 
 def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
-    settings = Settings(pull=200, equilibration=20, production=320, every=10, relax=3)
-    sampler().pull(Window(0, "forward", (2.0,), (2.4,), 5), settings, tmp_path / "pull.npz")
+    sampler().pull(Window(0, "forward", (2.0,), (2.4,), 5), replace(SHORT, pull=200), tmp_path / "pull.npz")
     series = Series.load(tmp_path / "pull.npz")
     assert len(series) == 201
     np.testing.assert_allclose(series.value[:, 0], np.linspace(2.0, 2.4, 201), atol=1e-9)
@@ -100,20 +99,15 @@ def test_what_a_folder_belongs_to():
     """The same in another process; another or changed calculator, or other constraints, are something else."""
     assert sampler().digest == sampler().digest == pickle.loads(pickle.dumps(sampler())).digest
     lj = LennardJones(epsilon=0.01)
+
+    def made(epsilon):
+        """Functions of the same name, without arguments."""
+        return lambda: LennardJones(epsilon=epsilon)
+
     calculators = (partial(LennardJones, sigma=1.1), made(0.01), made(0.02), lambda: lj)
-    others = [AseWindows(molecule("CH3OH"), each, {"turn": TURN}, [PIECES]) for each in calculators]
+    others = [sampler(calculator=each) for each in calculators]
     first = others[-1].digest
     assert len({sampler().digest, sampler(held=[]).digest, *(other.digest for other in others)}) == 6
-    lj.set(epsilon=0.02)
-    assert others[-1].digest != first
-    lj.set(epsilon=0.01)
-    assert others[-1].digest == first
-
-
-def made(epsilon):
-    """Functions of the same name, without arguments."""
-
-    def calculator():
-        return LennardJones(epsilon=epsilon)
-
-    return calculator
+    for epsilon in (0.02, 0.01):
+        lj.set(epsilon=epsilon)
+        assert (others[-1].digest == first) == (epsilon == 0.01)

@@ -28,12 +28,19 @@ def torsion(atoms=PHI):
     return force
 
 
-def simulation_of(system, integrator, positions=PDB.positions):
+X = np.array(PDB.positions.value_in_unit(unit.nanometer))
+
+
+def simulation_of(system, integrator, reporter, still=False):
     simulation = app.Simulation(PDB.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    simulation.context.setPositions(positions)
-    simulation.context.setVelocitiesToTemperature(300 * unit.kelvin, 3)
-    integrator.applyConstraints() if isinstance(integrator, ProjectedIntegrator) else None
-    integrator.applyVelocityConstraints() if isinstance(integrator, ProjectedIntegrator) else None
+    simulation.context.setPositions(X)
+    if still:
+        simulation.context.setVelocities(np.zeros_like(X))
+    else:
+        simulation.context.setVelocitiesToTemperature(300 * unit.kelvin, 3)
+        integrator.applyConstraints()
+        integrator.applyVelocityConstraints()
+    simulation.reporters.append(reporter)
     return simulation
 
 
@@ -48,10 +55,9 @@ def test_a_torsion_held_as_a_collective_variable(bonds):
     rows = CollectiveRows(system, [torsion()], positions=PDB.positions)
     integrator = ProjectedIntegrator(0.002, parts=[rows], ensemble=Langevin(300, 5))
     integrator.setRandomNumberSeed(1)
-    simulation = simulation_of(system, integrator)
     file = io.StringIO()
     reporter = HeldCoordinatesReporter(file, 5, {"phi": Dihedral([PHI])})
-    simulation.reporters.append(reporter)
+    simulation = simulation_of(system, integrator, reporter)
     for _ in range(4):
         simulation.step(5)
         assert reporter.series.multiplier[-1, 0] == pytest.approx(rows.multipliers(simulation.context)[0], rel=1e-6)
@@ -69,53 +75,36 @@ def test_a_torsion_held_as_a_collective_variable(bonds):
 
 def test_the_same_coordinate_held_in_three_ways(tmp_path):
     pair, angle = [8, 14], [6, 8, 14]
-    x = np.array(PDB.positions.value_in_unit(unit.nanometer))
+    far, length = (float(np.linalg.norm(X[i] - X[j])) for i, j in ([1, 0], pair))
     found = {}
     for way in ("System", "collective", "hold"):
         system = peptide(app.HBonds)
-        parts = []
-        length = float(np.linalg.norm(x[pair[0]] - x[pair[1]]))
-        bend = openmm.CustomAngleForce("theta")
+        bend, bond = openmm.CustomAngleForce("theta"), openmm.CustomBondForce("r")
         bend.addAngle(*angle, [])
+        bond.addBond(*pair, [])
         if way == "System":
             system.addConstraint(*pair, length)
-            parts = [CollectiveRows(system, [bend], positions=x)]
-        elif way == "collective":
-            bond = openmm.CustomBondForce("r")
-            bond.addBond(*pair, [])
-            parts = [CollectiveRows(system, [bond, bend], positions=x)]
+        if way == "hold":  # one object of several rows, of which one is named
+            part = hold(system, [Distance([[1, 0], pair], [far, length]), Angle([angle])], X)
         else:
-            # One object of several rows, of which one is named.
-            far = float(np.linalg.norm(x[0] - x[1]))
-            parts = [hold(system, [Distance([[1, 0], pair], [far, length]), Angle([angle])], x)]
-        integrator = ProjectedIntegrator(1e-6, parts=parts)
-        simulation = simulation_of(system, integrator, x)
-        simulation.context.setVelocities(np.zeros_like(x))
-        reporter = HeldCoordinatesReporter(
-            str(tmp_path / f"{way}.csv"), 1, {"bond": Distance([pair]), "angle": Angle([angle])}
-        )
-        simulation.reporters.append(reporter)
-        simulation.step(1)
-        found[way] = [reporter.series.multiplier[0], reporter.series.gradient[0], reporter.series.log_det_z[0]]
+            part = CollectiveRows(system, [bend] if way == "System" else [bond, bend], positions=X)
+        named = {"bond": Distance([pair]), "angle": Angle([angle])}
+        reporter = HeldCoordinatesReporter(str(tmp_path / f"{way}.csv"), 1, named)
+        simulation_of(system, ProjectedIntegrator(1e-6, parts=[part]), reporter, still=True).step(1)
+        sample = reporter.series[0]
+        found[way] = np.concatenate([sample.multiplier, sample.gradient, [sample.log_det_z]])
     for way in ("collective", "hold"):
-        for one, other in zip(found["System"], found[way], strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-6)
+        np.testing.assert_allclose(found["System"], found[way], rtol=1e-6)
 
 
 def test_work_of_a_pull_by_hold_is_the_energy_that_it_adds():
     """The target accelerates, which the constraint of `hold` knows and the one that names it does not."""
     system = peptide(None)
-    x = np.array(PDB.positions.value_in_unit(unit.nanometer))
-    length = float(np.linalg.norm(x[8] - x[14]))
+    length = float(np.linalg.norm(X[8] - X[14]))
     pull = Distance([[8, 14]], MovingTarget(lambda t: length + 8.0 * t * t))
-    part = hold(system, [pull], x)
-    integrator = ProjectedIntegrator(0.0001, parts=[part])
-    simulation = app.Simulation(PDB.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
-    simulation.context.setPositions(x)
-    simulation.context.setVelocities(np.zeros_like(x))
+    integrator = ProjectedIntegrator(0.0001, parts=[hold(system, [pull], X)])
     reporter = HeldCoordinatesReporter(io.StringIO(), 1, {"r": Distance([[8, 14]])})
-    energies = []
-    simulation.reporters.append(reporter)
+    simulation, energies = simulation_of(system, integrator, reporter, still=True), []
     for steps in (1, 300):
         simulation.step(steps)
         state = simulation.context.getState(energy=True)
@@ -137,11 +126,7 @@ def test_a_bond_to_a_virtual_site_does_not_count_its_force_twice_and_a_coordinat
     system.addForce(bonds)
     system.addForce(charges)
     integrator = ProjectedIntegrator(0.001, parts=[CollectiveRows(system, [torsion([0, 1, 2, 3])], positions=x)])
-    topology = app.Topology()
-    residue = topology.addResidue("X", topology.addChain())
-    for _ in range(7):
-        topology.addAtom("X", None, residue)
-    simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    simulation = app.Simulation(app.Topology(), system, integrator, openmm.Platform.getPlatformByName("Reference"))
     reporter = HeldCoordinatesReporter(io.StringIO(), 1, {"t": Dihedral([[0, 1, 2, 3]])})
 
     def energy(angle):
@@ -168,16 +153,13 @@ def test_bad_input():
     system = peptide()
     psi = [6, 8, 14, 16]
     rows = CollectiveRows(system, [torsion(), torsion(psi)], positions=PDB.positions)
-    simulation = simulation_of(system, ProjectedIntegrator(0.001, parts=[rows]))
-    simulation.reporters.append(HeldCoordinatesReporter(io.StringIO(), 1, {"phi": Dihedral([PHI])}))
+    phi = io.StringIO(), 1, {"phi": Dihedral([PHI])}
+    simulation = simulation_of(system, ProjectedIntegrator(0.001, parts=[rows]), HeldCoordinatesReporter(*phi))
     with pytest.raises(InputError, match=r"holds 2 rows, and 1 are named.*beside"):
         simulation.step(1)
-    simulation.reporters = [
-        HeldCoordinatesReporter(io.StringIO(), 1, {"phi": Dihedral([PHI])}, beside=[Dihedral([psi])])
-    ]
+    simulation.reporters = [HeldCoordinatesReporter(*phi, beside=[Dihedral([psi])])]
     simulation.step(1)
     assert len(simulation.reporters[0].series) == 1
-    other = simulation_of(peptide(), ProjectedIntegrator(0.001))
-    other.reporters = simulation.reporters
+    other = simulation_of(peptide(), ProjectedIntegrator(0.001), simulation.reporters[0])
     with pytest.raises(InputError, match="belongs to another simulation"):
         other.step(1)

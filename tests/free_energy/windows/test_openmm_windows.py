@@ -25,16 +25,15 @@ def system():
     return field.createSystem(PDB.topology, constraints=app.HBonds, removeCMMotion=False)
 
 
-def sampler(coordinates, of=None):
-    return OpenMMWindows(PDB.topology, of or system(), PDB.positions, coordinates, platform="Reference")
+def sampler(coordinates):
+    return OpenMMWindows(PDB.topology, system(), PDB.positions, coordinates, platform="Reference")
 
 
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")
 def test_two_torsions_far_from_the_structure(tmp_path):
     windows = pickle.loads(pickle.dumps(sampler({"phi": PHI, "psi": PSI})))
     assert windows.start == pytest.approx([np.pi, np.pi], abs=1e-3)
-    steps = {"relax": 5, "pull": 20, "equilibration": 20, "production": 320, "every": 10}
-    settings = Settings(timestep=2.0, **steps)
+    settings = Settings(timestep=2.0, relax=5, pull=20, equilibration=20, production=320, every=10)
     windows.sample(Window(0, "up", (-1.2, 1.9), (-1.1, 2.0), 7), settings, tmp_path / "window.npz")
     series = Series.load(tmp_path / "window.npz")
     assert len(series) == 32 and series.off.max() < 1e-10
@@ -46,8 +45,8 @@ def test_two_torsions_far_from_the_structure(tmp_path):
 @pytest.mark.skipif(bool(build.refusal()), reason=build.refusal())
 def test_windows_on_the_device_are_those_of_the_program(tmp_path, monkeypatch):
     """A hundred steps, the states recorded on the device: multipliers, weights and what belongs to them."""
-    steps = {"relax": 0, "pull": 16, "equilibration": 20, "production": 64, "every": 2}
-    settings = Settings(timestep=1.0, friction=1e-30, **steps)  # noise of 1e-14: each has its own
+    # Noise of 1e-14: each has its own.
+    settings = Settings(friction=1e-30, relax=0, pull=16, equilibration=20, production=64, every=2)
     found = []
     for why in ("", "there is no compiler"):
         monkeypatch.setattr(build, "refusal", lambda why=why: why)
@@ -83,12 +82,10 @@ def test_other_coordinates(tmp_path, coordinate, target):
 
 
 def test_structures_that_are_not_of_the_system():
-    made, topology, x = openmm.System(), app.Topology(), np.eye(3)[:2]
+    made, topology, x, distance = openmm.System(), app.Topology(), np.eye(3)[:2], {"r": Distance([[0, 1]])}
     residue = topology.addResidue("X", topology.addChain())
     for _ in x:
         made.addParticle(1.0)
-    distance = {"r": Distance([[0, 1]])}
-    for _ in x:
         topology.addAtom("X", None, residue)
     topology.setPeriodicBoxVectors(3.0 * np.eye(3))
     OpenMMWindows(topology, made, x, distance)
