@@ -99,8 +99,8 @@ class Batch:
         often = 1 if self.device.type == "cpu" else CHECK_EVERY
         self.check_every = often if check_every is None else whole_number(check_every, "check_every")
         self.n_systems = len(self.systems)
-        self.atom_starts = _starts([each.n_atoms for each in self.systems])
-        self.row_starts = _starts([each.constraint_set.n_rows for each in self.systems])
+        self.atom_starts = np.cumsum([0, *(each.n_atoms for each in self.systems)])
+        self.row_starts = np.cumsum([0, *(each.constraint_set.n_rows for each in self.systems)])
         self.n_atoms, self.n_rows = int(self.atom_starts[-1]), int(self.row_starts[-1])
         self._numbers: dict[Motion, list[int]] = {}
         for number, each in enumerate(self.systems):
@@ -138,16 +138,15 @@ class Batch:
 
     def _groups(self, velocity_rows: bool) -> list[Group]:
         """All clusters, with or without rows of velocities."""
-        key = velocity_rows or self._holonomic
-        if key not in self._known:
+        if velocity_rows not in self._known:
             parts: dict[Any, list[Any]] = {}
             for motion, numbers in self._numbers.items():
                 for pattern, kind in kinds_of(motion, velocity_rows).items():
                     where = np.stack([numbers, self.atom_starts[numbers], self.row_starts[numbers]], axis=1)
                     parts.setdefault(pattern, []).append((kind, where))
             own = [self._inverse_masses], [self.targets, self._still]
-            self._known[key] = [Group(pattern, each, own, self.compiled) for pattern, each in parts.items()]
-        return self._known[key]
+            self._known[velocity_rows] = [Group(pattern, each, own, self.compiled) for pattern, each in parts.items()]
+        return self._known[velocity_rows]
 
     # -- cells ----------------------------------------------------------------------------------------
 
@@ -226,8 +225,9 @@ class Batch:
         for item, own in zip(("masses", "targets"), self._given, strict=True):
             if getattr(self, item) is not own or own._version:  # numbers that follow from them are kept
                 raise InputError(f"{item} of a Batch were written to; give other ones as {item}= of a call", item=item)
-        t, t_start = (torch.full((), each, dtype=self.dtype, device=self.device) for each in (time, start))
-        return Task(self, self._groups(flight != 0 or not of_positions), of_positions, flight != 0, t, t_start)
+        t, t_start = (torch.as_tensor(each, dtype=self.dtype, device=self.device) for each in (time, start))
+        flies = not self._holonomic and flight != 0
+        return Task(self, self._groups(self._holonomic or flies or not of_positions), of_positions, flies, t, t_start)
 
     def _with_fixed(self, y: Tensor, rows: Tensor) -> Tensor:
         """With what the rows of fixed atoms say of these."""
@@ -340,26 +340,25 @@ class Batch:
         calls, self._calls = self._calls, 0
         limit = max(ACCEPTED, ROUNDINGS * torch.finfo(self.dtype).eps)
         groups = [group for known in self._known.values() for group in known]
-        worst = [(group, group.worst) for group in groups]
-        for group, off in worst:
-            if bool((off <= limit).all()):
-                continue
-            for each in groups:
-                each.worst = torch.zeros_like(each.worst)
-            k, lane = divmod(int(torch.nan_to_num(off, nan=torch.inf).argmax()), off.shape[1])
-            residual, copy = float(off[k, lane]), int(group.systems[lane])
-            row, held = int(group.rows[k, lane]) - int(self.row_starts[copy]), self.systems[copy].constraint_set
-            said = f"is off by {residual:.3g} of its scale" if np.isfinite(residual) else "has turned or is not finite"
-            error = ConvergenceError(
-                f"copy {copy}, row {held.row_name(row)} {said} in one of the last {calls} projections: there is no "
-                "solution near enough. Take a smaller time step, or start on the rows (Motion.restore_positions)",
-                residual=residual,
-                tolerance=limit,
-                row=row,
-                atoms=held.row_atoms(row).tolist(),
-            )
-            error.copy = copy
-            raise error
+        if all(bool((group.worst <= limit).all()) for group in groups):
+            return
+        off, rows = (torch.cat([of(group).ravel() for group in groups]) for of in (lambda g: g.worst, lambda g: g.rows))
+        for group in groups:
+            group.worst = torch.zeros_like(group.worst)
+        k = int(torch.nan_to_num(off, nan=torch.inf).argmax())
+        residual, copy = float(off[k]), int(np.searchsorted(self.row_starts, int(rows[k]), "right")) - 1
+        row, held = int(rows[k] - self.row_starts[copy]), self.systems[copy].constraint_set
+        said = f"is off by {residual:.3g} of its scale" if np.isfinite(residual) else "has turned or is not finite"
+        error = ConvergenceError(
+            f"copy {copy}, row {held.row_name(row)} {said} in one of the last {calls} projections: there is no "
+            "solution near enough. Take a smaller time step, or start on the rows (Motion.restore_positions)",
+            residual=residual,
+            tolerance=limit,
+            row=row,
+            atoms=held.row_atoms(row).tolist(),
+        )
+        error.copy = copy
+        raise error
 
     def report(self, x: Tensor, v: Tensor | None = None, *, time: float = 0.0) -> list[Report]:
         """What each system's engine reports of its positions, and velocities: residuals, rank, kinds of clusters."""
@@ -373,10 +372,6 @@ class Batch:
 
     def __repr__(self) -> str:
         return f"<Batch: {self.n_rows} rows on {self.n_atoms} atoms of {self.n_systems} systems>"
-
-
-def _starts(counts: Sequence[int]) -> IntArray:
-    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
 def _fixed_atoms(motion: Motion) -> list[int]:

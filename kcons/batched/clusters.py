@@ -136,8 +136,7 @@ class Lanes:
             return [self.table([row[k] for row in rows]) for k in range(width)]
 
         self.terms = tables([(k, mine[i][a], mine[j][a]) for k, i, j, a in both], 3)
-        self.n_entries, self.across = len(entries), self.table([entries[j, i] for i, j in entries])
-        self.levels = []
+        self.n_entries, self.levels = len(entries), []
         for begin, end in zip(found.levels[:-1], found.levels[1:], strict=True):
             factors: list[tuple[int, ...]] = []
             products: list[tuple[int, ...]] = []
@@ -244,8 +243,8 @@ class Lanes:
         parts = (_times(self.take(a, one), self.take(_times(w, b), other)) for a, b in zip(left, right, strict=True))
         return self.summed(reduce(_added, parts), entry, self.n_entries)
 
-    def solve(self, s: Vector, b: Vector, transposed: bool = False) -> Vector:
-        take, s, b = self.take, self.take(s, self.across) if transposed else _copied(s), _copied(b)
+    def solve(self, s: Vector, b: Vector) -> Vector:
+        take, s, b = self.take, _copied(s), _copied(b)
         for (entry, here, there, _), (which, beside, taken) in self.levels:
             factor = _each(operator.truediv, take(s, entry), take(s, here))
             self.subtract(s, taken, _times(take(factor, which), take(s, beside)))
@@ -290,7 +289,7 @@ class Lanes:
         at, slope = of.at_start if v is None else of, self.evaluate(of)[1]
         there = self.evaluate(at)[1] if v is None else slope
         b = _added(self.contract(there, _times(weights, h))[:rank], self.unpacked(bent))
-        a = self.solve(self.couple(slope, there, weights), b, transposed=True)
+        a = self.solve(self.couple(there, slope, weights), b)
         back = _each(operator.neg, self.spread(slope, a))
         z = _added(h, back)
         wz = _times(weights, z)

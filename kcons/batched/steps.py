@@ -16,23 +16,37 @@ from kcons.errors import InputError
 Force = Callable[[Tensor], Tensor]
 
 
-def _pushed(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: float, masses: Tensor | None) -> Tensor:
-    """Velocities after forces have acted for a time h."""
+def _pushed(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: Any, masses: Tensor | None) -> Tensor:
+    """Velocities after forces have acted for a time h; those between atoms whose distance is held may be any."""
     for item, given in (("v", v), ("forces", forces)):
         if given.shape != x.shape:  # which torch would spread over copies
             raise InputError(f"{item} must have shape {tuple(x.shape)}, not {tuple(given.shape)}", item=item)
     return v + h * batch.weights(masses).reshape(*x.shape[:-1], 1) * forces
 
 
-def _kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: float, time: float, masses: Tensor | None) -> Tensor:
+def kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: Any, time: Any = 0.0, masses: Any = None) -> Tensor:
     """The same, on the rows."""
     return batch.project_velocities(x, _pushed(batch, x, v, forces, h, masses), time=time, masses=masses)
 
 
-def _drift(batch: Batch, x: Tensor, v: Tensor, h: float, time: float, **held: Any) -> tuple[Tensor, Tensor]:
+def drift(batch: Batch, x: Tensor, v: Tensor, h: Any, time: Any = 0.0, **held: Any) -> tuple[Tensor, Tensor]:
     """Positions a time h later on the rows, and velocities with the impulse that has kept them there."""
     found = batch.solve_positions(x + h * v, x, time=time + h, reference_time=time, flight=h, **held)
-    return found.positions, v + found.push / h if h else v
+    return found.positions, v + found.push / (h if isinstance(h, Tensor) else h or 1.0)
+
+
+def drift_in_bath(
+    batch: Batch, x: Tensor, v: Tensor, dt: Any, bath: tuple[Any, Any, Any], time: Any = 0.0, **held: Any
+) -> tuple[Tensor, Tensor]:
+    """Half a flight, friction and noise, half a flight: g-BAOAB without its kicks; of a kT, a friction, a generator."""
+    kT, friction, generator = bath
+    half, w = 0.5 * dt, batch.weights(held.get("masses")).reshape(*x.shape[:-1], 1)
+    x, v = drift(batch, x, v, half, time, **held)
+    kept = torch.exp(torch.as_tensor(-friction * dt, dtype=x.dtype, device=x.device))
+    noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
+    v = kept * v + torch.sqrt((1 - kept * kept) * kT * w) * noise
+    v = batch.project_velocities(x, v, time=time + half, masses=held.get("masses"))
+    return drift(batch, x, v, half, time + half, **held)
 
 
 def rattle(
@@ -71,9 +85,9 @@ def rattle(
     H. C. Andersen, J. Comput. Phys. 52, 24 (1983).
     """
     v = _pushed(batch, x, v, forces, 0.5 * dt, masses)
-    x, v = _drift(batch, x, v, dt, time, targets=targets, masses=masses)
+    x, v = drift(batch, x, v, dt, time, targets=targets, masses=masses)
     forces = force(x)
-    return x, _kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces
+    return x, kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces
 
 
 def gbaoab(
@@ -109,13 +123,7 @@ def gbaoab(
     """
     positive(dt, "dt")  # noise cannot be taken back
     masses = held.get("masses")
-    v = _kick(batch, x, v, forces, 0.5 * dt, time, masses)
-    x, v = _drift(batch, x, v, 0.5 * dt, time, **held)
-    kept = torch.exp(torch.as_tensor(-friction * dt, dtype=x.dtype, device=x.device))
-    noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
-    w = batch.weights(masses).reshape(*x.shape[:-1], 1)
-    v = kept * v + torch.sqrt((1 - kept * kept) * kT * w) * noise
-    v = batch.project_velocities(x, v, time=time + 0.5 * dt, masses=masses)
-    x, v = _drift(batch, x, v, 0.5 * dt, time + 0.5 * dt, **held)
+    v = kick(batch, x, v, forces, 0.5 * dt, time, masses)
+    x, v = drift_in_bath(batch, x, v, dt, (kT, friction, generator), time, **held)
     forces = force(x)
-    return x, _kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces
+    return x, kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces

@@ -18,6 +18,7 @@ from torch_sim.integrators.md import InverseTimeArg, NoseHooverChain, TimeArg, c
 from torch_sim.models.interface import ModelInterface
 from torch_sim.units import unit_factor_from_annotation
 
+from kcons.batched.steps import drift_in_bath, kick, rattle
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.thermostats.freedom import open_directions
 from kcons.torchsim.holding import Constraints, array_of, constraints_of
@@ -88,7 +89,7 @@ def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = T
             sums = torch.zeros((state.n_systems, 4), dtype=state.dtype, device=state.device)
             sums = sums.index_add(0, state.system_idx, torch.cat([given, masses], dim=1))
             given = given - masses * (_free(state)[:, None] * sums[:, :3] / sums[:, 3:])[state.system_idx]
-    momenta = masses * held.tangent(start, given / masses)
+    momenta = masses * held.batch(state).project_velocities(start.positions, given / masses)
     output = model(start)
     _check_forces(state, output["forces"])
     made = MDState.from_state(start, momenta=momenta, energy=output["energy"], forces=output["forces"])
@@ -98,8 +99,9 @@ def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = T
 
 def _placed(state: SimState, held: Constraints) -> torch.Tensor:
     """Positions on the constraints; refuses those that somebody has moved off them."""
-    found = held.move(state, state.positions)[0]
-    held.check(state)
+    batch = held.batch(state)
+    found = batch.project_positions(state.positions, state.positions)
+    batch.check()
     away = (found - state.positions).abs().amax(1)
     if bool(away.max() > FAR):
         atom = int(away.argmax())
@@ -161,58 +163,35 @@ def _whole(step: Callable[..., State]) -> Callable[..., State]:
     return made
 
 
-def _project(state: MDState, held: Constraints) -> None:
-    masses = state.masses[:, None]
-    state.momenta = masses * held.tangent(state, state.momenta / masses)
-
-
-def _kick(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
-    """Let forces act for `dt`; those between atoms whose distance is held may be any."""
-    state.momenta = state.momenta + dt * state.forces
-    _project(state, held)
-
-
-def _drift(state: MDState, held: Constraints, dt: torch.Tensor) -> None:
-    """Fly for `dt` and onto the constraints; momenta change by the same correction, and may leave the tangent plane."""
-    masses = state.masses[:, None]
-    positions, push = held.move(state, state.positions + dt * state.momenta / masses)
-    state.positions = positions
-    state.momenta = state.momenta + masses * push / dt
-
-
-def _evaluate(state: MDState, model: ModelInterface) -> None:
+def _evaluate(state: MDState, model: ModelInterface, positions: torch.Tensor) -> torch.Tensor:
     """Forces at the end of a step, at positions that are on the constraints: looked at here, once a step."""
-    constraints_of(state).check(state)
+    held = constraints_of(state)
+    held.batch(state).check()
+    state.positions = positions
     output = model(state)
     if state.device.type == "cpu":  # elsewhere looking waits for the device: the next step tells
         _check_forces(state, output["forces"])
-    constraints_of(state).left = state.positions, state.positions._version
+    held.left = positions, positions._version
     state.energy, state.forces = output["energy"], output["forces"]
     state.store_model_extras(output)
+    return state.forces
 
 
 def _rattle(state: State, model: ModelInterface, *, dt: Any, **_: Any) -> State:
-    held, dt = constraints_of(state), _each(state, dt, atoms=True)
-    _kick(state, held, dt / 2)
-    _drift(state, held, dt)
-    _evaluate(state, model)
-    _kick(state, held, dt / 2)
+    batch, given = constraints_of(state).batch(state), (state.positions, state.velocities, state.forces)
+    _, v, _ = rattle(batch, functools.partial(_evaluate, state, model), *given, _each(state, dt, atoms=True))
+    state.momenta = state.masses[:, None] * v
     return state
 
 
 @_whole
 def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, gamma: Any = None) -> MDState:
-    held, dt = constraints_of(state), _each(state, dt, atoms=True)
-    keep = torch.exp(torch.full_like(dt, -FRICTION) if gamma is None else -_each(state, gamma, atoms=True) * dt)
-    _kick(state, held, dt)
-    _drift(state, held, dt / 2)
-    noise = torch.randn(state.momenta.shape, device=state.device, dtype=state.dtype, generator=state.rng)
-    spread = torch.sqrt(_each(state, kT, atoms=True) * (1 - keep**2) * state.masses[:, None])
-    state.momenta = keep * state.momenta + spread * noise
-    _project(state, held)
-    _drift(state, held, dt / 2)
-    _project(state, held)
-    _evaluate(state, model)
+    batch, dt = constraints_of(state).batch(state), _each(state, dt, atoms=True)
+    friction = FRICTION / dt if gamma is None else _each(state, gamma, atoms=True)
+    v = kick(batch, state.positions, state.velocities, state.forces, dt)
+    x, v = drift_in_bath(batch, state.positions, v, dt, (_each(state, kT, atoms=True), friction, state.rng))
+    state.momenta = state.masses[:, None] * batch.project_velocities(x, v)
+    _evaluate(state, model, x)
     return state
 
 

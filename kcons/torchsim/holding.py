@@ -55,21 +55,21 @@ class Constraints(SystemConstraint):
     def __init__(self, motions: Sequence[Motion], system_idx: torch.Tensor) -> None:
         super().__init__(system_idx)
         self.motions = tuple(motions)
-        #: Tensors that the engine was made for, with their versions, the engine, and its atoms.
-        self._made: tuple[list[tuple[torch.Tensor, int]], Batch, torch.Tensor] | None = None
+        #: Tensors that the engine was made for, with their versions, and the engine.
+        self._made: tuple[list[tuple[torch.Tensor, int]], Batch] | None = None
         #: Positions that the last step ended with, and their version.
         self.left: tuple[torch.Tensor, int] | None = None
 
-    def batch(self, state: SimState) -> tuple[Batch, torch.Tensor]:
-        """The engine for all systems of a state that have rows, and the numbers of their atoms."""
+    def batch(self, state: SimState) -> Batch:
+        """The engine for all systems of a state, also those that have no rows; failures wait for its `check`."""
         # TorchSim sets another system_idx where it reorders systems; masses and cells can be edited in a run.
         seen = [(each, each._version) for each in (self.system_idx, state.masses, state.cell)]
         if self._made is None or any(a is not b or n != m for (a, n), (b, m) in zip(self._made[0], seen, strict=True)):
             self.check_fits(state)
-            motions = [self.motions[k] for k in torch.argsort(self.system_idx).tolist()]
-            batch = Batch(motions, device=state.device, dtype=state.dtype, check_every=sys.maxsize)
-            self._made = seen, batch, torch.isin(state.system_idx, self.system_idx).nonzero().ravel()
-        return self._made[1:]
+            held = dict(zip(self.system_idx.tolist(), self.motions, strict=True))
+            motions = [held[k] if k in held else _unheld(state, k) for k in range(state.n_systems)]
+            self._made = seen, Batch(motions, device=state.device, dtype=state.dtype, check_every=sys.maxsize)
+        return self._made[1]
 
     def check_fits(self, state: SimState) -> None:
         """Refuse a state with other atoms, masses or cells than the rows were made for."""
@@ -85,24 +85,6 @@ class Constraints(SystemConstraint):
                     item="state",
                 )
 
-    def move(self, state: SimState, new: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions `new` on the constraints, along the gradients at ``state.positions``, and the correction.
-
-        Failures are kept until `check` looks for them.
-        """
-        batch, atoms = self.batch(state)
-        positions, push, _ = batch.solve_positions(new[atoms], state.positions[atoms])
-        return new.index_copy(0, atoms, positions), torch.zeros_like(new).index_copy(0, atoms, push)
-
-    def check(self, state: SimState) -> None:
-        """Raise `ConvergenceError` where rows were not met since the last look, which waits for the device."""
-        self.batch(state)[0].check()
-
-    def tangent(self, state: SimState, velocities: torch.Tensor) -> torch.Tensor:
-        """The part of velocities that stays on the constraints."""
-        batch, atoms = self.batch(state)
-        return velocities.index_copy(0, atoms, batch.project_velocities(state.positions[atoms], velocities[atoms]))
-
     def get_removed_dof(self, state: SimState) -> torch.Tensor:
         """The rank of the rows of each system, which may be less than their number."""
         ranks = torch.tensor([motion.rank for motion in self.motions], device=state.device)
@@ -112,8 +94,9 @@ class Constraints(SystemConstraint):
         """Bring positions that an optimizer asks for onto the constraints, in place."""
         if isinstance(state, MDState):
             raise UnsupportedError(_OWN)
-        found = self.move(state, new_positions)[0]
-        self.check(state)
+        batch = self.batch(state)
+        found = batch.project_positions(new_positions, state.positions)
+        batch.check()
         new_positions.copy_(found)
 
     def adjust_momenta(self, state: SimState, momenta: torch.Tensor) -> None:
@@ -123,7 +106,7 @@ class Constraints(SystemConstraint):
     def adjust_forces(self, state: SimState, forces: torch.Tensor) -> None:
         """Remove the part of forces that leaves the constraints, in place: what is left vanishes at a minimum."""
         masses = state.masses[:, None]
-        forces.copy_(masses * self.tangent(state, forces / masses))
+        forces.copy_(masses * self.batch(state).project_velocities(state.positions, forces / masses))
 
     def adjust_stress(self, state: SimState, stress: torch.Tensor) -> None:
         """Refuse cell filters, which do not know the stress of held rows."""
@@ -133,16 +116,15 @@ class Constraints(SystemConstraint):
 
     def select_constraint(self, atom_mask: torch.Tensor, system_mask: torch.Tensor) -> Constraints | None:
         """What is held of the systems that stay."""
-        kept = system_mask[self.system_idx].nonzero().ravel()
-        return self._part(kept, (torch.cumsum(system_mask, 0) - 1)[self.system_idx[kept]])
+        return self._part(system_mask[self.system_idx], (torch.cumsum(system_mask, 0) - 1)[self.system_idx])
 
     def select_sub_constraint(self, atom_idx: torch.Tensor, sys_idx: int) -> Constraints | None:
         """What is held of one system."""
-        kept = (self.system_idx == sys_idx).nonzero().ravel()
-        return self._part(kept, torch.zeros_like(kept))
+        return self._part(self.system_idx == sys_idx, torch.zeros_like(self.system_idx))
 
     def _part(self, kept: torch.Tensor, numbers: torch.Tensor) -> Constraints | None:
-        return Constraints([self.motions[k] for k in kept.tolist()], numbers) if len(kept) else None
+        motions = [self.motions[k] for k in kept.nonzero().ravel().tolist()]
+        return Constraints(motions, numbers[kept]) if motions else None
 
     def reindex(self, atom_offset: int, system_offset: int) -> Constraints:
         """The same where systems are numbered from `system_offset`."""
@@ -253,9 +235,15 @@ def hold(
 
 
 def report(state: SimState) -> list[Report]:
-    """What the engine of each held system reports: residuals of positions, and of momenta where there are any, rank."""
-    batch, atoms = constraints_of(state).batch(state)
-    return batch.report(state.positions[atoms], state.velocities[atoms] if isinstance(state, MDState) else None)
+    """What the engine of each system reports: residuals of positions, and of momenta where there are any, rank."""
+    batch = constraints_of(state).batch(state)
+    return batch.report(state.positions, state.velocities if isinstance(state, MDState) else None)
+
+
+def _unheld(state: SimState, system: int) -> Motion:
+    """An engine without rows."""
+    x, masses = (array_of(each[state.system_idx == system]) for each in (state.positions, state.masses))
+    return Motion(ConstraintSet([], x, masses), x)
 
 
 def _fixed_atoms(state: SimState) -> Any:

@@ -28,6 +28,7 @@ MUTANTS = {
     ],
     "batched/steps.py": [
         ("if «given.shape != x.shape→False»:", "batched/batch::what_is_refused"),
-        ("v + found.push / «h→(2 * h)»", "batched/batch::rattle_is_that_of_the_engine_and_reversible"),
+        ("v + «found.push→0.5 * found.push»", "batched/batch::rattle_is_that_of_the_engine_and_reversible"),
+        ("(1 - kept * «kept→1»)", "torchsim/torchsim_dynamics::short_runs_have_the_temperature_of_the_bath[langevin]"),
     ],
 }

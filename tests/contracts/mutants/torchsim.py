@@ -8,18 +8,26 @@ MUTANTS = {
             "for k in torch.«argsort(self.system_idx)→arange(len(self.motions))»",
             "torchsim/torchsim_states::slices_take_the_right_rows_along",
         ),
-        ("(0, atoms, «positions→new[atoms]»)", "torchsim/torchsim_states::systems_with_nothing_held_stay_free"),
-        ("«self.check(state)→pass»", "torchsim/torchsim_optimizers::steps_that_cannot_be_held_are_told"),
+        (
+            "motions = [«held[k] if k in held else →»_unheld",
+            "torchsim/torchsim_states::systems_with_nothing_held_stay_free",
+        ),
+        ("«batch.check()→pass»", "torchsim/torchsim_optimizers::steps_that_cannot_be_held_are_told"),
         ("self.system_idx + «system_offset→0»", "torchsim/torchsim_states::splitting_joining_popping_and_copies"),
         ("if excess.max(initial=0.0) > «1→1e9»", "torchsim/torchsim_refusals::bad_input_is_named_and_leaves_the_state"),
         ("[FixedAtoms(fixed)] if «len(fixed)→False»", "torchsim/torchsim_states::fixed_atoms_are_taken_over"),
     ],
     "torchsim/dynamics.py": [
         ("away.max() > «FAR→1e9»", "torchsim/torchsim_refusals::a_state_that_has_become_another_is_refused[positions]"),
-        ("* push / «dt→(2 * dt)»", "torchsim/torchsim_dynamics::constant_energy_is_the_trajectory_of_the_engine"),
-        ("(1 - keep**«2→1»)", "torchsim/torchsim_dynamics::short_runs_have_the_temperature_of_the_bath[langevin]"),
+        (
+            "«_each(state, dt, atoms=True)→0.5 * _each(state, dt, atoms=True)»)\n    state.momenta",
+            "torchsim/torchsim_dynamics::constant_energy_is_the_trajectory_of_the_engine",
+        ),
         ("- 3 * «_free(self)→1»", "torchsim/torchsim_states::fixed_atoms_are_taken_over"),
-        ("constraints_of(state).«check→batch»(state)", "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"),
+        (
+            "held.batch(state)«.check()→»\n    state.positions = positions",
+            "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state",
+        ),
         (
             "is not held.left[0] «or state.positions._version != held.left[1]→»",
             "torchsim/torchsim_refusals::positions_that_are_edited_between_steps_are_refused",
