@@ -5,7 +5,7 @@ MUTANTS = {
         ("or any(a is not b «or n != m→»", "torchsim/torchsim_refusals::masses_that_are_edited_in_a_run_are_refused"),
         ("(torch.cumsum(system_mask, 0) - «1→0»)", "torchsim/torchsim_states::slices_take_the_right_rows_along"),
         (
-            "for k in torch.«argsort(self.system_idx)→arange(len(self.motions))»",
+            "dict(zip(«self.system_idx.tolist()→range(len(self.motions))»,",
             "torchsim/torchsim_states::slices_take_the_right_rows_along",
         ),
         (
