@@ -96,6 +96,8 @@ WAYS = {
     "forces of v": lambda m, bad: Rattle().step(
         System(m, lambda x, v, t: bad, velocity_dependent=True), State(X, 0 * X), 0.01
     ),
+    "positions of a state": lambda m, bad: run(System(m, lambda x, t: PULL), State(bad, 0 * X), 0.01, 1),
+    "velocities of a state": lambda m, bad: run(System(m, lambda x, t: PULL), State(X, bad), 0.01, 1),
     "thermal_velocities": lambda m, bad: thermal_velocities(System(m), bad, 1.0, 1),
     "targets of fixed atoms": lambda m, bad: FixedAtoms([0, 1, 2], bad),
     "a moving target": lambda m, bad: FixedAtoms([0, 1, 2], lambda t: bad).target_at(0.0),
@@ -128,15 +130,6 @@ STEPPERS = [
     NoseHooverChain(0.1, 5.0),
     Isokinetic(),
 ]
-
-
-@pytest.mark.parametrize("kind", [k for k in KINDS if k != "masked rows"])
-@pytest.mark.parametrize("item", ["positions", "velocities"])
-def test_states_made_by_hand_are_refused(item: str, kind: str, motion: Motion) -> None:
-    arrays = {"positions": X, "velocities": motion.project_velocities(X, 0.5 * X[::-1])}
-    arrays[item] = spoilt(arrays[item])[kind]
-    with pytest.raises(InputError, match=SAID.get(kind, "no array of numbers")):
-        run(System(motion, lambda x, t: PULL), State(**arrays), 0.01, 3)
 
 
 # -- what is lent -----------------------------------------------------------------------------------

@@ -470,6 +470,7 @@ REMEDIES = [
     (lambda: Formula("x1^2", 0), r"a power is written \*\*"),
     (lambda: Formula("z1 = x1**2", 0), "write what is held at zero, the left side less the right one"),
     (lambda: Formula("x1 - y", 0), "known are x1, y1, z1, x2, ..., t, pi. Give it as a parameter"),
+    (lambda: Formula("x1 - vx1", 0), "'vx1' in 'x1 - vx1' is a velocity; .* is held by VelocityFormula"),
     (lambda: VelocityFormula("vx1 - x1*t", 0), "at rest it is not 0: what the sum is held at is the target"),
     (lambda: CustomVelocity(0, lambda r, t: r), r"takes \(r, t\), but is called with \(r\); say time_dependent=True"),
     (lambda: Angle([0, 1, 2], 109.5).check(bent(90.0)[None], 0.0, 0), "targets are in radian"),
