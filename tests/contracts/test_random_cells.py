@@ -113,62 +113,50 @@ def _seed_of(kind: str) -> int:
     return next(s for s in range(1000) if world(s).kinds == [kind] and judge(s).outcome == "right")
 
 
-@pytest.mark.parametrize("off", [1e-6, np.nan])
-def test_the_judge_sees_wrong_positions(monkeypatch, off):
-    seed = _seed_of("chain")
-    honest = Motion.project_positions
+def _added(where, what):
+    def fault(out, given, cell):
+        out[where] += cell if what == "a cell" else what
 
-    def shifted(self, *args, **kwargs):
-        out = honest(self, *args, **kwargs)
-        out[0, 0] += off
+    return fault
+
+
+def _careless(out, given, cell):
+    given[1][:] *= 1.0 + 1e-15
+
+
+def _raising(error):
+    def fault(out, given, cell):
+        raise error
+
+    return fault
+
+
+@pytest.mark.parametrize(
+    ("kind", "call", "fault", "said"),
+    [
+        ("chain", "project_positions", _added((0, 0), 1e-6), "silent: wrong result"),
+        ("chain", "project_positions", _added((0, 0), np.nan), "silent: NaN"),
+        # A result that is right up to a lattice vector is not the atom that was given.
+        ("rigid", "project_positions", _added(-1, "a cell"), "silent: wrong result"),
+        ("chain", "project_velocities", _careless, "silent: arguments were changed"),
+        # There is a solution; nothing is near half the cell; and an error that is not typed.
+        ("chain", "project_velocities", _raising(ConvergenceError("time step too large")), "unfounded"),
+        ("chain", "project_velocities", _raising(ConvergenceError("longer than half the box")), "unfounded: half"),
+        ("chain", "project_velocities", _raising(ZeroDivisionError("division by zero")), "silent: untyped"),
+    ],
+)
+def test_the_judge_sees(kind, call, fault, said, monkeypatch):
+    seed, honest = _seed_of(kind), getattr(Motion, call)
+    cell = world(seed).cell[np.argmax(world(seed).pbc)]
+
+    def spoiled(self, *given, **options):
+        out = honest(self, *given, **options)
+        fault(out, given, cell)
         return out
 
-    monkeypatch.setattr(Motion, "project_positions", shifted)
-    assert "silent" in {v.outcome for v in judge(seed).verdicts if v.operation == "project_positions"}
-
-
-def test_the_judge_sees_atoms_in_another_image(monkeypatch):
-    """A result that is right up to a lattice vector is not the atom that was given."""
-    seed = _seed_of("rigid")
-    honest, cell = Motion.project_positions, world(seed).cell[np.argmax(world(seed).pbc)]
-
-    def elsewhere(self, *args, **kwargs):
-        out = honest(self, *args, **kwargs)
-        out[-1] += cell
-        return out
-
-    monkeypatch.setattr(Motion, "project_positions", elsewhere)
-    assert judge(seed).outcome == "silent"
-
-
-def test_the_judge_sees_errors_without_a_cause(monkeypatch):
-    """A refusal where there is a solution; one that blames half the cell where nothing is near; an untyped one."""
-    seed = _seed_of("chain")
-    for error, outcome in (
-        (ConvergenceError("time step too large"), "unfounded"),
-        (ConvergenceError("longer than half the box"), "unfounded"),
-        (ZeroDivisionError("division by zero"), "silent"),
-    ):
-
-        def refuse(self, *args, error=error, **kwargs):
-            raise error
-
-        monkeypatch.setattr(Motion, "project_velocities", refuse)
-        said = {v.outcome for v in judge(seed).verdicts if v.operation == "project_velocities"}
-        assert said == {outcome}
-
-
-def test_the_judge_sees_arguments_that_were_changed(monkeypatch):
-    seed = _seed_of("chain")
-    honest = Motion.project_velocities
-
-    def careless(self, x, v, **kwargs):
-        out = honest(self, x, v, **kwargs)
-        v *= 1.0 + 1e-15
-        return out
-
-    monkeypatch.setattr(Motion, "project_velocities", careless)
-    assert "arguments were changed" in {v.why for v in judge(seed).verdicts}
+    monkeypatch.setattr(Motion, call, spoiled)
+    verdicts = [f"{v.outcome}: {v.why}" for v in judge(seed).verdicts if v.operation == call]
+    assert verdicts and all(verdict.startswith(said) for verdict in verdicts)
 
 
 def test_the_judge_wants_the_true_remedy():

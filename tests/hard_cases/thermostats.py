@@ -8,7 +8,7 @@ import numpy as np
 import openmm
 from ase import units
 from openmm import unit
-from systems.lennard_jones import LennardJones
+from systems.fluids import LennardJones
 
 import kcons.openmm
 from hard_cases.case import Outcome, case, outcome

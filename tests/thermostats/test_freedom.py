@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lennard_jones import LennardJones
+from fluids import LennardJones
 from thermostat_systems import METHANE, TEN, quartic, repelling, swirling, system, waves
 
 from kcons.constraints import (

@@ -8,7 +8,6 @@ import fluids
 import numpy as np
 import pytest
 from ase import Atoms, units
-from lennard_jones import LennardJones
 
 from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
 from kcons.comparison import Potential, PotentialCalculator
@@ -33,7 +32,7 @@ def chains():
         bend = np.cumsum(np.c_[np.full(6, 1.3), 0.75 * (-1.0) ** np.arange(6), 0.1 * rng.normal(size=6)], axis=0)
         x.append(bend + np.array([0, (k % 3) * box / 3, (k // 3) * box / 2]))
     atoms = Atoms("C" * 6 * n, positions=np.concatenate(x))
-    forces = LennardJones(np.repeat(range(n), 6), box, masses=atoms.get_masses(), epsilon=0.006, sigma=3.6)
+    forces = fluids.LennardJones(np.repeat(range(n), 6), box, masses=atoms.get_masses(), epsilon=0.006, sigma=3.6)
     return _ready(atoms, forces, 6), 6, 5
 
 

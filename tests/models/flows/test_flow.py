@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from growth_reference import case
+from model_references import case
 
 from kcons.errors import ConvergenceError, InputError
 from kcons.models.flows import (

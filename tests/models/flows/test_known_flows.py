@@ -4,7 +4,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from flow_reference import case
+from model_references import case
 
 from kcons.constraints import projection
 from kcons.errors import InputError

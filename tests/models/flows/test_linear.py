@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from exact_counts import in_skew_basis, left_axis_right
-from flow_reference import case
+from model_references import case
 
 from kcons.errors import InputError
 from kcons.models.flows import (

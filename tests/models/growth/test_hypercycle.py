@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from exact_mixture import exact_energies
-from growth_reference import case, system
+from model_references import case, exact_energies, system
 from scipy.integrate import simpson
 
 from kcons.errors import BudgetError, InputError

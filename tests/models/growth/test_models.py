@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from exact_mixture import exact_energies
-from growth_reference import case
+from model_references import case, exact_energies
 from scipy.special import rel_entr
 
 from kcons.errors import InputError, NonFiniteError
