@@ -61,6 +61,7 @@ def names() -> dict[str, Any]:
     return found | {
         "kcons": kcons,
         "X": X,
+        "LINE": np.arange(4.0)[:, None] * [1.0, 0.0, 0.0],
         "V": np.zeros_like(X),
         "F": X,
         "M": MASSES,
@@ -155,6 +156,7 @@ REFUSED: list[tuple[str, ...]] = [
         for row in ("CenterOfMass([0, 1])", "CenterDistance([2], [0, 1])", "RadiusOfGyration([0, 1])")
     ),
     ("ConstraintSet(RadiusOfGyration([1, 3]), X, M, cell=[3.0] * 3)", "positions"),
+    ("ConstraintSet(Distance([[0, 1], [1, 2], [2, 3], [3, 0]]), LINE, M, cell=[5.0, 9.0, 9.0])", "target"),
     ("HELD.value(X[:2])", "positions"),
     ("HELD.?", "time", "target(nan)", "measure(X, nan)", "value(X, nan)", "jacobian(X, nan)", "residuals(X, V, nan)"),
     ("HELD.?", "time", "velocity_target(X, nan)", "acceleration_target(X, V, nan)", "tolerance(X, nan)"),
