@@ -12,7 +12,7 @@ from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
 from openmm import unit
 
 from kcons import Motion
-from kcons.constraints import Constraint, Distance, MovingTarget, Sphere, Torus, from_dict
+from kcons.constraints import Constraint, Distance, MovingTarget, from_dict
 from kcons.constraints.constraint import FAMILIES, constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
@@ -134,23 +134,6 @@ def test_common_shift_changes_only_rows_that_say_so(name):
         assert unchanged
     elif item.holonomic:
         assert not unchanged
-
-
-def test_plain_data_that_does_not_fit():
-    data = Sphere([0, 1], [0.0, 0.0, 0.0], 1.0).todict()
-    with pytest.raises(InputError, match="no constraint family"):
-        from_dict({**data, "family": "Spheroid"})
-    with pytest.raises(InputError, match=r"'center'.* missing or unknown"):
-        from_dict({key: value for key, value in data.items() if key != "center"})
-    with pytest.raises(InputError, match="center has shape"):
-        from_dict({**data, "center": [[0.0, 0.0]]})
-    with pytest.raises(InputError, match="center of row 1 is not finite"):
-        from_dict({**data, "center": [[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]]})
-    data = Torus(0, [0.0, 0.0, 0.0], [0.0, 3.0, 4.0], 2.0).todict()
-    with pytest.raises(InputError, match="axis has vectors not of length 1"):
-        from_dict({**data, "axis": [[0.0, 3.0, 4.0]]})
-    with pytest.raises(InputError, match="Torus: major_radius -2 is not positive"):
-        from_dict({**data, "major_radius": [-2.0]})
 
 
 def test_one_constraint_or_several():

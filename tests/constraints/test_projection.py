@@ -410,32 +410,6 @@ def test_contradiction_names_its_rows() -> None:
     assert "1, 3" in str(caught.value)
 
 
-# -- errors and architecture ------------------------------------------------------------------------
-
-
-ROW, NOTHING = np.ones((1, 6)), np.zeros(6)
-REFUSED = [
-    *(("acceleration", (ROW, masses, NOTHING, [0.0]), "masses must")
-      for masses in ([1.0, 0.0], [1.0, -1.0], [1.0, np.nan], [1.0, np.inf], [1.0], np.ones(5))),
-    *(("bott_duffin", (np.ones((1, 2)), mass, np.zeros(2), [0.0]), "finite and symmetric")
-      for mass in ([[1.0, 0.5], [0.4, 1.0]], [[1.0, np.nan], [np.nan, 1.0]])),
-    *(("pseudo_inverse", (bad,), "^matrix")
-      for bad in (np.ma.masked_array([[1.0, 2.0]], mask=[[False, True]]), [["a", "b"]], [[1.0], [1.0, 2.0]])),
-    ("pseudo_inverse", (np.ones(3),), "two axes"),
-    ("pseudo_inverse", ([[1.0, 2.0], [np.nan, 0.0]],), "row 1"),
-    ("multipliers", (ROW, [1.0, 1.0], np.zeros(5), [0.0]), "f must have 6"),
-    ("constraint_force", (ROW, [1.0, 1.0], NOTHING, [0.0, 0.0]), "b must have 1"),
-    ("penrose_residuals", (ROW, ROW), "inverse"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "arguments", "words"), REFUSED)
-def test_bad_arrays_are_refused(name: str, arguments: tuple[object, ...], words: str) -> None:
-    with pytest.raises(InputError, match=words) as caught:
-        getattr(projection, name)(*arguments)
-    assert caught.value.item in ("masses", "matrix", "f", "b", "inverse")
-
-
 def test_the_oracle_shares_no_code_with_the_engine() -> None:
     tree = ast.parse(Path(projection.__file__).read_text(encoding="utf-8"))
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}

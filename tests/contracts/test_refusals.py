@@ -15,7 +15,7 @@ from ase.build import molecule
 from ase.calculators.emt import EMT
 
 import kcons.ase
-import kcons.constraints
+import kcons.constraints.projection
 import kcons.motion
 import kcons.openmm
 import kcons.steppers
@@ -60,6 +60,8 @@ def names() -> dict[str, Any]:
     atoms.calc = EMT()
     return found | {
         "kcons": kcons,
+        "np": np,
+        "ORACLE": kcons.constraints.projection,
         "X": X,
         "LINE": np.arange(4.0)[:, None] * [1.0, 0.0, 0.0],
         "V": np.zeros_like(X),
@@ -141,6 +143,11 @@ REFUSED: list[tuple[str, ...]] = [
     ("?(0.0, 2)", "target", "MovingTarget(abs, acceleration=abs).rate_at", "MovingTarget(lambda t: nan).at"),
     ("MovingTarget(lambda t: [1.0, 2.0, 3.0]).at(0.0, 2)", "target"),
     ("MovingTarget(abs, time_step=0.0)", "the time_step of the target"),
+    ("from_dict(Sphere([0, 1], [0, 0, 0], 1.0).todict() | ?)", "center", '{"center": [[0, 0]]}'),
+    ("from_dict(Sphere([0, 1], [0, 0, 0], 1.0).todict() | ?)", "center", '{"center": [[0, 0, 0], [0, nan, 0]]}'),
+    ("from_dict(Sphere([0, 1], [0, 0, 0], 1.0).todict() | ?)", "radius", '{"radius": 2.0}'),
+    ("from_dict(Torus(0, [0, 0, 0], [0, 0, 1], 2.0).todict() | ?)", "axis", '{"axis": [[0, 3.0, 4.0]]}'),
+    ("from_dict(Torus(0, [0, 0, 0], [0, 0, 1], 2.0).todict() | ?)", "major_radius", '{"major_radius": [-2.0]}'),
     ("from_dict(?)", "family", "{}", '{"family": "Distanz"}', "3", '{"family": ["Distance"]}'),
     ("from_dict(RadiusOfGyration([0, 1]).todict() | {'mass_weighted': 'no'})", "mass_weighted"),
     ("from_dict(DistanceDifference([[0, 1], [1, 2]]).todict() | {?})", "slots", "'slots': 3", "'weights': 'a'"),
@@ -191,6 +198,21 @@ REFUSED: list[tuple[str, ...]] = [
     ('System(MOTION, "force")', "force"),
     ("System(MOTION, force, potential=?)", "potential", "3", "lambda x: 0.0"),
     ("System(MOTION, ?)", "force", "lambda x, v, t: -v", "force, velocity_dependent=True"),
+    (
+        "ORACLE.acceleration([[1.0] * 6], ?, X[:2], [0.0])",
+        "masses",
+        "[1.0, 0.0]",
+        "[1.0, -1.0]",
+        "[1.0, nan]",
+        "[1.0, inf]",
+    ),
+    ("ORACLE.acceleration(?, [0.0])", "masses", "[[0.0] * 6], [1.0], [0.0] * 6", "[[0.0] * 6], [1.0] * 5, [0.0] * 6"),
+    ("ORACLE.bott_duffin([[1.0, 1.0]], ?, [0.0, 0.0], [0.0])", "masses", "[[1, 0.5], [0.4, 1]]", "[[nan, 0], [0, 1]]"),
+    ("ORACLE.pseudo_inverse(?)", "matrix", "[1.0]", "[['a', 'b']]", "[[1.0], [1.0, 2.0]]", "X / 0"),
+    ("ORACLE.pseudo_inverse(np.ma.masked_array(X, X == 1.0))", "matrix"),
+    ("ORACLE.multipliers(X[:1], [1.0], [0.0] * 5, [0.0])", "f"),
+    ("ORACLE.constraint_force(X[:1], [1.0], [0.0] * 3, [0.0, 0.0])", "b"),
+    ("ORACLE.penrose_residuals(X, X)", "inverse"),
     ("minimize(MOTION, lambda y: y, X, tolerance=1.0, longest=1.0)", "force"),
     ("CellSystem(CELL, lambda x, t, cell: x, lambda x, t, cell: 0.0, force)", "stress"),
     ("System(MOTION, force, far=?)", "far", "0.0", "-1.0", "nan", '"far"'),
