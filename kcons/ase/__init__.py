@@ -5,11 +5,10 @@ whole set and solves it as one. Units are ASE's; targets are in angstrom and rad
 the object with ASE, which makes files that contain it readable.
 
 - `topology`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
-- `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
-- `pressure`: cells that change, the pressure along a run
+- `binding`, `constraints_object`: the object, and whether the caller respects it
 - `calculator`, `named_calculators`: forces along the constraints, for optimizers; calculators by name
-- `logger`: ASE's log, with multipliers and the right temperature
-- `dynamics`, `thermostat_dynamics`: dynamics with any stepper, thermostat and barostat
+- `dynamics`: dynamics with any stepper, and ASE's log with multipliers and the right temperature
+- `thermostat_dynamics`: thermostats, barostats, the pressure along a run
 """
 
 from kcons.errors import with_extra
@@ -23,15 +22,14 @@ try:
         constrain,
         to_ase_constraints,
     )
-    from kcons.ase.dynamics import ConstrainedDynamics
-    from kcons.ase.logger import ConstraintLogger
-    from kcons.ase.pressure import PressureReporter
+    from kcons.ase.dynamics import ConstrainedDynamics, ConstraintLogger
     from kcons.ase.thermostat_dynamics import (
         ConstrainedLangevin,
         ConstrainedMonteCarlo,
         ConstrainedNoseHoover,
         IsokineticDynamics,
         MultipleTimeSteps,
+        PressureReporter,
         draw_velocities,
     )
     from kcons.ase.topology import constraints_of, repair_elements, repartition_hydrogen_mass, rigid_water

@@ -1,4 +1,8 @@
-"""The engine for one `Atoms`, and the tests whether it still fits."""
+"""The engine for one `Atoms`: whether it still fits, and whether others respect it.
+
+Edits of the atoms and dynamics classes that move them past their constraints are found by the positions that the
+constraints accepted last.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +16,58 @@ from typing import Any
 import ase.constraints
 import numpy as np
 from ase import Atoms
+from ase.cell import Cell
 from numpy.typing import NDArray
 
+from kcons.ase.topology import velocities_of
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import as_float_array
+from kcons.constraints.arguments import as_float_array, finite_array
+from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.motion.certificate import off_row
 from kcons.motion.motion import Motion
+from kcons.thermostats.cells import constraint_virial, rows_open
+
+#: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta: what the digits of
+#: most files leave. Farther off they are refused.
+START_TOLERANCE = 1e-6
+#: Digits after the point that coordinates in Angstrom may have in a file, where they are looked for: GROMACS and PDB
+#: files have 2 and 3; what more than 6 leave is within START_TOLERANCE.
+DIGITS = (2, 3, 4, 5, 6)
+#: Residual of asked positions, relative to the scale of the row, that no usable time step produces ...
+ABSURD = 0.3
+#: ... and how many steps in a row it takes to say so.
+ABSURD_STEPS = 3
+#: Farther (in Angstrom) time steps move no atom, but frames do.
+FRAME = 0.3
+#: A correction (in Angstrom) below which the residual is not even looked at.
+SMALL = 0.1
+
+#: What `compared` finds: atoms are elsewhere than accepted, other positions are asked for than before, far from the
+#: present ones, and the last correction was large.
+ELSEWHERE, NEW, FAR, LARGE = 1, 2, 4, 8
+
+ADVICE = (
+    "use kcons.ase.ConstrainedDynamics for constant energy, ConstrainedLangevin, ConstrainedNoseHoover or "
+    "IsokineticDynamics of kcons.ase for constant temperature, and these with barostat= for constant pressure; of "
+    "ASE's own classes VelocityVerlet, Langevin(fixcm=False) and Bussi are right"
+)
+_OFF_AT_START = (
+    "moving them from there would turn the correction into velocity. Use constrain(..., project=True) or "
+    "Constraints.restore(atoms) first"
+)
+_EDITED = (
+    "they were moved past the constraints since the last step, as atoms.positions[...] = ..., set_distance, "
+    "rotate_dihedral and set_positions(..., apply_constraint=False) do; going on from there would turn the correction "
+    "into velocity. Call Constraints.restore(atoms) first, or make new constraints that hold what they are at now"
+)
+_MOVED_WITHIN_A_STEP = (
+    "they were moved past the constraints since momenta were last set. If you moved them, call "
+    f"Constraints.restore(atoms). If not, this dynamics class does so (LangevinBAOAB does); instead, {ADVICE}"
+)
 
 #: What objects of ASE hold, by the names of their attributes.
 _HELD = "index", "mask", "dir", "pairs", "bondlengths", "triples", "bonds", "angles", "dihedrals", "bondcombos"
@@ -204,3 +251,237 @@ def with_added(atoms: Atoms, given: Any) -> FloatArray:
             if isinstance(item, FORCES_ONLY):
                 item.adjust_forces(atoms, forces)
     return forces
+
+
+# -- what respects the constraints ------------------------------------------------------------------
+
+
+class AcceptedPositions:
+    """The positions that the constraints last accepted: what differs from them was moved past the constraints.
+
+    Also what was last asked for, before it was corrected: an MD engine that goes on from its own copy of the positions
+    asks for uncorrected ones again.
+
+    Attributes
+    ----------
+    asked : ndarray, shape (n_atoms, 3)
+        Positions as they were asked for last.
+    between_steps : bool
+        Whether forces were asked for last: all dynamics and optimizers of ASE end their steps so. Who moves atoms then
+        is a person, and otherwise most often the dynamics class.
+    """
+
+    def __init__(self, n_atoms: int) -> None:
+        self.between_steps = True
+        self._cell: bytes | None = None  # of the accepted positions
+        #: Positions as they were accepted, as they were accepted before, and as they were asked for.
+        self._positions, self._before, self.asked = np.full((3, n_atoms, 3), np.nan)
+        self._momenta_since = self._again = False
+        self._repeats = self._absurd = 0
+
+    def in_another(self, cell: FloatArray) -> bool:
+        """Whether positions were accepted in another cell than this."""
+        return self._cell is not None and cell.tobytes() != self._cell
+
+    def know(self, x: FloatArray, cell: FloatArray) -> None:
+        """Accept positions that are on the constraints."""
+        self._positions[...], self._cell = x, cell.tobytes()
+
+    def look(self, motion: Motion, x: FloatArray, cell: FloatArray, *, elsewhere: bool = False) -> bool:
+        """Whether positions before a step, or where momenta are set, may stay: near enough to the constraints.
+
+        What they are off by less than START_TOLERANCE the next step puts right, along the rows, which momenta then
+        leave: no atom is faster for it. False where they were scaled together with the cell, as barostats do: they are
+        to be put right before the step.
+
+        Raises
+        ------
+        InputError
+            They are off otherwise.
+        UnsupportedError
+            They are, and were moved within a step; or they were scaled, and a row holds them in space.
+        """
+        changed = self.in_another(cell)
+        good = not (changed or elsewhere or differ(self._positions, x))
+        if not good:
+            scaled = changed and self._scaled(motion, x, cell)
+            good = _worst_row(motion.constraint_set, x)[0] < 0
+            if good:
+                self.know(x, cell)
+            elif not scaled:
+                by_class = self._cell is not None and not self.between_steps
+                why = _MOVED_WITHIN_A_STEP if by_class else _OFF_AT_START if self._cell is None else _EDITED
+                require_on_surface(motion.constraint_set, x, why=why, by_class=by_class)
+        self.between_steps = False
+        return good
+
+    def _scaled(self, motion: Motion, x: FloatArray, cell: FloatArray) -> bool:
+        """Whether positions are those accepted last but for a change of the cell that took them along."""
+        before = np.frombuffer(self._cell or b"").reshape(3, 3)
+        refuse_taken_along(motion, self._positions, before, x, cell)
+        moved = self._positions @ deformation(before, cell)
+        return float(np.abs(moved - x).max(initial=0.0)) <= START_TOLERANCE
+
+    def ask(self, held: ConstraintSet, old: FloatArray, new: FloatArray) -> int:
+        """Remember positions before they are corrected; what `compared` finds of them.
+
+        `UnsupportedError` where the last corrections were larger than any usable time step makes them.
+        """
+        found = compared(old, self._positions, new, self.asked)
+        if self._momenta_since:
+            if found & LARGE and np.isfinite(self.asked).all():
+                self._refuse_absurd(held)
+            else:
+                self._absurd = 0
+        if found & NEW:
+            self._repeats, self._again = self._repeats + 1 if self._again else 0, False
+            np.copyto(self._before, self._positions)
+            np.copyto(self.asked, new)
+        elif self._momenta_since:
+            self._again = True
+        self._momenta_since = False
+        return int(found)
+
+    def accept(self, new: FloatArray, cell: FloatArray) -> None:
+        """Remember the corrected positions."""
+        self.know(new, cell)
+        if self._again and (_near(self.asked, new) or _near(self._before, new)):
+            # Positions that need no correction may be set as often as one likes; atoms at rest ask for the same.
+            self._repeats, self._again = 0, False
+
+    def note_momenta(self) -> None:
+        """Momenta are set; `UnsupportedError` where an MD engine keeps asking for its own uncorrected positions."""
+        self._momenta_since = True
+        if self._again and self._repeats:
+            self._repeats, self._again = 0, False
+            raise UnsupportedError(
+                "this dynamics class asks again for positions that were corrected: it continues from its own copy "
+                f"(NoseHooverChainNVT does), so that the constraints have no effect on it. Instead, {ADVICE}"
+            )
+
+    def _refuse_absurd(self, held: ConstraintSet) -> None:
+        miss = np.abs(held.value(self.asked)) / held.scale
+        self._absurd = self._absurd + 1 if miss.max(initial=0.0) > ABSURD else 0
+        if self._absurd >= ABSURD_STEPS:
+            self._absurd = 0
+            row = int(np.argmax(miss))
+            raise UnsupportedError(
+                f"in {ABSURD_STEPS} steps in a row, this dynamics class moved atoms off row {held.row_name(row)} by "
+                f"{miss[row]:.0%}: it goes on from its own copy of the positions (MelchionnaNPT does), or the time "
+                f"step is far too large. Instead, {ADVICE}"
+            )
+
+
+#: Of atoms that are not known yet.
+UNKNOWN = AcceptedPositions(0)
+
+
+def _worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[int, float]:
+    """The row that `x` violates most beyond START_TOLERANCE, -1 if there is none, and by how much."""
+    miss = np.abs(held.value(x, time))
+    row = off_row(miss, np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time)))
+    return row, float(miss[row]) if row >= 0 else 0.0
+
+
+def require_on_surface(
+    held: ConstraintSet, x: FloatArray, time: float = 0.0, *, why: str = _OFF_AT_START, by_class: bool = False
+) -> None:
+    """Refuse positions that are off the constraints, or not finite there, and say `why`.
+
+    With `UnsupportedError` where a dynamics class moved them there.
+    """
+    row, miss = _worst_row(held, x, time)
+    if row >= 0:
+        finite_array(x, held.n_atoms, "position")
+        said = f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target(time)[row]:.6g}): {why}"
+        raise UnsupportedError(said) if by_class else InputError(said, item="positions", atoms=held.row_atoms(row))
+
+
+#: Places of the Voigt components xx, yy, zz, yz, xz, xy in a 3 x 3 matrix.
+VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
+
+
+def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray, time: float = 0.0) -> FloatArray:
+    """`constraint_virial` at the present positions and momenta, which are zero where there are none.
+
+    Raises
+    ------
+    UnsupportedError
+        The atoms are off the constraints: what scales atoms with the cell and asks for the stress there, as ASE's
+        StrainFilter, does not respect them.
+    """
+    x = atoms.arrays["positions"]
+    try:
+        require_on_surface(motion.constraint_set, x, time)
+    except InputError as error:
+        raise UnsupportedError(
+            f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms leave "
+            "them. Relax cells with FrechetCellFilter, or restore the atoms first"
+        ) from error
+    return constraint_virial(motion, x, velocities_of(atoms), forces, time)
+
+
+def deformation(before: FloatArray, after: FloatArray) -> FloatArray:
+    """The matrix that takes positions along from one cell to another, as ``atoms.set_cell(..., scale_atoms=True)``."""
+    return np.asarray(np.linalg.solve(Cell(before).complete(), Cell(after).complete()))
+
+
+def refuse_taken_along(
+    motion: Motion, before: FloatArray, cell_before: FloatArray, x: FloatArray, cell: FloatArray
+) -> None:
+    """Refuse atoms that a change of the cell took along an axis along which a row holds them in space.
+
+    So do the cell filters of ASE, while the row puts the atoms back: forces of the filter would not be the derivative
+    of its energy.
+    """
+    held = motion.constraint_set
+    if all(item.translation_invariant for item in held.constraints) or before.shape != x.shape:
+        return
+    strain = deformation(cell_before, cell)
+    taken = before @ strain
+    changed = np.abs(strain - np.eye(3)) > 1e-12
+    shut = ~rows_open(motion, before) & (changed.any(axis=0) | changed.any(axis=1))
+    for row, axis in np.argwhere(shut):
+        atoms = held.row_atoms(int(row))
+        along, stayed = (np.abs(there[atoms, axis] - x[atoms, axis]).max() for there in (taken, before))
+        if along < stayed:
+            raise UnsupportedError(
+                f"row {held.row_name(int(row))} holds atoms in space along {'xyz'[axis]}, and they were moved along "
+                "with the cell, as cell filters (FrechetCellFilter) and barostats of ASE do: relax at this cell, leave "
+                "the axis out of the mask, or hold these atoms relative to others; after an edit call "
+                "Constraints.restore(atoms)"
+            )
+
+
+def fulfilled(held: ConstraintSet, x: FloatArray) -> bool:
+    """Whether positions fulfill the rows: to rounding, or to the digits that they come with."""
+    if _worst_row(held, x)[0] < 0:
+        return True
+    for digits in DIGITS:
+        written = x[held.touched] * 10.0**digits
+        if np.abs(written - np.round(written)).max(initial=0.0) <= 1e-3:  # also those that were float32 in between
+            reach = np.asarray(abs(held.jacobian(x)).sum(axis=1)).ravel()
+            return bool(np.all(np.abs(held.value(x)) <= 0.5 * 10.0**-digits * reach + START_TOLERANCE * held.scale))
+    return False
+
+
+def differ(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two arrays differ in a bit."""
+    return a.tobytes() != b.tobytes()
+
+
+@njit(cache=True, nogil=True)
+def compared(old, accepted, new, asked):  # type: ignore[no-untyped-def]
+    """The sum of what is found of ELSEWHERE, NEW, FAR and LARGE."""
+    x, known, y, last = old.ravel(), accepted.ravel(), new.ravel(), asked.ravel()
+    elsewhere, other, far, large = 0, 0, 0, 0
+    for i in range(x.size):
+        elsewhere |= x[i] != known[i]
+        other |= y[i] != last[i]
+        far |= not abs(x[i] - y[i]) <= FRAME
+        large |= not abs(known[i] - last[i]) <= SMALL
+    return elsewhere * ELSEWHERE + other * NEW + far * FAR + large * LARGE
+
+
+def _near(a: FloatArray, b: FloatArray) -> bool:
+    return float(np.abs(a - b).max(initial=0.0)) <= START_TOLERANCE

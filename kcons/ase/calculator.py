@@ -11,8 +11,8 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
 from numpy.typing import NDArray
 
+from kcons.ase.binding import refuse_taken_along
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.respect import refuse_taken_along
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import as_float_array
 

@@ -15,16 +15,22 @@ from numpy.typing import ArrayLike
 
 import kcons.constraints as families
 from kcons.ase.binding import (
+    ELSEWHERE,
+    FAR,
     FORCES_ONLY,
+    UNKNOWN,
+    VOIGT,
+    AcceptedPositions,
     Binding,
     applied_forces,
     bind,
     check_company,
+    fulfilled,
     refuse_not_finite,
     touched_atoms,
     unchanged_on_failure,
+    virial_of,
 )
-from kcons.ase.respect import ELSEWHERE, FAR, UNKNOWN, VOIGT, AcceptedPositions, fulfilled, virial_of
 from kcons.ase.topology import bonds_of, constraints_of, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, translated
 from kcons.constraints import Constraint

@@ -13,7 +13,7 @@ from ase.calculators.emt import EMT
 from ase.constraints import FixAtoms, FixBondLengths, FixCartesian
 from ase.io import read
 from ase.io.trajectory import Trajectory
-from ase_systems import FS, Field, equal, off, rigid, slip, state, water
+from ase_systems import FS, Field, equal, rigid, state, water
 
 from kcons.ase import (
     ConstrainedDynamics,
@@ -89,15 +89,6 @@ def test_forces_are_not_computed_for_nobody():
     dyn.attach(atoms.get_potential_energy, 5)
     dyn.run(10)
     assert atoms.calc.calls == 3
-
-
-def test_momenta_set_past_the_constraints_are_projected():
-    atoms, held = water()
-    dyn = ConstrainedDynamics(atoms, FS)
-    dyn.run(3)
-    atoms.arrays["momenta"] += 0.1
-    dyn.run(1)
-    assert off(atoms, held) <= 1e-13 and slip(atoms, held) <= 1e-14
 
 
 #: Changes of fixed atoms, fixed components, held lengths and ours, and atoms that are at rest afterwards.

@@ -30,7 +30,7 @@ from kcons.ase import (
     draw_velocities,
     rigid_water,
 )
-from kcons.ase.respect import require_on_surface
+from kcons.ase.binding import require_on_surface
 from kcons.constraints import Angle, Dihedral, Distance
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 

@@ -242,12 +242,6 @@ def test_triangles_of_any_orientation_are_water(order: tuple[int, ...]) -> None:
     assert (shape.atoms % 3 == 0).any(axis=0).tolist().count(True) == 1  # oxygen in one place throughout
 
 
-def test_equal_graphs_with_other_masses_are_other_lanes() -> None:
-    masses = np.concatenate([np.tile([16.0, 1, 1], 10), np.tile([16.0, 2, 2], 12)])
-    shapes = shapes_of(copies(TRIANGLE, 3, 22), places(66), masses)
-    assert sorted((s.kind, s.clusters) for s in shapes) == [("RigidTriangles", 10), ("RigidTriangles", 12)]
-
-
 @pytest.mark.parametrize("few", [LANES_CLUSTERS - 1, LANES_CLUSTERS])
 def test_many_kinds_of_few_clusters_go_to_the_sparse_solver(few: int) -> None:
     pairs, masses, first = [], [], 0
@@ -280,19 +274,6 @@ def test_open_chains_beyond_the_lanes(rows: int) -> None:
             walked = pairs[shape.rows[k * rows : (k + 1) * rows]]
             for row, (a, b) in enumerate(pairwise(atoms)):
                 assert {a, b} == set(walked[row])
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_every_row_goes_to_exactly_one_shape(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    n = 120
-    pairs = {tuple(sorted(rng.choice(n, 2, replace=False).tolist())) for _ in range(90)}
-    rows = [held.FixedAtoms([3, 40]), held.Distance(sorted(pairs)), held.Angle([[1, 2, 3], [50, 51, 52]])]
-    rows.append(held.CenterOfMass([[7, 8, 9], [60, 61, 62]]))
-    plan = planned(rows, places(n, seed), rng.choice([1.0, 12.0], n))
-    taken = np.concatenate([s.rows.ravel() for s in classify(plan.constraint_set, plan.labels, plan.inverse_masses)])
-    np.testing.assert_array_equal(np.sort(taken), np.flatnonzero(plan.labels >= 0))
-    assert sum(k.clusters for k in plan.kinds) == plan.labels.max() + 1
 
 
 def blocks(rows, n_atoms, only=None):

@@ -20,6 +20,7 @@ MUTANTS = {
         ),
         ('("numbers",« "initial_charges", "initial_magmoms"→»)', "binding::forces_of_the_same_calculator_that_changed"),
         ("if «gone > 0→False» and self._more", "binding::what_was_given_by_numbers_of_atoms_is_no_longer_of_these"),
+        ("row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)", "logger::multipliers_by_name"),
     ],
     "ase/thermostat_dynamics.py": [
         (
@@ -46,11 +47,6 @@ MUTANTS = {
     "ase/binding.py": [
         ("(item, «holding(item)→None») for", "dynamics::what_constraints_hold_changed_between_steps_is_taken"),
         ("name«, arrays[name].tobytes()→»", "dynamics::masses_of_free_atoms_changed_between_steps_are_taken"),
-    ],
-    "constraints/arguments.py": [
-        ("«array.setflags(write=False)→pass»", "constraint::arrays_cannot_be_changed"),
-    ],
-    "ase/respect.py": [
         ("scaled = «changed and self._scaled(motion, x, cell)→True»", "ase/edits::an_edit_between_runs_is_refused"),
         (
             "«not (changed or elsewhere or differ(self._positions, x))→self._cell is not None»",
@@ -59,8 +55,8 @@ MUTANTS = {
         ("        if «along < stayed→False»:", "reporter::filters_beside_atoms_that_stay_are_refused"),
         ("if «self._again and self._repeats→False»:", "ase/edits::classes_that_move_atoms_past_constraints_are_found"),
     ],
-    "ase/logger.py": [
-        ("row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)", "logger::multipliers_by_name"),
+    "constraints/arguments.py": [
+        ("«array.setflags(write=False)→pass»", "constraint::arrays_cannot_be_changed"),
     ],
     "thermostats/cells.py": [
         ("motion.multipliers(x, v, f«, time→»)", "measured::a_rod_that_is_made_longer"),
