@@ -5,8 +5,8 @@ whole set and solves it as one. Units are ASE's; targets are in angstrom and rad
 the object with ASE, which makes files that contain it readable.
 
 - `topology`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
-- `binding`, `constraints_object`: the object, and whether the caller respects it
-- `calculator`, `named_calculators`: forces along the constraints, for optimizers; calculators by name
+- `binding`, `constraints_object`: the object, whether the caller respects it, a calculator on the constraints
+- `named_calculators`: calculators by name
 - `dynamics`: dynamics with any stepper, and ASE's log with multipliers and the right temperature
 - `thermostat_dynamics`: thermostats, barostats, the pressure along a run
 """
@@ -14,8 +14,8 @@ the object with ASE, which makes files that contain it readable.
 from kcons.errors import with_extra
 
 try:
-    from kcons.ase.calculator import ConstrainedCalculator
     from kcons.ase.constraints_object import (
+        ConstrainedCalculator,
         Constraints,
         ConstraintsWithFixedAtoms,
         attach,

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from kcons.batched.row_functions import RowFunction
-from kcons.plan.clusters_alike import elimination
+from kcons.plan.clusters import elimination
 
 #: Rows, and atoms in all rows, up to which a vector is a list.
 LANES_ROWS, LANES_PLACES = 6, 24

@@ -16,7 +16,7 @@ from kcons.batched.row_functions import row_function
 from kcons.constraints.arguments import FloatArray, IntArray
 from kcons.errors import UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.plan.clusters_alike import Alike, alike
+from kcons.plan.clusters import Alike, alike
 
 
 class Kind(NamedTuple):

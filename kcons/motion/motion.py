@@ -25,7 +25,7 @@ from kcons.motion.restoring.kept_geometry import Bonds
 from kcons.motion.restoring.moved_groups import restored
 from kcons.motion.restoring.nearest_point import LEFT_OVER, FarStart
 from kcons.motion.solver_sequence import SolverSequence
-from kcons.plan.independent_blocks import fixed_atoms
+from kcons.plan.clusters import fixed_atoms
 from kcons.plan.plan import Plan, make_plan
 from kcons.plan.second_order import MISFIT, FlatBody, without_second_order_rows
 

@@ -17,7 +17,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import row_norms
-from kcons.plan.independent_blocks import fixed_atoms
+from kcons.plan.clusters import fixed_atoms
 from kcons.plan.plan import ClusterKind, Plan
 from kcons.solvers.rank_revealing import independent, stacks
 

@@ -1,17 +1,25 @@
-"""Which rows belong together, and what shape each cluster has."""
+"""Which rows belong together, and what shape each cluster has; clusters that look alike; pieces whose ranks add up.
+
+Two groups of rows that share one atom only (or only fixed atoms) cannot depend on each other: the forces
+z = A^T lambda of one group add up to zero over its other atoms only if they do on the shared one. So the
+rank of a cluster is the sum of the ranks of the 2-connected blocks of its graph, whose edges are the rows.
+A row over several atoms is a cycle through them. Fixed atoms, and the frame of reference for rows that are
+not translation invariant (spheres, planes), are one common vertex, the ground.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraints.constraint import IntArray, RowKind
+from kcons.constraints.compilation import njit, plain_if_small
+from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import connected, spanning_tree
+from kcons.constraints.periodic.one_piece import BoolArray, connected, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.solvers.small_clusters import LARGEST
 
@@ -23,6 +31,10 @@ ShapeKind = Literal[
     "RigidTriangles", "SmallClusters", "Chains", "SparseDistances", "SingleRows", "SparseRows", "GeneralClusters"
 ]
 _NONE = np.zeros(0, np.int64)
+_GROUND = -1
+#: Rows with more couplings than the fewest that a row has, by so many times and so many, wait for a later level: what
+#: they would fill in costs more than the levels that they save.
+MORE_TIMES, MORE = 1.2, 20
 
 
 @dataclass(frozen=True)
@@ -225,3 +237,168 @@ def _paths(rows: IntArray, pairs: IntArray, n_atoms: int, clusters: int) -> Shap
     order = np.argsort(place[pairs].max(axis=1))
     starts = np.concatenate([[0], np.cumsum(np.bincount(chain, minlength=clusters))])
     return Shape("Chains", rows[order], clusters, True, atoms=atoms, starts=starts, pairs=pairs[order])
+
+
+# -- clusters alike ----------------------------------------------------------------------------------
+
+
+class Alike(NamedTuple):
+    """Clusters with equal rows: their atoms, shape (n, n_atoms), and their rows in the set, shape (n, n_rows)."""
+
+    atoms: IntArray
+    rows: IntArray
+
+
+def alike(
+    labels: IntArray, last: BoolArray, rows: Sequence[Hashable], atoms: Sequence[IntArray]
+) -> dict[tuple[tuple[Any, tuple[int, ...]], ...], Alike]:
+    """Clusters by what they are made of: of each row what it is, and its atoms as they are met.
+
+    `labels` are the clusters of the rows, -1 for none; rows that are `last` come after the others of their cluster.
+    `rows` say what each row is, equal for rows that are computed alike, and `atoms` are those of each row.
+    """
+    order = np.lexsort((last, labels))
+    order = order[labels[order] >= 0]
+    cuts = np.flatnonzero(np.diff(labels[order])) + 1
+    found: dict[tuple[Any, ...], tuple[list[list[int]], list[IntArray]]] = {}
+    for cluster in np.split(order, cuts) if len(order) else []:
+        place: dict[int, int] = {}
+        pattern = []
+        for row in cluster.tolist():
+            local = tuple(place.setdefault(a, len(place)) for a in atoms[row].tolist())
+            pattern.append((rows[row], local))
+        mine = found.setdefault(tuple(pattern), ([], []))
+        mine[0].append(list(place))
+        mine[1].append(cluster)
+    return {key: Alike(np.array(each[0]), np.array(each[1])) for key, each in found.items()}
+
+
+class Order(NamedTuple):
+    """Rows in the order of elimination, where levels begin in it, and the later rows that each is coupled to."""
+
+    rows: IntArray
+    levels: IntArray
+    later: list[IntArray]
+
+
+def elimination(atoms: Sequence[Sequence[int]], last: set[int]) -> Order:
+    """Order of elimination of rows by levels: in each level rows that share no entry, those with few couplings first.
+
+    Parameters
+    ----------
+    atoms : sequence of sequence of int
+        Atoms of each row; rows that share one are coupled.
+    last : set of int
+        Rows that come after all others that they are coupled to.
+    """
+    users: dict[int, set[int]] = {}
+    for k, some in enumerate(atoms):
+        for a in some:
+            users.setdefault(a, set()).add(k)
+    coupled = [set().union(*(users[a] for a in some)) - {k} for k, some in enumerate(atoms)]
+    left, order, levels = set(range(len(atoms))), list[int](), [0]
+    while left:
+        beside: set[int] = set()
+        ready = [(len(coupled[k]), k) for k in left if not (k in last and coupled[k] - last)]
+        most = MORE_TIMES * min(ready)[0] + MORE
+        for count, k in sorted(ready):
+            if k not in beside and count <= most:
+                order.append(k)
+                beside |= coupled[k]
+        for k in order[levels[-1] :]:
+            for other in coupled[k]:
+                coupled[other] |= coupled[k]
+                coupled[other] -= {other, k}
+        left.difference_update(order[levels[-1] :])
+        levels.append(len(order))
+    place = np.argsort(order)
+    return Order(np.array(order), np.array(levels), [np.sort(place[list(coupled[k])]) for k in order])
+
+
+# -- blocks ------------------------------------------------------------------------------------------
+
+
+def fixed_atoms(constraint_set: ConstraintSet) -> IntArray:
+    """Atoms that FixedAtoms of the set hold, sorted."""
+    return fixed_rows(constraint_set)[0]
+
+
+def fixed_rows(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
+    """Fixed atoms, sorted, and their rows, three an atom; the first ones of an atom that is named again."""
+    pairs = zip(constraint_set.constraints, constraint_set.starts, strict=False)
+    found = [(item.atoms[::3, 0], start + np.arange(0, item.n_rows, 3)) for item, start in pairs if item.fixes_atoms]
+    none = np.zeros(0, np.int64)
+    atoms, rows = (np.concatenate([none, *parts]) for parts in (zip(*found, strict=True) if found else ([], [])))
+    atoms, first = np.unique(atoms, return_index=True)
+    return atoms, (rows[first][:, None] + np.arange(3)).ravel()
+
+
+def row_blocks(
+    constraint_set: ConstraintSet, accept: Callable[[Constraint], bool], rows: IntArray | None = None
+) -> tuple[IntArray, IntArray]:
+    """Blocks of two rows and more, of the objects that `accept` takes and of `rows` (sorted; all by default).
+
+    Velocity rows and fixed atoms never take part. Gives members and starts: block k consists of the rows
+    ``members[starts[k]:starts[k + 1]]``, sorted; nothing for forests.
+    """
+    ground = fixed_atoms(constraint_set)
+    ends: list[tuple[IntArray, IntArray, IntArray]] = []
+    for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
+        if not item.holonomic or item.fixes_atoms or not accept(item) or item.n_rows == 0:
+            continue
+        numbers = np.arange(start, start + item.n_rows)
+        nodes = item.atoms
+        if rows is not None:
+            lo, hi = np.searchsorted(rows, [start, start + item.n_rows])
+            numbers = rows[lo:hi]
+            nodes = nodes[numbers - start]
+        if len(ground):
+            nodes = np.where(np.isin(nodes, ground), _GROUND, nodes)
+        if not item.translation_invariant:
+            nodes = np.hstack([nodes, np.full((len(nodes), 1), _GROUND)])
+        # A row of several atoms is a cycle through them.
+        sides, ahead = (nodes.shape[1] if nodes.shape[1] > 2 else 1), np.roll(nodes, -1, axis=1)
+        ends.append((nodes[:, :sides].ravel(), ahead[:, :sides].ravel(), np.repeat(numbers, sides)))
+    if not ends:
+        return np.zeros(0, np.int64), np.zeros(1, np.int64)
+    u, v, row = (np.concatenate(parts) for parts in zip(*ends, strict=True))
+    u, v, row = u[u != v], v[u != v], row[u != v]
+    vertices, index = np.unique(np.concatenate([u, v]), return_inverse=True)
+    u, v = index[: len(u)], index[len(u) :]
+    block = edge_blocks(u, v, len(vertices))
+    # A wide row has several edges, all in one block.
+    keys = np.unique(block * constraint_set.n_rows + row)
+    block, row = np.divmod(keys, constraint_set.n_rows)
+    sizes = np.bincount(block)
+    keep = sizes[block] > 1
+    sizes = sizes[sizes > 1]
+    return row[keep], np.concatenate([[0], np.cumsum(sizes)])
+
+
+def edge_blocks(u: IntArray, v: IntArray, n_vertices: int) -> IntArray:
+    """Number of the 2-connected block of each edge, from u to v, of a multigraph without loops."""
+    vertices, parents = spanning_tree(np.stack([u, v], axis=1), n_vertices)
+    place = np.argsort(vertices)
+    blocks: IntArray = plain_if_small(_edge_blocks, len(u))(place[u], place[v], place[parents])
+    return blocks
+
+
+@njit(cache=True)
+def _edge_blocks(u, v, parent):  # type: ignore[no-untyped-def]
+    # Each edge and those of the tree on the way between its ends are one cycle. Vertices come after their parents,
+    # breadth first; one stands for the edge to its parent, the first of a block for the block.
+    block = np.arange(len(parent))
+    for e in range(len(u)):
+        a, b, cycle = u[e], v[e], -1
+        while a != b:
+            a, b = max(a, b), min(a, b)
+            while block[a] != a:
+                block[a] = block[block[a]]
+                a = block[a]
+            if cycle >= 0:
+                block[max(a, cycle)] = min(a, cycle)
+            cycle = a if cycle < 0 else min(a, cycle)
+            a = parent[a]
+    for k in range(len(block)):
+        block[k] = block[block[k]]
+    return block[np.maximum(u, v)]

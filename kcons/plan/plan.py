@@ -12,8 +12,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError
-from kcons.plan.clusters import Shape, classify, cluster_labels
-from kcons.plan.independent_blocks import fixed_rows
+from kcons.plan.clusters import Shape, classify, cluster_labels, fixed_rows
 from kcons.solvers.chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters

@@ -32,7 +32,7 @@ from kcons.constraints.surface import LinearRelation
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.constraints.vectors import extent, row_norms
 from kcons.errors import SingularGeometryError
-from kcons.plan.independent_blocks import fixed_atoms, row_blocks
+from kcons.plan.clusters import fixed_atoms, row_blocks
 from kcons.solvers.tolerances import LOST
 
 #: Larger blocks are first reduced to their internal coordinates, then to their distances, and what is

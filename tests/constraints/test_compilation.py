@@ -271,7 +271,7 @@ for module in [module for name, module in sys.modules.items() if name.startswith
     counts = dict(line.split() for line in ended(started(code))[0].splitlines())
     assert counts.pop("kcons.solvers.sparse.mixed_rows._tangents") == "1"
     assert {counts[f"kcons.solvers.sparse.elimination.{name}"] for name in ("_minimum_degree", "_finish")} == {"0"}
-    assert {counts[f"kcons.plan.independent_blocks.{name}"] for name in ("_edge_blocks",)} == {"0"}
+    assert {counts[f"kcons.plan.clusters.{name}"] for name in ("_edge_blocks",)} == {"0"}
     assert set(counts.values()) <= {"0", "1"}
 
 

@@ -12,8 +12,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ContradictionError
 from kcons.motion import Motion
 from kcons.plan import make_plan
-from kcons.plan.clusters import LANES_CLUSTERS, Shape, classify
-from kcons.plan.independent_blocks import row_blocks
+from kcons.plan.clusters import LANES_CLUSTERS, Shape, classify, row_blocks
 from kcons.solvers.small_clusters import LARGEST
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])

@@ -15,7 +15,7 @@ from kcons.constraints.periodic.one_piece import connected, make_whole, minimum_
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
-from kcons.plan.independent_blocks import edge_blocks, fixed_rows
+from kcons.plan.clusters import edge_blocks, fixed_rows
 from kcons.solvers.rank_revealing import independent
 from kcons.topology.guessed_bonds import NEAREST, across, bonds_without_elements
 from kcons.topology.topology import BoolArray, bond_angles, sorted_pairs

@@ -29,7 +29,7 @@ from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsErr
 from kcons.motion.certificate import off_row
 from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
 from kcons.motion.restoring.nearest_point import least_squares
-from kcons.plan.independent_blocks import fixed_atoms
+from kcons.plan.clusters import fixed_atoms
 from kcons.plan.plan import Plan
 from kcons.solvers import tolerances
 

@@ -18,7 +18,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.functions.straight_line import Function, Operand, Tape, record
 from kcons.constraints.target import FloatArray
-from kcons.plan.clusters_alike import elimination
+from kcons.plan.clusters import elimination
 
 #: Rows, atoms of a cluster and atoms of a row up to which a work-item has the cluster in registers.
 ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4

@@ -38,7 +38,7 @@ from kcons.openmm.integrator.guard import SystemRows, settled_rows
 from kcons.openmm.integrator.part import SINGLE, Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import accepted, masses_of, positions_of
-from kcons.plan.clusters_alike import alike
+from kcons.plan.clusters import alike
 
 #: Newton iterations at most; those after which a large cluster is factored again.
 TURNS, CHORD = 30, 4

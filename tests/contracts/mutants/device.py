@@ -27,7 +27,7 @@ MUTANTS = {
     "openmm/device/build.py": [
         ("if not (accelerated() «or→and» is_built()):", "device_integrator::which_steps_are_made_on_the_device"),
     ],
-    "plan/clusters_alike.py": [
+    "plan/clusters.py": [
         (
             "for k in left if not «(k in last and coupled[k] - last)→False»]",
             "rows::levels_have_rows_that_share_no_entry",

@@ -11,7 +11,7 @@ from kcons.openmm.device.clusters import c_functions
 from kcons.openmm.device.device_integrator import refusal
 from kcons.openmm.device.rows import DeviceRows
 from kcons.openmm.integrator.program import ConstantEnergy, to_scheme
-from kcons.plan.clusters_alike import elimination
+from kcons.plan.clusters import elimination
 from tests.systems.constraint_cases import CASES, MASSES, TIME, scattered
 from tests.systems.device_rows import PlainRows
 from tests.systems.rows_in_cells import CHAIN, ROWS
