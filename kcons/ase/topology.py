@@ -18,9 +18,8 @@ from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.guessed_bonds import close_pairs, guess_bonds
-from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rigid_groups import water_rows
-from kcons.topology.rows_by_name import HeldRows, rows_of
+from kcons.topology.rows_by_name import HeldRows, Holding, Options, rows_of, with_options
 from kcons.topology.topology import (
     Snapshot,
     Topology,

@@ -17,8 +17,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, did_you_mean
 from kcons.motion.motion import Motion
 from kcons.steppers import State
-from kcons.topology.holding import Holding, Options, with_options
-from kcons.topology.rows_by_name import HeldRows, rows_of
+from kcons.topology.rows_by_name import HeldRows, Holding, Options, rows_of, with_options
 from kcons.topology.topology import (
     Snapshot,
     Topology,

@@ -14,8 +14,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.openmm.quantities import array, held_pairs, masses_of
-from kcons.topology.holding import Holding, Options, with_options
-from kcons.topology.rows_by_name import HeldRows, rows_of
+from kcons.topology.rows_by_name import HeldRows, Holding, Options, rows_of, with_options
 from kcons.topology.topology import (
     Snapshot,
     Topology,

@@ -4,12 +4,10 @@
 - `guessed_bonds`: bonds for systems that come without
 - `rigid_groups`: rigid groups of atoms as rows; massless sites that three atoms place
 - `angle_rows`: rows that hold all angles, none too many
-- `holding`: the options for what is held, the same for every MD engine
-- `rows_by_name`: rows by name: bonds with hydrogens, all bonds, angles, rigid water
+- `rows_by_name`: rows by name: bonds with hydrogens, all bonds, angles, rigid water; the options for what is held
 """
 
-from kcons.topology.holding import Holding
-from kcons.topology.rows_by_name import HeldRows, rows_of
+from kcons.topology.rows_by_name import HeldRows, Holding, rows_of
 from kcons.topology.topology import Snapshot, Topology, bond_angles
 
 __all__ = ["HeldRows", "Holding", "Snapshot", "Topology", "bond_angles", "rows_of"]

@@ -22,8 +22,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
-from kcons.topology.holding import Holding, Options
-from kcons.topology.rows_by_name import rows_of
+from kcons.topology.rows_by_name import Holding, Options, rows_of
 from kcons.topology.topology import Snapshot, Topology, require_kind, selected_numbers, sorted_pairs
 
 __all__ = ["Constraints", "hold", "report"]

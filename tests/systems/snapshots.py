@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.topology.holding import Holding
-from kcons.topology.rows_by_name import rows_of
+from kcons.topology.rows_by_name import Holding, rows_of
 from kcons.topology.topology import Snapshot, Topology, sorted_pairs
 
 HOH = np.radians(104.52)

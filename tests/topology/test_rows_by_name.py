@@ -18,7 +18,7 @@ from kcons.constraints import CenterOfMass
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.topology import Holding
-from kcons.topology.holding import Options
+from kcons.topology.rows_by_name import Options
 
 # Ethanol, C C O H(O) and five H, and a water.
 ETHANOL = np.array(

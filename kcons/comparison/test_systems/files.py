@@ -138,8 +138,7 @@ def _by_openmm(text: str, path: Path, constrain: str, angles: str, hydrogens: An
     from openmm import app
 
     from kcons.openmm.topology import snapshot_of
-    from kcons.topology.holding import Holding
-    from kcons.topology.rows_by_name import rows_of
+    from kcons.topology.rows_by_name import Holding, rows_of
 
     try:
         kind = app.PDBFile if path.suffix.lower() in (".pdb", ".ent", ".xz", "") else app.PDBxFile

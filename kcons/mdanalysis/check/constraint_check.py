@@ -39,8 +39,7 @@ from kcons.mdanalysis.check.targets import label, read_targets, with_targets
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.topology import constraints_of, host_of, require_angstrom, topology_of, velocities_known
 from kcons.motion.motion import Motion
-from kcons.topology.holding import Options
-from kcons.topology.rows_by_name import HeldRows
+from kcons.topology.rows_by_name import HeldRows, Options
 from kcons.topology.topology import Topology
 
 #: Frames, and atoms in each, that a grid of coordinates is looked for in.
