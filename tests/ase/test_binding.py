@@ -1,6 +1,8 @@
-"""One engine for masses, cell and company: what is noticed, and what is refused."""
+"""One engine for masses, cell and company, and edits of atoms: what is noticed, refused, or put right."""
 
 from __future__ import annotations
+
+import warnings
 
 import numpy as np
 import pytest
@@ -17,14 +19,48 @@ from ase.constraints import (
     FixedPlane,
     Hookean,
 )
+from ase.md.andersen import Andersen
+from ase.md.bussi import Bussi
+from ase.md.langevin import Langevin
+from ase.md.langevinbaoab import LangevinBAOAB
+from ase.md.melchionna import MelchionnaNPT
+from ase.md.nose_hoover_chain import NoseHooverChainNVT
+from ase.md.npt import NPT
+from ase.md.nvtberendsen import NVTBerendsen
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
-from ase.optimize import FIRE
-from ase_systems import FS, Field, Free, equal, loose_waters, off, rigid, state, water
+from ase.optimize import BFGS, FIRE
+from ase_systems import (
+    FS,
+    TEMPERATURE,
+    Field,
+    Free,
+    dumbbells,
+    equal,
+    loose_waters,
+    off,
+    random,
+    rigid,
+    state,
+    water,
+    water_gas,
+)
 
-from kcons.ase import ConstrainedDynamics, Constraints, MultipleTimeSteps, attach, constrain, rigid_water
-from kcons.constraints import Angle, CenterDistance, Distance, Sphere
-from kcons.errors import InputError, UnsupportedError
+from kcons import ConstraintSet
+from kcons.ase import (
+    ConstrainedDynamics,
+    ConstrainedLangevin,
+    ConstrainedNoseHoover,
+    Constraints,
+    MultipleTimeSteps,
+    attach,
+    constrain,
+    draw_velocities,
+    rigid_water,
+)
+from kcons.ase.binding import require_on_surface
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Sphere
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.steppers import BlanesMoan4
 
 
@@ -219,3 +255,245 @@ def test_company_that_is_changed_is_looked_at_again():
     beside.index[0] = 1
     with pytest.raises(UnsupportedError, match="FixAtoms acts on atom 1"):
         dynamics.run(1)
+
+
+# -- atoms that are edited between steps --------------------------------------------------------------
+
+
+#: Classes of ASE that respect constraints, each a dynamics object for these atoms and this time step.
+OF_ASE = {
+    "VelocityVerlet": VelocityVerlet,
+    "Langevin": lambda a, dt: Langevin(a, dt, temperature_K=250, friction=0.01 / FS, fixcm=False, rng=random()),
+    "NVTBerendsen": lambda a, dt: NVTBerendsen(a, dt, 250, 100 * FS, fixcm=False),
+    "Bussi": lambda a, dt: Bussi(a, dt, 250, 100 * FS, rng=random()),
+    "Andersen": lambda a, dt: Andersen(a, dt, 250, 1e-9, fixcm=False, rng=random()),
+}
+ALL = OF_ASE | {
+    "ConstrainedDynamics": ConstrainedDynamics,
+    "ConstrainedLangevin": lambda a, dt: ConstrainedLangevin(a, dt, 250, 0.01 / FS, rng=5),
+    "ConstrainedNoseHoover": lambda a, dt: ConstrainedNoseHoover(a, dt, 250, 50 * FS, momentum="free"),
+    "BFGS": lambda a, dt: BFGS(a, logfile=None),
+    "FIRE": lambda a, dt: FIRE(a, logfile=None),
+}
+EDITS = {
+    "set_dihedral": lambda a: a.set_dihedral(3, 2, 1, 0, 60, indices=[3]),
+    "rotate_dihedral": lambda a: a.rotate_dihedral(3, 2, 1, 0, 40, indices=[3]),
+    "set_angle": lambda a: a.set_angle(0, 1, 2, 100, indices=[2, 3]),
+    "set_distance": lambda a: a.set_distance(1, 2, a.get_distance(1, 2) + 0.03),
+    "positions": lambda a: a.positions.__setitem__(1, a.positions[1] + 0.02),
+    "apply_constraint": lambda a: a.set_positions(a.positions * 1.002, apply_constraint=False),
+}
+
+
+def held_ethanol():
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    held = constrain(atoms, [Distance([[1, 2]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])])
+    draw_velocities(atoms, 250, rng=4)
+    return atoms, held
+
+
+@pytest.mark.parametrize(
+    ("name", "edit"),
+    [
+        (n, e)
+        for n in ALL
+        for e in EDITS
+        if e == "rotate_dihedral" or n in ("VelocityVerlet", "ConstrainedDynamics", "BFGS")
+    ],
+)
+def test_an_edit_between_runs_is_refused(name, edit):
+    """The remedy is named, nothing is changed, and after it the run goes on as warm as it was."""
+    atoms, held = held_ethanol()
+    run = ALL[name](atoms, 0.8 * FS)
+    run.run(steps=3)
+    kelvin = atoms.get_temperature()
+    EDITS[edit](atoms)
+    x, p = atoms.get_positions(), atoms.get_momenta()
+    with pytest.raises(InputError, match=r"atoms are off row .*restore\(atoms\)"):
+        run.run(steps=1)
+    assert np.array_equal(atoms.positions, x) and np.array_equal(atoms.get_momenta(), p)
+    held.restore(atoms)
+    run.run(steps=1)
+    assert off(atoms, held) <= 1e-12
+    if name not in ("BFGS", "FIRE"):
+        assert abs(atoms.get_temperature() - kelvin) < 250
+
+
+@pytest.mark.parametrize("name", [*OF_ASE, "ConstrainedDynamics"])
+def test_what_a_file_rounds_is_put_right_without_heat(name):
+    """The correction alone, in steps as short as these, is 3 % of the speed of its atoms."""
+    ends = []
+    for size in (0.0, 5e-7):
+        atoms, held = held_ethanol()
+        run = ALL[name](atoms, 0.005 * FS)
+        run.run(2)
+        atoms.positions[1] += size * (atoms.positions[1] - atoms.positions[2])
+        run.run(1)
+        assert off(atoms, held) <= 1e-12
+        ends.append(atoms.get_momenta())
+    assert np.abs(ends[1] - ends[0]).max() <= 1e-4 * np.abs(ends[0]).max()
+
+
+def test_time_that_is_set_is_no_way_of_moving_targets():
+    """In one step, which would be made into velocity of all that hangs on them."""
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    length = atoms.get_distance(0, 1)
+    run = ConstrainedDynamics(atoms, FS, constraints=[Distance([[0, 1]], lambda t: length + 0.001 * t)])
+    run.run(2)
+    run.time += 200
+    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0\.2"):
+        run.run(1)
+
+
+# -- the cell ---------------------------------------------------------------------------------------
+
+
+def gas():
+    atoms = water_gas(2)
+    held = constrain(atoms, rigid_water(atoms))
+    draw_velocities(atoms, 250, rng=3)
+    return atoms, held
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [*((name, 0.97) for name in OF_ASE), ("VelocityVerlet", 1.00001), ("VelocityVerlet", 1.02)]
+)
+def test_atoms_scaled_with_the_cell_are_put_right(name, factor):
+    """As after a barostat: lengths are as before, each molecule is about its new center, and no atom is faster."""
+    atoms, held = gas()
+    run = OF_ASE[name](atoms, FS)
+    run.run(2)
+    kinetic, whole = atoms.get_kinetic_energy(), atoms.get_volume()
+    atoms.set_cell(atoms.cell * [factor, 1, 1], scale_atoms=True)
+    run.run(1)
+    assert off(atoms, held) <= 1e-12
+    assert atoms.get_volume() == pytest.approx(factor * whole)
+    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=0.1)
+    atoms.set_cell(atoms.cell * 1.001, scale_atoms=True)
+    atoms.positions[0] += 0.05
+    with pytest.raises(InputError, match=r"restore\(atoms\)"):  # this is another edit
+        run.run(1)
+
+
+# -- what is at fault -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["Bussi", "NVTBerendsen"])
+def test_an_edit_is_named_before_a_class(name):
+    atoms, _ = held_ethanol()
+    run = OF_ASE[name](atoms, FS)
+    run.run(3)
+    EDITS["set_distance"](atoms)
+    with pytest.raises(InputError, match="set_distance"):
+        run.run(1)
+
+
+# -- frames -----------------------------------------------------------------------------------------
+
+ROWS = {
+    "CO": [Distance([0, 1])],
+    "H2O": [Distance([[0, 1], [0, 2], [1, 2]])],
+    "CH3CH2OH": [Distance([[0, 1], [1, 2], [2, 3], [0, 6]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])],
+}
+
+
+@pytest.mark.parametrize("digits", [None, 8, 5, 3])
+@pytest.mark.parametrize("name", ROWS)
+def test_frames_on_the_constraints_are_taken(name, digits):
+    """Wherever they are; with the digits of a file they move by what these leave, and end on the constraints."""
+    rng = random(7)
+    reference = molecule(name)
+    for _ in range(60):
+        frame = reference.copy()
+        frame.rotate(rng.uniform(0, 180), rng.normal(size=3))
+        frame.translate(rng.normal(size=3))
+        if digits is not None:
+            frame.positions = np.round(frame.positions, digits)
+        atoms = reference.copy()
+        held = constrain(atoms, ROWS[name])
+        atoms.set_positions(frame.positions)
+        assert np.abs(atoms.positions - frame.positions).max() <= (1e-14 if digits is None else 2 * 10.0**-digits)
+        assert off(atoms, held) <= 1e-12
+
+
+def test_positions_that_no_digits_explain_are_refused_as_before():
+    atoms = molecule("CO")
+    atoms.calc = Free()
+    constrain(atoms, Distance([0, 1]))
+    frame = atoms.copy()
+    frame.set_constraint()
+    frame.rotate(170, "x")
+    frame.positions[0] += [0.0, 0.011234567, 0.02]
+    before = atoms.get_positions()
+    with pytest.raises(ConvergenceError, match="no positions near the given ones") as caught:
+        atoms.set_positions(frame.positions)
+    assert any("smaller timestep" in note for note in caught.value.__notes__)
+    assert np.array_equal(atoms.positions, before)
+    atoms.set_positions(before + 0.01)  # and the object still works
+
+
+# -- classes that move atoms past their constraints are found --------------------------------------
+
+
+#: Classes that do not go through the constraints: our error, in how many steps, and what it says.
+REFUSED = {
+    "LangevinBAOAB": (lambda a: LangevinBAOAB(a, FS, temperature_K=TEMPERATURE, T_tau=100 * FS, rng=1), 1, "off row"),
+    "NoseHooverChainNVT": (lambda a: NoseHooverChainNVT(a, FS, TEMPERATURE, 100 * FS), 2, "asks again"),
+    "MelchionnaNPT": (
+        lambda a: MelchionnaNPT(a, FS, temperature_K=TEMPERATURE, externalstress=0.0, ttime=50 * FS),
+        60,
+        "3 steps in a row",
+    ),
+    "NPT": (lambda a: NPT(a, FS, temperature_K=TEMPERATURE, externalstress=0.0, ttime=50 * FS), 60, "3 steps in a row"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_classes_that_move_atoms_past_constraints_are_found(name):
+    make, steps, message = REFUSED[name]
+    atoms, held = dumbbells(10)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ASE's own advice about its class
+        with pytest.raises(UnsupportedError, match=f"{message}.*ConstrainedDynamics.*Langevin") as caught:
+            make(atoms).run(steps)
+    assert name in str(caught.value) or name in ("NPT",)
+    # The object still works once the atoms are put right.
+    held.restore(atoms)
+    atoms.set_momenta(atoms.get_momenta())
+    VelocityVerlet(atoms, FS).run(3)
+    assert off(atoms, held) <= 1e-12
+
+
+def test_honest_dynamics_raise_no_alarm():
+    # Positions set again and again between momenta, velocities drawn anew, long steps.
+    atoms, held = dumbbells(6)
+    raw = atoms.positions + random().normal(scale=0.02, size=atoms.positions.shape)
+    for _ in range(4):
+        atoms.set_positions(raw)
+        thermalize_momenta(atoms, 900, rng=random())
+    atoms.set_positions(raw)
+    for _ in range(4):
+        VelocityVerlet(atoms, 8 * FS).run(20)
+        thermalize_momenta(atoms, 900, rng=random())
+    assert off(atoms, held) <= 1e-12
+
+
+def test_atoms_at_rest_ask_for_the_same_positions():
+    """A kick along the bond is the same in each step, but for rounding."""
+    atoms = molecule("CO")
+    held = constrain(atoms, Distance([0, 1]))
+    start = atoms.get_positions()
+    apart = np.outer(1 / atoms.get_masses(), start[0] - start[1]) * [[1], [-1]]
+    for pull in (0.1, 0.1, 0.11, 0.11, 0.1, 0.1, 0.1):
+        atoms.set_positions(start + pull * apart)
+        atoms.set_momenta(np.zeros((2, 3)))
+    assert off(atoms, held) <= 1e-14
+    assert atoms.positions == pytest.approx(start, abs=1e-14)
+
+
+def test_positions_that_are_not_finite_are_named():
+    held = ConstraintSet(Distance([[0, 1]]), [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [1.0, 1.0])
+    with pytest.raises(InputError, match="position of atom 1 is not finite"):
+        require_on_surface(held, np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]))

@@ -29,7 +29,7 @@ CANONICAL = {
     # All velocities are drawn anew at each step: with fewer, projections take energy (docs/ase.md).
     "Andersen": lambda a: Andersen(a, 1 * FS, TEMPERATURE, 1.0, fixcm=False, rng=random()),
 }
-#: Classes that do not go through the constraints: `tests/ase/test_edits.py` has what is said of them.
+#: Classes that do not go through the constraints: `tests/ase/test_binding.py` has what is said of them.
 REFUSED = {"LangevinBAOAB", "NoseHooverChainNVT", "MelchionnaNPT", "NPT"}
 #: Classes that refuse constraints themselves.
 REFUSE_THEMSELVES = {

@@ -1,4 +1,4 @@
-"""Rows by name: what is held, in which order, what is said where a topology does not do, and the options."""
+"""Rows by name: what is held, what is said where a topology does not do, the options; rigid groups and sites."""
 
 from __future__ import annotations
 
@@ -9,15 +9,25 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from snapshots import WATER, held_rows, snapshot
+from scipy.spatial.distance import pdist
+from snapshots import WATER, held_rows, rotations, snapshot
 
 import kcons.ase
 import kcons.mdanalysis
 import kcons.openmm
 from kcons.constraints import CenterOfMass
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.topology import Holding
+from kcons.topology.rigid_groups import (
+    GEOMETRIES,
+    VirtualSites,
+    body_rows,
+    find_waters,
+    listed_bodies,
+    water_rows,
+)
 from kcons.topology.rows_by_name import Options
 
 # Ethanol, C C O H(O) and five H, and a water.
@@ -220,3 +230,190 @@ def test_geometry_of_water():
     assert Holding(water_geometry=(1, 109)).geometry() == ((1.0, 109.0), 0.0)
     assert Holding(rigid_water=False).waters == frozenset()
     assert "MINE" in Holding(water_names=[" mine "]).waters
+
+
+# -- rigid water, residues and bodies: rank, all distances, flat groups, compositions; sites ----------
+
+
+RNG = np.random.default_rng(11)
+SHAPES = {
+    "pair": (np.array([[0.0, 0, 0], [1.1, 0, 0]]), 1),
+    "line of three": (np.array([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]]), 3 * 3 - 5),
+    "line of five": (np.outer([0, 1.2, 2.5, 3.6, 5.0], [0.6, 0.8, 0.0]), 3 * 5 - 5),
+    "bent": (WATER, 3),
+    "hexagon": (1.4 * np.array([[np.cos(a), np.sin(a), 0] for a in np.arange(6) * np.pi / 3]), 3 * 6 - 6),
+    "square": (np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), 3 * 4 - 6),
+    "tetrahedron": (np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), 6),
+    "cloud": (2 * RNG.normal(size=(30, 3)), 3 * 30 - 6),
+    "large cloud": (4 * RNG.normal(size=(80, 3)), 3 * 80 - 6),
+    "sheet with one atom above": (
+        np.array([*[[1.4 * i, 1.4 * j, 0.0] for i in range(8) for j in range(7)], [5.0, 4.0, 3.0]]),
+        3 * 57 - 6,
+    ),
+    "pyramid": (np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0.2, 0.1, 0]]), 3 * 6 - 6),
+}
+
+
+def moved(x, count=3, seed=5):
+    """Copies turned and apart."""
+    return np.concatenate([x @ q + 20 * k for k, q in enumerate(rotations(count, seed))])
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_rows_hold_all_distances_of_bodies(name):
+    shape, rows_each = SHAPES[name]
+    n = len(shape)
+    x = moved(shape)
+    made = snapshot(["C"] * len(x), x)
+    groups = [np.arange(len(x)).reshape(3, n)]
+    held = ConstraintSet(body_rows(made, groups), x, made.topology.masses)
+    assert held.n_rows == 3 * rows_each
+    motion = Motion(held, x)
+    assert motion.rank == held.n_rows  # regular, also where flat
+    assert np.abs(held.value(x)).max(initial=0.0) < 1e-12
+    # A rigid motion keeps the rows; and what the rows keep is rigid.
+    shaken = motion.project_positions(x + 0.02 * RNG.normal(size=x.shape), x)
+    for k in range(3):
+        body = slice(k * n, (k + 1) * n)
+        np.testing.assert_allclose(pdist(shaken[body]), pdist(x[body]), rtol=0, atol=1e-10)
+
+
+def test_no_atom_of_a_large_body_takes_part_in_many_rows():
+    x = 6 * RNG.normal(size=(300, 3))
+    (rows,) = body_rows(snapshot(["C"] * 300, x), [np.arange(300)[None]])
+    assert rows.family == "Distance" and rows.n_rows == 3 * 300 - 6
+    assert np.bincount(rows.atoms.ravel()).max() <= 60
+
+
+def test_a_ring_out_of_a_file_is_held_flat():
+    ring, rows = SHAPES["hexagon"]
+    x = np.round(ring @ rotations(1, 2)[0] + 31.7, 3)
+    held = ConstraintSet(body_rows(snapshot(["C"] * 6, x), [np.arange(6)[None]]), x, np.full(6, 12.0))
+    assert held.n_rows == rows
+    on = Motion(held, x).restore_positions(x)
+    assert np.abs(on - x).max() < 2e-3  # the three decimals
+    y = on - on.mean(axis=0)
+    assert np.linalg.svd(y, compute_uv=False)[2] < 1e-12
+
+
+def test_bodies_that_share_an_edge_hold_it_once():
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0.2, 1.0]])
+    rows = body_rows(snapshot(["C"] * 4, x), listed_bodies(snapshot(["C"] * 4, x), [[0, 1, 2], [0, 1, 3]]))
+    assert sum(r.n_rows for r in rows) == 5
+
+
+def test_four_site_water_with_its_site_placed():
+    m = 0.15 * (WATER[1] + WATER[2]) / np.linalg.norm(WATER[1] + WATER[2])
+    molecule = np.vstack([WATER, m])
+    x = np.round(moved(molecule), 3)
+    made = snapshot(
+        ["O", "H", "H", ""] * 3,
+        x,
+        names=["OW", "HW1", "HW2", "MW"] * 3,
+        residues=np.repeat([0, 1, 2], 4),
+        residue_names=["SOL"] * 3,
+    )
+    waters = find_waters(made)
+    np.testing.assert_array_equal(waters.triples, [[0, 1, 2], [4, 5, 6], [8, 9, 10]])
+    assert waters.sites.sites.tolist() == [3, 7, 11]
+    # Published: 0.128012065 for TIP4P, up to the decimals of the file.
+    np.testing.assert_allclose(waters.sites.coefficients, [[0.128012065, 0.128012065, 0.0]] * 3, atol=2e-3)
+    exact = find_waters(made, model_site=0.15)
+    placed = exact.sites.place(x)
+    np.testing.assert_allclose(np.linalg.norm(placed[3::4] - placed[0::4], axis=1), 0.15, atol=1e-3)
+    assert water_rows(waters.triples, None).n_rows == 9
+
+
+def lone_pairs(mirrored, n=2):
+    """Waters of TIP5P; in those that are mirrored the lone pairs have each other's names."""
+    behind = -0.35 * (WATER[1] + WATER[2])
+    pairs = np.array([[*behind[:2], 0.57], [*behind[:2], -0.57]])
+    x = np.concatenate([np.vstack([WATER, pairs[::-1] if k in mirrored else pairs]) + 5.0 * k for k in range(n)])
+    names, elements = ["OW", "HW1", "HW2", "LP1", "LP2"] * n, ["O", "H", "H", "", ""] * n
+    return snapshot(elements, x, names=names, residues=np.repeat(range(n), 5), residue_names=["SOL"] * n)
+
+
+@pytest.mark.parametrize("mirrored", [(), (1,), (0, 1, 2), (1, 3)])
+def test_lone_pairs_stay_on_their_sides_in_every_molecule(mirrored):
+    """A median over molecules of both kinds, whose heights are opposite, would put them into the plane."""
+    made = lone_pairs(mirrored, 4)
+    placed = find_waters(made).sites.place(made.positions)
+    height = abs(placed[3::5, 2] - placed[4::5, 2])
+    np.testing.assert_allclose(height, 1.14, atol=1e-12)
+    np.testing.assert_allclose(placed, made.positions, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", ["tip4p", "tip4p2005", "opc"])
+def test_the_site_of_a_model_is_where_the_model_has_it_in_its_own_geometry(model):
+    m = 0.15 * (WATER[1] + WATER[2]) / np.linalg.norm(WATER[1] + WATER[2])
+    made = snapshot(["O", "H", "H", ""], np.vstack([WATER, m]), names=["O", "H1", "H2", "M"], residue_names=["HOH"])
+    rows = held_rows(made, "none", water_geometry=model)
+    length, angle, away = GEOMETRIES[model]
+    half = np.radians(angle / 2)
+    sides = length * np.array([[np.sin(half), np.cos(half), 0.0], [-np.sin(half), np.cos(half), 0.0]])
+    placed = rows.virtual_sites.place(np.vstack([np.zeros(3), sides, m]))
+    np.testing.assert_allclose(placed[3], [0.0, away, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("atom", "place", "what"),
+    [
+        (1, [0, 0, 0], "no plane"),
+        (2, [np.nan] * 3, "no plane"),
+        (3, [8, 8, 8], "13.9 angstrom"),
+        (4, [np.nan] * 3, "nan"),
+    ],
+)
+def test_sites_that_cannot_be_placed_are_refused(atom, place, what):
+    made = lone_pairs((), 1)
+    made.positions[atom] = place
+    with pytest.raises(InputError, match=what) as caught:
+        find_waters(made)
+    assert caught.value.item == "positions"
+
+
+def test_particles_with_mass_are_no_sites():
+    """The Drude particle of SWM4 moves by itself; as a site it would be placed on its oxygen for ever."""
+    x = [*WATER, [0.14, 0.19, 0.0], [0.01, 0.0, 0.0]]
+    names = ["OH2", "H1", "H2", "OM", "DOH2"]
+    masses = [15.5994, 1.008, 1.008, 0.0, 0.4]
+    made = snapshot(["O", "H", "H", "", ""], x, names=names, residue_names=("SWM4",), masses=masses)
+    with pytest.raises(InputError, match="1 oxygens and 2 hydrogens and 1 with mass besides; rename it"):
+        find_waters(made, frozenset({"SWM4"}))
+
+
+def test_oxygens_alone_are_left_and_odd_waters_named():
+    assert not len(find_waters(snapshot(["O"], WATER[:1], residue_names=["HOH"])).triples)
+    with pytest.raises(InputError, match=r"residue HOH 1 \(atoms 0 to 1\).*1 oxygens and 1 hydrogens; rename it"):
+        find_waters(snapshot(["O", "H"], WATER[:2], residue_names=["HOH"]))
+
+
+# -- sites --------------------------------------------------------------------------------------------
+
+
+def sites():
+    """M of TIP4P, and the two lone pairs of TIP5P."""
+    return VirtualSites(
+        np.array([3, 4, 5]),
+        np.tile([0, 1, 2], (3, 1)),
+        np.array([[0.128, 0.128, 0.0], [-0.34, -0.34, 0.64], [-0.34, -0.34, -0.64]]),
+    )
+
+
+def test_spread_forces_do_the_same_work():
+    x = sites().place(np.concatenate([WATER, np.zeros((3, 3))]))
+    f = RNG.normal(size=(6, 3))
+    spread = sites().spread_forces(x, f)
+    assert not spread[3:].any()
+    for _ in range(3):
+        direction = np.concatenate([RNG.normal(size=(3, 3)), np.zeros((3, 3))])
+        h = 1e-6
+        moved = (sites().place(x + h * direction) - sites().place(x - h * direction)) / (2 * h)
+        np.testing.assert_allclose(np.sum(spread * direction), np.sum(f * moved), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(spread.sum(0), f.sum(0), atol=1e-13)
+    np.testing.assert_allclose(np.cross(x, spread).sum(0), np.cross(x, f).sum(0), atol=1e-13)
+
+
+def test_sites_in_other_units():
+    x = sites().place(np.concatenate([WATER, np.zeros((3, 3))]) + 3.0)
+    np.testing.assert_allclose(sites().in_unit(0.1).place(x / 10), x / 10, atol=1e-14)

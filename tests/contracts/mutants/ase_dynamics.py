@@ -4,11 +4,11 @@ MUTANTS = {
     "ase/dynamics.py": [
         (
             "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                last = replace",
-            "ase/edits::time_that_is_set_is_no_way_of_moving_targets",
+            "binding::time_that_is_set_is_no_way_of_moving_targets",
         ),
         (
             'step == self.nsteps« and np.array_equal(self.atoms.arrays["momenta"], self._momenta)→»',
-            "logger::with_noise_the_log_is_of_the_middle_of_the_step",
+            "dynamics::with_noise_the_log_is_of_the_middle_of_the_step",
         ),
         (
             "replace(state.copied(), **known«, forces=None, origin=None→»)",
@@ -20,7 +20,7 @@ MUTANTS = {
         ),
         ('("numbers",« "initial_charges", "initial_magmoms"→»)', "binding::forces_of_the_same_calculator_that_changed"),
         ("if «gone > 0→False» and self._more", "binding::what_was_given_by_numbers_of_atoms_is_no_longer_of_these"),
-        ("row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)", "logger::multipliers_by_name"),
+        ("row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)", "dynamics::multipliers_by_name"),
     ],
     "ase/thermostat_dynamics.py": [
         (
@@ -29,31 +29,31 @@ MUTANTS = {
         ),
     ],
     "thermostats/langevin.py": [
-        ("if self.thermostat.friction >«→=» 0:", "logger::without_noise_the_log_is_of_the_end[0.0]"),
+        ("if self.thermostat.friction >«→=» 0:", "dynamics::without_noise_the_log_is_of_the_end[0.0]"),
     ],
     "ase/constraints_object.py": [
         ("for item in self.constraints« if item.n_rows→»]", "translation::objects_without_rows_are_left_out_of_files"),
         ("if «not self._own→False» and cell.tobytes() != bound.cell", "binding::copies_in_cells_of_their_own"),
-        ("«WithFixedAtoms if fixed else Constraints→»  #", "ase_objects::files_of_other_programs_have_the_fixed_atoms"),
+        ("«WithFixedAtoms if fixed else Constraints→»  #", "translation::files_of_other_programs_have_the_fixed_atoms"),
         (
             "«        accepted.between_steps = True\n→»\n    def get_removed_dof",
-            "ase/edits::an_edit_is_named_before_a_class",
+            "binding::an_edit_is_named_before_a_class",
         ),
         (
             "if «found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x)→False»:",
-            "ase/edits::frames_on_the_constraints_are_taken",
+            "binding::frames_on_the_constraints_are_taken",
         ),
     ],
     "ase/binding.py": [
         ("(item, «holding(item)→None») for", "dynamics::what_constraints_hold_changed_between_steps_is_taken"),
         ("name«, arrays[name].tobytes()→»", "dynamics::masses_of_free_atoms_changed_between_steps_are_taken"),
-        ("scaled = «changed and self._scaled(motion, x, cell)→True»", "ase/edits::an_edit_between_runs_is_refused"),
+        ("scaled = «changed and self._scaled(motion, x, cell)→True»", "binding::an_edit_between_runs_is_refused"),
         (
             "«not (changed or elsewhere or differ(self._positions, x))→self._cell is not None»",
-            "ase/edits::an_edit_between_runs_is_refused",
+            "binding::an_edit_between_runs_is_refused",
         ),
-        ("        if «along < stayed→False»:", "reporter::filters_beside_atoms_that_stay_are_refused"),
-        ("if «self._again and self._repeats→False»:", "ase/edits::classes_that_move_atoms_past_constraints_are_found"),
+        ("        if «along < stayed→False»:", "ase/pressure::filters_beside_atoms_that_stay_are_refused"),
+        ("if «self._again and self._repeats→False»:", "binding::classes_that_move_atoms_past_constraints_are_found"),
     ],
     "constraints/arguments.py": [
         ("«array.setflags(write=False)→pass»", "constraint::arrays_cannot_be_changed"),

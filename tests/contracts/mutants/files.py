@@ -117,7 +117,7 @@ MUTANTS = {
         ("if «not isinstance(given, kind)→given is None»:", "openmm/topology::what_is_no_topology_is_refused"),
     ],
     "ase/topology.py": [
-        ("where=«(masses != 0.0) | (momenta != 0.0)→masses != -1.0»", "logger::a_fixed_atom_needs_no_mass"),
+        ("where=«(masses != 0.0) | (momenta != 0.0)→masses != -1.0»", "dynamics::a_fixed_atom_needs_no_mass"),
     ],
     "openmm/collective/collective_rows.py": [
         ("self._clock(holder) «=→>»= 0.0", "row_program::a_state_of_another_program_has_no_time_of_targets"),
