@@ -51,7 +51,7 @@ class _Shared(ctypes.Structure):
     """What both sides read and write of an integrator, as plugin/program_integrator.h has it."""
 
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("whole", "noisy", "every", "since", "moved")),
+        *((name, ctypes.c_int) for name in ("whole", "noisy", "every", "since", "moved", "bound", "planned")),
         ("origin", ctypes.c_double),
         ("told", ctypes.c_double * 7),
     )
@@ -111,12 +111,12 @@ class DeviceProgram(Program):
     def hand_over(self) -> None:
         """Describe the step to the plugin."""
         self.kept = sorted({*self.memory, *({"lost"} & set(self.numbers))}, key=lambda name: (len(name), name))
-        self.lines = []
+        self.lines, self.lazy = [], False
         self.push()
 
     def write(self, name: str, value: float) -> None:
         """Change a variable that is no setting; settings go over at the next call of `step`."""
-        if self.known(name) in self.kept and self.integrator.bound:
+        if self.known(name) in self.kept and self.integrator.shared.bound:
             values = self.integrator.read("memory")
             values[self.kept.index(name)] = value
             self.integrator.write("memory", values)
@@ -130,7 +130,7 @@ class DeviceProgram(Program):
     def push(self) -> None:
         """Settings, where they are others than the plugin has."""
         integrator = self.integrator
-        if integrator.describe() and integrator.bound:
+        if integrator.describe() and integrator.shared.bound:
             integrator.write("parameters", np.array([*self.settings.values(), 0.0]))
 
     def remembered(self) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class DeviceProgram(Program):
     def recall(self, values: Mapping[str, Any]) -> None:
         """Write what `remembered` gave back into the Context."""
         for name, found in values.items():
-            if self.integrator.bound:
+            if self.integrator.shared.bound:
                 self.integrator.write(name, found)
 
     def listing(self) -> str:
@@ -178,6 +178,8 @@ class DeviceIntegrator(ProjectedIntegrator):
         made = openmm.XmlSerializer.deserialize(_EMPTY.decode())
         self.this = made.this  # the proxy of this class owns what XmlSerializer has made
         openmm.Integrator.setStepSize(self, dt)
+        self._address = ctypes.c_void_p(int(made.this))
+        self.shared: _Shared = library.kcons_shared(self._address).contents
         _ALIVE[int(made.this)] = self
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
@@ -216,31 +218,12 @@ class DeviceIntegrator(ProjectedIntegrator):
             return False
         self._described = description
         spread = program.settings.get("kT", 0.0) * program.settings.get("friction", 0.0)
-        self._shared.noisy = self.ensemble.noisy and spread > 0
-        rows = [row for item in constraints_of(self.parts) if item.width > 1 for row in item.atoms.tolist()]
-        clusters = np.array([number for row in rows for number in (len(row), *row)], dtype=np.int32)
-        found = clusters.ctypes.data_as(_WHOLES)
-        build.library().kcons_describe(self._address, description.encode(), found, clusters.size)
+        self.shared.noisy = self.ensemble.noisy and spread > 0
+        held = [item.atoms for item in constraints_of(self.parts) if item.width > 1]
+        pairs = [np.stack([atoms[:, :-1], atoms[:, 1:]], axis=2).ravel() for atoms in held]
+        tied = np.concatenate([np.zeros(0), *pairs]).astype(np.int32)
+        build.library().kcons_describe(self._address, description.encode(), tied.ctypes.data_as(_WHOLES), tied.size)
         return True
-
-    @property
-    def _address(self) -> ctypes.c_void_p:
-        return ctypes.c_void_p(int(self.this))
-
-    @property
-    def _shared(self) -> _Shared:
-        shared: _Shared = build.library().kcons_shared(self._address).contents
-        return shared
-
-    @property
-    def bound(self) -> bool:
-        """Whether there is a Context."""
-        return bool(build.library().kcons_is_bound(self._address))
-
-    @property
-    def planned(self) -> bool:
-        """Whether the Context has its kernels; not after `reinitialize`."""
-        return bool(build.library().kcons_is_planned(self._address))
 
     def read(self, name: str) -> FloatArray:
         """An array of the device, by its name in `kcons.openmm.device.kernels`."""
@@ -263,13 +246,10 @@ class DeviceIntegrator(ProjectedIntegrator):
         super().attach(context)
         guard = self._guard
         assert guard is not None
-        self._shared.whole = guard.moving or not guard.undisturbed
-
-    def _run_block(self, guard: Guard, steps: int, ends: bool) -> None:
-        self._run(guard, steps, ends)
+        self.shared.whole = guard.moving or not guard.undisturbed
 
     def _run(self, guard: Guard, steps: int, ends: bool) -> None:
-        if guard.in_run and self._shared.moved:
+        if guard.in_run and self.shared.moved:
             guard.begin()
         first = guard.context.getStepCount()
         for part in self.parts:
@@ -278,7 +258,7 @@ class DeviceIntegrator(ProjectedIntegrator):
         try:
             self._advance(guard.context, steps)
         except openmm.OpenMMException as error:
-            told = list(self._shared.told)
+            told = list(self.shared.told)
             guard.put_back()
             if told[_FAILED]:
                 raise self._unsolved(told, guard) from error
@@ -300,7 +280,7 @@ class DeviceIntegrator(ProjectedIntegrator):
             time = context.getTime()._value
             for name, values in rows.renew(time, self._dt, block, *now).items():
                 self.write(name, values)
-            self._shared.origin = time if rows.n_movers else 0.0
+            self.shared.origin = time if rows.n_movers else 0.0
             openmm.Integrator.step(self, block)
 
     def _unsolved(self, told: Sequence[float], guard: Guard) -> KconsError:
@@ -352,11 +332,11 @@ class DeviceIntegrator(ProjectedIntegrator):
             context = self._watch().context
             time, since = context.getTime()._value, context.getStepCount()
             self.write("recorded", np.array([every, since]))
-            self._shared.every, self._shared.since = every, since
+            self.shared.every, self.shared.since = every, since
             try:
                 self.step(min(steps - done, room * every))
             finally:
-                self._shared.every = 0
+                self.shared.every = 0
             made = (context.getStepCount() - since) // every
             found = self.read("records").reshape(room, n, 3, 3)
             for k in range(made):
@@ -369,10 +349,10 @@ class DeviceIntegrator(ProjectedIntegrator):
         """A variable of the step, see `listing`."""
         program = self.program
         if name == "motion":
-            return float(self._shared.told[_MOTION])
+            return float(self.shared.told[_MOTION])
         if name == "failed":  # a call that fails raises
             return 0.0
-        if name in program.kept and self.bound:
+        if name in program.kept and self.shared.bound:
             return float(self.read("memory")[program.kept.index(name)])
         return {**program.numbers, **program.settings}[program.known(name)]
 

@@ -377,7 +377,7 @@ class KernelRows(CarriedConstraints):
         """The rows for a Context, at its positions."""
         program = self.program
         assert program is not None
-        if self._context() is not context or not program.integrator.planned:
+        if self._context() is not context or not program.integrator.shared.planned:
             system = context.getSystem()
             refuse_virtual_sites(system, self.atoms, masses_of(system))
             program.integrator.read("seed")  # makes the plan, which asks `rows_at`

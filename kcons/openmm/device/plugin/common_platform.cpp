@@ -14,15 +14,15 @@ using namespace std;
 
 namespace kcons {
 
-// Atoms of a cluster belong together: OpenMM moves molecules as wholes, and different ones to other places.
+// Two atoms that belong together: OpenMM moves molecules as wholes, and different ones to other places.
 class Together : public ComputeForceInfo {
 public:
-    Together(const vector<vector<int>>& clusters) : clusters(clusters) {}
-    int getNumParticleGroups() override { return clusters.size(); }
-    void getParticlesInGroup(int k, vector<int>& particles) override { particles = clusters[k]; }
+    Together(const vector<int>& tied) : tied(tied) {}
+    int getNumParticleGroups() override { return tied.size()/2; }
+    void getParticlesInGroup(int k, vector<int>& particles) override { particles = {tied[2*k], tied[2*k+1]}; }
     bool areGroupsIdentical(int, int) override { return true; }
 private:
-    vector<vector<int>> clusters;
+    vector<int> tied;
 };
 
 class CommonStep : public StepKernel {
@@ -49,9 +49,9 @@ public:
         if (declared(name, values.size()).whole) arrays.at(name).upload(vector<int>(values.begin(), values.end()));
         else arrays.at(name).upload(values, true);
     }
-    void begin(ContextImpl& c, const vector<vector<int>>& clusters) override {
+    void begin(ContextImpl& c, const vector<int>& tied) override {
         ContextSelector selector(cc);
-        if (!clusters.empty()) cc.addForce(new Together(clusters));
+        if (!tied.empty()) cc.addForce(new Together(tied));
         cc.initializeContexts();
     }
 protected:

@@ -18,7 +18,7 @@ class PlainStep : public StepKernel {
 public:
     PlainStep(const string& name, const Platform& platform, ReferencePlatform::PlatformData& data) : StepKernel(name, platform), data(data) {}
     ~PlainStep() { if (library != nullptr) dlclose(library); }
-    void begin(ContextImpl& c, const vector<vector<int>>&) override {
+    void begin(ContextImpl& c, const vector<int>&) override {
         const System& system = c.getSystem();
         for (int k = 0; k < system.getNumParticles(); k++)
             inverse.push_back(system.getParticleMass(k) == 0 ? 0 : 1/system.getParticleMass(k));

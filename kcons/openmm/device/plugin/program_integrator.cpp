@@ -26,8 +26,9 @@ void ProgramIntegrator::initialize(ContextImpl& c) {
     owner = &c.getOwner();
     context = &c;
     handle = c.getPlatform().createKernel(StepKernel::Name(), c);
-    handle.getAs<StepKernel>().begin(c, clusters);
+    handle.getAs<StepKernel>().begin(c, tied);
     middleKinetic = -1;
+    shared.bound = 1;
 }
 Plan ProgramIntegrator::made() const {
     const System& system = context->getSystem();
@@ -50,15 +51,14 @@ Plan ProgramIntegrator::made() const {
         throw OpenMMException(failure);
     return plan;
 }
-void ProgramIntegrator::cleanup() { handle = Kernel(); }
+void ProgramIntegrator::cleanup() { handle = Kernel(); shared.bound = shared.planned = 0; }
 vector<string> ProgramIntegrator::getKernelNames() { return {StepKernel::Name()}; }
 StepKernel& ProgramIntegrator::kernel() const {
     if (context == nullptr) throw OpenMMException("This Integrator is not bound to a context!");
     StepKernel& k = handle.getAs<StepKernel>();
-    if (!k.built) k.build(*context, made());
+    if (!shared.planned) { k.build(*context, made()); shared.planned = 1; }
     return k;
 }
-bool ProgramIntegrator::planned() const { return context != nullptr && handle.getAs<StepKernel>().built; }
 void ProgramIntegrator::step(int steps) {
     StepKernel& k = kernel();
     fill_n(shared.told, 7, 0);
@@ -239,16 +239,11 @@ extern "C" {
 const char* kcons_error() { return failure.c_str(); }
 void kcons_set_error(const char* text) { failure = text; }
 void kcons_set_planner(Planner p) { planner = p; }
-// `clusters`: of each its number of atoms, and these.
-void kcons_describe(void* integrator, const char* description, const int* clusters, int n) {
+void kcons_describe(void* integrator, const char* description, const int* tied, int n) {
     own(integrator).description = description;
-    own(integrator).clusters.clear();
-    for (const int* each = clusters; each < clusters+n; each += 1+*each)
-        own(integrator).clusters.emplace_back(each+1, each+1+*each);
+    own(integrator).tied.assign(tied, tied+n);
 }
 Shared* kcons_shared(void* integrator) { return &own(integrator).shared; }
-int kcons_is_bound(void* integrator) { return own(integrator).bound(); }
-int kcons_is_planned(void* integrator) { return own(integrator).planned(); }
 // The values of an array, until the next is read; null where that fails.
 const double* kcons_read(void* integrator, const char* name, int* n) try {
     static thread_local vector<double> values;

@@ -45,6 +45,7 @@ struct Shared {
     int noisy = 0;                 // whether the kinetic energy is that of the middle of the last step
     int every = 0, since = 0;      // steps from one record to the next, 0 for none, and the step that they count from
     int moved = 0;                 // whether others have set positions or velocities since the last step
+    int bound = 0, planned = 0;    // whether there is a Context, and whether it has its kernels; not after reinitialize
     double origin = 0;             // time that kernels count from
     double told[7] = {};           // by the kernel `look`, at the end of the last call
 };
@@ -54,13 +55,11 @@ class StepKernel;
 class ProgramIntegrator : public OpenMM::Integrator {
 public:
     std::string description;       // what Python makes the plan of
-    std::vector<std::vector<int>> clusters;   // atoms that stay together, beside those of constraints of the System
-    Shared shared;
+    std::vector<int> tied;         // pairs of atoms that stay together, beside those of constraints of the System
+    mutable Shared shared;
     void step(int steps) override;
     std::vector<double> read(const std::string& name) const;
     void write(const std::string& name, const std::vector<double>& values);
-    bool bound() const { return context != nullptr; }
-    bool planned() const;          // whether the kernel has all that it needs
 protected:
     void initialize(OpenMM::ContextImpl& c) override;
     void cleanup() override;
@@ -88,14 +87,14 @@ class StepKernel : public OpenMM::KernelImpl {
 public:
     static std::string Name() { return "KconsStep"; }
     StepKernel(const std::string& name, const OpenMM::Platform& platform) : KernelImpl(name, platform) {}
-    virtual void begin(OpenMM::ContextImpl& c, const std::vector<std::vector<int>>& clusters) = 0;
-    void build(OpenMM::ContextImpl& c, const Plan& made) { plan = made; prepare(c); built = true; }
+    virtual void begin(OpenMM::ContextImpl& c, const std::vector<int>& tied) = 0;
+    void build(OpenMM::ContextImpl& c, const Plan& made) { plan = made; prepare(c); }
     virtual void execute(OpenMM::ContextImpl& c, ProgramIntegrator& integrator, int steps);
     virtual double kineticEnergy() = 0;
     virtual std::vector<double> read(const std::string& name) = 0;
     virtual void write(const std::string& name, const std::vector<double>& values) = 0;
     virtual void lookBack() { launch("look"); }   // sums and failures to the array `looked`
-    bool built = false, valid = false;   // valid: forces are those at the present positions
+    bool valid = false;            // whether forces are those at the present positions
     Plan plan;
 protected:
     struct Numbers { int step, launch; double dt, time, tolerance; OpenMM::Vec3 box[3]; };
