@@ -218,6 +218,17 @@ def loose_alanine():
     return system, x, v
 
 
+def free_alanine(nonbonded=True):
+    """The same with nothing held, perhaps without long-range forces."""
+    system, x, v = loose_alanine()
+    for k in reversed(range(system.getNumConstraints())):
+        system.removeConstraint(k)
+    for k in reversed(range(system.getNumForces())):
+        if not nonbonded and isinstance(system.getForce(k), openmm.NonbondedForce):
+            system.removeForce(k)
+    return system, x, v
+
+
 #: Every kind, for a temperature (K).
 BAROSTATS = {
     "isotropic": lambda kelvin: openmm.MonteCarloBarostat(1.0, kelvin, 5),

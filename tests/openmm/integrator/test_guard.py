@@ -14,6 +14,7 @@ from openmm_systems import (
     alanine,
     dumbbell,
     field,
+    free_alanine,
     hexagon,
     holding,
     loose_alanine,
@@ -133,14 +134,6 @@ def test_starts_that_are_refused(stretch, speed, error, words):
         assert residuals(system, context)[0] < 1e-9
 
 
-def unconstrained_alanine():
-    """For one step: its bonds are held by nothing."""
-    system, x, v = loose_alanine()
-    for k in reversed(range(system.getNumConstraints())):
-        system.removeConstraint(k)
-    return system, x + 0.0, v
-
-
 #: Rows of each kind, on their targets at x.
 NEARLY = {
     "distance": lambda system, x: CollectiveRows(system, [Row(bond(4, 14))], positions=x),
@@ -154,7 +147,7 @@ NEARLY = {
 @pytest.mark.parametrize(("off", "near"), [(0.006, True), (0.2, False)])
 def test_rows_that_are_near_are_put_right_in_the_first_step(kind, off, near, caplog):
     """As constraints of the System are: with a note in the log; farther ones are refused and nothing moves."""
-    system, x, v = unconstrained_alanine()
+    system, x, v = free_alanine()
     part = NEARLY[kind](system, x)
     x[[3, 4]] += off * np.array([0.3, 0.5, 0.8])
     integrator = ProjectedIntegrator(1e-3, parts=[part])
@@ -185,7 +178,7 @@ def test_rows_that_constraints_of_the_system_pull_off_are_put_right_too():
 
 @pytest.mark.parametrize("together", [False, True])
 def test_a_row_that_is_far_off_keeps_the_others_where_they_are(together):
-    system, x, v = unconstrained_alanine()
+    system, x, v = free_alanine()
     planes = [Plane([k], (0.0, 0.0, 1.0), float(x[k, 2]) + off) for k, off in ((3, 0.004), (9, 0.5))]
     integrator = ProjectedIntegrator(1e-3, parts=[hold(system, rows, x) for rows in ([planes] if together else planes)])
     context = started(system, integrator, x, v)

@@ -12,7 +12,7 @@ from openmm_systems import (
     LONG,
     alanine,
     context_of,
-    loose_alanine,
+    free_alanine,
     on_gpus,
     residuals,
     started,
@@ -36,17 +36,6 @@ INTEGRATORS = {
     "Langevin": lambda **k: ProjectedIntegrator(STEP, ensemble=Langevin(300, 1), **k),
     "Isokinetic": lambda **k: ProjectedIntegrator(STEP, ensemble=Isokinetic(300, momentum="free"), **k),
 }
-
-
-def free_alanine():
-    """Nothing held by the System, and no long-range forces: what is seen is what parts do."""
-    system, x, v = loose_alanine()
-    for k in reversed(range(system.getNumConstraints())):
-        system.removeConstraint(k)
-    for k in reversed(range(system.getNumForces())):
-        if isinstance(system.getForce(k), openmm.NonbondedForce):
-            system.removeForce(k)
-    return system, x, v
 
 
 def water():
@@ -180,7 +169,7 @@ def rows_of_two_kinds(system, x):
 )
 def test_parts_run_in_any_precision(scheme, platform):
     """Rows within 2e-6 where forces are single numbers: by the values that were asked for."""
-    system, x, v = free_alanine()
+    system, x, v = free_alanine(nonbonded=False)
     parts = rows_of_two_kinds(system, x)
     integrator = ProjectedIntegrator(STEP, scheme, parts=parts, check_every=10)
     context = run(system, integrator, x, v, 30, platform)
@@ -211,7 +200,7 @@ def test_parts_run_in_any_precision(scheme, platform):
 def test_constraint_objects_are_held_in_mixed_precision(some, kind, platform):
     """Bonds, angles and a dihedral at 2 fs to what single numbers leave of a correction, 1e-9; doubles to rounding."""
     precision = Precision(*platform.split())
-    system, x, v = free_alanine()
+    system, x, v = free_alanine(nonbonded=False)
     rows = [Distance([[4, 5], [4, 6], [6, 7], [6, 8]]), Angle([[5, 4, 6], [4, 6, 8]]), Dihedral([[6, 8, 14, 16]])]
     if not some:
         rows.append(Distance([[k, k + 1] for k in (0, 9, 12, 18, 20)]))
@@ -232,7 +221,7 @@ def test_some_particles_or_all_are_the_same_motion(monkeypatch):
     ends = []
     for every in (False, True):
         monkeypatch.setattr("kcons.openmm.callback_rows.hands_over_all", lambda every=every: every)
-        system, x, v = free_alanine()
+        system, x, v = free_alanine(nonbonded=False)
         integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
         context = started(system, integrator, x, v)
         force = system.getForce(system.getNumForces() - 1)
