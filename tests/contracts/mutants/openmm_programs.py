@@ -120,7 +120,7 @@ MUTANTS = {
     "openmm/ensembles/spheres_ensemble.py": [
         (
             "if «self.steps is not None→False»:\n            refuse_other_groups(integrator, integrator.context",
-            "molecule_spheres::forces_of_groups_without_a_number_of_steps_are_refused",
+            "langevin_ensemble::a_force_that_gets_another_group_leaves_the_state_that_was_checked",
         ),
     ],
     "openmm/integrator/projected.py": [

@@ -99,28 +99,6 @@ def test_trajectories_are_those_on_arrays(kind, auxiliary):
     assert np.abs(end.positions - x1).max() > 0.005
 
 
-def test_forces_of_groups_without_a_number_of_steps_are_refused():
-    """Nobody would compute them: before the first step, and where a force gets another group in a run."""
-    for late in (False, True):
-        system, x, v, _ = system_of(groups=True)
-        bath = IsokineticSpheres(300.0, 1.0, {0: 1, 1: 2})
-        integrator = ProjectedIntegrator(0.001, ensemble=bath, device=True, check_every=5)
-        if not late:
-            system.getForces()[-1].setForceGroup(5)
-        context = started(system, integrator, x, v)
-        if late:
-            integrator.step(5)
-            context.getSystem().getForces()[-1].setForceGroup(5)
-        with pytest.raises(InputError, match="is in force group 5, which has no number of steps; there are 0, 1"):
-            integrator.step(5)
-    system, x, v, _ = system_of(groups=True)
-    integrator = ProjectedIntegrator(0.001, ensemble=bath, device=True)
-    integrator.setIntegrationForceGroups({0})
-    context = started(system, integrator, x, v)
-    with pytest.raises(InputError, match="force group 1 is left out by setIntegrationForceGroups"):
-        context.getIntegrator().step(1)
-
-
 def test_configurations_are_canonical_at_long_steps():
     """Of dumbbells in a harmonic field, with fast and slow forces apart and a bath."""
     n, stiffness = 200, 800.0

@@ -7,6 +7,7 @@ from ensemble_runs import run
 from openmm import unit
 from openmm_parts import HeldCoordinates
 from openmm_systems import (
+    DEVICE,
     GPUS,
     PLATFORMS,
     alanine,
@@ -24,7 +25,7 @@ from kcons import ConstraintSet, Motion, State, System
 from kcons import run as steps_of
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm import Langevin, LangevinRespa, ProjectedIntegrator
+from kcons.openmm import IsokineticSpheres, Langevin, LangevinRespa, ProjectedIntegrator
 from kcons.openmm.quantities import forces_at
 from kcons.thermostats import ForceGroups
 from kcons.thermostats import LangevinRespa as CoreRespa
@@ -113,12 +114,32 @@ def test_constraints_are_held_and_a_seed_repeats(platform):
     assert np.abs(ends[0][0] - x).max() > 1e-3
 
 
-def test_forces_of_other_groups_and_virtual_sites_and_parts():
+GROUPED = {
+    "LangevinRespa": {"ensemble": LangevinRespa(300, 1.0, TWO)},
+    "spheres": {"ensemble": IsokineticSpheres(300.0, 1.0, TWO), "device": True},
+}
+grouped_kinds = pytest.mark.parametrize(
+    "kind", ["LangevinRespa", pytest.param("spheres", id="spheres, device", marks=DEVICE.marks)]
+)
+
+
+@grouped_kinds
+def test_forces_whose_group_has_no_number_of_steps_or_does_not_act_are_refused(kind):
+    """Nobody would compute the first; the others acted all the same."""
     system, x, v = trapped()
+    integrator = ProjectedIntegrator(1e-3, **GROUPED[kind])
+    integrator.setIntegrationForceGroups({1})
+    context = started(system, integrator, x, v)
+    with pytest.raises(InputError, match="group 0 is left out by setIntegrationForceGroups"):
+        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context), (x, v))
     system.getForces()[0].setForceGroup(7)
-    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, TWO))
+    context = started(system, integrator := ProjectedIntegrator(1e-3, **GROUPED[kind]), x, v)
     with pytest.raises(InputError, match="CustomExternalForce is in force group 7, which has no number of steps"):
-        run(system, integrator, x, v, 1)
+        integrator.step(1)
+
+
+def test_virtual_sites_and_parts_are_refused():
     system, x, v = trapped()
     system.addParticle(0.0)
     system.setVirtualSite(4, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
@@ -158,22 +179,17 @@ def test_forces_in_reciprocal_space_have_a_number_of_steps_too():
     assert np.isfinite(context.getState(energy=True).getPotentialEnergy()._value)
 
 
-def test_groups_that_are_left_out_are_refused():
-    """They acted all the same."""
-    system, x, v = trapped()
-    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, TWO))
-    integrator.setIntegrationForceGroups({1})
-    context = started(system, integrator, x, v)
-    with pytest.raises(InputError, match="group 0 is left out by setIntegrationForceGroups"):
-        integrator.step(1)
-    np.testing.assert_array_equal(state_of(context), (x, v))
-
-
-@pytest.mark.parametrize(("check_every", "faster"), [(5, 1.0), (1000, 1e9)])
-def test_a_force_that_gets_another_group_leaves_the_state_that_was_checked(check_every, faster):
+@pytest.mark.parametrize(
+    ("check_every", "faster", "kind"),
+    [
+        *((5, 1.0, "LangevinRespa"), (1000, 1e9, "LangevinRespa")),
+        pytest.param(5, 1.0, "spheres", id="spheres, device", marks=DEVICE.marks),
+    ],
+)
+def test_a_force_that_gets_another_group_leaves_the_state_that_was_checked(check_every, faster, kind):
     """It would act no more; told at the next check, or where velocities have become infinite before."""
     system, x, v = trapped()
-    integrator = ProjectedIntegrator(1e-3, check_every=check_every, ensemble=LangevinRespa(300, 1.0, TWO))
+    integrator = ProjectedIntegrator(1e-3, check_every=check_every, **GROUPED[kind])
     context = run(system, integrator, x, v, 5)
     if faster > 1:
         context.setVelocities(faster * v)

@@ -8,11 +8,11 @@ import numpy as np
 import openmm
 import pytest
 from ensemble_runs import run
-from openmm_systems import potential_energy, started, state_of, water_box, with_and_without_device
+from openmm_systems import potential_energy, started, state_of, with_and_without_device
 from tied_cluster import ON_DEVICE, X, carried_at, cluster, row_at, thermostatted
 
 from kcons.errors import CertificateError, InputError, KconsError
-from kcons.openmm import ProjectedIntegrator, hold
+from kcons.openmm import ProjectedIntegrator
 
 parts = pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective", "carried"])
 everywhere = pytest.mark.parametrize(
@@ -132,26 +132,6 @@ def test_the_minimizer_of_openmm_does_not_know_rows(make):
     assert potential_energy(made.context) < before
     assert length_of(made.context) == pytest.approx(0.5, abs=1e-12)
     made.run(3)
-
-
-# -- the start --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", ["constant energy", "hold"])
-def test_a_start_that_is_a_little_off_is_put_right(kind, caplog):
-    system, x = water_box(8, spacing=0.4)
-    parts = [hold(system, [], 1.02 * x, take="all", keep_water=False)] if kind == "hold" else []
-    context = started(system, integrator := ProjectedIntegrator(1e-3, parts=parts), 1.02 * x)
-    with caplog.at_level(logging.WARNING, "kcons"):
-        integrator.step(1)
-    (record,) = (each for each in caplog.records if each.name == "kcons.openmm")
-    assert "put right" in record.getMessage()
-    y = state_of(context)[0].reshape(-1, 3, 3)
-    for a, b, d in ((0, 1, 0.09572), (0, 2, 0.09572), (1, 2, 0.15139)):
-        np.testing.assert_allclose(np.linalg.norm(y[:, a] - y[:, b], axis=1), d, rtol=1e-7)
-    caplog.clear()
-    integrator.step(3)
-    assert not caplog.records
 
 
 # -- parts that were forgotten ------------------------------------------------------------------------------

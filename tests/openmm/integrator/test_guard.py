@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 
 import numpy as np
 import openmm
@@ -115,14 +116,22 @@ def test_a_member_of_a_compound_integrator_stops_where_a_part_fails():
         (0.03, 1.0, InputError, r"constraint \d+ of the System .* at the start; minimize"),
         (None, 1.0, InputError, "at the start; set positions first"),
         (0.0, np.nan, NonFiniteError, "velocity of particle 0"),
+        (0.003, 1.0, None, r"the start was put right: constraint \d+ of the System"),
     ],
-    ids=["off the constraints", "without positions", "not finite"],
+    ids=["off the constraints", "without positions", "not finite", "a little off"],
 )
-def test_starts_that_are_refused(stretch, speed, error, words):
+def test_starts_that_are_refused_or_put_right(stretch, speed, error, words, caplog):
     system, x, v = alanine()
     x[4] += stretch or 0.0
     x = 0 * x if stretch is None else x
     context = started(system, integrator := ProjectedIntegrator(1e-3), x, speed * v)
+    if error is None:
+        integrator.step(1)
+        assert re.search(words, caplog.text) and residuals(system, context)[0] < 1e-9
+        caplog.clear()
+        integrator.step(3)
+        assert not caplog.text
+        return
     with pytest.raises(error, match=words) as caught:
         integrator.step(5)
     np.testing.assert_array_equal(state_of(context), [x, speed * v])
