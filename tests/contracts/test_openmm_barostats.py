@@ -11,7 +11,7 @@ import copy
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import GPUS, PLATFORMS, residuals, started, state_of, volumes_under_pressure, water_box
+from openmm_systems import DEVICE, GPUS, PLATFORMS, residuals, started, state_of, volumes_under_pressure, water_box
 from pressure_systems import TRIANGLE, p_value, placed
 from scipy import stats
 
@@ -33,10 +33,12 @@ MADE = {
     "NoseHoover": lambda: ProjectedIntegrator(2e-3, ensemble=NoseHoover(300, 1.0)),
     "constant energy": lambda: ProjectedIntegrator(2e-3),
 }
+ON_DEVICE = {"device, Langevin": lambda: ProjectedIntegrator(2e-3, ensemble=Langevin(300, 1.0), device=True)}
 CASES = [
     *((name, "isotropic", platform) for name in MADE for platform in PLATFORMS),
     *(("Langevin", barostat, "Reference") for barostat in BAROSTATS if barostat != "isotropic"),
     ("constant energy", "flexible", "CPU"),
+    *(pytest.param(name, "isotropic", place, marks=DEVICE.marks) for name in ON_DEVICE for place in PLATFORMS),
 ]
 
 
@@ -56,7 +58,7 @@ def pressed(barostat, n=27):
 def test_volumes_change_and_all_is_held(name, barostat, platform):
     """Checked at each look, and by the integrator at the end."""
     system, x = pressed(barostat)
-    integrator = MADE[name]()
+    integrator = (MADE | ON_DEVICE)[name]()
     context = started(system, integrator, x, None, platform)
     volumes = volumes_under_pressure(system, integrator, context)
     assert len(volumes) > 5

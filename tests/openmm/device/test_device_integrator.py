@@ -7,7 +7,7 @@ import numpy as np
 import openmm
 import pytest
 from device_systems import waters
-from openmm_systems import GPUS, LONG, dumbbell, field, masses_of, particles, residuals, started, state_of
+from openmm_systems import GPUS, LONG, dumbbell, field, particles, residuals, started, state_of
 
 from kcons.constraints import Distance, Plane
 from kcons.errors import ConvergenceError, UnsupportedError
@@ -187,22 +187,6 @@ def test_others_move_positions_and_velocities():
         context.getState(energy=True, forces=True, groups={0})
         integrator.step(5)
     assert difference(*contexts) < 1e-8
-
-
-@pytest.mark.parametrize("platform", PLAIN)
-def test_barostats_and_removers_act_on_whole_velocities(platform):
-    system, x, v = waters(27)
-    system.addForce(openmm.MonteCarloBarostat(2000.0, 300.0, 2))
-    integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300.0, 5.0), device=True)
-    context = run(integrator, system, x, v, platform, (60,))
-    assert abs(context.getState().getPeriodicBoxVolume()._value / 0.93**3 - 1) > 1e-4
-    assert residuals(system, context)[0] < 1e-9
-    system, x, v = waters()
-    system.addForce(openmm.CMMotionRemover(1))
-    integrator = ProjectedIntegrator(0.001, device=True)
-    context = run(integrator, system, x, v + 0.3, platform, (3,))
-    masses = masses_of(system)
-    assert np.abs(masses @ state_of(context)[1]).max() / masses.sum() < 1e-8  # forces of single numbers on the CPU
 
 
 @pytest.mark.parametrize("rows", [False, True])

@@ -11,6 +11,7 @@ import pytest
 from collective_cases import bond, dihedral, points, with_variable
 from ensemble_runs import in_calls, run
 from openmm_systems import (
+    DEVICE,
     PLATFORMS,
     alanine,
     dumbbell,
@@ -268,6 +269,7 @@ def collective(n):
     ("kind", "force"),
     [
         *((kind, external) for kind in ("constant energy", *BATHS, "carried")),
+        pytest.param("device", external, marks=DEVICE.marks),
         ("Langevin", collective),
     ],
 )
@@ -275,7 +277,7 @@ def test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_pl
     system, x, v = alanine()
     system.addForce(force(len(x)))
     assert openmm.CMMotionRemover in {type(force) for force in system.getForces()}
-    end = the_same_in_any_calls(system, x, v, 12, ensemble=BATHS.get(kind))
+    end = the_same_in_any_calls(system, x, v, 12, ensemble=BATHS.get(kind), device=kind == "device")
     if kind == "carried":
         carried = copy.deepcopy(system)
         same = the_same_in_any_calls(carried, x, v, 12, parts=[hold(carried, [], x, take="all")])
