@@ -51,7 +51,8 @@ def off(profile, case):
 
 
 @pytest.mark.parametrize(
-    ("name", "n", "error"), [("Lennard-Jones", 20, 0.3), ("double well", 9, 0.4), ("torsion", 14, 1.0)]
+    ("name", "n", "error"),
+    [("Lennard-Jones", 20, 0.3), ("double well", 9, 0.4), ("torsion", 14, 1.0), ("torsion", 12, 1.0)],
 )
 @pytest.mark.parametrize(
     ("seeds", "low", "high", "covered"),
@@ -60,27 +61,11 @@ def off(profile, case):
 )
 def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error, seeds, low, high, covered):
     """Few windows: what lies between them counts as well. 30 differences; their mean square has a standard deviation
-    of 0.26 if they are independent."""
+    of 0.26 if they are independent. Of twelve windows of a torsion the band was once 1.8 times too wide."""
     case = CASES[name]
     away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(seeds)])
     assert low < (away**2).mean() < high
     assert covered <= (np.abs(away) < 1.96).mean() <= (1.0 if seeds < 100 else 0.98)
-
-
-@pytest.mark.parametrize(
-    ("seeds", "low", "high"),
-    [(range(6), 0.7, 1.3), pytest.param(range(40), 0.9, 1.15, marks=pytest.mark.validation)],
-    ids=["few", "many"],
-)
-def test_the_band_of_a_torsion_of_few_windows(seeds, low, high):
-    """Twelve windows, four for each wave of the fastest part: the band was 1.8 times what profiles are off by."""
-    case, found = CASES["torsion"], []
-    for seed in seeds:
-        profile = made(case, 12, 1.0, seed, zero=case.grid(12)[3])
-        away = profile.F - (case.F(profile.x) - case.F(profile.zero))
-        found.append((away[20:200:20] ** 2, profile.error[20:200:20] ** 2))
-    square, said = np.mean(found, axis=(0, 2))
-    assert low <= math.sqrt(square / said) <= high
 
 
 def test_mean_forces_that_vanish_within_their_errors():
@@ -102,13 +87,8 @@ def test_a_period_closes():
     assert profile.closure.error == pytest.approx(2 * math.pi * e / 4, rel=0.05)
     assert profile.closure.value == pytest.approx(2 * math.pi * np.mean(f), rel=0.15)
     assert profile.F[0] == pytest.approx(profile.F[-1], abs=1e-6)
-
-
-def test_a_period_that_does_not_close_is_warned_of():
-    case = CASES["torsion"]
-    x = case.grid(24)
     with pytest.warns(UserWarning, match="which should be 0"):
-        integrate(x, case.f(x) + 3.0, np.full(24, 0.1), period=case.period)
+        integrate(x, case.f(x) + 3.0, np.full(16, 0.1), period=case.period)
 
 
 def test_windows_of_a_circle_may_be_given_in_any_turn_and_order():
@@ -169,17 +149,14 @@ def test_a_profile_prints_its_windows_and_not_its_arrays():
     assert last.startswith("from 1 to 2 F rises by 3")
 
 
-def test_a_profile_with_its_band_and_windows(tmp_path):
+def test_a_profile_with_its_band_and_windows():
     x = np.linspace(0.0, 2.0, 6)
     profile = integrate(x, np.cos(3 * x), np.full(6, 0.05))
     figure = plot_profile(profile, coordinate="r / Å", energy="eV")
     above, below = figure.axes
     assert above.get_ylabel() == "F / eV" and below.get_xlabel() == "r / Å"
-    (F,) = (line for line in above.lines if line.get_label() == "F")
-    assert (F.get_ydata() == profile.F).all()
+    assert (next(line for line in above.lines if line.get_label() == "F").get_ydata() == profile.F).all()
     band = above.collections[0].get_paths()[0].get_extents()
     assert band.y1 == pytest.approx((profile.F + 2 * profile.error).max())
     (windows,) = (each for each in below.containers if each.get_label() == "windows")
     assert (windows.lines[0].get_xdata() == profile.windows).all()
-    figure.savefig(tmp_path / "profile.png")
-    assert (tmp_path / "profile.png").stat().st_size > 10000

@@ -69,16 +69,7 @@ def test_an_input_for_ase(folder):
     assert found.options == {"both_sides": False, "rng": 4}
     assert found.improve == {"error": 0.5, "most": 20, "below": 40}
     assert found.sampler.start == pytest.approx([np.pi])
-    assert found.sampler.held[0].n_rows == 4
-
-
-def test_atoms_from_one_and_two_coordinates(folder):
-    text = INPUT.replace(FILE, f"{FILE}\ncount_from = 1").replace(TURN, "dihedral = [3, 1, 2, 4]")
-    text += "\n[[coordinate]]\ndistance = [1, 2]\nvalues = [1.4, 1.5]\n"
-    found = read(folder, text.replace(IMPROVE, ""))
-    assert found.sampler.coordinates["turn"].atoms.tolist() == [[2, 0, 1, 3]]
-    assert found.sampler.names == ("turn", "distance-1-2") and found.targets.shape == (24, 2)
-    assert found.targets[1] == pytest.approx([-np.pi, 1.5])
+    assert found.sampler.held[0].n_rows == 4 and found.pulls is None
 
 
 def test_a_difference_of_distances(folder):
@@ -86,21 +77,15 @@ def test_a_difference_of_distances(folder):
     text = INPUT.replace("rng = 4", "approach = [6, 0.2]").replace("[2, 0, 1, 3]", "[3, 1, 2, 4]").replace(IMPROVE, "")
     text = text.replace('methanol.xyz"', 'methanol.xyz"\ncount_from = 1')
     text += "\n[[coordinate]]\ndifference = [1, 2, 4, 2]\nfrom = -0.5\nto = 0.5\nwindows = 3.0\n"
-    found = read(folder, text + "[pulls]\nto = [90.0, 0.4]\n")
+    found = read(folder, text + "[pulls]\nto = [90.0, 0.4]\ncount = 8.0\nsteps = 300\n")
     assert found.sampler.names == ("turn", "difference-1-2-4-2")
-    assert found.targets[:3, 1].tolist() == [-0.5, 0.0, 0.5]
+    assert found.sampler.coordinates["turn"].atoms.tolist() == [[2, 0, 1, 3]]
+    assert found.targets.shape == (36, 2) and found.targets[:3, 1].tolist() == [-0.5, 0.0, 0.5]
     assert found.options["approach"] == pytest.approx([np.radians(6), 0.2])
-    assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4]) and found.pulls["steps"] == 20000
+    assert found.pulls["start"] == pytest.approx(found.targets[0]) and found.pulls["count"] == 8
+    assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4]) and found.pulls["steps"] == 300
     atoms = molecule("CH3OH")
     assert found.sampler.start[1] == pytest.approx(atoms.get_distance(0, 1) - atoms.get_distance(3, 1))
-
-
-def test_pulls(folder):
-    assert read(folder).pulls is None
-    found = read(folder, INPUT + "\n[pulls]\nfrom = -60\ncount = 8.0\nsteps = 300\n")
-    assert found.pulls["start"] == pytest.approx([-np.pi / 3])
-    assert found.pulls["end"] == pytest.approx(found.targets[-1])
-    assert found.pulls["count"] == 8 and found.pulls["steps"] == 300
 
 
 def test_an_input_for_openmm(folder):
