@@ -62,7 +62,6 @@ def rows(child: Child, case: Case, program: str, quick: bool) -> Iterator[dict[s
     """The one row of a cell: its verdict, and the number that decided."""
     begun = time.perf_counter()
     cell = child.cell(case, program, quick)
-    decided: Mapping[str, Any] = deciding(cell.checks)
     yield {
         "case": case.number,
         "title": case.title,
@@ -70,19 +69,12 @@ def rows(child: Child, case: Case, program: str, quick: bool) -> Iterator[dict[s
         "program": program,
         "verdict": cell.verdict,
         "as asked": cell.met,
-        "check": decided.get("name"),
-        "value": decided.get("value"),
-        "limit": decided.get("limit"),
+        "check": cell.check and cell.check.name,
+        "value": cell.check and cell.check.value,
+        "limit": cell.check and cell.check.limit,
         "words": cell.text,
         "seconds": round(time.perf_counter() - begun, 3),
     }
-
-
-def deciding(checks: list[dict[str, Any]]) -> Mapping[str, Any]:
-    """The first check that failed, or the one nearest to its limit."""
-    failed = [check for check in checks if not check["passed"]]
-    share = {id(check): check["value"] / check["limit"] if check["limit"] else 0.0 for check in checks}
-    return failed[0] if failed else max(checks, key=lambda check: share[id(check)], default={})
 
 
 def silent(table: pd.DataFrame) -> list[str]:

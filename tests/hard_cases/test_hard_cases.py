@@ -162,3 +162,8 @@ OF_OPENMM = type("OpenMMException", (Exception,), {})("Particle coordinate is Na
 def test_verdicts(case, found, warned, program, verdict, met):
     cell = judge(case, found, warned, program)
     assert (cell.verdict, cell.met) == (verdict, met), cell.text
+
+
+def test_the_number_that_decides():
+    far, near, wrong = ("far", 0.1, 1.0), ("near", 0.9, 1.0), ("wrong", 2.0, 1.0)
+    assert judge(BOUND, outcome(far, near)).check == near and judge(BOUND, outcome(near, wrong)).check == wrong

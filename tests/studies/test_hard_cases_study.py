@@ -48,11 +48,7 @@ def test_a_program_that_hangs_is_given_up(study, monkeypatch):
     child.pool.shutdown()
 
 
-def test_the_number_that_decides(study):
-    near = {"name": "a", "value": 0.9, "limit": 1.0, "passed": True}
-    far = {"name": "b", "value": 0.1, "limit": 1.0, "passed": True}
-    wrong = {"name": "c", "value": 2.0, "limit": 1.0, "passed": False}
-    assert study.deciding([far, near]) is near and study.deciding([near, wrong]) is wrong
+def test_a_verdict_in_words(study):
     assert study.words_of({"verdict": "right", "words": "", "check": "a", "value": 0.9}) == "right: a 0.9"
 
 
