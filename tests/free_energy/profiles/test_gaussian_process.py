@@ -68,11 +68,9 @@ def test_an_average_over_processes_has_the_moments_of_a_mixture():
     mixed = Learned(one, [one, other], np.array([0.3, 0.7]))
     x = np.array([[-0.5], [0.7], [1.9]])
     mean, covariance = mixed.posterior((x, [-1]), (x[:1], [0]))
-    rng = np.random.default_rng(6)
-    drawn = [
-        rng.multivariate_normal(*each.posterior((x, [-1]), (x[:1], [0])), size=count, method="eigh")
-        for each, count in ((one, 60000), (other, 140000))
-    ]
+    rng, asked = np.random.default_rng(6), ((x, [-1]), (x[:1], [0]))
+    counts = {one: 60000, other: 140000}
+    drawn = [rng.multivariate_normal(*each.posterior(*asked), n, method="eigh") for each, n in counts.items()]
     samples = np.concatenate(drawn)
     spread = np.sqrt(np.diag(covariance))
     assert np.abs((samples.mean(axis=0) - mean) / spread).max() < 0.015  # 6/sqrt(200,000)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from functools import cache
 
 import numpy as np
@@ -42,19 +41,16 @@ SURFACES = {
 }
 
 
-def noise(n, error, seed):
-    """Vectors with correlated components, and their covariance."""
-    mixing = error * np.array([[1.0, 0.0], [0.6, 0.8]])
-    drawn = np.random.default_rng(seed).standard_normal((n, 2)) @ mixing.T
-    return drawn, np.broadcast_to(mixing @ mixing.T, (n, 2, 2))
-
-
 @cache
-def fitted(name, n, error, seed):
+def fitted(name, seed=0, swirl=0.0):
+    """Of 60 windows whose errors have correlated components, beside a field that is no gradient."""
     _, gradient, low, high, periods = SURFACES[name]
-    x = np.random.default_rng(100 + seed).uniform(low, high, (n, 2))
-    drawn, covariances = noise(n, error, seed)
-    return fit_surface(x, gradient(x) + drawn, covariances, periods=periods)
+    x = np.random.default_rng(100 + seed).uniform(low, high, (60, 2))
+    mixing = 0.4 * np.array([[1.0, 0.0], [0.6, 0.8]])
+    drawn = np.random.default_rng(seed).standard_normal((60, 2)) @ mixing.T + swirl * np.stack(
+        [-x[:, 1], x[:, 0]], axis=1
+    )
+    return fit_surface(x, gradient(x) + drawn, np.broadcast_to(mixing @ mixing.T, (60, 2, 2)), periods=periods)
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -62,7 +58,7 @@ def test_scattered_windows_give_the_surface_within_its_errors(name):
     value = SURFACES[name][0]
     away, sizes = [], []
     for seed in range(3):
-        surface = fitted(name, 60, 0.4, seed)
+        surface = fitted(name, seed)
         at = np.random.default_rng(7 + seed).uniform(surface.low, surface.high, (12, 2))
         F, errors = surface.free_energy(at)
         exact = value(at) - value(surface.zero[None])
@@ -91,7 +87,7 @@ def test_a_grid_without_noise_gives_the_surface(name):
 def test_minima():
     from scipy.optimize import minimize
 
-    surface = fitted("wells", 60, 0.4, 0)
+    surface = fitted("wells")
     lowest, second = surface.minima()
     exact = [minimize(lambda x: wells(x[None])[0], start, tol=1e-10) for start in ([-1.0, 0.4], [1.0, 0.4])]
     for minimum, expected in zip((lowest, second), exact, strict=True):
@@ -107,21 +103,16 @@ def test_minima_around_a_torus():
     F = torsions(np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 2)).reshape(200, 200)
     around = [np.roll(F, (a, b), axis=(0, 1)) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
     exact = places[np.argwhere((np.array(around) > F).all(axis=0))]
-    found = np.array([minimum.x for minimum in fitted("torsions", 60, 0.4, 0).minima()])
+    found = np.array([minimum.x for minimum in fitted("torsions").minima()])
     assert len(found) == len(exact) == 2
     away = (found[:, None] - exact[None] + math.pi) % TURN - math.pi
     assert np.abs(away).max(axis=2).min(axis=0).max() < 0.1
 
 
 def test_vectors_that_are_no_gradient_are_warned_of():
-    x = np.random.default_rng(9).uniform([-1.4, -0.6], [1.4, 1.4], (60, 2))
-    swirl = 3.0 * np.stack([-x[:, 1], x[:, 0]], axis=1)
-    drawn, covariances = noise(60, 0.2, 1)
+    """Warnings are errors in all other tests."""
     with pytest.warns(UserWarning, match="no gradient"):
-        fit_surface(x, slopes(x) + swirl + drawn, covariances)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        fit_surface(x, slopes(x) + drawn, covariances)
+        fitted("wells", swirl=3.0)
 
 
 def test_three_coordinates():

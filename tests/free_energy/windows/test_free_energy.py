@@ -17,19 +17,13 @@ from kcons.free_energy.windows.driver import combine_sides
 PERIOD = 2 * np.pi
 
 
-class Units:
-    """Of a sampler, all that is needed here."""
-
-    kJ, scales = 1.0, np.ones(2)
-
-
 def of_two_sides(apart):
     """A window whose sides, with errors of 0.1 and 0.2, differ by so much."""
     sides = {
         name: MeanForce(("a", "b"), np.zeros(2), force, error**2 * np.eye(2), force, 100, 50.0)
         for name, force, error in (("up", np.zeros(2), 0.1), ("down", np.array(apart), 0.2))
     }
-    return combine_sides(0, np.zeros(2), sides, Units())
+    return combine_sides(0, np.zeros(2), sides, Fake("", scales=np.ones(2)))
 
 
 def test_sides_that_differ_by_more_than_chance_widen_the_error():
@@ -94,13 +88,12 @@ def test_where_all_windows_failed_a_profile_says_why():
 
 @pytest.fixture
 def sampled(tmp_path):
-    windows = Windows(
-        Fake(str(tmp_path / "diary"), fails=("window-0001-up",), shift=0.4),
-        tmp_path / "out",
-        Settings(production=640, every=10),
-        executor=ThreadPoolExecutor(1),
-    )
-    return windows.run(np.linspace(-np.pi, np.pi, 9)[:-1])
+    return run(tmp_path, np.linspace(-np.pi, np.pi, 9)[:-1], fails=("window-0001-up",), shift=0.4)
+
+
+def run(folder, places, **fake):
+    how = {"settings": Settings(production=640, every=10), "executor": ThreadPoolExecutor(1)}
+    return Windows(Fake(str(folder / "diary"), **fake), folder / "out", **how).run(places)
 
 
 def test_table_and_sentences(sampled):
@@ -126,9 +119,7 @@ def test_files(sampled, tmp_path):
 @pytest.mark.parametrize("places", [[0.1, 0.5, 0.9], [0.1, 0.5], [0.1, 0.1, 0.5]], ids=str)
 def test_a_profile_or_why_there_is_none(places, tmp_path):
     """What `integrate` takes: three windows at different places."""
-    profile = len(set(places)) == 3
-    how = {"settings": Settings(production=640, every=10), "executor": ThreadPoolExecutor(1)}
-    found = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", **how).run(places)
+    profile, found = len(set(places)) == 3, run(tmp_path, places)
     said = found.summary()
     names = [path.name for path in found.write(tmp_path)]
     assert ("from the lowest to the highest point" in said) == ("profile.csv" in names) == profile
