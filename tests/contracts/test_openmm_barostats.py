@@ -11,7 +11,17 @@ import copy
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import DEVICE, GPUS, PLATFORMS, residuals, started, state_of, volumes_under_pressure, water_box
+from openmm_systems import (
+    DEVICE,
+    GPUS,
+    PLATFORMS,
+    particles,
+    residuals,
+    started,
+    state_of,
+    volumes_under_pressure,
+    water_box,
+)
 from pressure_systems import TRIANGLE, p_value, placed
 from scipy import stats
 
@@ -110,32 +120,24 @@ def barostats(pressure):
     }
 
 
-def gas(sites=False, n=N, side=SIDE):
+def gas(sites=False):
     """Rigid triangles without forces in a periodic box, perhaps with a virtual site each."""
-    system, x = openmm.System(), []
+    x = placed(0.1 * TRIANGLE, N, SIDE, 3).reshape(N, 3, 3)
+    x -= SIDE * np.round((x - x[:, :1]) / SIDE)
     force = openmm.NonbondedForce()
     force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
     force.setCutoffDistance(0.1)
-    shape = 0.1 * TRIANGLE
-    for molecule in placed(shape, n, side, 3).reshape(n, 3, 3):
-        first = system.getNumParticles()
-        whole = molecule - side * np.round((molecule - molecule[0]) / side)
-        for mass, place in zip((16.0, 1.0, 2.0), whole, strict=True):
-            system.addParticle(mass)
-            x.append(place)
-        for i, j in ((0, 1), (0, 2), (1, 2)):
-            system.addConstraint(first + i, first + j, float(np.linalg.norm(shape[i] - shape[j])))
-        if sites:
-            system.addParticle(0.0)
-            system.setVirtualSite(
-                first + 3, openmm.ThreeParticleAverageSite(first, first + 1, first + 2, 0.5, 0.25, 0.25)
-            )
-            x.append(whole[0])
-    for _ in x:
+    for _ in range((4 if sites else 3) * N):
         force.addParticle(0.0, 0.1, 0.0)
-    system.addForce(force)
-    system.setDefaultPeriodicBoxVectors(*(side * np.eye(3)))
-    return system, np.array(x)
+    pairs = [(3 * k + i, 3 * k + j) for k in range(N) for i, j in ((0, 1), (0, 2), (1, 2))]
+    masses = [16.0, 1.0, 2.0] * N + [0.0] * (N if sites else 0)
+    y = np.vstack([x.reshape(-1, 3), x[:, 0]])[: len(masses)]
+    system = particles(masses, force, held=pairs, x=y)
+    for k in range(N if sites else 0):
+        site = openmm.ThreeParticleAverageSite(3 * k, 3 * k + 1, 3 * k + 2, 0.5, 0.25, 0.25)
+        system.setVirtualSite(3 * N + k, site)
+    system.setDefaultPeriodicBoxVectors(*(SIDE * np.eye(3)))
+    return system, y
 
 
 def volumes(system, integrator, x, barostat, count=1200, part=None):
@@ -183,8 +185,8 @@ def test_volumes_of_a_rigid_ideal_gas(ensemble, barostat, sites):
     judge(found, N, PRESSURE)
     integrator.check()
     if sites:
-        y = state_of(context)[0].reshape(N, 4, 3)
-        assert y[:, 3] == pytest.approx(0.5 * y[:, 0] + 0.25 * (y[:, 1] + y[:, 2]), abs=1e-6)
+        y, places = np.split(state_of(context)[0], [3 * N])
+        assert places == pytest.approx(np.tensordot([0.5, 0.25, 0.25], y.reshape(N, 3, 3), (0, 1)), abs=1e-6)
 
 
 @pytest.mark.slow

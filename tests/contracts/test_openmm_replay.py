@@ -11,7 +11,19 @@ import openmm
 import pytest
 from openmm import unit
 from openmm_ensembles import ENSEMBLES
-from openmm_systems import GPUS, PLATFORMS, context_of, masses_of, rows_of, started, state_of, total_energy
+from openmm_systems import (
+    GPUS,
+    PLATFORMS,
+    context_of,
+    field,
+    masses_of,
+    pairs_force,
+    particles,
+    rows_of,
+    started,
+    state_of,
+    total_energy,
+)
 
 from kcons.openmm import SCHEMES, Langevin, ProjectedIntegrator
 
@@ -62,17 +74,14 @@ def every_shape(coupled=True):
     Not `coupled` are pairs, a star and rigid waters: of a processor (pocl), OpenMM's solver for coupled bonds leaves
     6e-7 at a tolerance of 1e-8, with VerletIntegrator as well.
     """
-    system, force = openmm.System(), openmm.NonbondedForce()
-    x, rows = [], []
+    force, masses, x, rows = openmm.NonbondedForce(), [], [], []
 
-    def add(masses, places, pairs):
-        first = system.getNumParticles()
-        for k, (m, place) in enumerate(zip(masses, places, strict=True)):
-            system.addParticle(m)
+    def add(weights, places, pairs):
+        rows.extend((len(x) + i, len(x) + j) for i, j in pairs)
+        for k, place in enumerate(places):
             force.addParticle(0.2 if k % 2 == 0 else -0.2, 0.3, 1.0)
             x.append(place)
-        for i, j in pairs:
-            rows.append((first + i, first + j))
+        masses.extend(weights)
 
     shift = np.array([0.0, 0.0, 2.0])
     stairs = np.array([[k // 2, (k + 1) // 2, 0.0] for k in range(8)])
@@ -84,26 +93,18 @@ def every_shape(coupled=True):
     for k in range(2):
         water = np.array([[0, 0, 0], [1.0, 0, 0], [0.25, np.sqrt(15) / 4, 0]])  # sides 1, 1 and sqrt(1.5)
         add([16.0, 1.0, 1.0], water + 3 * shift + [2.0 * k, 0, 0], [(0, 1), (0, 2), (1, 2)])
-    x = np.array(x)
     for i, j in rows:
-        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
         force.addException(i, j, 0, 1, 0)
-    system.addForce(force)
-    return system, x
+    x = np.array(x)
+    return particles(masses, force, held=rows, x=x), x
 
 
 @pytest.mark.parametrize(("name", "platform"), here(AT_CONSTANT_ENERGY))
 def test_single_bond(name, platform):
     """A harmonic oscillator; positions and velocities against the closed form, and the energy."""
-    system, bond = openmm.System(), openmm.HarmonicBondForce()
-    system.addParticle(2.0)
-    system.addParticle(2.0)
-    bond.addBond(0, 1, 1.5, 1.0)
-    system.addForce(bond)
+    system = particles([2.0, 2.0], pairs_force(openmm.HarmonicBondForce(), (0, 1, 1.5, 1.0)))
     dt = 0.01
-    integrator = MADE[name](dt)
-    context = context_of(system, integrator, platform)
-    context.setPositions([[-1, 0, 0], [1, 0, 0]])
+    context = started(system, integrator := MADE[name](dt), [[-1, 0, 0], [1, 0, 0]], None, platform)
     first = total_energy(context)
     for step in range(STEPS.get(name, 200)):
         time = dt * step
@@ -147,15 +148,9 @@ def test_constraints_of_every_shape(name, platform):
 @pytest.mark.parametrize(("name", "platform"), here(ENSEMBLE_MADE))
 def test_temperature(name, platform):
     """<K> = g kT/2 of a constrained chain in a field, to 6/sqrt(n), from 200 K; constant where it is to be."""
-    system = openmm.System()
-    field = openmm.CustomExternalForce("50*(x^2+1.3*y^2+0.7*z^2)+20*x^4")
-    rng = np.random.default_rng(0)
-    x = np.cumsum(rng.normal(size=(8, 3)) * 0.1, axis=0)
-    for i in range(8):
-        field.addParticle(system.addParticle(2.0 + i), [])
-        if i % 3:
-            system.addConstraint(i - 1, i, float(np.linalg.norm(x[i] - x[i - 1])))
-    system.addForce(field)
+    x = np.cumsum(np.random.default_rng(0).normal(size=(8, 3)) * 0.1, axis=0)
+    trap = field("50*(x^2+1.3*y^2+0.7*z^2)+20*x^4", 8)
+    system = particles(np.arange(2.0, 10.0), trap, held=[(i - 1, i) for i in range(8) if i % 3], x=x)
     integrator = MADE[name](0.004, tolerance=1e-7)
     integrator.setRandomNumberSeed(1)  # before the Context, which reads it
     context = started(system, integrator, x, None, platform)
@@ -195,12 +190,8 @@ def test_random_seed(platform):
 @pytest.mark.parametrize(("name", "platform"), here(("rattle", *ENSEMBLE_MADE)))
 def test_initial_temperature(name, platform):
     """Velocities that are drawn have the temperature on average, to 2 %; no particle alone."""
-    system = openmm.System()
     n = 3000
-    for k in range(n):
-        system.addParticle(10.0)
-        if k % 2:
-            system.addConstraint(k - 1, k, 1.0)
+    system = particles([10.0] * n, held=[(k - 1, k, 1.0) for k in range(1, n, 2)])
     x = np.random.default_rng(0).random((n, 3)) * 10
     x[1::2] = x[::2]
     x[1::2, 0] += 1.0
@@ -218,12 +209,10 @@ def test_initial_temperature(name, platform):
 @made
 def test_massless_particles(name, platform):
     """Particles without mass stay where they are; a constraint between one and another with a mass is refused."""
-    system, force = openmm.System(), openmm.NonbondedForce()
-    for m in (0.0, 1.0, 1.0, 0.0):
-        system.addParticle(m)
+    force = openmm.NonbondedForce()
+    for _ in range(4):
         force.addParticle(0.1, 0.2, 0.5)
-    system.addForce(force)
-    system.addConstraint(1, 2, 1.0)
+    system = particles([0.0, 1.0, 1.0, 0.0], force, held=[(1, 2, 1.0)])
     x = np.array([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0.5, 0]])
     integrator = MADE[name](0.001)
     context = started(system, integrator, x, None, platform)
@@ -242,14 +231,7 @@ def test_massless_particles(name, platform):
 @pytest.mark.filterwarnings("ignore:total momentum")
 @made
 def test_force_groups(name, platform):
-    system = openmm.System()
-    system.addParticle(1.0)
-    system.addParticle(1.0)
-    for group, energy in ((1, "100*x"), (2, "100*y")):
-        force = openmm.CustomExternalForce(energy)
-        force.addParticle(0)
-        force.setForceGroup(group)
-        system.addForce(force)
+    system = particles([1.0, 1.0], field("100*x", 1, 1), field("100*y", 1, 2))
     integrator = ProjectedIntegrator(0.01, ensemble=Langevin(0, 0)) if name == "Langevin" else MADE[name](0.01)
     integrator.setIntegrationForceGroups({1})
     context = started(system, integrator, np.zeros((2, 3)), [[0, 0, 0.0], [1.0, 0, 0]], platform)
