@@ -190,6 +190,8 @@ def figure(table: pd.DataFrame, width: float = 9.0) -> Figure:
     error = f"error at {about['horizon']:g} {about['time']} / {about['error_unit']}"
     axes.set_ylabel(about.get("what", error).replace(" of the conf", "\nof the conf"))
     axes.grid(True, which="major", linewidth=0.5, alpha=0.5)
+    # Those within a decade are named where few decades are shown.
+    axes.tick_params(axis="x", which="minor", labelsize=7)
     axes.set_title(about["title"], fontsize=10, loc="left", wrap=True)
     if "environment" in about:
         where = f"{processor_of(about['environment'])}; {about['environment']['date']}"

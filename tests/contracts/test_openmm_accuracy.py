@@ -34,13 +34,12 @@ ORDERS = {
 }
 
 
-def flown(scheme, dt, start=None, time=TIME, tolerance=1e-13):
-    """Positions and velocities after a time, as one array."""
-    system, x, v = alanine() if start is None else start
-    integrator = ProjectedIntegrator(dt, scheme, tolerance=tolerance)
-    context = started(system, integrator, x, v)
-    steps = round(time / dt)
-    assert steps * dt == pytest.approx(time, rel=1e-12)
+def flown(scheme, dt):
+    """Positions and velocities after the time, as one array."""
+    system, x, v = alanine()
+    context = started(system, integrator := ProjectedIntegrator(dt, scheme, tolerance=1e-13), x, v)
+    steps = round(TIME / dt)
+    assert steps * dt == pytest.approx(TIME, rel=1e-12)
     integrator.step(steps)
     return np.array(state_of(context))
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import openmm
+import openmm_systems
 from openmm import unit
-from openmm_systems import context_of, state_of
+from openmm_systems import field, pairs_force, particles, state_of
 
 from kcons.constraints import Cylinder, Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.constraints.constraint_set import ConstraintSet
@@ -20,11 +21,6 @@ CENTER = np.array([0.3, -0.2, 0.5])
 FORMULA = "b*x1**2 + y1**2 + 2*z1**2 + 0.3*x1*y1*z1"
 
 
-def _formula(atoms, x):
-    # Each particle on a level of its own.
-    return Formula(FORMULA, atoms, {"b": 1.5}, target=None)
-
-
 KINDS = {
     "sphere": lambda atoms, x: Sphere(atoms, CENTER),
     "cylinder": lambda atoms, x: Cylinder(atoms, CENTER, [0, 0, 1]),
@@ -33,7 +29,8 @@ KINDS = {
     "ellipsoid": lambda atoms, x: Ellipsoid(atoms, CENTER, [0.9, 1.2, 1.6], target=None),
     "rotated ellipsoid": lambda atoms, x: Ellipsoid(atoms, CENTER, [0.9, 1.2, 1.6], TURN, target=None),
     "torus": lambda atoms, x: Torus(atoms, CENTER, TURN[0], 1.2),
-    "formula": _formula,
+    # Each particle on a level of its own.
+    "formula": lambda atoms, x: Formula(FORMULA, atoms, {"b": 1.5}, target=None),
 }
 
 MASSES = np.array([1.0, 2.5, 40.0])
@@ -50,24 +47,13 @@ def force_of(x, t=0.0):
 
 
 def system_of(masses=MASSES, potential=POTENTIAL, springs=0.3):
-    system = openmm.System()
-    field = openmm.CustomExternalForce(potential)
-    bonds = openmm.CustomBondForce(f"0.5*{springs}*r^2")
-    for k, mass in enumerate(masses):
-        system.addParticle(mass)
-        field.addParticle(k)
-        for j in range(k):
-            bonds.addBond(j, k)
-    system.addForce(field)
-    if springs:
-        system.addForce(bonds)
-    return system
+    pairs = [(j, k) for k in range(len(masses)) for j in range(k)]
+    bonds = [pairs_force(openmm.CustomBondForce(f"0.5*{springs}*r^2"), *pairs)] if springs else []
+    return particles(masses, field(potential, len(masses)), *bonds)
 
 
 def started(system, integrator, x, v, platform="Reference"):
-    context = context_of(system, integrator, platform)
-    context.setPositions(x)
-    context.setVelocities(v)
+    context = openmm_systems.started(system, integrator, x, v, platform)
     integrator.applyVelocityConstraints(context)
     return context
 
