@@ -134,6 +134,7 @@ MUTANTS = {
     ],
     "plan/plan.py": [
         ("«plan.eliminate_last[rows[order]] = left_over→pass»", "plan::dependent_rows_are_eliminated_last"),
+        ("plan.eliminate_last[rows«[order]→»] = left_over", "plan::rank_is_that_of_the_dense_matrix"),
     ],
     "motion/certificate.py": [
         ("SPEED = 1«0.→e1»0", "certificate::a_solver_that_is_wrong_without_knowing_is_found_in_the_first_step"),
