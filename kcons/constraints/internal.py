@@ -360,8 +360,7 @@ class MassWeighted(Constraint, base=True):
         """Shares of the atoms in the mass of their group, shape (n_rows, width)."""
         if self.masses is None:
             raise InputError(
-                f"{self!r} needs the masses of its atoms; put it in a ConstraintSet, or call with_masses",
-                item="masses",
+                f"{self!r} needs the masses of its atoms; put it in a ConstraintSet, or call with_masses", item="masses"
             )
         return _shares(self.masses)
 

@@ -1,4 +1,4 @@
-"""Rows linear in the velocities: knife edges, rolling, driven velocities (nonholonomic constraints).
+"""Rows linear in the velocities: knife edges, rolling (nonholonomic constraints); others by `VelocityFormula`.
 
 A row is a(r, t) . v = target; its gradient is a, and it never fixes a position. Differentiated once,
 a . acceleration = d target/dt - v . da/dt (notes, eqs. 82 and 92).
@@ -19,7 +19,7 @@ from kcons.constraints.target import Target
 from kcons.constraints.vectors import dot, norm
 from kcons.errors import InputError
 
-__all__ = ["KnifeEdge", "LinearVelocity", "Rolling"]
+__all__ = ["KnifeEdge", "Rolling"]
 
 _VECTOR = (3,)
 
@@ -34,46 +34,6 @@ class VelocityRows(Constraint, base=True):
     holonomic = False
     kind = RowKind.VELOCITY
     held = SPEED
-
-
-class LinearVelocity(VelocityRows):
-    """A combination of velocity components, sum_a c_a . v_a = target.
-
-    Parameters
-    ----------
-    atoms : array_like of int, shape (n_rows, width) or (width,)
-        Atoms of each row.
-    coefficients : array_like, shape (width, 3) or (n_rows, width, 3)
-        What each component is multiplied with.
-    target : float, array_like, callable of time, or MovingTarget
-        Speed held.
-
-    Examples
-    --------
-    An atom driven along x with speed cos(t):
-
-    >>> import numpy as np
-    >>> drive = LinearVelocity(0, [[1, 0, 0]], target=np.cos)
-    """
-
-    alike = 1
-    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
-    coefficients: FloatArray
-
-    def __init__(self, atoms: ArrayLike, coefficients: ArrayLike, target: Target = 0.0) -> None:
-        super().__init__(atoms, target, coefficients=coefficients)
-
-    def _settle(self) -> None:
-        self.refuse_zero(self.coefficients)
-
-    @staticmethod
-    def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        # p holds the number of atoms, and the coefficients.
-        n, speed = 3 * int(p[0]), 0.0
-        for i in range(n):
-            speed += p[1 + i] * r[n + i]
-            out[1 + i] = p[1 + i]
-        out[0] = speed
 
 
 class KnifeEdge(VelocityRows):
@@ -107,12 +67,7 @@ class KnifeEdge(VelocityRows):
     normal: FloatArray
 
     def __init__(
-        self,
-        back: ArrayLike,
-        front: ArrayLike,
-        normal: Directions,
-        contact: ArrayLike = 0.0,
-        target: Target = 0.0,
+        self, back: ArrayLike, front: ArrayLike, normal: Directions, contact: ArrayLike = 0.0, target: Target = 0.0
     ) -> None:
         super().__init__(_pairs(back, front, self.family), target, normal=normal, contact=contact)
 

@@ -14,8 +14,8 @@ from kcons.constraints import (
     Ellipsoid,
     FixedAtoms,
     ImplicitSurface,
+    LinearCombination,
     LinearRelation,
-    LinearVelocity,
     Plane,
     Sphere,
 )
@@ -105,7 +105,7 @@ WAYS = {
     "points": lambda m, bad: Plane([0, 1, 2], [0, 0, 1], point=bad),
     "centers": lambda m, bad: Sphere([0, 1, 2], bad),
     "semi-axes": lambda m, bad: Ellipsoid([0, 1, 2], np.zeros(3), bad),
-    "coefficients": lambda m, bad: LinearVelocity([0, 1, 2], bad),
+    "coefficients": lambda m, bad: LinearCombination([0, 1, 2], bad),
     "weights": lambda m, bad: LinearRelation([3], [0, 1, 2], bad if isinstance(bad, list) else bad[0]),
     "a gradient": lambda m, bad: held([Custom([0, 1, 2], lambda r: 1.0, lambda r: bad)]),
     "gradients of a surface": lambda m, bad: held([ImplicitSurface([0, 1, 2], lambda r: r[:, 0], lambda r: bad)]),

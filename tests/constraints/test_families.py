@@ -30,7 +30,6 @@ from kcons.constraints import (
     Line,
     LinearCombination,
     LinearRelation,
-    LinearVelocity,
     Plane,
     RadiusOfGyration,
     Rolling,
@@ -205,10 +204,7 @@ def test_groups_in_a_cell_far_away_and_of_many_atoms():
     assert held.target() == pytest.approx([*x.mean(axis=0), np.sqrt(3 * x.var(axis=0).mean())], rel=1e-10)
 
 
-@pytest.mark.parametrize(
-    "item", [RadiusOfGyration(np.arange(40)), CenterDistance(np.arange(20), np.arange(20, 40)),
-             LinearVelocity(np.arange(40), np.arange(120.0).reshape(40, 3))], ids=lambda item: item.family
-)  # fmt: skip
+@pytest.mark.parametrize("item", [RadiusOfGyration(np.arange(40)), CenterDistance(np.arange(20), np.arange(20, 40))])
 def test_wide_rows_are_what_narrow_ones_would_be(item, monkeypatch):
     r, v = np.random.default_rng(0).normal(size=(2, 1, 40, 3))
     item = item.with_masses(np.arange(1.0, 41.0)[None])
@@ -401,7 +397,7 @@ def test_a_wheel_rolls_one_circumference_a_turn(marker):
 
 def test_driven_speeds_and_coefficients_that_turn():
     x = np.eye(3)[:2]
-    held = ConstraintSet(LinearVelocity([0, 1], [[1, 0, 0], [-1, 0, 0]], target=lambda t: np.sin(2 * t)), x, np.ones(2))
+    held = ConstraintSet(VelocityFormula("vx1 - vx2", [0, 1], target=lambda t: np.sin(2 * t)), x, np.ones(2))
     assert held.moving and not held.holonomic.any()
     assert held.velocity_target(x, 0.3) == pytest.approx([np.sin(0.6)])
     assert held.acceleration_target(x, x, 0.3) == pytest.approx([2 * np.cos(0.6)], rel=1e-11)

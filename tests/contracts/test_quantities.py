@@ -72,7 +72,6 @@ MADE = {
         **{"formula": "z1 - a*x1", "atoms": [0], "parameters": {"a": 2.0}, "target": 0.3, "period": 2.0},
     },
     "VelocityFormula": {"formula": "vz1 - a*x1*vx1", "atoms": [0], "parameters": {"a": 2.0}, "target": 0.3},
-    "LinearVelocity": {"atoms": [[0]], "coefficients": [[0, 0, 1.0]], "target": 0.1},
     "KnifeEdge": {"back": [0], "front": [1], "normal": [0, 1.0, 1.0], "contact": [0.5], "target": 0.1},
     "Rolling": {
         **{"hub": [0], "rim": [1], "radius": 0.2, "heading": [1.0, 0, 0], "normal": [0, 0, 1.0]},

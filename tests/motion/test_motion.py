@@ -47,7 +47,7 @@ def system(extra: int, seed: int = 0, moving: bool = False):
     ]
     if moving:
         rows.append(held.Distance([(23, 24)], lambda t: 3.0 + 0.3 * np.sin(t)))
-        rows.append(held.LinearVelocity([[25]], [[1.0, 0.5, 0]], lambda t: np.cos(t)))
+        rows.append(held.VelocityFormula("vx1 + 0.5*vy1", [25], None, np.cos))
     n = ATOMS + extra
     numbers = rng.permutation(n)[:ATOMS]
     whole = rng.uniform(-4, 4, (n, 3))
@@ -256,8 +256,8 @@ def test_rescue_by_damped_newton(name: str, crowd: int) -> None:
 
 
 def test_rows_of_velocities_that_contradict_each_other() -> None:
-    rows = [held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.0), held.LinearVelocity([[0, 1]], np.eye(3)[[0, 1]], 0.0)]
-    rows += [held.LinearVelocity([[1]], [[0, 1.0, 0]], 1.0)]
+    rows = [held.VelocityFormula("vx1", 0, None, 1.0), held.VelocityFormula("vx1 + vy2", [0, 1])]
+    rows += [held.VelocityFormula("vy1", 1, None, 1.0)]
     motion = Motion(ConstraintSet(rows, WATER, np.ones(3)), WATER)
     with pytest.raises(ConvergenceError, match=r"contradict.*Remove or change"):
         motion.project_velocities(WATER, 0 * WATER)

@@ -115,7 +115,7 @@ def test_fulfilled_rows_between_fixed_atoms_are_dropped() -> None:
 
 @pytest.mark.parametrize(
     "row",
-    [held.Distance([0, 1], 1.1), held.LinearVelocity([[0, 1]], np.eye(3)[:2], 0.5), held.Plane(0, [1.0, 0, 0], 2)],
+    [held.Distance([0, 1], 1.1), held.VelocityFormula("vx1 + vy2", [0, 1], None, 0.5), held.Plane(0, [1.0, 0, 0], 2)],
 )
 def test_rows_between_fixed_atoms_that_contradict_are_refused(row) -> None:
     far = np.vstack([np.full((20, 3), 9.0) + np.arange(20)[:, None], WATER])
@@ -146,10 +146,10 @@ def test_atoms_fixed_on_a_path_that_breaks_a_row_between_them() -> None:
 
 def test_velocity_row_between_fixed_atoms_that_agrees() -> None:
     moving = held.FixedAtoms([0], held.MovingTarget(lambda t: [t, 0.0, 0.0], lambda t: [1.0, 0, 0], lambda t: 0.0))
-    plan = planned([moving, held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.0)], WATER)
+    plan = planned([moving, held.VelocityFormula("vx1", 0, None, 1.0)], WATER)
     assert plan.rank == 3
     with pytest.raises(ContradictionError):
-        planned([moving, held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.1)], WATER)
+        planned([moving, held.VelocityFormula("vx1", 0, None, 1.1)], WATER)
 
 
 # -- rows that are named twice ----------------------------------------------------------------------

@@ -28,11 +28,11 @@ from kcons.constraints import (
     FixedAtoms,
     ImplicitSurface,
     KnifeEdge,
-    LinearVelocity,
     MovingTarget,
     Plane,
     Rolling,
     Sphere,
+    VelocityFormula,
 )
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Composition, Geodesic, Rattle, Splitting, State, Stepper, run
@@ -83,7 +83,7 @@ def error_skate(stepper, dt):
 
 
 def error_driven_atom(stepper, dt):
-    system = system_of([LinearVelocity(0, [[1, 0, 0]], target=lambda t: np.cos(3 * t))], np.zeros((1, 3)), [2.0])
+    system = system_of([VelocityFormula("vx1", 0, target=lambda t: np.cos(3 * t))], np.zeros((1, 3)), [2.0])
     end = run(system, system.initial_state(np.zeros((1, 3))), dt, round(2 / dt), stepper=stepper)
     return abs(end.positions[0, 0] - np.sin(6.0) / 3)
 
@@ -360,7 +360,7 @@ def pivoting_skate():
 def bodies_apart():
     """An atom whose velocity is held, a rod, and a free atom."""
     x = np.array([[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0], [5.0, 1.2, 0], [9.0, 9, 9]])
-    system = system_of([LinearVelocity(0, [[0, 0, 1]], target=lambda t: 0.5), Distance([2, 3])], x, np.ones(5))
+    system = system_of([VelocityFormula("vz1", 0, target=lambda t: 0.5), Distance([2, 3])], x, np.ones(5))
     return system, system.initial_state(x, np.random.default_rng(1).normal(size=(5, 3)), project=True)
 
 

@@ -135,7 +135,6 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "VelocityFormula moving": lambda: kc.VelocityFormula(
         "cos(w*t)*vx1 + sin(w*t - z1)*vy2", [0, 1], {"w": 0.8}, np.sin
     ),
-    "LinearVelocity": lambda: kc.LinearVelocity([[0, 1], [5, 2]], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]], np.sin),
     "KnifeEdge": lambda: kc.KnifeEdge([0, 3], [1, 4], [[0.0, 0.0, 1.0], [0.2, 0.1, 1.0]], contact=[0.0, 0.3]),
     "Rolling": lambda: kc.Rolling([0, 3], [1, 4], [0.7, 1.5], [1.0, 0.2, 0.1], [0.1, 0.0, 1.0]),
     "CustomVelocity": lambda: swirl([[0, 1], [6, 4]]),

@@ -11,7 +11,7 @@ import torch
 import torch_sim as ts
 from torch_models import Butanes, Drops, K, butane, drop, state_of
 
-from kcons.constraints import Distance, LinearVelocity, Plane
+from kcons.constraints import Distance, Plane, VelocityFormula
 from kcons.errors import InputError, UnsupportedError
 from kcons.torchsim import hold, langevin, nose_hoover, nve, report
 
@@ -61,7 +61,7 @@ def test_the_system_is_named():
 
 
 @pytest.mark.parametrize(
-    "row", [Distance([0, 1], lambda t: [1.0 + t]), LinearVelocity(0, [[1, 0, 0]])], ids=["moving target", "velocities"]
+    "row", [Distance([0, 1], lambda t: [1.0 + t]), VelocityFormula("vx1", 0)], ids=["moving target", "velocities"]
 )
 def test_rows_that_need_the_time_are_refused(row):
     with pytest.raises(UnsupportedError, match=r"kcons\.steppers"):

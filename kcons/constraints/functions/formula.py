@@ -458,10 +458,6 @@ class VelocityFormula(Formula):
     shared: ClassVar[tuple[str, ...]] = ("formula", "names")
 
     def __init__(
-        self,
-        formula: str,
-        atoms: ArrayLike,
-        parameters: Mapping[str, ArrayLike] | None = None,
-        target: Target = 0.0,
+        self, formula: str, atoms: ArrayLike, parameters: Mapping[str, ArrayLike] | None = None, target: Target = 0.0
     ) -> None:
         super().__init__(formula, atoms, parameters, target)

@@ -50,9 +50,7 @@ PLACES = {
     "CenterOfMass of three": lambda s: CenterOfMass([[1, 2, 4]], axes=(0, 2)),
     "LinearCombination": lambda s: LinearCombination([[1, 3]], [[1.0, 2.0, 0.0], [0.5, 0.0, 1.0]]),
     "Custom of two": lambda s: Custom(
-        [1, 2],
-        lambda r: float(np.sum((r - s[1:3] - 8.0) ** 2)),
-        lambda r: 2.0 * (r - s[1:3] - 8.0),
+        [1, 2], lambda r: float(np.sum((r - s[1:3] - 8.0) ** 2)), lambda r: 2.0 * (r - s[1:3] - 8.0)
     ),
     "Formula of a fixed atom": lambda s: (
         FixedAtoms(3),
