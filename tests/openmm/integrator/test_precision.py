@@ -156,64 +156,48 @@ def test_molecules_that_cross_a_face_of_the_box_are_no_failure(platform, kept, c
 # -- parts ------------------------------------------------------------------------------------------
 
 
-def rows_of_two_kinds(system, x):
-    return [CollectiveRows(system, [Row(bond(4, 14)), Row(dihedral(4, 6, 8, 14))], positions=x)]
+HELD = {
+    **{f"collective {scheme}": ("collective", {"scheme": scheme}) for scheme in ("rattle", "geodesic", "suzuki4")},
+    **{f"objects {scheme}": ("objects", {"scheme": scheme}) for scheme in ("rattle", "suzuki4")},
+    "objects Isokinetic": ("objects", {"ensemble": Isokinetic(300, momentum="free")}),
+}
 
 
 @pytest.mark.parametrize(
-    "scheme, platform",
-    on_each_gpu(
-        {scheme: (scheme,) for scheme in ("rattle", "geodesic", "suzuki4")},
-        lambda name, platform: name == "suzuki4" and "mixed" in platform,
-    ),
-)
-def test_parts_run_in_any_precision(scheme, platform):
-    """Rows within 2e-6 where forces are single numbers: by the values that were asked for."""
-    system, x, v = free_alanine(nonbonded=False)
-    parts = rows_of_two_kinds(system, x)
-    integrator = ProjectedIntegrator(STEP, scheme, parts=parts, check_every=10)
-    context = run(system, integrator, x, v, 30, platform)
-    precision = Precision(*platform.split())
-    for part in parts:
-        assert np.abs(part.residuals(context)).max() < (1e-11 if precision.name == "double" else 2e-6)
-        assert part.worst_violation(context) is None
-
-
-# -- rows of constraint objects ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("some", "kind", "platform"),
+    "kind, options, platform",
     [
-        pytest.param(
-            some, kind, *p.values, id=f"{name}-{p.id}", marks=p.marks if name == "isokinetic" else [*p.marks, LONG]
+        param
+        for param in on_each_gpu(
+            HELD, lambda name, gpu: name in ("collective suzuki4", "objects Isokinetic") and "mixed" in gpu
         )
-        for name, some, kind in (
-            ("rattle", True, {}),
-            ("suzuki4", False, {"scheme": "suzuki4"}),
-            ("isokinetic", True, {"ensemble": Isokinetic(300, momentum="free")}),
-        )
-        for p in GPUS
-        if "single" not in p.id and ("double" in p.id) == (name == "suzuki4")
+        if not ("single" in param.id and "objects" in param.id)
     ],
 )
-def test_constraint_objects_are_held_in_mixed_precision(some, kind, platform):
-    """Bonds, angles and a dihedral at 2 fs to what single numbers leave of a correction, 1e-9; doubles to rounding."""
-    precision = Precision(*platform.split())
+def test_rows_are_held_in_any_precision(kind, options, platform):
+    """Forces as rows within 2e-6 where they are single numbers, by the values that were asked for.
+
+    Objects, bonds, angles and a dihedral at 2 fs, to what single numbers leave of a correction, 1e-9; doubles to
+    rounding.
+    """
+    fine = Precision(*platform.split()).name == "double"
     system, x, v = free_alanine(nonbonded=False)
-    rows = [Distance([[4, 5], [4, 6], [6, 7], [6, 8]]), Angle([[5, 4, 6], [4, 6, 8]]), Dihedral([[6, 8, 14, 16]])]
-    if not some:
-        rows.append(Distance([[k, k + 1] for k in (0, 9, 12, 18, 20)]))
-    part = hold(system, rows, x)
-    integrator = ProjectedIntegrator(2e-3, parts=[part], check_every=20, **kind)
+    if kind == "collective":
+        part = CollectiveRows(system, [Row(bond(4, 14)), Row(dihedral(4, 6, 8, 14))], positions=x)
+    else:
+        bonds = [[4, 5], [4, 6], [6, 7], [6, 8], *([k, k + 1] for k in (0, 9, 12, 18, 20) if fine)]
+        part = hold(system, [Distance(bonds), Angle([[5, 4, 6], [4, 6, 8]]), Dihedral([[6, 8, 14, 16]])], x)
+    integrator = ProjectedIntegrator(STEP if kind == "collective" else 2e-3, parts=[part], check_every=10, **options)
     context = started(system, integrator, x, v, platform)
-    held = part.motion.constraint_set
     for _ in range(10):
         integrator.step(10)
-        y, w = state_of(context)
-        assert np.abs(held.value(y)).max() < (1e-9 if precision.name == "mixed" else 1e-13)
-        assert np.abs(held.jacobian(y) @ w.ravel()).max() < (1e-6 if precision.name == "mixed" else 1e-12)
+        if kind == "collective":
+            assert np.abs(part.residuals(context)).max() < (1e-11 if fine else 2e-6)
+            continue
+        (y, w), held = state_of(context), part.motion.constraint_set
+        assert np.abs(held.value(y)).max() < (1e-13 if fine else 1e-9)
+        assert np.abs(held.jacobian(y) @ w.ravel()).max() < (1e-12 if fine else 1e-6)
     integrator.check()
+    assert part.worst_violation(context) is None
 
 
 def test_some_particles_or_all_are_the_same_motion(monkeypatch):
