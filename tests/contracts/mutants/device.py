@@ -40,7 +40,7 @@ MUTANTS = {
     "openmm/device/clusters.py": [
         ("off[bad]«/unit[bad]→»); return", "rows::rows_without_a_solution_are_told"),
         ("'+' if one[a] «==→!=» other[a] else", "rows::clusters_of_all_sizes"),
-        ('"there« && last→»"', "surfaces_on_the_device::the_device_holds_the_same_surfaces"),
+        ('"there« && last→»"', "surface_integrator::the_device_holds_the_same_surfaces"),
     ],
     "openmm/device/device_integrator.py": [
         ("array in «arrays→rows.arrays» if array.saved", "molecule_spheres::a_failure_puts_auxiliary_variables_back"),

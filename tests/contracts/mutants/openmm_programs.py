@@ -124,7 +124,7 @@ MUTANTS = {
         ),
     ],
     "openmm/integrator/projected.py": [
-        ("        «→# »self._write()  # the same", "part::integrators_in_turn_hold_the_same_part"),
+        ("        «→# »self._write()  # the same", "settings::integrators_in_turn_hold_the_same_part"),
     ],
     "openmm/collective/collective_rows.py": [
         (
@@ -139,7 +139,7 @@ MUTANTS = {
     "openmm/surface_integrator.py": [
         (
             "«positions is None→False»:",
-            "surfaces_on_the_device::a_particle_at_the_center_is_refused_and_one_far_from_the_origin_is_held",
+            "surface_integrator::a_particle_at_the_center_is_refused_and_one_far_from_the_origin_is_held",
         ),
     ],
     "openmm/callback_rows.py": [
@@ -151,7 +151,7 @@ MUTANTS = {
         ("= «not p.integrator.thermostatted→False»", "hold::velocities_are_those_of_the_core"),
         (
             "self._«engine.stand_at(self._state(context)[0])→state(context)[0]»",
-            "part::integrators_in_turn_hold_the_same_part",
+            "settings::integrators_in_turn_hold_the_same_part",
         ),
         ("u * np.cos(w) - d * (w * np.sin(w))« - way→»", "surface_integrator::great_circles_at_any_time_step"),
         ('"ij,ij->i", d, way)[:, None] / radius«**2→»)', "surface_integrator::the_steps_are_those_of_the_core"),
