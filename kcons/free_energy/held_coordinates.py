@@ -74,11 +74,8 @@ class Sample(NamedTuple):
 def named(coordinates: Mapping[str, Constraint]) -> dict[str, Constraint]:
     """Coordinates by name, checked."""
     if not isinstance(coordinates, Mapping) or not coordinates or not all(isinstance(k, str) for k in coordinates):
-        raise InputError(
-            "no coordinates are named; give a mapping of names to constraints, such as "
-            '{"torsion": Dihedral([[0, 1, 2, 3]])}',
-            item="coordinates",
-        )
+        remedy = 'give a mapping of names to constraints, such as {"torsion": Dihedral([[0, 1, 2, 3]])}'
+        raise InputError(f"no coordinates are named; {remedy}", item="coordinates")
     for name, coordinate in coordinates.items():
         if not isinstance(coordinate, Constraint):
             raise InputError(f"{name!r} is {coordinate!r}, and no kcons constraint", item=name)
@@ -160,10 +157,8 @@ class HeldCoordinates:
         everything = np.flatnonzero(np.isin(label, label[self.rows]))  # of the clusters of the coordinates
         others = np.setdiff1d(everything, self.rows)
         if not held.holonomic[others].all():
-            raise UnsupportedError(
-                f"{' and '.join(names)} share atoms with velocity constraints, under which configurations have no "
-                "known distribution; multipliers alone are those of Motion.multipliers"
-            )
+            said = "share atoms with velocity constraints, under which configurations have no known distribution"
+            raise UnsupportedError(f"{' and '.join(names)} {said}; multipliers alone are those of Motion.multipliers")
         # All rows of the clusters; in results those of the coordinates, as they are named, come after the others.
         self._rows, self.atoms = held.subset(everything)
         self._order = np.searchsorted(everything, np.concatenate([others, self.rows]))
@@ -179,14 +174,14 @@ class HeldCoordinates:
         near = 1e-3 * np.random.default_rng(1).normal(size=here.shape) * np.ptp(here, axis=0).max()
         # Beside a structure so symmetric that a gradient vanishes, too.
         self._at(self._gathered(np.stack([here, here + near])), time)
-        self._turns: list[RigidTurn | None] = [None] * len(self)
-        if bonds is not None:
-            pairs = np.array(bonds, dtype=np.int64).reshape(-1, 2)
-            for k, row in enumerate(self.rows.tolist()):
-                item, own = held.locate(row)
-                turn = rigid_turn(item.select([own]), pairs, x, held.lattice)
-                if turn is not None and leaves_the_rest(turn, row, held, others, x, time):
-                    self._turns[k] = turn
+        #: Of the coordinates, by number, that are torsions whose group can be turned.
+        self._turns: dict[int, RigidTurn] = {}
+        pairs = np.array([] if bonds is None else bonds, dtype=np.int64).reshape(-1, 2)
+        for k, row in enumerate(self.rows.tolist()):
+            item, own = held.locate(row)
+            turn = rigid_turn(item.select([own]), pairs, x, held.lattice)
+            if turn is not None and leaves_the_rest(turn, row, held, others, x, time):
+                self._turns[k] = turn
 
     def __len__(self) -> int:
         return len(self.names)
@@ -198,7 +193,7 @@ class HeldCoordinates:
     @property
     def seen(self) -> IntArray:
         """All atoms that samples depend on: `atoms`, and those of the groups that torsions turn."""
-        groups = [part for turn in self._turns if turn for part in (turn.axis, turn.group, turn.bonds.ravel())]
+        groups = [part for turn in self._turns.values() for part in (turn.axis, turn.group, turn.bonds.ravel())]
         return np.unique(np.concatenate([self.atoms, *groups])).astype(np.int64)
 
     def sample(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> Sample:
@@ -259,9 +254,8 @@ class HeldCoordinates:
         value = np.concatenate(values, axis=1)[:, order[-d:]]
         off = np.abs(nearest_image(value - rows.target(time)[order[-d:]], self.periods)).max(axis=1)
         turned = np.full((n, d), np.nan)
-        for k, turn in enumerate(self._turns):
-            if turn is not None:
-                turned[:, k] = turn.force(whole[0], whole[2])
+        for k, turn in self._turns.items():
+            turned[:, k] = turn.force(whole[0], whole[2])
         # Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarized.
         bends = bent[:, 1 : 1 + d * d] @ shares.swapaxes(1, 2)
         gradient, crossed = np.diagonal(bends[:, :d], axis1=1, axis2=2).copy(), iter(np.moveaxis(bends[:, d:], 1, 0))
@@ -277,10 +271,10 @@ class HeldCoordinates:
 
     def _copied(self, k: int, copies: int) -> Constraint:
         """The rows of the k-th constraint object, so many times."""
-        item = self._rows.constraints[k]
-        if copies > 1 and (k, copies) not in self._copies:
+        if (k, copies) not in self._copies:
+            item = self._rows.constraints[k]
             self._copies[k, copies] = item.select(np.tile(np.arange(item.n_rows), copies))
-        return item if copies == 1 else self._copies[k, copies]
+        return self._copies[k, copies]
 
     def _gathered(self, x: FloatArray) -> list[FloatArray]:
         """Positions of each object's rows in n configurations, shape (n, n_rows, width, 3)."""

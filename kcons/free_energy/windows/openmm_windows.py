@@ -210,12 +210,9 @@ class OpenMMWindows(Sampler):
         platform: str | None = None,
         properties: Mapping[str, str] | None = None,
     ) -> None:
-        if topology.getNumAtoms() != system.getNumParticles():
-            raise InputError(
-                f"the Topology has {topology.getNumAtoms()} atoms and the System {system.getNumParticles()} particles; "
-                "give those of one structure",
-                item="topology",
-            )
+        if (atoms := topology.getNumAtoms()) != (particles := system.getNumParticles()):
+            said = f"the Topology has {atoms} atoms and the System {particles} particles"
+            raise InputError(f"{said}; give those of one structure", item="topology")
         wraps, box = system.usesPeriodicBoundaryConditions(), topology.getPeriodicBoxVectors()
         cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
         if box is not None and cell is not None and np.abs(cell_of(box) - cell).max() > _SAME_BOX * np.abs(cell).max():
@@ -231,7 +228,7 @@ class OpenMMWindows(Sampler):
             raise UnsupportedError(f"the System has a {barostats[0]}; windows are sampled in a box at rest: remove it")
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
-        x, masses = nanometers(positions, system.getNumParticles()).copy(), masses_of(system)
+        x, masses = nanometers(positions, particles).copy(), masses_of(system)
         bonds, others = bonds_of(system, x), _beside(system, list(named(coordinates).values()), masses)
         where = (x, np.where(masses > 0, masses, 1.0), cell, True)
         super().__init__(coordinates, others, *where, bonds, _turning(system, bonds, masses), angstrom=10.0)
