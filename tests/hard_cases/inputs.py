@@ -130,17 +130,9 @@ def over_determined(program: Program, quick: bool) -> Outcome:
 class _Raw(Problem):
     """Hands its arrays over in the precision they have."""
 
-    @property
-    def x(self) -> Any:
-        return np.array(self.positions)
-
-    @property
-    def v(self) -> Any:
-        return np.array(self.velocities)
-
-    @property
-    def m(self) -> Any:
-        return np.array(self.masses)
+    x = property(lambda self: np.array(self.positions))
+    v = property(lambda self: np.array(self.velocities))
+    m = property(lambda self: np.array(self.masses))
 
 
 @case("H27", "float32 input", "as the same numbers in float64, to 1e-12; results in float64")

@@ -46,21 +46,10 @@ class Problem:
     cell: ArrayLike | None = None
     others: Sequence[Constraint] = ()
 
-    @property
-    def x(self) -> Array:
-        return np.array(self.positions, dtype=float)
-
-    @property
-    def v(self) -> Array:
-        return np.zeros_like(self.x) if self.velocities is None else np.array(self.velocities, dtype=float)
-
-    @property
-    def m(self) -> Array:
-        return np.array(self.masses, dtype=float)
-
-    @property
-    def n_atoms(self) -> int:
-        return len(self.x)
+    x = property(lambda self: np.array(self.positions, dtype=float))
+    v = property(lambda self: np.zeros_like(self.x) if self.velocities is None else np.array(self.velocities, float))
+    m = property(lambda self: np.array(self.masses, dtype=float))
+    n_atoms = property(lambda self: len(self.x))
 
     @property
     def held_lengths(self) -> Array:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import openmm
@@ -34,8 +34,7 @@ class CannotExpressError(Exception):
     """The program has no means to state the problem; the message says which are missing."""
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(NamedTuple):
     """What is seen of a run: positions, velocities, energies; NaN where a program does not tell."""
 
     x: Array
@@ -43,9 +42,7 @@ class Frame:
     kinetic: float
     potential: float
 
-    @property
-    def energy(self) -> float:
-        return self.kinetic + self.potential
+    energy = property(lambda self: self.kinetic + self.potential)
 
 
 class Seen:
@@ -407,9 +404,7 @@ class KconsInOpenMM(PlainOpenMM):
         return int(integrator.degrees_of_freedom(context))
 
 
-PROGRAMS: dict[str, type[Program]] = {
-    program.name: program for program in (Core, KconsInAse, KconsInOpenMM, PlainAse, PlainOpenMM)
-}
+PROGRAMS = {program.name: program for program in (Core, KconsInAse, KconsInOpenMM, PlainAse, PlainOpenMM)}
 
 
 def quiet(function: Callable[[], Any]) -> tuple[Any, str]:
