@@ -75,6 +75,13 @@ class Free(Drops):
         return torch.zeros(n, dtype=x.dtype) + 0.0 * x.sum()
 
 
+class WithStress(Drops):
+    """A stress of 0."""
+
+    def forward(self, state, **_):
+        return {**super().forward(state), "stress": torch.zeros((state.n_systems, 3, 3), dtype=state.dtype)}
+
+
 class Butanes(Model):
     """Springs between atoms one and two bonds apart, Lennard-Jones between the others, and torsions."""
 

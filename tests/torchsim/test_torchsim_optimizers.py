@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import torch_sim as ts
-from torch_models import Butanes, Drops, butane, drop, off
+from torch_models import Butanes, Drops, WithStress, butane, drop, off
 
 from kcons.constraints import Dihedral
 from kcons.errors import ConvergenceError, UnsupportedError
@@ -100,11 +100,6 @@ def test_cells_are_not_relaxed(optimizer):
         ts.optimize(
             state, WithStress(), optimizer=optimizer, max_steps=5, init_kwargs={"cell_filter": ts.CellFilter.unit}
         )
-
-
-class WithStress(Drops):
-    def forward(self, state, **_):
-        return {**super().forward(state), "stress": torch.zeros((state.n_systems, 3, 3), dtype=state.dtype)}
 
 
 def test_steps_that_cannot_be_held_are_told():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch_sim as ts
-from torch_models import Butanes, Drops, K, butane, drop, state_of
+from torch_models import Butanes, Drops, K, WithStress, butane, drop, state_of
 
 from kcons.constraints import Distance, Plane, VelocityFormula
 from kcons.errors import InputError, UnsupportedError
@@ -43,13 +43,6 @@ def test_bad_input_is_named_and_leaves_the_state(constraints, options, says):
     with pytest.raises(InputError, match=says):
         hold(state, constraints, **options)
     assert state.constraints == [] and torch.equal(state.positions, x)
-
-
-def test_fixed_atoms_of_one_system_leave_the_others_free():
-    state = ts.concatenate_states([drop(1), drop(1, 1)])
-    state.constraints = ts.constraints.FixAtoms([0, 1])
-    held = hold(state, [])
-    assert held.get_removed_dof(state).tolist() == [6, 0]
 
 
 def test_the_system_is_named():
@@ -126,15 +119,6 @@ def test_constant_pressure_is_refused(integrator):
         )
 
 
-class WithStress(Drops):
-    def __init__(self):
-        super().__init__()
-        self._compute_stress = True
-
-    def forward(self, state, **_):
-        return {**super().forward(state), "stress": torch.zeros((state.n_systems, 3, 3), dtype=state.dtype)}
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -173,13 +157,6 @@ def test_positions_that_are_edited_between_steps_are_refused():
             nve.step(state, model, **settings)
         state.positions = kept
     nve.step(state, model, **settings)
-
-
-def test_rows_that_are_singular_are_converted():
-    """Three distances of atoms in a line are singular at second order."""
-    line = state_of([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]], [8, 6, 8], [16.0, 12.0, 16.0])
-    hold(line, Distance([[0, 1], [1, 2], [0, 2]]))
-    assert line.get_number_of_degrees_of_freedom().tolist() == [5]
 
 
 def test_bonds_that_are_given_are_taken():

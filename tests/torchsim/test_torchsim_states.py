@@ -26,6 +26,9 @@ def test_degrees_of_freedom_are_counted_by_rank():
     flat = state_of([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [6] * 4, [12.0] * 4)
     hold(flat, Distance([[i, j] for i in range(4) for j in range(i + 1, 4)]))
     assert flat.get_number_of_degrees_of_freedom().tolist() == [6]  # a rigid body, whatever holds it
+    line = state_of([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]], [8, 6, 8], [16.0, 12.0, 16.0])
+    hold(line, Distance([[0, 1], [1, 2], [0, 2]]))  # singular at second order: converted
+    assert line.get_number_of_degrees_of_freedom().tolist() == [5]
 
 
 def test_slices_take_the_right_rows_along():
@@ -156,6 +159,9 @@ def test_fixed_atoms_are_taken_over():
         assert torch.equal(made.positions[[0, 6]], state.positions[[0, 6]]) and off(made).max() < 1e-12
         # No 3 degrees of freedom of a center of mass are left out where it cannot move freely.
         assert made.get_number_of_degrees_of_freedom().tolist() == [9, 15]
+    state = ts.concatenate_states([drop(1), drop(1, 1)])
+    state.constraints = ts.constraints.FixAtoms([0, 1])
+    assert hold(state, []).get_removed_dof(state).tolist() == [6, 0]
 
 
 def test_single_precision_ends_within_two_units_in_the_last_place():
