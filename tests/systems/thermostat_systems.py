@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from itertools import combinations
 
 import numpy as np
@@ -12,7 +13,7 @@ from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State, Stepper, System
-from kcons.thermostats import Isokinetic
+from kcons.thermostats import Isokinetic, thermal_velocities
 
 Array = NDArray[np.float64]
 METHANE = 0.63 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -70,6 +71,20 @@ def dumbbells(n: int = 2, seed: int = 0, force=waves, potential=waves_potential)
     masses = np.tile([1.0, 2.0], n)
     pairs = np.arange(2 * n).reshape(-1, 2)
     return system([Distance(pairs, np.ones(n))], x, masses, force, potential), x
+
+
+def started(n: int = 2, **options) -> tuple[System, State]:
+    """Dumbbells with velocities at kT = 0.5."""
+    held, x = dumbbells(n, **options)
+    return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
+
+
+def loaded(state: State) -> State:
+    """From the file that it is saved to."""
+    file = io.BytesIO()
+    state.save(file)
+    file.seek(0)
+    return State.load(file)
 
 
 def integrated(system: System, state: State, end: float) -> tuple[Array, Array]:

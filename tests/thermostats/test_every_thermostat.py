@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from thermostat_systems import (
     distance,
     dumbbells,
+    loaded,
     molecules,
     quartic,
     quartic_potential,
@@ -19,7 +19,7 @@ from thermostat_systems import (
 )
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.steppers import Rattle, State, System, run
+from kcons.steppers import Rattle, System, run
 from kcons.thermostats import (
     ForceGroups,
     HamiltonianMonteCarlo,
@@ -78,10 +78,7 @@ def test_a_run_goes_on_to_the_last_bit(name):
     held, state = begun()
     half = run(held, state, 0.05, 12, stepper=BATHS[name](3))
     whole = run(held, half, 0.05, 12, stepper=BATHS[name](3))
-    file = io.BytesIO()
-    half.save(file)
-    file.seek(0)
-    assert same(run(begun()[0], State.load(file), 0.05, 12, stepper=BATHS[name](3)), whole)
+    assert same(run(begun()[0], loaded(half), 0.05, 12, stepper=BATHS[name](3)), whole)
     if name in NOISY:
         for other, seed in ((half, 4), (replace(half, step=0), 3)):
             assert distance(run(held, other, 0.05, 12, stepper=BATHS[name](seed)), whole) > 1e-3

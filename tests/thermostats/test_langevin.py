@@ -8,17 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from thermostat_systems import dumbbells, system, waves
+from thermostat_systems import dumbbells, started, system, waves
 
 from kcons.constraints import Distance, FixedAtoms, MovingTarget, Sphere
 from kcons.steppers import System, run
 from kcons.thermostats import ForceGroups, Langevin, LangevinRespa, thermal_velocities
 from kcons.thermostats.noise import fill_normal, noise_generator
-
-
-def started(n=2, **options):
-    held, x = dumbbells(n, **options)
-    return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
 
 
 def test_moving_targets_are_followed_and_friction_knows_their_speed():

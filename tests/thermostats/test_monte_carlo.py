@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from thermostat_systems import dumbbells, system, waves, waves_potential
+from thermostat_systems import dumbbells, loaded, started, system, waves, waves_potential
 
 from kcons.constraints import Distance, Formula, MovingTarget
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
@@ -22,7 +21,7 @@ from kcons.steppers import (
     System,
     run,
 )
-from kcons.thermostats import Counts, HamiltonianMonteCarlo, exchange, thermal_velocities, tune
+from kcons.thermostats import Counts, HamiltonianMonteCarlo, exchange, tune
 from kcons.thermostats.monte_carlo import CHANGE, EXCHANGE, POTENTIAL, PROPOSAL, SIZE, SUM, ReversedSteps
 from kcons.thermostats.noise import noise_generator
 
@@ -53,11 +52,6 @@ def trap(x, t=0.0):
 
 def trap_potential(x, t=0.0):
     return float(0.5 * (np.array([1.0, 0.5, 2.0]) * (x * x).sum(axis=1)).sum() - 1.5 * x[2, 0])
-
-
-def started(n=2):
-    held, x = dumbbells(n)
-    return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
 
 
 def refreshed(held, state, kt, keep, random):
@@ -123,11 +117,8 @@ def test_a_loaded_state_is_judged_by_the_energy_of_its_forces_now():
     held, state = started()
     sampler = HamiltonianMonteCarlo(0.5, 3, 12)
     saved = run(held, state, 0.02, 2, stepper=sampler)
-    file = io.BytesIO()
-    saved.save(file)
     other = System(held.motion, lambda x, t: 3 * waves(x), potential=lambda x, t: 3 * waves_potential(x) + 40)
-    file.seek(0)
-    after = HamiltonianMonteCarlo(0.5, 3, 12).step(other, State.load(file), 0.02)
+    after = HamiltonianMonteCarlo(0.5, 3, 12).step(other, loaded(saved), 0.02)
     plain = replace(saved, forces=None, thermostat=None, origin=None)
     expected = HamiltonianMonteCarlo(0.5, 3, 12).step(other, plain, 0.02)
     assert np.array_equal(after.positions, expected.positions)

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import math
 
 import numpy as np
 import pytest
-from thermostat_systems import METHANE, TEN, dumbbells, system, waves
+from thermostat_systems import METHANE, TEN, loaded, started, system, waves
 
 from kcons.constraints import Distance
 from kcons.steppers import State, run
 from kcons.thermostats import NoseHooverChain, thermal_velocities
-
-
-def started(n=2, **options):
-    held, x = dumbbells(n, **options)
-    return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
 
 
 @pytest.mark.parametrize(("length", "steps"), [(1, 500), (3, 450), (5, 100)])
@@ -30,13 +24,6 @@ def test_a_negative_step_undoes_a_step(length, steps):
     assert np.abs(back.positions - begun.positions).max() <= 1e-10
     assert np.abs(back.velocities - begun.velocities).max() <= 1e-10
     assert np.abs(back.thermostat - begun.thermostat).max() <= 1e-10
-
-
-def loaded(state):
-    file = io.BytesIO()
-    state.save(file)
-    file.seek(0)
-    return State.load(file)
 
 
 def test_a_loaded_chain_of_other_degrees_of_freedom_begins_anew():
