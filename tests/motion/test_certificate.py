@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ase import Atoms
-from ase.calculators.calculator import Calculator, all_changes
 from ase.md.verlet import VelocityVerlet
+from ase_systems import Free
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain
@@ -107,18 +107,10 @@ def test_rows_that_were_converted_are_looked_at_as_they_were_given():
         motion.certify(x)
 
 
-class Zero(Calculator):
-    implemented_properties = ("energy", "forces")
-
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        super().calculate(atoms, properties, system_changes)
-        self.results = {"energy": 0.0, "forces": np.zeros((len(atoms), 3))}
-
-
 @pytest.mark.parametrize("what", ["positions", "tangents"])
 @pytest.mark.parametrize("dynamics", [VelocityVerlet, ConstrainedDynamics])
 def test_ase_hooks_and_dynamics_are_certified(dynamics, what):
-    atoms = Atoms("OCO", positions=X, calculator=Zero())
+    atoms = Atoms("OCO", positions=X, calculator=Free())
     held = constrain(atoms, [Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2]])])
     atoms.set_velocities(V)
     driver = dynamics(atoms, 0.05)

@@ -68,8 +68,7 @@ def engine(atoms: Atoms, rows: list[held.Constraint], masses: np.ndarray | None 
     return Motion(ConstraintSet(rows, atoms.positions, masses, cell=cell), atoms.positions)
 
 
-def fulfilled(motion: Motion, x: np.ndarray) -> None:
-    whole = motion.constraint_set
+def fulfilled(whole: ConstraintSet, x: np.ndarray) -> None:
     assert np.all(np.abs(whole.value(x)) <= whole.tolerance(x))
 
 
@@ -79,7 +78,7 @@ def brought(
     """The engine, and positions on its rows for which no bond and no angle but those in `free` has changed."""
     motion = engine(atoms, list(rows), masses)
     x = motion.restore_positions(atoms.positions, bonds=bonds)
-    fulfilled(motion, x)
+    fulfilled(motion.constraint_set, x)
     kept(atoms, x, free)
     return motion, x
 
@@ -212,7 +211,7 @@ def test_without_bonds_the_nearest_point_as_asked() -> None:
     with pytest.raises(InfeasibleError, match="bonds="):
         motion.restore_positions(ring.positions)
     x = motion.restore_positions(ring.positions, bonds=[])
-    fulfilled(motion, x)
+    fulfilled(motion.constraint_set, x)
     away = np.linalg.norm(x - ring.positions, axis=1)
     assert set(np.flatnonzero(away > 1e-12).tolist()) == {0, 1}
 
@@ -254,7 +253,7 @@ def test_tangled_starts_end_soon_and_never_silently_off(monkeypatch: pytest.Monk
         except KconsError:
             np.testing.assert_array_equal(start, kept_start)
         else:
-            fulfilled(motion, x)
+            fulfilled(motion.constraint_set, x)
             solved += 1
         most = max(most, looks[0])
     assert len(cases) > 12 and solved >= 0.7 * len(cases)
@@ -379,10 +378,6 @@ def engine_of(name: str, seed: int = 0) -> tuple[Motion, ConstraintSet, np.ndarr
     return Motion(whole, x), whole, x
 
 
-def on_rows(whole: ConstraintSet, x: np.ndarray, time: float = 0.0) -> None:
-    assert np.all(np.abs(whole.value(x, time)) <= whole.tolerance(x, time))
-
-
 def off_the_perpendicular(whole: ConstraintSet, motion: Motion, start: np.ndarray, x: np.ndarray) -> float:
     """Part of sqrt(M) (x - start) outside the mass-weighted rows at x, relative to its size; fixed atoms apart."""
     movable = motion.plan.inverse_masses > 0
@@ -401,7 +396,7 @@ def test_nearest_point(name: str, seed: int) -> None:
     kept = start.copy()
     found = motion.restore_positions(start)
     np.testing.assert_array_equal(start, kept)
-    on_rows(whole, found)
+    fulfilled(whole, found)
     assert off_the_perpendicular(whole, motion, start, found) < 1e-9
     # No point nearby on the constraints is nearer.
     movable = (motion.plan.inverse_masses > 0)[:, None]
@@ -434,14 +429,14 @@ def test_scaled_starts(name: str, factor: float) -> None:
     """All lengths 20 % or a factor of two off."""
     motion, whole, x = engine_of(name)
     start = x.mean(axis=0) + factor * (x - x.mean(axis=0)) + 0.02 * np.random.default_rng(1).normal(size=x.shape)
-    on_rows(whole, motion.restore_positions(start))
+    fulfilled(whole, motion.restore_positions(start))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_folded_starts(seed: int) -> None:
     """Random positions, nothing near what is held."""
     motion, whole, x = engine_of("chain with angles")
-    on_rows(whole, motion.restore_positions(x + 0.4 * np.random.default_rng(seed).normal(size=x.shape)))
+    fulfilled(whole, motion.restore_positions(x + 0.4 * np.random.default_rng(seed).normal(size=x.shape)))
 
 
 @pytest.mark.parametrize("free", [0, 10])
@@ -473,7 +468,7 @@ def test_one_bad_cluster_among_good_ones() -> None:
     start = x.copy()
     start[30:33] = 2.2 * (x[30:33] - x[30]) + x[30] + [[0, 0, 0], [0.1, 0.3, 0], [0.2, 0, -0.2]]
     found = Motion(whole, x).restore_positions(start)
-    on_rows(whole, found)
+    fulfilled(whole, found)
     others = np.r_[0:30, 33 : 3 * times]
     np.testing.assert_allclose(found[others], x[others], rtol=0, atol=1e-13)
 
@@ -485,7 +480,7 @@ def test_long_chain_off_by_a_fifth() -> None:
     x = np.stack([0.8 * k, 0.6 * (k % 2), 0.05 * np.sin(k)], axis=1)
     whole = ConstraintSet(held.Distance(np.stack([k[:-1], k[1:]], axis=1), 1.0), x, np.ones(n))
     start = 1.2 * x + 0.05 * np.random.default_rng(0).normal(size=x.shape)
-    on_rows(whole, Motion(whole, x).restore_positions(start))
+    fulfilled(whole, Motion(whole, x).restore_positions(start))
 
 
 #: Bonds and next neighbors of a chain are held: it bends, and the surface of its rows with it.
@@ -511,7 +506,7 @@ def test_the_nearest_point_is_found_where_the_surface_is_much_bent() -> None:
     for share in np.repeat([0.05, 0.1, 0.15, 0.2, 0.25, 0.3], 14):
         start = x + _displaced(rng, share)
         found = motion.restore_positions(start, bonds=[])
-        on_rows(whole, found)
+        fulfilled(whole, found)
         assert off_the_perpendicular(whole, motion, start, found) < 1e-9
 
 
@@ -523,7 +518,7 @@ def test_a_search_that_ends_before_the_nearest_point_says_so(monkeypatch: pytest
         monkeypatch.setattr(module, "FAILED", 5)
     with pytest.warns(UserWarning, match=r"fulfil all rows, but are not the nearest.* Start nearer"):
         found = motion.restore_positions(start, bonds=[])
-    on_rows(whole, found)
+    fulfilled(whole, found)
     assert off_the_perpendicular(whole, motion, start, found) > 1e-6
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -13,7 +13,7 @@ from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State, Stepper, System
-from kcons.thermostats import Isokinetic, thermal_velocities
+from kcons.thermostats import ForceGroups, Isokinetic, thermal_velocities
 
 Array = NDArray[np.float64]
 METHANE = 0.63 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -61,6 +61,14 @@ def waves(x: Array, t: float = 0.0) -> Array:
 def waves_potential(x: Array, t: float = 0.0) -> float:
     k = np.array([1.0, 1.3, 0.7])
     return float((np.cos(k * x + np.array([0.1, 0.5, 0.9])) / k).sum())
+
+
+#: Steps of two groups of forces, and a System of groups.
+TWO = {"slow": 1, "fast": 4}
+
+
+def grouped(motion: Motion, **forces) -> System:
+    return System(motion, ForceGroups(forces))
 
 
 def dumbbells(n: int = 2, seed: int = 0, force=waves, potential=waves_potential) -> tuple[System, Array]:

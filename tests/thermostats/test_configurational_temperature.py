@@ -9,7 +9,7 @@ import fluids as fluid
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from thermostat_systems import dumbbells, system, waves
+from thermostat_systems import dumbbells, grouped, system, waves
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Distance, FixedAtoms, Formula, Plane, Sphere
@@ -17,7 +17,6 @@ from kcons.errors import InputError
 from kcons.steppers import System
 from kcons.thermostats import (
     Estimate,
-    ForceGroups,
     TemperatureSplit,
     mean,
     slow_share,
@@ -119,15 +118,10 @@ def test_curvatures_of_a_fluid():
     assert rest.value == 0
 
 
-def _determinant(angle: np.ndarray | float, masses: np.ndarray) -> np.ndarray | float:
-    """det Z of the two bonds."""
-    w = 1.0 / masses
-    return (w[0] + w[1]) * (w[0] + w[2]) - (w[0] * np.cos(angle)) ** 2
-
-
 def _density(angle: np.ndarray | float, masses: np.ndarray) -> np.ndarray | float:
-    """Volume of the constraint surface, of an angle."""
-    return np.sin(angle) * np.sqrt(_determinant(angle, masses))
+    """Volume of the constraint surface, of an angle: with det Z of the two bonds."""
+    w = 1.0 / masses
+    return np.sin(angle) * np.sqrt((w[0] + w[1]) * (w[0] + w[2]) - (w[0] * np.cos(angle)) ** 2)
 
 
 # -- against a sampler without forces ---------------------------------------------------------------
@@ -261,15 +255,15 @@ def test_frames_off_the_constraints():
 K = 3.0
 
 
-def grouped(rows, x, masses, **forces) -> System:
-    return system(rows, x, masses, ForceGroups(forces))
+def made(rows, x, masses, **forces) -> System:
+    return grouped(system(rows, x, masses).motion, **forces)
 
 
 def test_springs_of_free_atoms():
     """k/m of each: 9 and 1 in the squares of H, whose traces are 3 (81 + 1) and 3; normal moves of many frames."""
     x = np.array([[0.0, 0, 0], [5.0, 0, 0]])
     fast, slow = np.array([[9.0], [0.0]]), np.array([[0.0], [4.0]])
-    held = grouped([], x, [1.0, 4.0], fast=lambda x, t: -fast * x, slow=lambda x, t: -slow * x)
+    held = made([], x, [1.0, 4.0], fast=lambda x, t: -fast * x, slow=lambda x, t: -slow * x)
     share = slow_share(held, np.tile(x, (4000, 1, 1)))
     assert share == pytest.approx(np.sqrt(1 / 82), rel=0.05)
     other = slow_share(held, np.tile(x, (4000, 1, 1)), "fast")
@@ -279,7 +273,7 @@ def test_springs_of_free_atoms():
 def test_signs_do_not_cancel():
     """A saddle without a trace, beside a trap of the same size."""
     saddle = np.diag([1.0, 1.0, -2.0])
-    held = grouped([], [[1.0, 2, 3]], [1.0], fast=lambda x, t: -x - x @ saddle, slow=lambda x, t: x @ saddle)
+    held = made([], [[1.0, 2, 3]], [1.0], fast=lambda x, t: -x - x @ saddle, slow=lambda x, t: x @ saddle)
     frames = np.tile([[1.0, 2, 3]], (4000, 1, 1))
     assert slow_share(held, frames, displacement=0.01) == pytest.approx(np.sqrt(2), rel=0.05)
 
@@ -293,7 +287,7 @@ def test_a_rigid_pair_turns_freely_in_a_trap():
         return 50 * np.array([d, -d])
 
     def held(**more):
-        return grouped([Distance([[0, 1]])], x, [2.0, 2.0], fast=lambda x, t: -K * x, **more)
+        return made([Distance([[0, 1]])], x, [2.0, 2.0], fast=lambda x, t: -K * x, **more)
 
     frames = np.tile(x, (20, 1, 1))
     assert slow_share(held(slow=along), frames, displacement=1e-3) < 1e-6
@@ -316,8 +310,8 @@ def test_fixed_atoms_make_no_longer_moves():
     for fixed in ([], slab):
         x = np.array([[0.0, 0, 0], [1.0, 0, 0], *fixed])
         rows = [FixedAtoms(np.arange(2, len(x)))] if fixed else []
-        shares.append(slow_share(grouped(rows, x, np.ones(len(x)), fast=fast, slow=slow), np.tile(x, (200, 1, 1))))
+        shares.append(slow_share(made(rows, x, np.ones(len(x)), fast=fast, slow=slow), np.tile(x, (200, 1, 1))))
     assert shares[1] == pytest.approx(shares[0], rel=0.3)
-    held = grouped([FixedAtoms([0])], [[0.0, 0, 0]], [1.0], fast=lambda x, t: -x, slow=lambda x, t: -x)
+    held = made([FixedAtoms([0])], [[0.0, 0, 0]], [1.0], fast=lambda x, t: -x, slow=lambda x, t: -x)
     with pytest.raises(InputError, match="all atoms are fixed"):
         slow_share(held, [[[0.0, 0, 0]]], displacement=0.1)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from thermostat_systems import (
+    TWO,
     distance,
     dumbbells,
     loaded,
@@ -31,7 +32,6 @@ from kcons.thermostats import (
     thermal_velocities,
 )
 
-TWO = {"slow": 1, "fast": 4}
 FIELDS = ("positions", "velocities", "forces", "thermostat", "time")
 BATHS = {
     "Langevin": lambda seed: Langevin(0.5, 1.0, seed),

@@ -60,29 +60,27 @@ FLAT = SCATTERED[:6] * [1.0, 1.0, 0.0]
 ROUND = SCATTERED[:6].copy()
 ROUND[:, :2] *= 2.0 / np.linalg.norm(ROUND[:, :2], axis=1)[:, None]
 
+
+def twelve(force=None, *rows, x=SCATTERED):
+    """Atoms and rows; the system, and where they are."""
+    return system(list(rows), x, WEIGHTS[: len(x)], force), x
+
+
 # (system and positions, g by hand, directions in which momentum is conserved)
 COUNTED = {
-    "free atoms, own forces": ((system([], SCATTERED, WEIGHTS, swirling), SCATTERED), 36 - 3, 3),
-    "free atoms, single precision": ((system([], SCATTERED, WEIGHTS, single), SCATTERED), 36 - 3, 3),
+    "free atoms, own forces": (twelve(swirling), 36 - 3, 3),
+    "free atoms, single precision": (twelve(single), 36 - 3, 3),
     "two atoms, balanced by symmetry": ((system([], OPPOSITE, [1.0, 1.0], quartic), OPPOSITE), 6, 0),
-    "free atoms in a field": ((system([], SCATTERED, WEIGHTS, waves), SCATTERED), 36, 0),
-    "ideal gas": ((system([], SCATTERED, WEIGHTS), SCATTERED), 36 - 3, 3),
-    "gravity": ((system([], SCATTERED, WEIGHTS, gravity), SCATTERED), 36 - 2, 2),
-    "a trap": ((system([], SCATTERED, WEIGHTS, quartic), SCATTERED), 36, 0),
+    "free atoms in a field": (twelve(waves), 36, 0),
+    "ideal gas": (twelve(), 36 - 3, 3),
+    "gravity": (twelve(gravity), 36 - 2, 2),
+    "a trap": (twelve(quartic), 36, 0),
     "methanes, redundant": (methanes(swirling), 36 - 18 - 3, 3),
     "methanes in a field": (methanes(waves), 36 - 18, 0),
     "mixed": (mixed(swirling), 36 - 3 - 1 - 1 - 1 - 2, 0),
-    "center of mass held": (
-        (system([CenterOfMass([list(range(12))])], SCATTERED, WEIGHTS, swirling), SCATTERED),
-        36 - 3,
-        0,
-    ),
-    "flat": ((system([Plane(list(range(6)), [0, 0, 1.0])], FLAT, WEIGHTS[:6], swirling), FLAT), 12 - 2, 2),
-    "on a cylinder": (
-        (system([Cylinder(list(range(6)), [0, 0, 0], [0, 0, 1.0], 2.0)], ROUND, WEIGHTS[:6], swirling), ROUND),
-        12 - 1,
-        1,
-    ),
+    "center of mass held": (twelve(swirling, CenterOfMass([range(12)])), 36 - 3, 0),
+    "flat": (twelve(swirling, Plane(range(6), [0, 0, 1.0]), x=FLAT), 12 - 2, 2),
+    "on a cylinder": (twelve(swirling, Cylinder(range(6), [0, 0, 0], [0, 0, 1.0], 2.0), x=ROUND), 12 - 1, 1),
 }
 
 

@@ -7,13 +7,24 @@ import logging
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from thermostat_systems import METHANE, TEN, dumbbells, molecules, quartic, quartic_potential, springs, system, waves
+from thermostat_systems import (
+    METHANE,
+    TEN,
+    TWO,
+    dumbbells,
+    grouped,
+    molecules,
+    quartic,
+    quartic_potential,
+    springs,
+    system,
+    waves,
+)
 
 from kcons.constraints import CenterOfMass, Distance, FixedAtoms, LinearRelation, Plane, Sphere
 from kcons.errors import InputError
 from kcons.steppers import State, System, run
 from kcons.thermostats import (
-    ForceGroups,
     HamiltonianMonteCarlo,
     Isokinetic,
     IsokineticSpheres,
@@ -25,6 +36,7 @@ from kcons.thermostats import sphere_kernels as kernels
 from kcons.thermostats.spheres import SphereLayout
 
 KT, L = 0.5, 2
+FORCES = {"fast": springs, "slow": lambda x, t: 0.3 * waves(x)}
 
 
 def made(kind):
@@ -116,17 +128,6 @@ def test_the_bath_leaves_the_uniform_distribution():
     np.testing.assert_allclose(y.mean(axis=0), 0, atol=4.5 * 0.5 / np.sqrt(n))
 
 
-TWO = {"slow": 1, "fast": 4}
-
-
-def gentle(x, t):
-    return 0.3 * waves(x)
-
-
-def grouped(motion):
-    return System(motion, ForceGroups({"fast": springs, "slow": gentle}))
-
-
 def lengths(stepper, held, state):
     """|y|^2 of each sphere."""
     layout = stepper.layout(held, state.positions)
@@ -141,7 +142,7 @@ def lengths(stepper, held, state):
 @pytest.mark.parametrize("kind", KINDS)
 def test_velocities_stay_on_their_spheres(kind):
     held, state = molecules("triangles", 4, ions=1)
-    split = grouped(held.motion)
+    split = grouped(held.motion, **FORCES)
     stepper = IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres=kind, auxiliary=2)
     end = run(split, state, 0.2, 25, stepper=stepper)
     has, wanted = lengths(stepper, split, end)
@@ -166,11 +167,11 @@ def test_many_auxiliary_variables_are_langevin_dynamics():
 
 def test_noise_is_a_function_of_seed_step_and_part():
     held, state = molecules("bent", 2)
-    split = grouped(held.motion)
+    split = grouped(held.motion, **FORCES)
     ends = [run(split, state, 0.1, 5, stepper=IsokineticSpheres(0.5, 2.0, seed, steps=TWO)) for seed in (3, 3, 4)]
     assert np.array_equal(ends[0].positions, ends[1].positions)
     assert np.abs(ends[0].positions - ends[2].positions).max() > 1e-3
-    by_engine = grouped(held.motion)
+    by_engine = grouped(held.motion, **FORCES)
     by_engine.packed = None  # where Python draws it
     other = run(by_engine, state, 0.1, 5, stepper=IsokineticSpheres(0.5, 2.0, 3, steps=TWO))
     np.testing.assert_allclose(other.positions, ends[0].positions, rtol=0, atol=1e-13)

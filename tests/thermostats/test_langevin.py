@@ -8,10 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from thermostat_systems import dumbbells, started, system, waves
+from thermostat_systems import TWO, dumbbells, grouped, started, system, waves
 
 from kcons.constraints import Distance, FixedAtoms, MovingTarget, Sphere
-from kcons.steppers import System, run
+from kcons.steppers import run
 from kcons.thermostats import ForceGroups, Langevin, LangevinRespa, thermal_velocities
 from kcons.thermostats.noise import fill_normal, noise_generator
 
@@ -83,13 +83,6 @@ def test_a_difference_does_not_trust_an_array_that_is_used_again():
         return shared
 
     np.testing.assert_array_equal(ForceGroups.difference(one, two).of("slow", X, 0.0), X)
-
-
-TWO = {"slow": 1, "fast": 4}
-
-
-def grouped(motion, **groups):
-    return System(motion, ForceGroups(groups))
 
 
 def test_slow_kicks_in_the_middle_are_made_once():
