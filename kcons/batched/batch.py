@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -225,8 +226,9 @@ class Batch:
         for item, own in zip(("masses", "targets"), self._given, strict=True):
             if getattr(self, item) is not own or own._version:  # numbers that follow from them are kept
                 raise InputError(f"{item} of a Batch were written to; give other ones as {item}= of a call", item=item)
-        t, t_start = (torch.as_tensor(each, dtype=self.dtype, device=self.device) for each in (time, start))
-        flies = not self._holonomic and flight != 0
+        new = partial(torch.full, (), dtype=self.dtype, device=self.device)
+        t, t_start = (each if isinstance(each, Tensor) else new(each) for each in (time, start))
+        flies = bool(not self._holonomic and flight != 0)
         return Task(self, self._groups(self._holonomic or flies or not of_positions), of_positions, flies, t, t_start)
 
     def _with_fixed(self, y: Tensor, rows: Tensor) -> Tensor:

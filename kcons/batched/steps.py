@@ -42,7 +42,7 @@ def drift_in_bath(
     kT, friction, generator = bath
     half, w = 0.5 * dt, batch.weights(held.get("masses")).reshape(*x.shape[:-1], 1)
     x, v = drift(batch, x, v, half, time, **held)
-    kept = torch.exp(torch.as_tensor(-friction * dt, dtype=x.dtype, device=x.device))
+    kept = torch.exp(-friction * dt * torch.ones((), dtype=x.dtype, device=x.device))
     noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
     v = kept * v + torch.sqrt((1 - kept * kept) * kT * w) * noise
     v = batch.project_velocities(x, v, time=time + half, masses=held.get("masses"))
