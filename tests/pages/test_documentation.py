@@ -28,7 +28,7 @@ OWN |= {"batched", "water_model_by_gradients"}
 PLAIN = {"constraint_figures", "own_constraints"}
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
 EXAMPLES = [*(path for path in sorted((ROOT / "examples").glob("*.py")) if path.stem not in OWN), *STUDIES]
-#: Pages on a program that `all` does not install; those on torch run in tests/torchsim.
+#: Pages on a program that `all` does not install; `.ci/run` has torch for some of these.
 NEEDS = {"batched.md": "torch_sim"} | {
     f"tutorials/{name}.md": package for name, package in runpy.run_path(ROOT / "docs/notebooks.py")["NEEDS"].items()
 }

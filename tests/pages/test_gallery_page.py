@@ -12,7 +12,7 @@ from PIL import Image
 
 PAGE = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
 SCRIPTS = sorted((ROOT / "examples" / "gallery").glob("*.py"))
-#: What a script needs that is not among the extras of `all`; tests/torchsim runs it.
+#: What a script needs that is not among the extras of `all`; `.ci/run` has it in an environment of its own.
 NEEDS = {"torsions_at_once": "torch_sim"}
 
 

@@ -35,7 +35,7 @@ def test_the_reference_has_every_package_with_public_names():
 def test_the_reference_finds_all_public_names():
     """What is imported when it is asked for is found by `dir`, of which the reference is made."""
     for name in described():
-        if name.startswith(NEED_TORCH):  # tests/torchsim looks at these
+        if name.startswith(NEED_TORCH):  # which import all names
             continue
         module = import_module(name)
         assert set(getattr(module, "__all__", ())) <= set(dir(module)), name
