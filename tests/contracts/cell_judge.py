@@ -13,9 +13,8 @@ import numpy as np
 from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
 from ase.md.verlet import VelocityVerlet
-from cell_molecules import half_width
 from cell_oracle import EPS, Array, NoSolution, advance, stepper_of
-from cell_worlds import World, row_length, world, wrapping
+from cell_worlds import World, half_width, row_length, world, wrapping
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain

@@ -25,30 +25,17 @@ def solution(name, time):
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_start_is_on_the_constraints(name):
+def test_start_forces_and_time_steps(name):
+    """On the constraints; the gradient of the energy; parts of the horizon."""
     system = small(name)
-    sigma, tangency = system.residuals(system.positions, system.velocities)
-    assert np.all(
-        np.abs(system.constraint_set.value(system.positions)) <= system.constraint_set.tolerance(system.positions)
-    )
-    assert sigma < 1e-13
-    assert tangency < 1e-14
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_forces_are_the_gradient_of_the_energy(name):
-    system = small(name)
-    rng = np.random.default_rng(0)
-    direction = rng.standard_normal(system.positions.shape)
-    energy = [system.potential.energy(system.positions + h * direction) for h in (-1e-4, 1e-4)]
-    slope = (energy[1] - energy[0]) / 2e-4
-    work = -np.sum(system.potential.forces(system.positions) * direction)
-    assert slope == pytest.approx(work, rel=1e-4, abs=1e-7)
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_time_steps_divide_the_horizon(name):
-    system = small(name)
+    x, held = system.positions, system.constraint_set
+    sigma, tangency = system.residuals(x, system.velocities)
+    assert np.all(np.abs(held.value(x)) <= held.tolerance(x))
+    assert sigma < 1e-13 and tangency < 1e-14
+    direction = np.random.default_rng(0).standard_normal(x.shape)
+    energy = [system.potential.energy(x + h * direction) for h in (-1e-4, 1e-4)]
+    work = -np.sum(system.potential.forces(x) * direction)
+    assert (energy[1] - energy[0]) / 2e-4 == pytest.approx(work, rel=1e-4, abs=1e-7)
     for dt in (*system.time_steps, *system.shortened(2).time_steps):
         assert system.horizon / dt == pytest.approx(round(system.horizon / dt), abs=1e-9)
 

@@ -37,7 +37,7 @@ REFUSE_THEMSELVES = {
     "MTKNPT": lambda a: MTKNPT(a, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS),
     "MaskedMTKNPT": lambda a: MaskedMTKNPT(a, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS, mask=(1, 1, 1)),
 }
-TESTED_BY_NAME = {
+BY_NAME = {
     "VelocityVerlet",
     "NPTBerendsen",
     "Inhomogeneous_NPTBerendsen",
@@ -48,13 +48,20 @@ TESTED_BY_NAME = {
 
 def test_no_dynamics_class_is_forgotten():
     found = set(classes_in(ase.md, MolecularDynamics, Dynamics)) - {"MolecularDynamics"}
-    assert found == set(CANONICAL) | REFUSED | set(REFUSE_THEMSELVES) | TESTED_BY_NAME
+    assert found == set(CANONICAL) | REFUSED | set(REFUSE_THEMSELVES) | BY_NAME
+
+
+def warmed(kelvin, fmax=0.05):
+    """Ethanol from its minimum."""
+    atoms, held = ethanol()
+    BFGS(atoms, logfile=None).run(fmax=fmax)
+    energy = atoms.get_potential_energy()
+    thermalize_momenta(atoms, kelvin, rng=random())
+    return atoms, held, energy
 
 
 def test_velocity_verlet_has_no_energy_slope():
-    atoms, held = ethanol()
-    BFGS(atoms, logfile=None).run(fmax=0.01)
-    thermalize_momenta(atoms, 50, rng=random())  # EMT knows no molecules; hotter, they fall apart
+    atoms, *_ = warmed(50, 0.01)  # EMT knows no molecules; hotter, they fall apart
     kinetic = atoms.get_kinetic_energy()
     energies = {}
     for dt, steps in ((0.5, 300), (0.25, 600)):
@@ -80,33 +87,19 @@ def test_temperature(name):
 
 
 def test_langevin_with_two_hamiltonians():
-    atoms, held = ethanol()
-    BFGS(atoms, logfile=None).run(fmax=0.05)
-    thermalize_momenta(atoms, TEMPERATURE, rng=random())
-    dyn = SwitchLangevin(
-        atoms,
-        EMT(),
-        Free(),
-        0.5 * FS,
-        temperature_K=TEMPERATURE,
-        friction=0.02 / FS,
-        n_eq=20,
-        n_switch=40,
-        fixcm=False,
-    )
+    atoms, held, _ = warmed(TEMPERATURE)
+    bath = {"temperature_K": TEMPERATURE, "friction": 0.02 / FS, "fixcm": False}
+    dyn = SwitchLangevin(atoms, EMT(), Free(), 0.5 * FS, n_eq=20, n_switch=40, **bath)
     dyn.run()
     assert len(dyn.path_data) == 40
     assert off(atoms, held) <= 1e-12
 
 
 def test_contour_exploration_keeps_lengths():
-    atoms, held = ethanol()
-    BFGS(atoms, logfile=None).run(fmax=0.05)
-    target = atoms.get_potential_energy() + 0.3
-    thermalize_momenta(atoms, TEMPERATURE, rng=random())
-    dyn = ContourExploration(atoms, maxstep=0.05, energy_target=target, rng=np.random.RandomState(0))
+    atoms, held, energy = warmed(TEMPERATURE)
+    dyn = ContourExploration(atoms, maxstep=0.05, energy_target=energy + 0.3, rng=np.random.RandomState(0))
     seen = follow(dyn, atoms.get_potential_energy, 100)
-    assert np.abs(seen[50:] - target).mean() < 0.05
+    assert np.abs(seen[50:] - energy - 0.3).mean() < 0.05
     assert off(atoms, held) <= 1e-12
 
 

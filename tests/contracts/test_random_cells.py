@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import random_cells
 from cell_judge import judge
-from cell_molecules import KINDS
 from cell_oracle import Dense, Row, advance
-from cell_worlds import world
+from cell_worlds import KINDS, world
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
