@@ -23,7 +23,7 @@ MUTANTS = {
         ("if «getattr(self, item) is not own or own._version→False»:", "batched/batch::what_is_refused"),
         (
             "torch.where(self._is_position, held, «flight→1.0» * middle)",
-            "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-VelocityFormula moving]",
+            "batched/against_the_engine::families_are_held_as_the_engine_holds_them",
         ),
     ],
     "batched/steps.py": [
