@@ -25,7 +25,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
 from kcons.mdanalysis.check.deviations import Found, RowTable
-from kcons.mdanalysis.check.endings import Break, broken_by, damage_of, ending_of
+from kcons.mdanalysis.check.endings import Break, broken_by, damage, ending, first_break
 from kcons.mdanalysis.check.precision import (
     FilePrecision,
     by_frame,
@@ -169,9 +169,9 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             chosen["frames"] = numbers
         remarks = self._look_for_grid(numbers) if self._may_be_on_grid else []
         remarks += self._bind(int(numbers[0]))
-        damage = damage_of(self._trajectory)
+        damaged = first_break(self._trajectory, damage)
         masses = self._masses if self._trajectory.ts.has_velocities else None
-        self._compute = _Frames(self._trajectory, self._rows, masses, self._velocities, damage, self._precision)
+        self._compute = _Frames(self._trajectory, self._rows, masses, self._velocities, damaged, self._precision)
         super().run(**chosen, **options)
         if self.asked.mode == "mean":
             self._rows.take_means(self.results.found)
@@ -183,7 +183,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         first, end = (stop, start) if step is not None and step < 0 else (start, stop)
         open_ended = end is None or end < 0 or end > self._trajectory.n_frames or (first or 0) < 0
         if found.broken is None and Path(self._path).is_file() and frames is None and open_ended:
-            found.broken = damage or ending_of(self._trajectory)
+            found.broken = damaged or first_break(self._trajectory, ending)
         text = described([self._precision[frame] for frame in self.frames.tolist()], self._largest)
         asked = replace(self.asked, remarks=self.asked.remarks + remarks)
         self.results.check = result_of(found, self._rows, asked, text, self._rank, int(self._trajectory.n_frames))
@@ -285,9 +285,13 @@ class _Frames:
     ) -> Any:
         """Look at frames, in order, up to the first that cannot be used."""
         numbers, trajectory, previous = indexed_frames[:, 1], self.trajectory, -1
-        in_place = isinstance(trajectory, DCDReader) and not trajectory.transformations
-        own = _Uncopied.from_timestep(trajectory.ts) if in_place else None
-        found = Found.nothing(self.rows.n_rows, numbers)
+        own = None
+        if isinstance(trajectory, DCDReader) and not trajectory.transformations:
+            own, converts = _Uncopied.from_timestep(trajectory.ts), trajectory.convert_units
+            # That there is nothing to convert, the reader would find out for each frame again.
+            trajectory.convert_units = converts and trajectory.units["length"] != "Angstrom"
+        found = Found.nothing(numbers)
+        self.rows.begin()
         with quiet(), ProgressBar(total=len(numbers), verbose=bool(verbose), **(progressbar_kwargs or {})) as bar:
             for k, number in enumerate(numbers.tolist()):
                 try:
@@ -298,7 +302,7 @@ class _Frames:
                         if not 0 <= previous == number - 1:
                             ts = trajectory[number]
                         else:
-                            ts = trajectory._read_next_timestep(own) if in_place else trajectory.next()
+                            ts = trajectory.next() if own is None else trajectory._read_next_timestep(own)
                         previous = number
                         v = ts.velocities if ts.has_velocities and self.velocities else None
                         self.rows.look(found, k, ts, self.precision[number], self.masses, v)
@@ -308,8 +312,9 @@ class _Frames:
                     found.units, found.frames = found.units[:k], found.frames[:k]
                     break
                 bar.update()
-        if in_place:
-            trajectory.ts = Timestep.from_timestep(trajectory.ts)
+        self.rows.end(found)
+        if own is not None:
+            trajectory.ts, trajectory.convert_units = Timestep.from_timestep(trajectory.ts), converts
         return SimpleNamespace(frames=found.frames["frame"], times=found.frames["time"], results=Results(found=found))
 
 

@@ -29,6 +29,18 @@ from kcons.errors import NonFiniteError
 from kcons.mdanalysis.check.endings import Break
 from kcons.mdanalysis.check.precision import FilePrecision
 from kcons.mdanalysis.topology import NARROWEST
+from kcons.solvers.kernels.eight_wide import (
+    FASTMATH,
+    WIDTH,
+    absolute,
+    all_within,
+    gather_ends,
+    load,
+    splat,
+    square_root,
+    store,
+    where_greater,
+)
 from kcons.solvers.kernels.lattices import NO_LATTICE, TRICLINIC, lattice_numbers, minimum_image
 
 #: Natural units of rows, in this order.
@@ -38,18 +50,15 @@ SECOND_ORDER = 1.1
 _ROOT_THREE = np.sqrt(3.0)
 #: Bits of the exponent of a single, which are the power of two below it; all of them are set where it is no number.
 _EXPONENT = np.int32(0x7F800000)
+_NO_SPEEDS = np.zeros((0, 4))
 
-#: What is held: atoms of a length (-1 of other rows), target, what the row may be off by besides rounding, and the
-#: rounding up to which a frame counts: that or its size.
-_HELD = np.dtype([("i", "i4"), ("j", "u4"), ("target", "f8"), ("slack", "f8"), ("most", "f8")])
 #: Over all frames, by row: the largest excess over what was allowed (negative where there was none), the absolute
 #: deviation in that frame and its number; sums of deviations, of what rounding makes of them, and of frames that count.
-_BY_ROW = np.dtype(
-    [(name, "f8") for name in ("margin", "largest", "total", "rounded")] + [("counted", "i4"), ("frame", "i4")]
-)
-#: By frame and unit: of deviations; the largest excess and the largest rounding; rows that count; of A v.
+_BY_ROW = np.dtype([(name, "f8") for name in ("margin", "largest", "frame", "total", "rounded", "counted")])
+#: By frame and unit: of deviations; rows that are off by more than allowed and rows that count; of A v; the largest
+#: deviation and the largest rounding.
 _BY_UNIT = np.dtype(
-    [(name, "f8") for name in ("sum", "squares", "largest", "excess", "rounding", "seen", "rate_squares", "rate")]
+    [(name, "f8") for name in ("sum", "squares", "violated", "seen", "rate_squares", "rate", "largest", "rounding")]
 )
 #: By frame: its number and time, twice the kinetic energy, momentum, and whether it has no cell.
 _BY_FRAME = np.dtype([("frame", "i8"), ("time", "f8"), ("kinetic", "f8"), ("momentum", "f8", 3), ("bare", "?")])
@@ -59,7 +68,7 @@ _BY_FRAME = np.dtype([("frame", "i8"), ("time", "f8"), ("kinetic", "f8"), ("mome
 class Found:
     """What was found in some frames. Kinetic energies and rates are NaN without velocities."""
 
-    #: By row, shape (n_rows,); by frame and unit, (n_frames, 2); by frame, (n_frames,).
+    #: By row, shape (n_rows,); by frame and unit, (n_frames, 3); by frame, (n_frames,).
     rows: NDArray[np.void]
     units: NDArray[np.void]
     frames: NDArray[np.void]
@@ -67,11 +76,10 @@ class Found:
     broken: Break | None = None
 
     @classmethod
-    def nothing(cls, n_rows: int, numbers: IntArray) -> Found:
+    def nothing(cls, numbers: IntArray) -> Found:
         """Of frames that were not looked at yet."""
         n = len(numbers)
-        found = cls(np.zeros(n_rows, _BY_ROW), np.zeros((n, len(UNITS)), _BY_UNIT), np.zeros(n, _BY_FRAME))
-        found.rows["margin"] = found.units["excess"] = -np.inf
+        found = cls(np.zeros(0, _BY_ROW), np.zeros((n, len(UNITS)), _BY_UNIT), np.zeros(n, _BY_FRAME))
         found.units["rate_squares"] = found.units["rate"] = found.frames["kinetic"] = np.nan
         found.frames["frame"] = numbers
         return found
@@ -139,23 +147,30 @@ class RowTable:
             for item in held.constraints
         ]
         self._lengths: NDArray[np.bool_] = np.concatenate(plain)
-        self._table = table = np.zeros(held.n_rows, _HELD)
-        table["i"] = -1
+        # It has lengths, which are all of the first unit, before other rows by their units, in runs of whole vectors.
+        kinds, runs, end = np.where(self._lengths, 0, 1 + self.units), [], 0
+        self._places = np.empty(held.n_rows, dtype=np.int64)
+        for kind in np.unique(kinds).tolist():
+            rows = np.flatnonzero(kinds == kind)
+            begin, end = end, end - (-len(rows) // WIDTH) * WIDTH
+            self._places[rows] = begin + np.arange(len(rows))
+            runs.append((begin, end, max(kind - 1, 0), kind == 0))
+        self._runs, self._n_places = np.array(runs), end
+        # Atoms of lengths, and the targets; 0 of other rows.
+        self._pairs, targets = np.zeros((2, held.n_rows), dtype=np.int64), np.zeros(held.n_rows)
         for item, first, mine in zip(held.constraints, held.starts, plain, strict=False):
             if mine.any():
                 rows = first + np.flatnonzero(mine)
-                table["i"][rows], table["j"][rows] = item.atoms[mine].T
-                table["target"][rows] = item.target_at(0.0)[mine]
+                self._pairs[:, rows], targets[rows] = item.atoms[mine].T, item.target_at(0.0)[mine]
+        offsets = self._placed(4 * self._pairs).reshape(2, -1, WIDTH)
+        self._offsets, self._targets = offsets.swapaxes(0, 1).astype(np.uint32, "C"), self._placed(targets)
         self._rows = np.flatnonzero(~self._lengths)
+        self._given = np.zeros((3, self._n_places if len(self._rows) else 0))
         self.others: ConstraintSet | None = None
         if len(self._rows):
             self.others, self._atoms = held.subset(self._rows)
-        self._is_held = np.zeros(held.n_atoms, dtype=np.int32)  # 0 where no row has the atom
-        self._is_held[held.touched] = _EXPONENT
-        # Runs of rows of one unit.
-        starts = np.append(0, np.flatnonzero(np.diff(self.units)) + 1)
-        self._runs = np.stack([starts, np.append(starts[1:], held.n_rows), self.units[starts]], axis=1)
-        self._given = np.zeros((held.n_rows if len(self._rows) else 0, 3))
+        self._is_held = np.zeros(held.n_atoms, dtype=bool)
+        self._is_held[held.touched] = True
         #: What was added to the targets.
         self.means = np.zeros(held.n_rows)
         with np.errstate(all="ignore"):
@@ -168,33 +183,35 @@ class RowTable:
         found, told = (self._made_of(errors, slopes) for errors in (precision.half_step(x), target_error))
         self._allow(np.where(self.measured, found, told))
 
-    @property
-    def n_rows(self) -> int:
-        return len(self._table)
+    def _placed(self, values: NDArray[Any], rest: float = 0.0) -> FloatArray:
+        """Numbers by row where compiled code has them, and one for what is no row there."""
+        placed = np.full((*values.shape[:-1], self._n_places), rest)
+        placed[..., self._places] = values
+        return placed
 
     def __getstate__(self) -> dict[str, Any]:
         """What `look` needs, in other processes: to copy all of it takes longer than to look at some frames."""
-        kept = {"_dimensions", "_cell", "_table", "_given", "_runs", "_is_held", "others", "_rows"}
-        kept |= {"_atoms", "means"} if self.others is not None else set()
+        kept = {"_dimensions", "_cell", "_offsets", "_targets", "_slack", "_most", "_given", "_runs", "_is_held"}
+        kept |= {"_places", "_n_places", "others", "_rows", "_atoms", "means"}
         return {name: value for name, value in vars(self).items() if name in kept}
 
     def _made_of(self, errors: FloatArray, slopes: Any) -> FloatArray:
         """What errors of coordinates make of each row, at most; rows of velocities have no position to be off."""
         result: FloatArray = SECOND_ORDER * (slopes @ np.repeat(errors, 3))
-        lengths = self._table[self._lengths]
-        result[self._lengths] = _ROOT_THREE * (errors[lengths["i"]] + errors[lengths["j"]])
+        result[self._lengths] = _ROOT_THREE * errors[self._pairs[:, self._lengths]].sum(axis=0)
         return np.where(self.set.holonomic, result, 0.0)
 
     def _allow(self, of_targets: FloatArray) -> None:
         #: What rounding makes of the targets, at most; the tolerance and the rounding of frames come besides.
         self.of_targets = of_targets
-        self._table["slack"] = of_targets + self.tolerance * self.sizes
-        self._table["most"] = np.maximum(self._table["slack"], self.sizes)
+        # What rows may be off by besides rounding, and the rounding up to which a frame counts: that or their size.
+        slack = of_targets + self.tolerance * self.sizes
+        self._slack, self._most = self._placed(slack), self._placed(np.maximum(slack, self.sizes), -1.0)
 
     def take_means(self, found: Found) -> None:
         """Take the means that a first pass found as targets."""
         self.means = np.where(self.measured & self.set.holonomic, found.mean("total"), 0.0)
-        self._table["target"] += np.where(self._lengths, self.means, 0.0)
+        self._targets += self._placed(np.where(self._lengths, self.means, 0.0))
         seen = self.measured & (found.rows["counted"] > 0)
         self._allow(np.where(seen, found.mean("rounded"), self.of_targets))
 
@@ -202,9 +219,9 @@ class RowTable:
         """Cell with its inverse, shape (2, 3, 3), and the square of half its smallest width, infinite without one."""
         if dimensions is None:
             return NO_LATTICE, np.inf
-        if not np.isfinite(dimensions).all():
-            raise NonFiniteError(f"the cell is ({', '.join(f'{value:g}' for value in dimensions)})", item="cell")
         if dimensions.tobytes() != self._dimensions:
+            if not np.isfinite(dimensions).all():
+                raise NonFiniteError(f"the cell is ({', '.join(f'{value:g}' for value in dimensions)})", item="cell")
             self._dimensions, self._cell = dimensions.tobytes(), (NO_LATTICE, np.inf)
             matrix = triclinic_vectors(dimensions, dtype=np.float64)
             # Files without a cell have lengths of 1; of angles that cannot be there are no vectors.
@@ -214,6 +231,18 @@ class RowTable:
                 self._cell = np.stack([matrix, inverse]), half * half
         return self._cell
 
+    def begin(self) -> None:
+        """Forget what was found by row."""
+        self._by_row = np.zeros((_BY_ROW.itemsize // 8, self._n_places))
+        self._by_row[0] = -np.inf
+
+    def end(self, found: Found) -> None:
+        """Put what was found by row in the frames that were looked at."""
+        rows = self._by_row[:, self._places].T.copy().view(_BY_ROW)[:, 0]
+        # Compiled code counts the others.
+        rows["counted"] = len(found.frames) - rows["counted"]
+        found.rows = rows
+
     def look(self, found: Found, k: int, ts: Any, precision: FilePrecision, masses: FloatArray | None, v: Any) -> None:
         """Put what is found in one frame, which must be finite, into the k-th place; with velocities rates, too."""
         frame = found.frames[k]
@@ -221,21 +250,24 @@ class RowTable:
         lattice, limit = self._cell_of(ts.dimensions)
         frame["bare"] = limit == np.inf
         planes = np.ascontiguousarray(ts.positions.T, dtype=np.float32)
-        speeds = np.zeros((0, 3)) if v is None else np.asarray(v, dtype=np.float64)
-        if not np.isfinite(speeds).all():
-            atom = int(np.argmin(np.isfinite(speeds).all(axis=1)))
-            raise NonFiniteError(f"velocity of atom {atom} is {v[atom]}", item="velocity", atom=atom)
-        if v is not None and masses is not None:
-            frame["kinetic"], frame["momentum"] = masses @ (speeds * speeds).sum(axis=1), masses @ speeds
+        speeds = _NO_SPEEDS
+        if v is not None:
+            speeds = np.column_stack([v, np.zeros(len(v))])
+            if not np.isfinite(speeds).all():
+                atom = int(np.argmin(np.isfinite(speeds).all(axis=1)))
+                raise NonFiniteError(f"velocity of atom {atom} is {v[atom]}", item="velocity", atom=atom)
+            found.units["rate_squares"][k] = found.units["rate"][k] = 0.0
+            if masses is not None:
+                frame["kinetic"], frame["momentum"] = (masses @ (speeds * speeds)).sum(), (masses @ speeds)[:3]
         if self.others is not None:
-            self._look_at_others(planes.T, speeds, lattice if limit < np.inf else None, precision, time)
+            self._look_at_others(planes.T, speeds[:, :3], lattice if limit < np.inf else None, precision, time)
         bad = _look(
             (planes, planes.view(np.int32), self._is_held, speeds),
             (lattice, limit, precision.grid, *precision.coefficients),
-            (self._table, self._given, self._runs),
-            found.rows,
-            found.units[k],
-            found.frames["frame"][k],
+            (self._offsets, self._targets, self._slack, self._most, self._given, self._runs),
+            self._by_row,
+            found.units[k].view(np.float64),
+            float(frame["frame"]),
         )
         if bad >= 0:
             raise NonFiniteError(f"position of atom {bad} is {planes[:, bad]}", item="position", atom=bad)
@@ -245,6 +277,7 @@ class RowTable:
     ) -> None:
         """Put deviation, rounding and rate of the rows that are no lengths where compiled code finds them."""
         others, rows, atoms = self.others, self._rows, self._atoms
+        given = self._given[:, self._places[rows]]
         assert others is not None
         others.lattice = lattice
         here = precision.stored(x[atoms])
@@ -253,10 +286,11 @@ class RowTable:
             slopes = others.jacobian(here, time)
             rounding = SECOND_ORDER * (abs(slopes) @ np.repeat(precision.half_step(here), 3))
             if len(v):
-                self._given[rows, 2] = np.abs(slopes @ v[atoms].ravel() - others.velocity_target(here, time))
+                given[2] = np.abs(slopes @ v[atoms].ravel() - others.velocity_target(here, time))
         # Where atoms coincide, an angle is no number, nor is its rounding.
-        self._given[rows, 0] = off
-        self._given[rows, 1] = np.where(np.isfinite(off + rounding), np.where(others.holonomic, rounding, 0), np.inf)
+        given[0] = off
+        given[1] = np.where(np.isfinite(off + rounding), np.where(others.holonomic, rounding, 0), np.inf)
+        self._given[:, self._places[rows]] = given
 
 
 def _by_row(constraints: Sequence[Constraint], values: Sequence[Any]) -> Any:
@@ -264,84 +298,87 @@ def _by_row(constraints: Sequence[Constraint], values: Sequence[Any]) -> Any:
     return np.repeat(np.array(values), [item.n_rows for item in constraints])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=FASTMATH)
 def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untyped-def]
     """Put deviations of all rows in one frame into `by_row` and `by_unit`; the first held atom of no number, or -1.
 
-    `atoms`: positions, shape (3, n_atoms), and their bits; which are held; velocities, shape (n_atoms, 3) or (0, 3).
+    `atoms`: positions, shape (3, n_atoms), and their bits; which are held; velocities with 0 behind each, or none.
     `space`: the cell and its inverse, and the square of half its smallest width, below which vectors are their own
-    nearest images; the grid of coordinates in the file, or 0; the coefficients of `FilePrecision`. `held`: `_HELD`;
-    deviation, rounding and rate of rows that are no lengths; first row, end and unit of runs.
+    nearest images; the grid of coordinates in the file, or 0; the coefficients of `FilePrecision`. `held`: where both
+    atoms of eight rows at a time are among quads; target, slack and largest rounding of rows; deviation, rounding and
+    rate of those that are no lengths; first row, end and unit of runs, and whether they are lengths.
     """
-    x, bits, is_held, v = atoms
+    x, bits, is_held, speeds = atoms
     lattice, limit, step, base, factor, reach = space
     cell = lattice_numbers(lattice)
-    table, given, runs = held
-    powers = np.empty(len(is_held), dtype=np.float32)
+    offsets, targets, slack, most, given, runs = held
+    n_atoms, n_rows = len(is_held), len(targets)
+    powers = np.empty(n_atoms, dtype=np.float32)
     exponents, least, worst = powers.view(np.int32), np.float32(reach).view(np.int32), np.int32(0)
-    for a in range(len(powers)):
+    for a in range(n_atoms):
         exponent = max(max(bits[0, a] & _EXPONENT, bits[1, a] & _EXPONENT), bits[2, a] & _EXPONENT)
-        worst = max(worst, exponent & is_held[a])
+        worst = max(worst, exponent)
         exponents[a] = exponent if exponent >= least else 0
     if worst == _EXPONENT:
-        return np.argmax((is_held != 0) & (exponents == _EXPONENT))
-    # As the file holds them.
-    points = np.empty(x.shape)
-    numbers, stored, inverse = x.reshape(-1), points.reshape(-1), 1.0 / step if step > 0.0 else 0.0
-    for k in range(len(numbers)):
-        exact = np.float64(numbers[k])
-        stored[k] = np.rint(exact * inverse) * step if step > 0.0 else exact
+        for a in range(n_atoms):
+            if is_held[a] and exponents[a] == _EXPONENT:
+                return a
+    # Coordinates as the file holds them, and the power of two below the largest.
+    quads, inverse = np.empty((n_atoms, 4)), 1.0 / step if step > 0.0 else 0.0
+    for a in range(n_atoms):
+        p, q, r = np.float64(x[0, a]), np.float64(x[1, a]), np.float64(x[2, a])
+        if step > 0.0:
+            p, q, r = np.rint(p * inverse) * step, np.rint(q * inverse) * step, np.rint(r * inverse) * step
+        quads[a, 0], quads[a, 1], quads[a, 2], quads[a, 3] = p, q, r, powers[a]
+    lanes, zero, one = np.empty(8 * WIDTH), splat(0.0), splat(1.0)
     for run in range(len(runs)):
-        first, end, unit = runs[run]
-        total, squares, largest, excess, coarsest, seen, rates, fastest = 0.0, 0.0, 0.0, -np.inf, 0.0, 0, 0.0, 0.0
-        for r in range(first, end):
-            row, rate = table[r], 0.0
-            i, j = row.i, row.j
-            if i >= 0:
-                dx, dy, dz = points[0, i] - points[0, j], points[1, i] - points[1, j], points[2, i] - points[2, j]
+        begin, end, unit, lengths = runs[run]
+        total, squares, violated, seen = zero, zero, zero, zero
+        rates, fastest, largest, coarsest = zero, zero, zero, zero
+        for r in range(begin, end, WIDTH):
+            rate, told = zero, one
+            if lengths:
+                dx, dy, dz, power = gather_ends(quads, offsets, 2 * r, 2 * r + WIDTH)
                 square = dx * dx + dy * dy + dz * dz
-                if not square < limit:
+                if not all_within(square, limit):
                     dx, dy, dz = minimum_image(dx, dy, dz, cell, TRICLINIC)
                     square = dx * dx + dy * dy + dz * dz
-                off = np.sqrt(square) - row.target
-                rounding = _ROOT_THREE * (2.0 * base + factor * (powers[i] + powers[j]))
-                if len(v) and square > 0.0:
-                    along = dx * (v[i, 0] - v[j, 0]) + dy * (v[i, 1] - v[j, 1]) + dz * (v[i, 2] - v[j, 2])
-                    rate = abs(along) / np.sqrt(square)
+                off = square_root(square) - load(targets, r)
+                rounding = power * (_ROOT_THREE * factor) + 2.0 * _ROOT_THREE * base
+                if len(speeds):
+                    vx, vy, vz, _ = gather_ends(speeds, offsets, 2 * r, 2 * r + WIDTH)
+                    along = absolute(dx * vx + dy * vy + dz * vz) / square_root(square)
+                    rate = where_greater(square, zero, along, zero)
             else:
-                off, rounding, rate = given[r, 0], given[r, 1], given[r, 2]
-            if rounding > row.most:
-                continue
-            size = abs(off)
-            margin = size - rounding - row.slack
-            total += off
-            squares += off * off
-            rates += rate * rate
-            seen += 1
-            # Not max(), which costs more where a number may be none.
-            if size > largest:
-                largest = size
-            if rounding > coarsest:
-                coarsest = rounding
-            if margin > excess:
-                excess = margin
-            if rate > fastest:
-                fastest = rate
-            mine = by_row[r]
-            if margin > mine.margin:
-                mine.margin, mine.largest, mine.frame = margin, size, frame
-            mine.total += off
-            mine.rounded += rounding
-            mine.counted += 1
-        all_rows = by_unit[unit]
-        all_rows.sum += total
-        all_rows.squares += squares
-        all_rows.largest = max(all_rows.largest, largest)
-        all_rows.excess = max(all_rows.excess, excess)
-        all_rows.rounding = max(all_rows.rounding, coarsest)
-        all_rows.seen += seen
-        if len(v):
-            before = all_rows.rate_squares
-            all_rows.rate_squares = rates if np.isnan(before) else before + rates
-            all_rows.rate = max(fastest, 0.0 if np.isnan(before) else all_rows.rate)
+                off, rounding, rate = load(given, r), load(given, n_rows + r), load(given, 2 * n_rows + r)
+            size, bound = absolute(off), load(most, r)
+            margin = size - rounding - load(slack, r)
+            if not all_within(rounding, bound):
+                told = where_greater(rounding, bound, zero, one)
+                off, size = where_greater(rounding, bound, zero, off), where_greater(rounding, bound, zero, size)
+                margin = where_greater(rounding, bound, splat(-np.inf), margin)
+                rate, rounding = told * rate, where_greater(rounding, bound, zero, rounding)
+                store(by_row, 5 * n_rows + r, load(by_row, 5 * n_rows + r) + one - told)
+            total = total + off
+            squares = squares + off * off
+            violated = violated + where_greater(margin, zero, one, zero)
+            seen = seen + told
+            rates = rates + rate * rate
+            fastest = where_greater(rate, fastest, rate, fastest)
+            largest = where_greater(size, largest, size, largest)
+            coarsest = where_greater(rounding, coarsest, rounding, coarsest)
+            store(by_row, 3 * n_rows + r, load(by_row, 3 * n_rows + r) + off)
+            store(by_row, 4 * n_rows + r, load(by_row, 4 * n_rows + r) + rounding)
+            best = load(by_row, r)
+            if not all_within(margin, best):
+                store(by_row, r, where_greater(margin, best, margin, best))
+                for k, value in ((1, size), (2, splat(frame))):
+                    before = load(by_row, k * n_rows + r)
+                    store(by_row, k * n_rows + r, where_greater(margin, best, value, before))
+        # Sums, then what is largest.
+        for k, vector in enumerate((total, squares, violated, seen, rates, fastest, largest, coarsest)):
+            store(lanes, k * WIDTH, vector)
+        for k in range(8 * WIDTH):
+            at = 8 * unit + k // WIDTH
+            by_unit[at] = by_unit[at] + lanes[k] if k < 5 * WIDTH else max(by_unit[at], lanes[k])
     return -1

@@ -6,6 +6,7 @@ first that it does not recognize. Of formats of structures, such as GRO, it read
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 from collections.abc import Callable
@@ -13,15 +14,14 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
-import numpy as np
 from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.lib.util import anyopen
 
 from kcons.errors import NonFiniteError
 from kcons.mdanalysis.loading import READ_ERRORS, format_of
 
-#: Bytes of a file that are mapped into memory at a time.
-MAPPED = 1 << 25
+#: What is said of a frame of DCD whose records are not as long as they say.
+DAMAGED = "its records are damaged"
 
 
 @dataclass(frozen=True)
@@ -48,22 +48,14 @@ def broken_by(error: BaseException, reader: Any, frame: int) -> Break:
             reader[frame]
         except READ_ERRORS as hidden:
             error = hidden
-    lines = str(error).strip().splitlines()
-    return Break(frame, lines[0].strip() if lines else "the file ends", not isinstance(error, NonFiniteError))
+    said = str(error).strip().partition("\n")[0].strip() or "the file ends"
+    # So it is said of any frame of DCD.
+    said = DAMAGED if said.startswith("Reading DCD header failed") else said
+    return Break(frame, said, not isinstance(error, NonFiniteError))
 
 
-def ending_of(reader: Any) -> Break | None:
-    """What keeps the last frame from being read, or lies behind it; None if nothing does."""
-    return _first(reader, _ending)
-
-
-def damage_of(reader: Any) -> Break | None:
-    """The first damaged frame of DCD and text files, of which the reader takes what it finds for coordinates."""
-    return _first(reader, _damage)
-
-
-def _first(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | None:
-    """What is found first; in a chain of files, frames are counted from its beginning."""
+def first_break(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | None:
+    """What `ending` or `damage` finds first; in a chain of files, frames are counted from its beginning."""
     parts, begin = getattr(reader, "readers", None) or [reader], 0
     for part in parts:
         path = str(getattr(part, "filename", None) or "")
@@ -75,7 +67,8 @@ def _first(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | Non
     return None
 
 
-def _ending(reader: Any, path: str) -> Break | None:
+def ending(reader: Any, path: str) -> Break | None:
+    """What keeps the last frame of a file from being read, or lies behind it; None if nothing does."""
     name, n, size = format_of(reader), reader.n_frames, os.path.getsize(path)
     try:
         reader[n - 1]
@@ -85,7 +78,10 @@ def _ending(reader: Any, path: str) -> Break | None:
         file = reader._file
         end = file._header_size + file._firstframesize + (n - 1) * file._framesize
         with open(path, "rb") as opened:
-            announced = np.frombuffer(opened.read(12), _order(path) + "i4")[2]
+            head = opened.read(12)
+        # The first record has 84 or 164 bytes, in the order of bytes of the file.
+        order = "<" if struct.unpack_from("<i", head)[0] in (84, 164) else ">"
+        announced = struct.unpack_from(order + "i", head, 8)[0]
         if end >= size and announced > n:
             return Break(n, f"its header announces {announced} frames, and it has {n}")
     elif name in ("XTC", "TRR"):
@@ -98,37 +94,23 @@ def _ending(reader: Any, path: str) -> Break | None:
     return Break(n, f"{size - end} bytes follow the last whole frame") if end < size else None
 
 
-def _damage(reader: Any, path: str) -> Break | None:
+def damage(reader: Any, path: str) -> Break | None:
+    """The first damaged frame of a DCD or text file that the reader does not refuse when it comes to it."""
     if not isinstance(reader, DCDReader):
         try:
             return _text_break(path, format_of(reader), reader.n_atoms)
         except (OSError, EOFError):
             return None
-    # Of all frames but the first, which has coordinates of fixed atoms too.
     file = reader._file
-    cell = [48] * file.is_periodic
-    records = np.array(cell + [(file._framesize - 56 * len(cell)) // file.ndims - 8] * file.ndims)
-    begin = file._header_size + file._firstframesize
-    n_frames = min(reader.n_frames - 1, (os.path.getsize(path) - begin) // file._framesize)
-    if n_frames < 1 or (records + 8).sum() != file._framesize:
-        return None
-    # Records are framed by their lengths.
-    ends = np.cumsum(records + 8)
-    places = np.concatenate([ends - records - 8, ends - 4]) // 4
-    at_once = max(MAPPED // file._framesize, 1)
-    for first in range(0, n_frames, at_once):
-        shape = min(at_once, n_frames - first), file._framesize // 4
-        words = np.memmap(path, _order(path) + "i4", "r", begin + first * file._framesize, shape)
-        wrong = (words[:, places] != np.tile(records, 2)).any(axis=1)
-        if wrong.any():
-            return Break(1 + first + int(np.argmax(wrong)), "its records are damaged")
+    # Records are framed by their lengths, at which the reader looks itself, but for the one behind a cell; frame by
+    # frame, but for the first, which has coordinates of fixed atoms too.
+    with open(path, "rb", buffering=0 if file._framesize > io.DEFAULT_BUFFER_SIZE else -1) as opened:
+        for k in range(1, reader.n_frames if file.is_periodic else 0):
+            opened.seek(file._header_size + file._firstframesize + (k - 1) * file._framesize)
+            cell = opened.read(56)
+            if cell[:4] != cell[52:]:
+                return Break(k, DAMAGED)
     return None
-
-
-def _order(path: str) -> str:
-    """Of the bytes of a DCD file."""
-    with open(path, "rb") as file:
-        return "<" if struct.unpack("<i", file.read(4))[0] in (84, 164) else ">"
 
 
 def _behind_the_only_frame(path: str, file_format: str, n_atoms: int) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -57,7 +58,7 @@ class FilePrecision:
         """Steps of coordinates that can be had back exactly, in angstrom; 0 if they cannot."""
         return self.step if self.exact else 0.0
 
-    @property
+    @cached_property
     def coefficients(self) -> tuple[float, float, float]:
         """Rounding moves coordinates of an atom, 2^e <= largest < 2^(e+1), by base; + factor 2^e from `reach` on."""
         if self.exact:

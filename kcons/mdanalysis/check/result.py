@@ -173,7 +173,7 @@ def result_of(
         )
     if alone := _first_alone(table, found):
         remarks.append(alone)
-    frames = numbers[(found.units["excess"] > 0).any(axis=1)]
+    frames = numbers[(found.units["violated"] > 0).any(axis=1)]
     status = "tolerated" if (margins + table.tolerance * table.sizes > 0).any() else "kept"
     status = "violated" if violated.any() else "incomplete" if gaps else status
     columns = (("largest", found.units["largest"]), ("rms", found.rms), ("rounding", found.units["rounding"]))
@@ -260,7 +260,7 @@ def _row(table: RowTable, topology: Topology, found: Found, row: int) -> RowResu
 
 def _first_alone(table: RowTable, found: Found) -> str:
     """What to say where the first frame alone differs from others that agree; '' elsewhere."""
-    off = np.asarray((found.units["excess"] > 0).any(axis=1))
+    off = np.asarray((found.units["violated"] > 0).any(axis=1))
     if len(off) < 3 or off[0] == off[1] or (off[1:] != off[1]).any():
         return ""
     spreads = []

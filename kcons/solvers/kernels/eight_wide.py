@@ -132,6 +132,23 @@ def gather_differences(builder, points, table, start, other):
     return _columns(builder, [builder.fsub(a, b, flags=FLAGS) for a, b in zip(left, right, strict=True)])
 
 
+@instruction(types.UniTuple(lanes_type, 4), None, None, types.int64, types.int64)
+def gather_ends(builder, quads, table, start, other):
+    """Of quads (x, y, z, w), those at `start` minus those at `other`; of w, which comes last, their sum."""
+    quad = ir.VectorType(_VECTOR.element, 4)
+    left, right = (
+        [
+            builder.load(builder.bitcast(at, ir.PointerType(quad)), align=8)
+            for at in _places(builder, quads, table, first)
+        ]
+        for first in (start, other)
+    )
+    signs = ir.Constant(quad, [1.0, 1.0, 1.0, -1.0])
+    rows = [builder.fsub(a, builder.fmul(b, signs), flags=FLAGS) for a, b in zip(left, right, strict=True)]
+    last = _EIGHT.of(builder, [builder.extract_element(row, INT32(3)) for row in rows])
+    return [*_columns(builder, rows), last]
+
+
 @instruction(types.void, None, None, types.int64, *(lanes_type,) * 3)
 def scatter_points(builder, points, table, start, x, y, z):
     """Inverse of `gather_points`; lanes that repeat a point must agree."""

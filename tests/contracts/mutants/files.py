@@ -13,7 +13,11 @@ MUTANTS = {
             "mdanalysis/check/precision::targets_that_are_means_have_the_mean_rounding_of_their_frames",
         ),
         (".where(angular, 1.0, «held.scale→1.0»)", "mdanalysis/check/precision::the_tolerance_is_a_part_of_the_length"),
-        ("powers[«j→i»", "mdanalysis/check/precision::what_is_allowed_is_the_rounding_of_both_atoms_and_the_tolerance"),
+        ("n_rows + r) + one« - told→»)", "deviations::targets_of_the_first_frame_and_of_the_mean"),
+        (
+            "off, size = «where_greater(rounding, bound, zero, off)→off»,",
+            "mdanalysis/check/precision::rows_of_which_nothing_can_be_told_leave_a_check_incomplete",
+        ),
         ("«exponent if exponent >= least else →»0", "mdanalysis/check/precision::xtc_beyond_the_reach_of_its_grid"),
     ],
     "mdanalysis/check/result.py": [
@@ -25,7 +29,7 @@ MUTANTS = {
     ],
     "mdanalysis/check/constraint_check.py": [
         (
-            "«trajectory.ts = Timestep.from_timestep(trajectory.ts)→pass»",
+            "«Timestep.from_timestep(trajectory.ts)→trajectory.ts», converts",
             "deviations::rows_that_were_made_for_a_part_are_refused",
         ),
         (
@@ -34,6 +38,7 @@ MUTANTS = {
         ),
     ],
     "mdanalysis/check/endings.py": [
+        ("if «cell[:4] != cell[52:]→False»:", "endings::records_of_all_kinds_of_dcd"),
         ('"GRO": «n_atoms + 3→2 * n_atoms + 6»,', "endings::what_lies_behind_the_only_frame_that_is_read"),
         ("word.isdigit()« and int(word) == n_atoms→»", "endings::a_frame_with_another_number_of_atoms"),
     ],

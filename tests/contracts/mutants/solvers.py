@@ -99,6 +99,10 @@ MUTANTS = {
         ("slope < «FLAT→0.0» * size", "single_rows::a_dihedral_that_turns_over_has_no_solution_far_away"),
     ],
     "solvers/kernels/eight_wide.py": [
+        (
+            "1.0, 1.0, «-1.0→1.0»]",
+            "mdanalysis/check/precision::what_is_allowed_is_the_rounding_of_both_atoms_and_the_tolerance",
+        ),
         ('«→un»ordered("<=", value', "distance_solvers::failure_changes_nothing_and_names_the_cluster[nan-small-bond]"),
     ],
     "solvers/kernels/two_and_four_wide.py": [
