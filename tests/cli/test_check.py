@@ -144,19 +144,9 @@ def test_in_a_c_locale_and_into_a_pipe_that_nobody_reads(folder, name, status, w
     assert "Å" in (folder / f"plain-{name}" / "check.txt").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    "name,more,words",
-    [
-        ("none.xtc", [], "no file"),
-        ("good.xtc", ["--targets", "nope.toml"], "nope.toml"),
-        ("good.xtc", ["--constrain", "hbnds"], "hbonds"),
-        ("good.xtc", ["--select", "resname ABC"], "ABC"),
-        ("good.xtc", ["--frames", "9:"], "no frames"),
-        ("good.xtc", ["--tolerance", "-1"], "tolerance"),
-    ],
-)
-def test_errors_take_one_line(folder, capsys, name, more, words):
-    assert command(folder, name, *more) == 2
+@pytest.mark.parametrize("more,words", [(["--targets", "nope.toml"], "nope.toml"), (["--frames", "9:"], "no frames")])
+def test_errors_take_one_line(folder, capsys, more, words):
+    assert command(folder, "good.xtc", *more) == 2
     said = capsys.readouterr()
     assert said.err.startswith("kcons: ") and said.err.count("\n") == 1 and words in said.err
 

@@ -128,8 +128,8 @@ class RowTable:
         tolerance: float,
     ) -> None:
         time, self.tolerance = float(ts.time), tolerance
-        self._dimensions, self._cell = b"", (NO_LATTICE, np.inf)
-        lattice, limit = self._cell_of(ts.dimensions)
+        self._known_cell, self._cell = b"", (NO_LATTICE, np.inf)
+        lattice, limit = self._cell_of(ts)
         x = precision.stored(ts.positions)
         self.set = held = ConstraintSet(given, x, masses, cell=lattice[0] if limit < np.inf else None, time=time)
         #: By row: whether its target is that of this frame, or of the mean of all; which of `UNITS` it has; what a
@@ -191,7 +191,7 @@ class RowTable:
 
     def __getstate__(self) -> dict[str, Any]:
         """What `look` needs, in other processes: to copy all of it takes longer than to look at some frames."""
-        kept = {"_dimensions", "_cell", "_offsets", "_targets", "_slack", "_most", "_given", "_runs", "_is_held"}
+        kept = {"_known_cell", "_cell", "_offsets", "_targets", "_slack", "_most", "_given", "_runs", "_is_held"}
         kept |= {"_places", "_n_places", "others", "_rows", "_atoms", "means"}
         return {name: value for name, value in vars(self).items() if name in kept}
 
@@ -215,20 +215,20 @@ class RowTable:
         seen = self.measured & (found.rows["counted"] > 0)
         self._allow(np.where(seen, found.mean("rounded"), self.of_targets))
 
-    def _cell_of(self, dimensions: NDArray[np.float32] | None) -> tuple[FloatArray, float]:
+    def _cell_of(self, ts: Any) -> tuple[FloatArray, float]:
         """Cell with its inverse, shape (2, 3, 3), and the square of half its smallest width, infinite without one."""
-        if dimensions is None:
-            return NO_LATTICE, np.inf
-        if dimensions.tobytes() != self._dimensions:
-            if not np.isfinite(dimensions).all():
+        if ts._unitcell.tobytes() != self._known_cell:
+            dimensions = ts.dimensions
+            if dimensions is not None and not np.isfinite(dimensions).all():
                 raise NonFiniteError(f"the cell is ({', '.join(f'{value:g}' for value in dimensions)})", item="cell")
-            self._dimensions, self._cell = dimensions.tobytes(), (NO_LATTICE, np.inf)
-            matrix = triclinic_vectors(dimensions, dtype=np.float64)
+            self._known_cell, self._cell = ts._unitcell.tobytes(), (NO_LATTICE, np.inf)
             # Files without a cell have lengths of 1; of angles that cannot be there are no vectors.
-            if (dimensions[:3] > NARROWEST).all() and matrix.any():
-                inverse = np.linalg.inv(matrix)
-                half = 0.5 / float(np.linalg.norm(inverse, axis=0).max())
-                self._cell = np.stack([matrix, inverse]), half * half
+            if dimensions is not None and (dimensions[:3] > NARROWEST).all():
+                matrix = triclinic_vectors(dimensions, dtype=np.float64)
+                if matrix.any():
+                    inverse = np.linalg.inv(matrix)
+                    half = 0.5 / float(np.linalg.norm(inverse, axis=0).max())
+                    self._cell = np.stack([matrix, inverse]), half * half
         return self._cell
 
     def begin(self) -> None:
@@ -247,7 +247,7 @@ class RowTable:
         """Put what is found in one frame, which must be finite, into the k-th place; with velocities rates, too."""
         frame = found.frames[k]
         frame["time"] = time = float(ts.time)
-        lattice, limit = self._cell_of(ts.dimensions)
+        lattice, limit = self._cell_of(ts)
         frame["bare"] = limit == np.inf
         planes = np.ascontiguousarray(ts.positions.T, dtype=np.float32)
         speeds = _NO_SPEEDS
