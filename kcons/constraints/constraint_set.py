@@ -383,7 +383,7 @@ class ConstraintSet:
             if positions is not None and self.lattice is not None:
                 self.refuse_unheld_links(self.whole(positions))
                 if before is not None:
-                    self.refuse_other_images(positions, before, None)
+                    self.refuse_other_images(positions, before)
         except KconsError:
             self.lattice = before
             raise
@@ -456,37 +456,20 @@ class ConstraintSet:
             atoms=atoms,
         )
 
-    def refuse_other_images(
-        self, x: FloatArray, before: FloatArray, time: float | None, numbers: IntArray | None = None
-    ) -> None:
-        """Raise `ImageError` where a changed cell gives atoms that nothing ties together other images than before.
-
-        Positions may have been moved along with the cell or not: other images are right if with them the rows are
-        fulfilled, or much nearer to that. Where the time is not known (None), moving rows are not.
-        """
+    def refuse_other_images(self, x: FloatArray, before: FloatArray, numbers: IntArray | None = None) -> None:
+        """Raise `ImageError` where a changed cell gives atoms that nothing ties together other images than before."""
         if self.images is None or self.lattice is None:
             return
-        y = self.whole(x)
-        cells = np.round((self.images.make_whole(x, before) - x) @ before[1])
-        changed = np.any(cells != np.round((y - x) @ self.lattice[1]), axis=1)
+        then = np.round((self.images.make_whole(x, before) - x) @ before[1])
+        changed = np.any(then != np.round((self.whole(x) - x) @ self.lattice[1]), axis=1)
         if not changed.any():
             return
-        as_before = x + cells @ self.lattice[0]
-
-        def miss(whole: FloatArray) -> FloatArray:
-            def of(c: Constraint) -> FloatArray:
-                unknown = time is None and c.moving
-                return np.ones(c.n_rows) if unknown else c.sigma(self.gather(c, x, whole), time or 0.0)
-
-            return np.abs(self._rows(of)) / self.scale
-
-        here, there = miss(y), miss(as_before)
-        other = np.concatenate([changed[c.atoms].any(axis=1) & c.relative for c in self.constraints if c.n_rows])
-        bad = other & (here > np.maximum(1e-9, 0.5 * there))
-        if bad.any():
-            row = int(np.argmax(np.where(bad, here, -1.0)))
-            atoms = self.row_atoms(row)
-            raise self._image_error(row, atoms[[0, int(np.argmax(changed[atoms]))]], numbers)
+        for item, start in zip(self.constraints, self.starts, strict=False):
+            bad = changed[item.atoms].any(axis=1) & item.relative
+            if bad.any():
+                k = int(np.argmax(bad))
+                atoms = item.atoms[k]
+                raise self._image_error(int(start) + k, atoms[[0, int(np.argmax(changed[atoms]))]], numbers)
 
     @cached_property
     def _longest_plain(self) -> tuple[float, int]:

@@ -262,9 +262,6 @@ class Angle(Internal):
         out[4], out[5], out[6] = -ax - bx, -ay - by, -az - bz
         out[7], out[8], out[9] = bx, by, bz
 
-    def undefined(self, k: int, r: FloatArray, time: float) -> str:
-        return self.coincident(k, r) or self._straight(self.measure(r[None], time)[0])
-
     @staticmethod
     def _straight(angle: Any, verb: str = "is") -> str:
         return (
@@ -273,9 +270,9 @@ class Angle(Internal):
         )
 
     def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
-        yield from super().faults(r, time)
         angle = self.measure(r, time)
-        yield np.sin(angle) < COLLINEAR, lambda k: self._straight(angle[k])
+        yield ~(np.sin(angle) >= COLLINEAR), lambda k: self.coincident(k, r[k]) or self._straight(angle[k])
+        yield from super().faults(r, time)
         if self.target is not None:
             target, words = self.target_at(time), "is no angle between 0 and pi; targets are in radian"
             outside = (target < -COLLINEAR) | (target > np.pi + COLLINEAR)

@@ -183,7 +183,7 @@ class SolverSequence:
                     plan.check_rows_between_fixed_atoms(x, time)
             if images is not None and lattice is not None:
                 if self.unchecked is not None:
-                    rows.refuse_other_images(ref, self.unchecked, reference_time, self.numbers)
+                    rows.refuse_other_images(ref, self.unchecked, self.numbers)
                     self.unchecked = None
                 stored, ref = ref, images.make_whole(ref, lattice)
                 shifts = images.follow(x, stored, ref, lattice)
