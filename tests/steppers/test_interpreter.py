@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stepper_systems import SYMMETRIC, system_of
+from stepper_systems import SYMMETRIC, assert_same, system_of
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import (
@@ -177,15 +177,6 @@ def one_by_one(stepper, system: System, state: State, dt: float, steps: int) -> 
     for _ in range(steps):
         state = stepper.step(system, state, dt)
     return state
-
-
-def assert_same(one: State, two: State) -> None:
-    """To the last bit."""
-    for name in ("positions", "velocities", "forces", "remainder", "thermostat"):
-        a, b = getattr(one, name), getattr(two, name)
-        assert (a is None) == (b is None)
-        assert a is None or np.array_equal(a, b), name
-    assert (one.time, one.time_remainder, one.step) == (two.time, two.time_remainder, two.step)
 
 
 def distance(a: State, b: State) -> float:

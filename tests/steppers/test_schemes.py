@@ -18,7 +18,6 @@ from stepper_systems import (
     slope,
     spherical_pendulum,
     system_of,
-    verlet,
 )
 
 from kcons import ConstraintSet, Motion, System
@@ -158,20 +157,6 @@ def test_state_off_the_constraints_is_named_as_the_cause():
     crossed = State(np.array([[0.0, 9.0, 0.0], [0.0, -9.0, 0.0]]), np.array([[90.0, 0, 0], [-90.0, 0, 0]]))
     with pytest.raises(ConvergenceError, match=r"already off row #0 Distance\(0, 1\) by 16\.8"):
         Rattle().step(system, crossed, 1.0)
-
-
-@pytest.mark.parametrize(("atoms", "held"), [(1, []), (3, []), (9, [2, 7])])
-def test_what_is_not_held_moves_by_velocity_verlet(atoms, held):
-    rng = np.random.default_rng(3)
-    x, v, masses = rng.normal(size=(atoms, 3)), rng.normal(size=(atoms, 3)), rng.uniform(1, 2, atoms)
-    steps = 50 if held else 1000
-    system = system_of([Distance(held)] if held else [], x, masses, lambda x, t: -x)
-    end = run(system, system.initial_state(x, v, project=True), 0.02, steps)
-    x1, v1 = verlet(x, v, masses, lambda x, t: -x, 0.02, steps)
-    others, scale = np.delete(np.arange(atoms), held), np.abs(x1).max()
-    assert np.abs(end.positions - x1)[others].max() <= 1e-13 * scale
-    assert np.abs(end.velocities - v1)[others].max() <= 1e-13 * scale
-    assert not held or np.abs(end.positions - x1)[held].max() > 1e-3
 
 
 def test_huge_force_along_a_bond_cancels():

@@ -9,7 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stepper_systems import PROJECTED, SYMMETRIC, gravity, growing_rod, rotor, skate, spherical_pendulum, system_of
+from stepper_systems import (
+    PROJECTED,
+    SYMMETRIC,
+    assert_same,
+    gravity,
+    growing_rod,
+    rotor,
+    skate,
+    spherical_pendulum,
+    system_of,
+)
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Distance, FixedAtoms, MovingTarget, Plane, Sphere
@@ -78,15 +88,6 @@ def test_velocities_of_a_rod_that_grows(time):
 
 
 # -- saving -----------------------------------------------------------------------------------------
-
-
-def assert_same(a: State, b: State) -> None:
-    """To the last bit, in everything a state holds."""
-    assert a.__getstate__().keys() == b.__getstate__().keys()
-    for name, value in a.__getstate__().items():
-        other = getattr(b, name)
-        assert type(value) is type(other), name
-        assert np.array_equal(value, other), name
 
 
 @pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
@@ -305,32 +306,10 @@ def test_far_may_be_switched_off() -> None:
 REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
 
 
-def copies(state: State) -> list[np.ndarray | None]:
-    return [None if a is None else a.copy() for a in (state.positions, state.velocities, state.forces)]
+BATHS = [Langevin(1.0, 0.5, 1), Isokinetic(1.0), HamiltonianMonteCarlo(1.0, 2, 3), IsokineticSpheres(1.0, 0.5, 2)]
 
 
-def assert_untouched(state: State, before: list[np.ndarray | None]) -> None:
-    for array, copy in zip((state.positions, state.velocities, state.forces), before, strict=True):
-        assert (array is None) == (copy is None)
-        assert array is None or np.array_equal(array, copy)
-
-
-# -- forces -----------------------------------------------------------------------------------------
-
-
-# -- purity and failure -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "stepper",
-    [
-        Langevin(1.0, 0.5, 1),
-        Isokinetic(1.0),
-        HamiltonianMonteCarlo(1.0, 2, 3),
-        IsokineticSpheres(1.0, 0.5, 2),
-    ],
-    ids=lambda stepper: type(stepper).__name__,
-)
+@pytest.mark.parametrize("stepper", BATHS, ids=lambda stepper: type(stepper).__name__)
 def test_copies_leave_behind_what_was_found_for_a_system(stepper) -> None:
     """Whose functions need not be any that pickle knows."""
     system, state = rotor(force=lambda x, t: -x * [1.0, 2.0, 3.0], potential=lambda x, t: float((x**2).sum()))
@@ -341,13 +320,10 @@ def test_copies_leave_behind_what_was_found_for_a_system(stepper) -> None:
     )
 
 
-# -- time steps -------------------------------------------------------------------------------------
-
-
 @REVERSIBLE
 def test_steps_of_no_number_and_of_zero(stepper) -> None:
     system, state = rotor(force=lambda x, t: -x)
-    before = copies(state)
+    before = state.copied()
     for dt in (np.nan, np.inf, -np.inf):
         with pytest.raises(InputError, match="time step"):
             stepper.step(system, state, dt)
@@ -355,7 +331,7 @@ def test_steps_of_no_number_and_of_zero(stepper) -> None:
         after = stepper.step(system, state, dt)
         assert np.array_equal(after.positions, state.positions) and np.array_equal(after.velocities, state.velocities)
         assert after.time == state.time and after.step == state.step + 1
-    assert_untouched(state, before)
+    assert_same(state, before)
 
 
 @REVERSIBLE
@@ -394,11 +370,11 @@ class Drifting(Rattle):
 def test_check_finds_a_stepper_that_is_not_reversible() -> None:
     system, state = rotor()
     state = State(state.positions, state.velocities, step=6)
-    before = copies(state)
+    before = state.copied()
     with pytest.raises(ReversibilityError, match="step 7 is not reversible: taken back, atom") as caught:
         ReversibilityCheck(Drifting()).step(system, state, 0.1)
     assert caught.value.step == 7 and 1e-8 < caught.value.residual < 1e-6
-    assert_untouched(state, before)
+    assert_same(state, before)
     ReversibilityCheck(Drifting(), tolerance=1e-5).step(system, state, 0.1)
 
 

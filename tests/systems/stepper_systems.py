@@ -92,13 +92,12 @@ def slope(dts, errors) -> float:
     return float(np.polyfit(np.log(dts), np.log(errors), 1)[0])
 
 
-def verlet(x, v, masses, force, dt, steps):
-    m = np.asarray(masses)[:, None]
-    for _ in range(steps):
-        v = v + 0.5 * dt * force(x, 0) / m
-        x = x + dt * v
-        v = v + 0.5 * dt * force(x, 0) / m
-    return x, v
+def assert_same(a: State, b: State) -> None:
+    """To the last bit, in everything a state holds."""
+    for name, value in a.__getstate__().items():
+        other = getattr(b, name)
+        assert type(value) is type(other), name
+        assert np.array_equal(value, other), name
 
 
 def growing_rod(speed: float = 0.9) -> tuple[System, State]:
