@@ -32,7 +32,7 @@ MUTANTS = {
         ("certain = «closer == 1.0 and →»kept", "linear::neighbors_that_rounding_joins_are_told_as_uncertain"),
     ],
     "models/flows/flow.py": [
-        ("concatenate([slope[self.f :], «-→»slope[: self", "mechanics::friction_by_a_hamiltonian_that_depends_on_time"),
+        ("concatenate([slope[self.f :], «-→»slope[: self", "flow::friction_by_a_hamiltonian_that_depends_on_time"),
     ],
     "constraints/projection.py": [
         ("vt[kept].«conj().→»T)", "constraints/projection::complex_matrices"),
