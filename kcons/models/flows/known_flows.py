@@ -70,16 +70,12 @@ class DampedOscillator(LinearFlow):
         e^(-eta t/2) [C 1 + S (A + eta/2)] with C = cosh(at/2), S = sinh(at/2)/(a/2): both depend on a^2 alone, and are
         smooth through a = 0.
         """
-        square = 0.25 * (self.eta - 2 * self.omega) * (self.eta + 2 * self.omega)
-        root = np.sqrt(complex(square))
-        shifted = self.matrix + 0.5 * self.eta * np.eye(2)
-        if root.real * t > 1.0:
-            # e^(-eta t/2) cosh overflows in its second factor: both exponentials together.
-            slow = np.exp(-(self.omega**2) / (0.5 * self.eta + root.real) * t)
-            fast = np.exp(-(root.real + 0.5 * self.eta) * t)
-            return np.asarray(0.5 * (slow + fast) * np.eye(2) + 0.5 * (slow - fast) / root.real * shifted)
-        C, S = np.cosh(root * t).real, t * np.sinc(1j * root * t / np.pi).real
-        return np.asarray(np.exp(-0.5 * self.eta * t) * (C * np.eye(2) + S * shifted))
+        half = 0.5 * np.sqrt(complex(self.eta - 2 * self.omega)) * np.sqrt(self.eta + 2 * self.omega)
+        # C = e^(at/2) (1 + e^(-at))/2, the first factor with the other exponential: apart they overflow.
+        first = np.exp(-(self.omega**2) / (0.5 * self.eta + half) * t)
+        share = -np.expm1(-2 * half * t) / (2 * half * t) if half * t else 1.0
+        C, S = first * (1.0 - half * t * share), first * t * share
+        return np.asarray((C * np.eye(2) + S * (self.matrix + 0.5 * self.eta * np.eye(2))).real)
 
 
 class HarmonicOscillator(DampedOscillator):

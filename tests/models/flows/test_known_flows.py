@@ -33,6 +33,7 @@ def test_damped_oscillator_reference(number):
         wanted = np.array([w * regime["x"][k], regime["v"][k]])
         for found in (flow.closed_form(t) @ X0, flow.exact(t, X0)):
             assert abs(found - wanted).max() < 1e-12 * max(abs(wanted).max(), 1e-3)
+    assert np.all(np.isfinite(flow.closed_form(1e5)))
     eigenvalues = sorted((complex(*pair) for pair in regime["eigenvalues"]), key=lambda z: (z.real, z.imag))
     # The first of (23) is the faster one, or the one below the real axis. Near critical damping a rounding of eta, by
     # eps, moves them by eps/a.
@@ -98,14 +99,6 @@ def test_jordan_form_of_the_harmonic_oscillator():
     assert form.J.tolist() == [[-2j, 0.0], [0.0, 2j]]
     assert form.T.tolist() == [[1j, -1j], [1.0, 1.0]]
     assert HarmonicOscillator(2.0).eigenvalues() == (-2j, 2j)
-
-
-@pytest.mark.parametrize("eta", [0.0, 0.2, 1.999999, 2.0, 2.000001, 2.01, 3.0, 50.0])
-def test_closed_form_is_the_exponential(eta):
-    flow = DampedOscillator(1.3, 1.3 * eta)
-    for t in (0.0, 1e-3, 1.0, 20.0):
-        assert flow.closed_form(t) == pytest.approx(flow.propagator(t), rel=1e-10, abs=1e-14)
-    assert np.all(np.isfinite(flow.closed_form(1e5)))
 
 
 def test_harmonic_oscillator_runs_on_a_circle():
