@@ -78,7 +78,8 @@ class Interpreted(Listed):
         known = self.depends_on(system, state)
         if kept is not None and kept[0] is state and kept[1] is self and kept[2] == known and kept[3].dt == dt:
             on_their_way = kept[3]
-            on_their_way.resume(state, steps if steps == 1 else self.at_once(state, steps))
+            n = steps if steps == 1 else self.at_once(state, steps)
+            on_their_way.resume(state, n, state.positions, state.velocities, state.forces)
         else:
             self.check(system)
             still = stays(state, dt)
@@ -162,47 +163,37 @@ class Interpreter:
         steps: int = 1,
         numbers: FloatArray = _EMPTY,
     ) -> None:
-        self.system, self.dt, self.program, self.start = system, dt, program, start
-        self.steps = 1 if start.remainder is not None else steps
+        self.system, self.dt, self.program = system, dt, program
         x, v, f = system.kernel_arrays(start)
         self.shape = shape = x.shape
-        self.shift: FloatArray | None = None
-        if start.remainder is not None:
-            x, self.shift = system.near_origin(start)
-        self.x = x
-        self.push = self.v = v.copy()
-        self.spare = self.out = np.empty(shape)
         self.known = f is not None
         self.forces: FloatArray = np.zeros(shape) if f is None or system.force is None else f
         self.low: FloatArray | None = None
         begin = len(program.numbers)
         first = begin + (3 * x.size if program.pairs else 0)
         self.room = room = np.zeros(first + len(numbers))
-        room[:begin] = program.numbers
+        room[:begin], room[first:] = program.numbers, numbers
         self.numbers = room[first:]
-        if len(numbers):
-            room[first:] = numbers
         if program.pairs:
             self.low, self.push, self.spare = room[begin:first].reshape(3, *shape)
         sets, lists = system.motion.sources, (program.rows, program.shown, program.ends, program.flies)
         simple, end = self.simple and not system.velocity_dependent, len(program.rows) - 1
         self.unchanging = kernel(), system, dt, room, shape, *sets, *lists, simple, end
-        self.then, self.left_over_then = start.time, start.time_remainder
-        self.made, self.number = -1, start.step
-        self._next_step()
+        self.then, self.left_over_then, self.number = start.time, start.time_remainder, start.step
+        self.resume(start, steps, x, v, f)
 
-    def resume(self, state: State, steps: int) -> None:
-        """Get ready for more steps, from the state that the last ones have ended in."""
-        self.start, self.steps, self.made, self.x, self.shift = state, steps, -1, state.positions, None
+    def resume(self, state: State, steps: int, x: FloatArray, v: FloatArray, forces: FloatArray | None) -> None:
+        """Get ready for more steps from a state, that which the last ones have ended in, and its arrays."""
+        self.start, self.steps, self.made, self.x, self.shift = state, steps, -1, x, None
         if state.remainder is not None:
             self.steps, (self.x, self.shift) = 1, self.system.near_origin(state)
-        self.v, self.out = state.velocities.copy(), np.empty(self.shape)
+        self.v, self.out = v.copy(), np.empty(self.shape)
         if self.low is None:
             self.push, self.spare = self.v, self.out
         else:
             self.low.fill(0.0)
-        if self.simple and state.forces is not None:
-            self.forces = state.forces  # those of the function may be in an array that it uses again
+        if self.simple and forces is not None and self.system.force is not None:
+            self.forces = forces  # those of the function may be in an array that it uses again
         self._next_step()
 
     # -- the loop -------------------------------------------------------------------------------
@@ -436,7 +427,7 @@ class Interpreter:
     def applied(self, here: int) -> FloatArray | None:
         """The forces at the end, None where a drift came last."""
         if self.system.force is None:
-            return self.start.forces
+            return self.start.forces if self.known else None
         return self.forces.copy() if self.known and not here else None
 
     def variables(self) -> FloatArray | None:

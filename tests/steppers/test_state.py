@@ -195,6 +195,17 @@ def test_forces_of_another_system_are_not_taken(stepper) -> None:
     assert set(asked) == {1.0} and np.array_equal(taken.positions, stepper.step(here, made, 0.05).positions)
 
 
+@pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_forces_are_nothing_to_a_system_without(stepper, by_hand) -> None:
+    """Also not once steps go on: those of the state that they began from stayed in the states."""
+    (system, state), (other, _), (driven, _) = rotor(), rotor(), rotor(force=lambda x, t: 0 * x + 1.0)
+    pushed = replace(driven.with_forces(state), **({"origin": None} if by_hand else {}))
+    for _ in range(3):
+        pushed, state = stepper.step(system, pushed, 0.01), stepper.step(other, state, 0.01)
+        assert np.array_equal(pushed.velocities, state.velocities)
+
+
 @pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
 def test_forces_are_kept_at_their_positions_only(stepper) -> None:
     system, start, asked = pendulum(1.0)
