@@ -256,7 +256,6 @@ EXTRAS = {
     "openmm": "openmm",
     "MDAnalysis": "mdanalysis",
     "tblite": "xtb",
-    "sympy": "models",
     "pymbar": "free-energy",
     "torch": "torch",
     "torch_sim": "torchsim",
