@@ -122,9 +122,7 @@ class Multibody:
     ) -> None:
         self.force, self.constraints, self.jacobian, self.curvature = force, constraints, jacobian, curvature
         self.length = positive(length, "length")
-        if force is None:
-            raise InputError("force must be a function, not None", item="force")
-        check_call("force", force, ("q", "v", "t"))
+        check_call("force", force, ("q", "v", "t"), needed=True)
         for name, taken in (("constraints", ("q",)), ("jacobian", ("q",)), ("curvature", ("q", "v"))):
             check_call(name, getattr(self, name), taken)
             if constraints is None and getattr(self, name) is not None:

@@ -132,6 +132,8 @@ class State:
         """Whether it carries forces of this System, of its positions, velocities and time, as far as one can tell."""
         if self.origin is None or self.forces is None:
             return self.forces is not None
+        if system.force is None and np.any(self.forces):
+            return False
         (_, there, v, time), here = self.origin, self.positions
         if time != self.time or (system.velocity_dependent and not np.array_equal(v, self.velocities)):
             return False

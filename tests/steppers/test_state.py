@@ -201,6 +201,7 @@ def test_forces_are_nothing_to_a_system_without(stepper, by_hand) -> None:
     """Also not once steps go on: those of the state that they began from stayed in the states."""
     (system, state), (other, _), (driven, _) = rotor(), rotor(), rotor(force=lambda x, t: 0 * x + 1.0)
     pushed = replace(driven.with_forces(state), **({"origin": None} if by_hand else {}))
+    assert not system.with_forces(pushed).forces.any()
     for _ in range(3):
         pushed, state = stepper.step(system, pushed, 0.01), stepper.step(other, state, 0.01)
         assert np.array_equal(pushed.velocities, state.velocities)
