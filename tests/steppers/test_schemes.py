@@ -20,7 +20,6 @@ from stepper_systems import (
     system_of,
 )
 
-from kcons import ConstraintSet, Motion, System
 from kcons.constraints import (
     CustomVelocity,
     Distance,
@@ -321,16 +320,18 @@ def literal_flight(system, state, h: float):
     return x1, u.reshape(x0.shape)
 
 
+def rolling(masses, turns, size: float, slope: float = 0.0, force=None):
+    """A wheel of three masses and a hub that rolls down a slope."""
+    along, up = np.array([np.cos(slope), 0, -np.sin(slope)]), np.array([np.sin(slope), 0, np.cos(slope)])
+    turns = np.radians(turns)[:, None]
+    x = up + np.vstack([np.zeros(3), size * (np.cos(turns) * along + np.sin(turns) * up)])
+    held = [Plane([0], up), Plane([0, 1, 2, 3], [0.0, 1, 0]), Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]])]
+    return system_of([*held, Rolling([0], [1], 1.0, along, up)], x, masses, force), x, along
+
+
 def wheel():
-    """A wheel of three masses and a hub that rolls, and is pushed at its hub in a direction that turns with it."""
-    turns = np.radians([10, 130, 250])[:, None]
-    x = np.array([0, 0, 1.0]) + np.vstack([np.zeros(3), 0.9 * np.hstack([np.sin(turns), 0 * turns, np.cos(turns)])])
-    held = [
-        Plane([0], [0.0, 0, 1]),
-        Plane([0, 1, 2, 3], [0.0, 1, 0]),
-        Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]),
-    ]
-    system = system_of([*held, Rolling([0], [1], 1.0, [1.0, 0, 0])], x, [0.5, 1.0, 2.0, 1.5])
+    """It is pushed at its hub in a direction that turns with it."""
+    system, x, _ = rolling([0.5, 1.0, 2.0, 1.5], [80, -40, -160], 0.9)
     return system, system.initial_state(x, np.array([[1.0, 0, 0], [2, 0, 0.5], [0, 0, 1], [-1, 0, 0]]), project=True)
 
 
@@ -427,13 +428,9 @@ def swept(*more) -> tuple:
 @pytest.mark.parametrize("slope, dt", [(0.0, 0.0001), (0.17, 0.005), (0.17, 0.001)])
 def test_a_wheel_starts_to_roll_from_rest(slope, dt) -> None:
     """Velocities are known to what rounding of the positions leaves of them, also where they vanish."""
-    along, up = np.array([np.cos(slope), 0, -np.sin(slope)]), np.array([np.sin(slope), 0, np.cos(slope)])
-    turns = np.radians([0, 120, 240])[:, None]
-    x = up + np.vstack([np.zeros(3), np.cos(turns) * along + np.sin(turns) * up])
     masses = np.array([0.5, 1.0, 1.0, 1.0])
-    held = [Plane([0], up), Plane([0, 1, 2, 3], [0.0, 1.0, 0.0]), Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]])]
-    motion = Motion(ConstraintSet([*held, Rolling([0], [1], 1.0, along, up)], x, masses), x)
     weight = masses[:, None] * np.array([0.0, 0.0, -10.0])
-    end = run(System(motion, lambda x, t: weight), State(x, np.zeros_like(x)), dt, 100)
+    system, x, along = rolling(masses, [0, 120, 240], 1.0, slope, lambda x, t: weight)
+    end = run(system, State(x, np.zeros_like(x)), dt, 100)
     rolled = (end.positions[0] - x[0]) @ along
     assert rolled == pytest.approx(10 * np.sin(slope) * 3.5 / 6.5 * (100 * dt) ** 2 / 2, rel=1e-4, abs=1e-13)
