@@ -1,5 +1,8 @@
 """The hypercycle against reference and closed form; laws of entropy production; arrival, extinction and return."""
 
+import runpy
+from pathlib import Path
+
 import numpy as np
 import pytest
 from model_references import case, exact_energies, system
@@ -134,14 +137,8 @@ def test_extinction_beyond_all_numbers_ends_at_the_least_logarithm():
     assert found.log_y.min() == pytest.approx(-1e300, rel=1e-3)
 
 
-def random_system(rng, n, kind):
-    """Parameters over decades, starts down to ln x = -700."""
-    k_h, kT = 10 ** rng.uniform(-1, 1), 10 ** rng.uniform(-1, 1)
-    model = Hypercycle(n, k_h, rng.normal(size=n) * kT * 10 ** rng.uniform(-1, 0.5), kT)
-    tau, total = 10 ** rng.uniform(-1, 2) / k_h, 10 ** rng.uniform(-0.5, 0.5)
-    log_x = [np.log(rng.dirichlet(np.ones(n))), rng.uniform(-5, 0, n), rng.uniform(-700, 0, n)][rng.integers(3)]
-    held = model.with_entropy_production(tau) if kind == "b" else model.without_entropy_production()
-    return held, log_x + np.log(total) - np.log(np.sum(np.exp(log_x)))
+#: Parameters over decades, starts down to ln x = -700.
+random_system = runpy.run_path(str(Path(__file__).parents[3] / "examples/notes/growth_results.py"))["random_system"]
 
 
 @pytest.mark.parametrize(("n", "kind"), [(2, "c"), (3, "b"), (3, "c"), (5, "b"), (5, "c"), (8, "b")])

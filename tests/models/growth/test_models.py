@@ -49,17 +49,6 @@ def test_sources_lift_tiny_populations():
     assert found.y[0] == pytest.approx(0.3 * -np.expm1(-times) + 1e-30 * np.exp(-times), rel=1e-10, abs=0)
 
 
-def test_functions_cannot_change_the_populations():
-    def feeding(t, x):
-        x[0] += 1.0
-        return x
-
-    x = np.array([1.0, 2.0])
-    with pytest.raises(ValueError, match="read-only"):
-        GrowthModel(feeding, n=2).velocity(0.0, x)
-    assert x.tolist() == [1.0, 2.0]
-
-
 # -- logistic growth, Lotka-Volterra -------------------------------------------------------------------
 
 
