@@ -241,11 +241,8 @@ def _structures(
     chosen = np.isin(np.arange(len(found.values)), members).astype(np.int32)
     T, Q, *_ = scipy.linalg.lapack.ztrsen(chosen, found.triangular, np.eye(len(chosen), dtype=np.complex128), job="N")
     top, basis = T[:m, :m], found.basis @ Q[:, :m]
-    if m == 1:
-        return [(JordanBlocks(mean, (1,), closer == 1.0), _of_unit_length(basis))]
     # What the entries of `top` may be off by: from the Schur form, from the exchanges, and from the mean.
-    noise = m * EPSILON * float(scipy.linalg.norm(np.triu(top, 1)))
-    noise += found.noise
+    noise = m * EPSILON * float(scipy.linalg.norm(np.triu(top, 1))) + found.noise
     found_chains = _chains(top - mean * np.eye(m), NULL * noise)
     if found_chains is None:
         parts = _clusters(values, found.errors[members] / (CLOSER * closer))
