@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 from scipy.integrate import BDF, DOP853, RK23, RK45, DenseOutput, OdeSolver, Radau, solve_ivp
 
 from kcons.constraints.arguments import FloatArray, as_float_array, read_only_view
-from kcons.constraints.target import WRONG, first_derivative
+from kcons.constraints.target import WRONG, first_derivative_4
 from kcons.errors import ContradictionError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 
 METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
 #: What SciPy takes where less is asked for.
 LEAST_RTOL = 100 * float(np.finfo(float).eps)
-#: Longest of the steps of `jacobian_by_differences`, in parts of the variable where that is larger than 1.
+#: h of `jacobian_by_differences`.
 STEP = 0.02
 #: Parts of the time left in which a motion that is known is looked at for events.
 PARTS = 100
@@ -159,16 +159,17 @@ def called(
 def jacobian_by_differences(
     velocity: Callable[[float, FloatArray], ArrayLike], t: float, X: ArrayLike, step: float | FloatArray = STEP
 ) -> FloatArray:
-    """dV/dX by central differences of eighth order that reach as far as h; shape (m, n).
+    """dV/dX by central differences of fourth order, shape (m, n).
 
-    h is `step`, times the size of a variable where that is larger than 1; or an array of one h a variable.
+    Their steps are h/16; h is `step`, times the size of a variable where that is larger than 1, or an array of one h a
+    variable.
     """
     X = as_float_array(X, "X")
     steps = step if isinstance(step, np.ndarray) else step * np.maximum(1.0, np.abs(X))
 
     def along(e: FloatArray, h: float) -> FloatArray:
-        return first_derivative(
-            lambda s: as_float_array(velocity(t, read_only_view(X + s * e)), "velocity"), 0.0, 0.25 * h
+        return first_derivative_4(
+            lambda s: as_float_array(velocity(t, read_only_view(X + s * e)), "velocity"), 0.0, h / 16
         )
 
     return np.stack([along(e, h) for e, h in zip(np.eye(len(X)), steps, strict=True)], axis=-1)
