@@ -364,7 +364,12 @@ def solve(
     solver, span, times = check_run(t_span, t_eval, method, options, system.n)
     rtol, atol = (as_float_array(options[name], name) for name in ("rtol", "atol"))
     tolerance = max(float(np.min(rtol + atol)), 1e-13)
-    p0 = Populations.start(span[0], x0, log_x0)
+    if (x0 is None) == (log_x0 is None):
+        raise InputError("give the start either as x0 or as log_x0", item="x0")
+    log_x = np.array(as_float_array(() if log_x0 is None else log_x0, "log_x0"))
+    if not np.all(np.isfinite(log_x)):
+        raise InputError("log_x0 is not finite", item="log_x0")
+    p0 = Populations.from_logarithms(span[0], log_x) if x0 is None else Populations.from_values(span[0], x0)
     bound = system.bind(p0)
     end, settled_time = p0, None
 

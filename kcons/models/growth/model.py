@@ -66,6 +66,7 @@ class Populations(NamedTuple):
 
     @classmethod
     def from_logarithms(cls, time: float, log_x: FloatArray) -> Self:
+        """Populations from ln x."""
         # A trial step of an integrator may overflow; it is then rejected.
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             return cls(time, np.exp(log_x), log_x)
@@ -85,18 +86,6 @@ class Populations(NamedTuple):
                 item="x0",
             )
         return cls(time, array, np.log(array))
-
-    @classmethod
-    def start(cls, time: float, x0: ArrayLike | None, log_x0: ArrayLike | None) -> Self:
-        """The start of a run, given as populations or as their logarithms."""
-        if (x0 is None) == (log_x0 is None):
-            raise InputError("give the start either as x0 or as log_x0", item="x0")
-        if x0 is not None:
-            return cls.from_values(time, x0)
-        log_x = np.array(as_float_array(log_x0, "log_x0"))
-        if not np.all(np.isfinite(log_x)):
-            raise InputError("log_x0 is not finite", item="log_x0")
-        return cls.from_logarithms(time, log_x)
 
 
 class GrowthModel:
