@@ -335,15 +335,6 @@ def test_events():
     assert found.t[-1] == found.t_events[0][-1] and not len(found.t_events[1])
 
 
-def test_rank_that_is_lost_on_the_way_is_named():
-    # The row (1, x2) becomes a multiple of (1, 1) at x2 = 1 and asks for the impossible there.
-    model = GrowthModel(lambda t, x: [0.0, 0.0], n=2)
-    rows = [TotalPopulation(2), VelocityRow(lambda t, x: [1.0, x[1]], 0.5)]
-    with pytest.raises(ContradictionError, match=r"row 1 .* at t = 0") as caught:
-        solve(ConstrainedGrowth(model, rows), (0.0, 1.0), [1.0, 1.0 + 1e-14])
-    assert caught.value.rows == (1,)
-
-
 def nan_from_half(t, x):
     return [np.sqrt(0.5 - t), 1.0] if t < 0.5 else [np.nan, 1.0]
 
