@@ -21,7 +21,6 @@ from kcons.ase.binding import (
     FAR,
     FORCES_ONLY,
     UNKNOWN,
-    VOIGT,
     AcceptedPositions,
     Binding,
     applied_forces,
@@ -30,9 +29,9 @@ from kcons.ase.binding import (
     fulfilled,
     refuse_not_finite,
     refuse_taken_along,
+    stress_of_rows,
     touched_atoms,
     unchanged_on_failure,
-    virial_of,
 )
 from kcons.ase.topology import bonds_of, constraints_of, require_atoms, velocities_of
 from kcons.ase.translation import ase_forms, translated
@@ -241,8 +240,7 @@ class Constraints(FixConstraint):
         energy under a strain after which the constraints are restored. Rows with a place in space count as external
         forces and have no part. Refused where atoms are off the constraints.
         """
-        virial = virial_of(self._bound(atoms).motion, atoms, applied_forces(atoms))
-        stress -= virial[VOIGT] / atoms.get_volume()
+        stress += stress_of_rows(self._bound(atoms).motion, atoms, applied_forces(atoms))
 
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""

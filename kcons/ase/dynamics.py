@@ -19,15 +19,14 @@ from ase.stress import full_3x3_to_voigt_6_stress
 from kcons.ase.binding import (
     FORCES_ONLY,
     START_TOLERANCE,
-    VOIGT,
     Binding,
     applied_forces,
     bind,
     company,
     differ,
     require_on_surface,
+    stress_of_rows,
     unchanged_on_failure,
-    virial_of,
 )
 from kcons.ase.constraints_object import Constraints, listed
 from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
@@ -534,8 +533,8 @@ def _stress(dyn: Any, atoms: Atoms) -> FloatArray:
     """Without that of momenta; the constraints' part is of all rows that a dynamics class of kcons holds."""
     if not hasattr(dyn, "motion"):
         return np.asarray(atoms.get_stress())
-    virial = virial_of(dyn.motion, atoms, applied_forces(atoms), dyn.get_time())
-    return np.asarray(atoms.get_stress(apply_constraint=False)) - virial[VOIGT] / atoms.get_volume()
+    rows = stress_of_rows(dyn.motion, atoms, applied_forces(atoms), dyn.get_time())
+    return np.asarray(atoms.get_stress(apply_constraint=False)) + rows
 
 
 def _motion(dyn: Any, atoms: Atoms) -> Motion:
