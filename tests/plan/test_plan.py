@@ -218,9 +218,6 @@ def test_dependent_rows_are_eliminated_last():
 # -- clusters and blocks ----------------------------------------------------------------------------
 
 
-TRIANGLE = list(combinations(range(3), 2))
-
-
 def places(n: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(n, 3)) * 3
 
@@ -230,14 +227,10 @@ def shapes_of(rows, x, masses=None) -> list[Shape]:
     return list(classify(plan.constraint_set, plan.labels, plan.inverse_masses))
 
 
-def copies(pairs, atoms: int, times: int) -> held.Distance:
-    return held.Distance(np.concatenate([np.array(pairs) + atoms * k for k in range(times)]))
-
-
 @pytest.mark.parametrize("order", list(np.ndindex(2, 2, 2)))
 def test_triangles_of_any_orientation_are_water(order: tuple[int, ...]) -> None:
-    pairs = [pair[::-1] if turned else pair for pair, turned in zip(TRIANGLE, order, strict=True)]
-    (shape,) = shapes_of(copies(pairs[::-1], 3, 9), places(27), np.tile([16.0, 1, 1], 9))
+    pairs = [pair[::-1] if turned else pair for pair, turned in zip(all_pairs(3), order, strict=True)]
+    (shape,) = shapes_of(*many(WATER, pairs[::-1], 9), np.tile([16.0, 1, 1], 9))
     assert shape.kind == "RigidTriangles" and shape.clusters == 9
     assert shape.atoms.shape == (9, 3) and shape.rows.shape == (9, 3)
     assert (shape.atoms % 3 == 0).any(axis=0).tolist().count(True) == 1  # oxygen in one place throughout
@@ -277,16 +270,11 @@ def test_open_chains_beyond_the_lanes(rows: int) -> None:
                 assert {a, b} == set(walked[row])
 
 
-def blocks(rows, n_atoms, only=None):
-    x = np.random.default_rng(1).normal(size=(n_atoms, 3))
+def blocks(rows, n_atoms):
+    x = places(n_atoms, 1)
     rows = ConstraintSet(rows, x, np.ones(n_atoms))
-    members, starts = row_blocks(rows, lambda item: True, only)
+    members, starts = row_blocks(rows, lambda item: True)
     return rows, x, sorted(members[a:b].tolist() for a, b in pairwise(starts))
-
-
-def test_a_row_of_several_atoms_is_a_cycle_through_them():
-    assert blocks([held.Distance([[0, 1], [1, 2]]), held.Angle([[0, 1, 2]])], 4)[2] == [[0, 1, 2]]
-    assert blocks([held.Distance([[0, 1]]), held.Angle([[1, 2, 3]])], 4)[2] == []
 
 
 def test_fixed_atoms_and_space_are_one_vertex():
