@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ase_systems
 import numpy as np
 import pytest
 from ase import Atoms, units
@@ -211,10 +212,8 @@ def ethanol(inner=None) -> tuple[Atoms, ConstrainedCalculator]:
 
 def test_on_the_constraints_forces_are_f_plus_z():
     atoms, _ = ethanol()
-    peer = molecule("CH3CH2OH")
-    peer.calc = EMT()
-    energy, forces = peer.get_potential_energy(), peer.get_forces()
-    held = constrain(peer, ROWS)
+    peer, held = ase_systems.ethanol()
+    energy, forces = peer.get_potential_energy(), peer.get_forces(apply_constraint=False)
     assert atoms.get_potential_energy() == energy
     assert np.array_equal(atoms.get_forces(), held.engine(peer).project_forces(peer.positions, forces))
     assert np.abs(atoms.get_forces() - peer.get_forces()).max() <= 1e-14
@@ -269,9 +268,7 @@ def test_new_masses_and_settings_are_noticed():
 
 @pytest.mark.parametrize("optimizer", [BFGS, FIRE])
 def test_optimizer_without_a_constraint_object(optimizer):
-    peer = molecule("CH3CH2OH")
-    peer.calc = EMT()
-    held = constrain(peer, ROWS)
+    peer, held = ase_systems.ethanol()
     optimizer(peer, logfile=None).run(fmax=0.01, steps=300)
 
     atoms, calculator = ethanol()

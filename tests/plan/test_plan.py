@@ -164,12 +164,6 @@ def test_atoms_that_are_fixed_twice_count_once() -> None:
     assert force == pytest.approx(motion.acceleration(WATER, 0 * WATER, f) - f, abs=1e-13)
 
 
-def test_atoms_that_are_fixed_at_two_places_are_refused() -> None:
-    rows = [held.FixedAtoms(0), held.FixedAtoms(0, [9.0, 9.0, 9.0])]
-    with pytest.raises(ContradictionError, match=r"row #3 FixedAtoms\(0\) .* is off by .*; remove it"):
-        planned(rows, WATER)
-
-
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_multipliers_of_dependent_rows_in_very_different_units(unit: float) -> None:
     x, rng = unit * np.array([[0.0, 0, 0], [1.0, 0.2, 0], [0.3, 1.1, 0.4]]), np.random.default_rng(0)
