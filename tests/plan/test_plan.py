@@ -709,22 +709,6 @@ def test_group_across_a_periodic_boundary():
     assert np.abs(held.value(x)).max() < 1e-14
 
 
-def test_only_the_rows_of_the_flat_group_change():
-    """A rigid water and a flexible tail beside and on the ring stay as they were."""
-    water = np.array([[5.0, 5, 5], [5.96, 5, 5], [4.76, 5.93, 5]])
-    x = np.vstack([ring(6), [[2.9, 0, 0.3], [3.3, 1.4, 0.1]], water])
-    rows = [Distance([(0, 6), (6, 7), *all_pairs(6)]), Distance([(8, 9), (8, 10), (9, 10)])]
-    held = converted(rows, x)
-    assert [(c.family, c.n_rows) for c in held.constraints] == [
-        ("Distance", 2),
-        ("Distance", 3),
-        ("Distance", 3),
-        ("LinearRelation", 9),
-    ]
-    assert held.constraints[0].atoms.tolist() == [[0, 6], [6, 7]]
-    assert rank_of(held, x) == held.n_rows == 17
-
-
 def test_fixed_atoms_become_bases():
     x = ring(6)
     held = converted([Distance(all_pairs(6)), FixedAtoms([2])], x)
