@@ -17,7 +17,6 @@ from ase.constraints import (
     FixCom,
     FixedMode,
     FixedPlane,
-    Hookean,
 )
 from ase.md.andersen import Andersen
 from ase.md.bussi import Bussi
@@ -61,7 +60,6 @@ from kcons.ase import (
 from kcons.ase.binding import require_on_surface
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, Sphere
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
-from kcons.steppers import BlanesMoan4
 
 
 @pytest.mark.parametrize(
@@ -136,30 +134,6 @@ def test_cells_that_are_set():
 
 
 # -- company ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "run",
-    [
-        lambda atoms: VelocityVerlet(atoms, 0.5 * FS),
-        lambda atoms: ConstrainedDynamics(atoms, 0.5 * FS, BlanesMoan4()),
-        lambda atoms: FIRE(atoms, logfile=None),
-    ],
-    ids=["VelocityVerlet", "ConstrainedDynamics", "FIRE"],
-)
-def test_fixed_atoms_and_components_alongside(run):
-    atoms = molecule("CH3CH2OH")
-    atoms.calc = EMT()
-    atoms.set_constraint([FixAtoms([8]), FixCartesian([7], (True, False, True)), Hookean(a1=5, a2=6, rt=1.0, k=0.5)])
-    held = constrain(atoms, [Distance([[0, 1], [1, 2]]), Angle([0, 1, 2])])
-    before = atoms.get_positions()
-    thermalize_momenta(atoms, 100, rng=np.random.default_rng(0))
-    run(atoms).run(steps=10)
-    moved = atoms.positions - before
-    assert np.array_equal(moved[8], [0, 0, 0])
-    assert np.abs(moved[7, [0, 2]]).max() <= 1e-14 and abs(moved[7, 1]) > 1e-5
-    assert off(atoms, held) <= 1e-13
-    assert atoms.get_number_of_degrees_of_freedom() == 27 - 3 - 2 - 3
 
 
 # -- forces that are known --------------------------------------------------------------------------

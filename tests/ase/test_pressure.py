@@ -15,7 +15,7 @@ from ase.calculators.lj import LennardJones
 from ase.constraints import FixAtoms, Hookean
 from ase.filters import ExpCellFilter, FrechetCellFilter, StrainFilter, UnitCellFilter
 from ase.optimize import BFGS
-from ase_systems import FS, TEMPERATURE, Field, Free, copper, dumbbells, follow, pressure, state
+from ase_systems import FS, TEMPERATURE, Field, Free, copper, dumbbells, follow, state
 
 from kcons.ase import (
     ConstrainedCalculator,
@@ -195,14 +195,6 @@ def test_a_step_that_fails_after_a_trial_leaves_the_cell(monkeypatch):
 
 
 # -- pressure and stress ------------------------------------------------------------------------------
-
-
-def test_atomic_pressure_is_that_of_ase_with_the_constraint_part():
-    atoms = copper()
-    reporter = PressureReporter(ConstrainedDynamics(atoms, FS), virial="atomic")
-    reporter()
-    assert reporter.mean == pytest.approx(pressure(atoms), rel=1e-9)
-    assert reporter.values[0] == pytest.approx(-atoms.get_stress(voigt=False, include_ideal_gas=True), abs=1e-12)
 
 
 def test_a_reporter_changes_no_run():

@@ -216,18 +216,6 @@ def test_momenta_set_in_between_are_used(kind):
         assert np.abs(moving.state.thermostat - chain).max() <= 0.5  # the chain and the heat go on
 
 
-@pytest.mark.parametrize("kind", ["langevin", "nose-hoover", "monte carlo", "two steps", "spheres"])
-def test_set_temperature(kind):
-    atoms = waters()
-    moving = made(kind, atoms)
-    moving.run(2)
-    moving.set_temperature(50)
-    assert moving.stepper.thermal_energy == 50 * units.kB
-    moving.run(20)
-    with pytest.raises(InputError, match="temperature_K is 0"):
-        moving.set_temperature(0)
-
-
 def test_another_calculator_on_the_atoms():
     """Its energies would be logged, and its forces not used."""
     atoms = waters()
@@ -318,12 +306,14 @@ def test_logs_and_trajectories_cost_no_call(tmp_path):
 
 
 def test_forces_that_ase_objects_add():
-    one, two = waters(2), waters(2, Waves(0.25))
+    one, two, without = waters(2), waters(2, Waves(0.25)), waters(2, Waves(0.25))
     for atoms in (one, two):
         atoms.constraints = [*atoms.constraints, ExternalForce(0, 5, 0.3)]
     made("two steps", one, fast_steps=2, friction=0.0).run(3)
-    made("langevin", two, FS / 8, friction=0.0).run(24)
+    for atoms in (two, without):
+        made("langevin", atoms, FS / 8, friction=0.0).run(24)
     np.testing.assert_allclose(one.positions, two.positions, rtol=0, atol=2e-5)
+    assert np.abs(two.positions - without.positions).max() > 1e-3
 
 
 # -- velocities -------------------------------------------------------------------------------------
