@@ -168,6 +168,9 @@ def test_hydrogens_take_mass_from_the_atoms_that_they_are_bonded_to():
     assert repartition_hydrogen_mass(given, 2) == 1
     assert (given.get_masses() - before)[[0, 8]] == pytest.approx([before[8] - 2, 2 - before[8]])
     assert np.count_nonzero(given.get_masses() != before) == 2
+    bridge = Atoms("CHC", np.eye(3), info={"bonds": [[0, 1], [1, 2]]})
+    assert repartition_hydrogen_mass(bridge, 2.0) == 1
+    assert bridge.get_masses() == pytest.approx([12.011 + 1.008 - 2, 2, 12.011])  # from the first of the two
 
 
 def test_water_keeps_its_masses():
@@ -176,8 +179,7 @@ def test_water_keeps_its_masses():
     light = atoms.get_masses()
     assert repartition_hydrogen_mass(atoms) == 4
     assert np.array_equal(atoms.get_masses()[:3], light[:3])
-    hydrogen = molecule("H2")
-    assert repartition_hydrogen_mass(hydrogen) == 0
+    assert repartition_hydrogen_mass(molecule("H2")) == 0
     assert repartition_hydrogen_mass(Atoms("Ar")) == 0
 
 
