@@ -122,7 +122,7 @@ void ProgramIntegrator::restore(const string& text, bool exactly) {
         if (known) next += (size_t) size;
     }
     if (!known || next != all.size())
-        throw OpenMMException("kcons: this state belongs to other steps or rows; take over its positions and velocities only");
+        throw OpenMMException("kcons: this state belongs to other steps or rows; OpenMM has taken over its positions and velocities, and the rest of it is left out");
     for (auto& each : found) write(each.first, each.second);
     middleKinetic = all[0]; endKinetic = all[1];
 }
