@@ -146,10 +146,10 @@ _PASSED = ("parameters", "failure", "failure_residual")
 def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_group: int = 64, slots: int = 1) -> str:
     """What comes before the source of rows: types and names of the platform, `ROWS`, `FAIL`, random numbers."""
     plain = platform in PLAIN
-    passed = [array for array in arrays if array.name in _PASSED or array.name.startswith("rows_")]
     typed = ["int step", "int launch", "mixed tolerance", *(f"mixed4 {name}" for name in _BOX)]
-    typed += [f"GLOBAL {a.kind}* {a.name}" for a in passed] + ["LOCAL_ARG mixed* scratch"] * (scratch > 0)
-    names = ["step", "launch", "HELD_TO", *_BOX, *(a.name for a in passed)] + ["scratch"] * (scratch > 0)
+    typed += [f"GLOBAL {a.kind}* {a.name}" for a in arrays if a.name in _PASSED or a.name.startswith("rows_")]
+    typed += ["LOCAL_ARG mixed* scratch"] * (scratch > 0)
+    names = [each.split()[-1].replace("tolerance", "HELD_TO") for each in typed]
     forces = [f"force{k}" for k in range(slots)]
     if plain:
         given = "void** pointers, const Numbers* given, int GROUP_ID, int NUM_GROUPS"

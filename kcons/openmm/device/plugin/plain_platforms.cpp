@@ -83,14 +83,13 @@ class PlainFactory : public KernelFactory {
     }
 };
 
-static struct PlainRegistered {
-    PlainRegistered() {
-        for (int k = 0; k < Platform::getNumPlatforms(); k++) {
-            Platform& platform = Platform::getPlatform(k);
-            if (platform.getName() == "Reference" || platform.getName() == "CPU")
-                platform.registerKernelFactory(StepKernel::Name(), new PlainFactory());
-        }
+static const bool plainRegistered = [] {
+    for (int k = 0; k < Platform::getNumPlatforms(); k++) {
+        Platform& platform = Platform::getPlatform(k);
+        if (platform.getName() == "Reference" || platform.getName() == "CPU")
+            platform.registerKernelFactory(StepKernel::Name(), new PlainFactory());
     }
-} plainRegistered;
+    return true;
+}();
 
 }

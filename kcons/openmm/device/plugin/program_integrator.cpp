@@ -222,9 +222,7 @@ const Array& StepKernel::declared(const string& name, long size) const {
     throw OpenMMException("kcons: no array is called '"+name+"'");
 }
 
-static struct Registered {
-    Registered() { SerializationProxy::registerProxy(typeid(ProgramIntegrator), new Proxy()); }
-} registered;
+static const bool registered = (SerializationProxy::registerProxy(typeid(ProgramIntegrator), new Proxy()), true);
 
 }
 
