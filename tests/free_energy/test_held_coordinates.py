@@ -153,29 +153,27 @@ def test_names_follow_the_mapping_and_not_the_set():
     assert repr(mine) == "<HeldCoordinates: turn, bend[0], bend[1], bond, beside 0 rows of their clusters>"
 
 
+R, BEND, BONDS = Distance([[0, 3]]), Angle([[0, 3, 4]]), Distance([[0, 1], [1, 2]])
+
+
+def of_chain(*rows, x=CHAIN, masses=MASSES, named=None, **cell):
+    return HeldCoordinates(ConstraintSet(rows, x, masses, **cell), named or {"r": R}, x)
+
+
 def test_only_the_clusters_of_the_coordinates_are_looked_at():
-    far = CHAIN + np.array([50.0, 0, 0])
-    x, m = np.vstack([CHAIN, far]), np.tile(MASSES, 2)
-    r = Distance([[0, 3]])
-    alone = HeldCoordinates(ConstraintSet([Distance([[0, 1], [1, 2]]), r], CHAIN, MASSES), {"r": r}, CHAIN)
-    among = HeldCoordinates(
-        ConstraintSet([Distance([[6, 7], [7, 8]]), Distance([[0, 1], [1, 2]]), r], x, m), {"r": r}, x
-    )
+    x = np.vstack([CHAIN, CHAIN + np.array([50.0, 0, 0])])
+    among = of_chain(Distance([[6, 7], [7, 8]]), BONDS, R, x=x, masses=np.tile(MASSES, 2))
     assert among.atoms.tolist() == [0, 1, 2, 3]
     v, f = np.random.default_rng(0).normal(size=(2, 12, 3))
-    one, two = alone.sample(CHAIN, v[:6], f[:6]), among.sample(x, v, f)
+    one, two = of_chain(BONDS, R).sample(CHAIN, v[:6], f[:6]), among.sample(x, v, f)
     np.testing.assert_array_equal(np.hstack(one), np.hstack(two))
 
 
 def test_redundant_constraints_beside_change_nothing():
     """All ten distances of five atoms, nine of them independent, or nine alone."""
-    pairs = [[a, b] for a in range(5) for b in range(a)]
-    r = Distance([[4, 5]])
+    pairs, r = [[a, b] for a in range(5) for b in range(a)], Distance([[4, 5]])
     v, f = np.random.default_rng(5).normal(size=(2, N, 3))
-    samples = []
-    for rows in (pairs, pairs[:9]):
-        constraint_set = ConstraintSet([Distance(rows), r], CHAIN, MASSES)
-        samples.append(HeldCoordinates(constraint_set, {"r": r}, CHAIN))
+    samples = [of_chain(Distance(rows), r, named={"r": r}) for rows in (pairs, pairs[:9])]
     assert [repr(s).split()[3] for s in samples] == ["10", "9"]
     tangent = Motion(ConstraintSet([Distance(pairs), r], CHAIN, MASSES), CHAIN).project_velocities(CHAIN, v)
     one, two = (s.sample(CHAIN, tangent, f) for s in samples)
@@ -183,31 +181,25 @@ def test_redundant_constraints_beside_change_nothing():
 
 
 def test_fixed_atoms_have_no_share():
-    r, bend = Distance([[0, 3]]), Angle([[0, 3, 4]])
-    heavy = MASSES.copy()
+    heavy, named = MASSES.copy(), {"r": R, "b": BEND}
     heavy[[0, 4]] = 1e14
     v, f = np.random.default_rng(2).normal(size=(2, N, 3))
     v[[0, 4]] = 0
-    fixed = HeldCoordinates(ConstraintSet([FixedAtoms([0, 4]), r, bend], CHAIN, MASSES), {"r": r, "b": bend}, CHAIN)
-    plain = HeldCoordinates(ConstraintSet([r, bend], CHAIN, heavy), {"r": r, "b": bend}, CHAIN)
-    one, two = fixed.sample(CHAIN, v, f), plain.sample(CHAIN, v, f)
+    held = of_chain(FixedAtoms([0, 4]), R, BEND, named=named), of_chain(R, BEND, masses=heavy, named=named)
+    one, two = (each.sample(CHAIN, v, f) for each in held)
     np.testing.assert_allclose(np.hstack(one[:-1]), np.hstack(two[:-1]), rtol=0, atol=1e-10)
 
 
 def test_wrapped_molecules_and_a_new_cell():
-    cell = np.diag([8.0, 9.0, 10.0])
-    r = Distance([[0, 3]])
-    rows = [Distance([[0, 1], [1, 2]]), r]
+    cell, images = np.diag([8.0, 9.0, 10.0]), np.array([0, 1, 0, -1, 2, 0])[:, None]
     v, f = np.random.default_rng(4).normal(size=(2, N, 3))
-    moved = CHAIN + np.array([0, 1, 0, -1, 2, 0])[:, None] * cell[0]
-    whole = HeldCoordinates(ConstraintSet(rows, CHAIN, MASSES, cell=cell), {"r": r}, CHAIN).sample(CHAIN, v, f)
-    constraint_set = ConstraintSet(rows, moved, MASSES, cell=cell)
-    motion = Motion(constraint_set, moved)
-    mine = HeldCoordinates(motion, {"r": r}, moved)
-    np.testing.assert_allclose(np.hstack(whole), np.hstack(mine.sample(moved, v, f)), rtol=0, atol=1e-12)
+    moved, wider = (CHAIN + images * factor * cell[0] for factor in (1.0, 1.25))
+    whole = np.hstack(of_chain(BONDS, R, cell=cell).sample(CHAIN, v, f))
+    motion = Motion(ConstraintSet([BONDS, R], moved, MASSES, cell=cell), moved)
+    mine = HeldCoordinates(motion, {"r": R}, moved)
+    np.testing.assert_allclose(whole, np.hstack(mine.sample(moved, v, f)), rtol=0, atol=1e-12)
     motion.set_cell(1.25 * cell)
-    wider = CHAIN + np.array([0, 1, 0, -1, 2, 0])[:, None] * 1.25 * cell[0]
-    np.testing.assert_allclose(np.hstack(whole), np.hstack(mine.sample(wider, v, f)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(whole, np.hstack(mine.sample(wider, v, f)), rtol=0, atol=1e-12)
 
 
 def test_moving_targets_and_moving_constraints_beside():
@@ -244,27 +236,23 @@ def test_large_clusters_have_no_mean_over_velocities():
 
 def test_coordinates_that_come_to_depend_on_others():
     """Straight, the far ends no longer tell their distance from the bonds."""
-    beside = ConstraintSet([Distance([[0, 1], [1, 2]]), Distance([[0, 2]])], CHAIN, MASSES)
-    flat = CHAIN.copy()
+    side, flat = Distance([[0, 2]]), CHAIN.copy()
     flat[0] = 2 * flat[1] - flat[2] + [0.0, 0.0, 1e-9]
     with pytest.raises(SingularGeometryError, match="side depends on the other"):
-        HeldCoordinates(beside, {"side": Distance([[0, 2]])}, CHAIN).sample(flat, CHAIN, CHAIN)
+        of_chain(BONDS, side, named={"side": side}).sample(flat, CHAIN, CHAIN)
 
 
 def test_formulas_on_the_same_atoms_are_told_apart():
-    formulas = [Formula(text, [[0, 3]], target=None) for text in ("x1*x2 - z1", "y1 + 3*y2")]
-    constraint_set = ConstraintSet(formulas, CHAIN, MASSES)
-    again = Formula("y1 + 3*y2", [[0, 3]], target=None)
-    assert HeldCoordinates(constraint_set, {"second": again}, CHAIN).rows.tolist() == [1]
+    first, second, again, third = (
+        Formula(text, [[0, 3]], target=None) for text in ("x1*x2 - z1", "y1 + 3*y2", "y1 + 3*y2", "y1 + 4*y2")
+    )
+    assert of_chain(first, second, named={"second": again}).rows.tolist() == [1]
     with pytest.raises(InputError, match="not among"):
-        HeldCoordinates(constraint_set, {"third": Formula("y1 + 4*y2", [[0, 3]], target=None)}, CHAIN)
+        of_chain(first, second, named={"third": third})
 
 
 def test_what_no_coordinate_touches_may_be_anything():
-    r, edge, far = Distance([[0, 3]]), KnifeEdge(0, 1, (0, 0, 1)), Distance([[4, 5]])
-    still = np.zeros((N, 3))
+    far, still = Distance([[4, 5]]), np.zeros((N, 3))
     still[2] = np.nan
-    assert np.isfinite(
-        HeldCoordinates(ConstraintSet([r], CHAIN, MASSES), {"r": r}, CHAIN).sample(CHAIN, still, still).off
-    )
-    assert len(HeldCoordinates(ConstraintSet([far, edge], CHAIN, MASSES), {"far": far}, CHAIN)) == 1
+    assert np.isfinite(of_chain(R).sample(CHAIN, still, still).off)
+    assert len(of_chain(far, KnifeEdge(0, 1, (0, 0, 1)), named={"far": far})) == 1
