@@ -287,8 +287,8 @@ class Descent:
                 radius = min(radius, longest) / (2 if ratio > 0 else 4)
             if gain <= 0 or ratio > 0 or there.largest <= fmax:
                 here = there
-        terms, memory = self.internals.terms, np.array(self._memory[-MEMORY:])
-        return Relaxed(here.x, here.energy, here.largest, self.evaluations, memory.reshape(-1, 2, len(terms)), terms)
+        memory = np.array(self._memory[-MEMORY:])
+        return Relaxed(here.x, here.energy, here.largest, self.evaluations, memory, self.internals.terms)
 
     def _step(self, here: _Place, radius: float) -> tuple[FloatArray, float]:
         """Along the rows, the longest move of an atom at most `radius`, shape (columns,); what it is to gain."""

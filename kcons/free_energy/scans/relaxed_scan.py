@@ -215,7 +215,7 @@ class _Wavefront:
         fmax, evaluations = self.settings["fmax"], self.settings["evaluations"]
         before = self.start if source is None else source.positions
         # What a calculator remembers, such as a density, would make the bits depend on what was done before.
-        getattr(self.atoms.calc, "reset", list)()
+        getattr(self.atoms.calc, "reset", lambda: None)()
         motion = self._engine(self.grid.held_at(point))
         try:
             x = motion.restore_positions(before, bonds=self._bonds)
@@ -229,7 +229,7 @@ class _Wavefront:
             energy = self.evaluate(found.positions)[0]
             return Relaxed(found.positions, energy, found.largest, found.evaluations)
         internals = Internals(self.atoms.numbers, x, motion.lattice)
-        memory = () if source is None else internals.remapped(source.memory, source.terms)
+        memory = internals.remapped(source.memory, source.terms) if source and len(source.memory) else ()
         return Descent(motion, self.evaluate, internals, memory).relaxed(x, fmax, evaluations)
 
     # -- from point to point --------------------------------------------------------------------
