@@ -42,10 +42,12 @@ CALCULATOR = partial(LennardJones, sigma=1.0, epsilon=0.02, rc=6.0)
 # -- settings of windows, and who samples them --
 
 _SETTINGS = [
-    *(("temperature", value) for value in (-1.0, "x", "300")),
-    *(("friction", value) for value in ([1, 2], True)),
-    *(("every", value) for value in (0, None)),
-    *(("timestep", 0.0), ("relax", -1), ("pull", 0.5)),
+    ("temperature", "300"),
+    ("friction", True),
+    ("every", None),
+    ("timestep", 0.0),
+    ("relax", -1),
+    ("pull", 0.5),
 ]
 SETTINGS = [
     *((partial(Settings, **{name: value}), name, f"{name} is") for name, value in _SETTINGS),
@@ -107,8 +109,6 @@ RING = [[0, 0.1, 0.2], [1.1, 0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9], [3.1, 0
 X = np.array([*RING, [9, 9.1, 9.2], [10.1, 9, 8.9]])
 R, CENTER, EDGE = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5]), KnifeEdge(6, 7, (0, 0, 1))
 SET, STILL = ConstraintSet([R, CENTER, EDGE], X, np.ones(8)), np.zeros((8, 3))
-BROKEN = STILL.copy()
-BROKEN[0, 1] = np.inf
 
 
 def held(coordinates, rows=None, x=X):
@@ -132,8 +132,7 @@ HELD = [
     (lambda: held({"r": BESIDE}, [BESIDE, EDGE]), None, r"r share.* velocity.*Motion\.mult", UnsupportedError),
     (lambda: held({"r": R}).sample(X, STILL, STILL[:4]), "forces", "forces must have shape"),
     (lambda: held({"r": R}).sample(X * np.nan, STILL, STILL), "positions", "positions of atom 0", NonFiniteError),
-    (lambda: held({"r": R}).sample(X, BROKEN, STILL), "velocities", "velocities of atom 0", NonFiniteError),
-    (lambda: held({"r": R}).sample(X, STILL, BROKEN), "forces", "forces of atom 0", NonFiniteError),
+    (lambda: held({"r": R}).sample(X, STILL, np.inf + STILL), "forces", "forces of atom 0", NonFiniteError),
 ]
 
 # -- series, means, mean forces --
@@ -188,9 +187,8 @@ PROFILES = [
     (lambda: integrate(N3, N3, [1.0] * 3, period="360"), "period", "positive"),
     (lambda: integrate(N4, [0.0, 1.0, 2.0, 2.0], [0.0] * 4), "e", "windows at 1 have mean forces from 1 to"),
     (lambda: integrate([0.0, 90.0, 180.0], N3, [1.0] * 3, period=6.28), "period", "units"),
-    *((lambda n=n: profile().next_windows(n), "count", "count is") for n in (-1, 0, 1.5)),
-    *((lambda b=b: profile().next_windows(1, below=b), "below", "below is") for b in (-1.0, np.nan)),
-    (lambda: profile().next_windows(1, below=-5.0), "below", "below is"),
+    (lambda: profile().next_windows(0), "count", "count is"),
+    *((lambda b=b: profile().next_windows(1, below=b), "below", "below is") for b in (0.0, np.nan)),
     (lambda: surface(x=np.zeros((3, 2))), "x", r"d \+ 2 or more"),
     (lambda: surface(x=np.ones((9, 2))), "x", "one value of coordinate 0"),
     (lambda: surface(f=np.zeros((9, 3))), "f", r"shape \(9, 2\)"),
@@ -203,17 +201,11 @@ PROFILES = [
     (lambda: surface(periods=(0.5, None)), "x", "further apart than the period in coordinate 0"),
     (lambda: surface(zero=[0.0]), "zero", "2 finite"),
     (lambda: surface(zero=[9.0, 0.0]), "x", "beyond the windows"),
-    *(
-        (lambda b=b: surface().difference([0.0, 0.0], b), "a", "a and b must be places of 2 coordinates")
-        for b in ([0.5], 0.5, [0.5, 0.5, 0.5])
-    ),
+    (lambda: surface().difference([0.0, 0.0], 0.5), "a", "a and b must be places of 2 coordinates"),
     (lambda: pull_free_energy([1.0] * 4, thermal_energy=1.0), "forward", "5 pulls"),
     (lambda: pull_free_energy([1.0] * 5, [1.0] * 4, thermal_energy=1.0), "backward", "5 pulls"),
     (lambda: pull_free_energy([1.0] * 5 + [np.inf], thermal_energy=1.0), "forward", "work 5"),
-    *(
-        (lambda kT=kT: pull_free_energy([1.0] * 5, thermal_energy=kT), "thermal_energy", "positive")
-        for kT in (-1.0, "x", "1")
-    ),
+    (lambda: pull_free_energy([1.0] * 5, thermal_energy="1"), "thermal_energy", "positive"),
 ]
 
 # -- scans --
