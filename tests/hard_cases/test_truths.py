@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hard_cases import truths
+from hard_cases.long_runs import pendulum
 from hard_cases.problem import Problem
 
 MASSES = np.array([16.0, 1.0, 2.0])
@@ -13,26 +14,18 @@ WATER = truths.rotated([[0.0, 0, 0], [0.8, 0.6, 0], [-0.8, 0.6, 0]])
 OMEGA = np.array([0.9, -0.5, 0.7])
 
 
-def test_euler_agrees_with_the_dense_theory():
-    v = truths.spinning(WATER, MASSES, OMEGA)
-    problem = Problem(WATER, MASSES, [(0, 1), (0, 2), (1, 2)], velocities=v)
-    found = truths.true_motion(problem, 2.0)
-    np.testing.assert_allclose(found, truths.rigid_flight(WATER, MASSES, OMEGA, 2.0), atol=1e-9)
-
-
-def test_the_map_of_moser_and_veselov_is_rattle():
-    v = truths.spinning(WATER, MASSES, OMEGA)
-    problem = Problem(WATER, MASSES, [(0, 1), (0, 2), (1, 2)], velocities=v)
-    found = truths.dense_rattle(problem, 0.05, 20)
-    np.testing.assert_allclose(found, truths.rigid_rattle(WATER, MASSES, OMEGA, 0.05, 20), atol=1e-11)
+def test_euler_and_the_map_of_moser_and_veselov_agree_with_the_dense_theory():
+    body = WATER, MASSES, OMEGA
+    problem = Problem(WATER, MASSES, [(0, 1), (0, 2), (1, 2)], velocities=truths.spinning(*body))
+    np.testing.assert_allclose(truths.true_motion(problem, 2.0), truths.rigid_flight(*body, 2.0), atol=1e-9)
+    rattle = truths.dense_rattle(problem, 0.05, 20)
+    np.testing.assert_allclose(rattle, truths.rigid_rattle(*body, 0.05, 20), atol=1e-11)
 
 
 @pytest.mark.parametrize("angle", [0.1, 1.0, 2.9])
 def test_pendulum(angle):
-    x = np.array([[0.0, 0, 0], [np.sin(angle), 0, -np.cos(angle)]])
-    push = np.array([[0, 0, 0], [0, 0, -1.0]])
-    problem = Problem(x, [1.0, 1.0], [(0, 1)], [1.0], fixed=[0], push=push)
-    np.testing.assert_allclose(truths.true_motion(problem, 1.7)[1], truths.pendulum(angle, 1.7), atol=1e-9)
+    found = truths.true_motion(pendulum(angle), 1.7)[1]
+    np.testing.assert_allclose(found, truths.pendulum(angle, 1.7), atol=1e-9)
 
 
 def test_linear_flight():
