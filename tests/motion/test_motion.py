@@ -369,37 +369,31 @@ def test_few_atoms_among_many_get_what_they_get_alone(moving: bool) -> None:
     f = np.random.default_rng(5).normal(size=x.shape)
     free = np.setdiff1d(np.arange(len(x)), numbers)
     n = many.n_rows
+
+    def alike(found, expected, tolerance, plain) -> None:
+        np.testing.assert_allclose(found[numbers], expected, rtol=0, atol=tolerance)
+        np.testing.assert_array_equal(found[free], plain[free])
+
     for time in (0.0, 0.4) if moving else (0.0,):
         vb, vs, lb, ls = v.copy(), v[numbers], np.empty(n), np.empty(n)
         kw = {"time": time, "reference_time": 0.0, "dt": 0.1}
-        found = big.project_positions(x + move, x, velocities=vb, multipliers=lb, **kw)
-        expected = small.project_positions((x + move)[numbers], x[numbers], velocities=vs, multipliers=ls, **kw)
-        np.testing.assert_allclose(found[numbers], expected, rtol=0, atol=1e-14)
-        np.testing.assert_array_equal(found[free], (x + move)[free])
-        np.testing.assert_allclose(vb[numbers], vs, rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(vb[free], v[free])
+        y = big.project_positions(x + move, x, velocities=vb, multipliers=lb, **kw)
+        ys = small.project_positions((x + move)[numbers], x[numbers], velocities=vs, multipliers=ls, **kw)
+        alike(y, ys, 1e-14, x + move)
+        alike(vb, vs, 1e-12, v)
         np.testing.assert_allclose(lb, ls, rtol=0, atol=1e-12)
-        y, ys = found, expected
         found = big.project_velocities(y, v, time=time, multipliers=lb)
-        expected = small.project_velocities(ys, v[numbers], time=time, multipliers=ls)
-        np.testing.assert_allclose(found[numbers], expected, rtol=0, atol=1e-13)
-        np.testing.assert_array_equal(found[free], v[free])
+        alike(found, small.project_velocities(ys, v[numbers], time=time, multipliers=ls), 1e-13, v)
         np.testing.assert_allclose(lb, ls, rtol=0, atol=1e-12)
-        for name in ("acceleration", "constraint_force"):
-            found = getattr(big, name)(y, v, f, time)
+        for name, plain in (("acceleration", f / many.masses[:, None]), ("constraint_force", np.zeros_like(f))):
             expected = getattr(small, name)(ys, v[numbers], f[numbers], time)
-            np.testing.assert_allclose(found[numbers], expected, rtol=0, atol=1e-11)
-            plain = f / many.masses[:, None] if name == "acceleration" else np.zeros_like(f)
-            np.testing.assert_array_equal(found[free], plain[free])
+            alike(getattr(big, name)(y, v, f, time), expected, 1e-11, plain)
         lam = big.multipliers(y, v, f, time)
         np.testing.assert_allclose(lam, small.multipliers(ys, v[numbers], f[numbers], time), rtol=0, atol=1e-11)
-        found = big.project_forces(y, f, time=time)
-        np.testing.assert_allclose(found[numbers], small.project_forces(ys, f[numbers], time=time), rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(found[free], f[free])
+        alike(big.project_forces(y, f, time=time), small.project_forces(ys, f[numbers], time=time), 1e-12, f)
         off = x + 3 * move
         found = big.restore_positions(off, time=time)
-        np.testing.assert_allclose(found[numbers], small.restore_positions(off[numbers], time=time), rtol=0, atol=1e-10)
-        np.testing.assert_array_equal(found[free], off[free])
+        alike(found, small.restore_positions(off[numbers], time=time), 1e-10, off)
 
 
 def test_memory_of_one_bond_does_not_depend_on_the_number_of_atoms() -> None:
