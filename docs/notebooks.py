@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,8 @@ def write(folder: Path, *, executed: bool = False) -> None:
     for page in pages():
         notebook = notebook_of(page)
         if executed and (page.stem not in NEEDS or find_spec(NEEDS[page.stem])):
-            notebook = run(notebook, folder)
+            with tempfile.TemporaryDirectory() as place:  # some refuse to write over what an earlier run has left
+                notebook = run(notebook, Path(place))
         nbformat.write(notebook, folder / f"{page.stem}.ipynb")
 
 
