@@ -188,14 +188,10 @@ def test_positions_masses_and_the_like_are_refused_with_units():
         lambda: motion.project_velocities(x, x * nm / unit.picosecond),
         lambda: run(System(motion), State(x * nm, x), 0.1, 1),
         lambda: run(System(motion), State(x, x), 1 * fs, 1),
-        lambda: run(System(motion, lambda x, t: x * nm), motion_start(motion, x), 0.1, 1),
+        lambda: run(System(motion, lambda x, t: x * nm), State(x, motion.project_velocities(x, x)), 0.1, 1),
     ):
         with pytest.raises(InputError, match="has units"):
             call()
-
-
-def motion_start(motion, x):
-    return State(x, motion.project_velocities(x, x))
 
 
 def test_units_of_other_libraries_are_refused():
