@@ -169,7 +169,7 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
             chosen["frames"] = numbers
         remarks = self._look_for_grid(numbers) if self._may_be_on_grid else []
         remarks += self._bind(int(numbers[0]))
-        damaged = first_break(self._trajectory, damage)
+        damaged = None if _in_place(self._trajectory) else first_break(self._trajectory, damage)
         masses = self._masses if self._trajectory.ts.has_velocities else None
         self._compute = _Frames(self._trajectory, self._rows, masses, self._velocities, damaged, self._precision)
         super().run(**chosen, **options)
@@ -267,6 +267,11 @@ class _Uncopied(Timestep):  # type: ignore[misc]
         self.given = given
 
 
+def _in_place(reader: Any) -> bool:
+    """Whether frames are read like this, which each worker does for its own."""
+    return isinstance(reader, DCDReader) and not reader.transformations
+
+
 @dataclass
 class _Frames:
     """The work of one worker, all that goes to others: MDAnalysis' own loop takes the analysis, and ends in errors."""
@@ -276,7 +281,8 @@ class _Frames:
     #: None where there are no velocities, or no masses.
     masses: FloatArray | None
     velocities: bool
-    damage: Break | None
+    #: In files of which not each worker looks itself.
+    damaged: Break | None
     #: Of each frame.
     precision: list[FilePrecision]
 
@@ -285,8 +291,9 @@ class _Frames:
     ) -> Any:
         """Look at frames, in order, up to the first that cannot be used."""
         numbers, trajectory, previous = indexed_frames[:, 1], self.trajectory, -1
-        own = None
-        if isinstance(trajectory, DCDReader) and not trajectory.transformations:
+        own, damaged = None, self.damaged
+        if _in_place(trajectory):
+            damaged = damage(trajectory, trajectory.filename, numbers.tolist())
             own, converts = _Uncopied.from_timestep(trajectory.ts), trajectory.convert_units
             # That there is nothing to convert, the reader would find out for each frame again.
             trajectory.convert_units = converts and trajectory.units["length"] != "Angstrom"
@@ -295,8 +302,8 @@ class _Frames:
         with quiet(), ProgressBar(total=len(numbers), verbose=bool(verbose), **(progressbar_kwargs or {})) as bar:
             for k, number in enumerate(numbers.tolist()):
                 try:
-                    if self.damage is not None and number >= self.damage.frame:
-                        found.broken = self.damage
+                    if damaged is not None and number >= damaged.frame:
+                        found.broken = damaged
                     else:
                         # Seeking reads compressed files from their beginning.
                         if not 0 <= previous == number - 1:

@@ -50,7 +50,6 @@ SECOND_ORDER = 1.1
 _ROOT_THREE = np.sqrt(3.0)
 #: Bits of the exponent of a single, which are the power of two below it; all of them are set where it is no number.
 _EXPONENT = np.int32(0x7F800000)
-_NO_SPEEDS = np.zeros((0, 4))
 
 #: Over all frames, by row: the largest excess over what was allowed (negative where there was none), the absolute
 #: deviation in that frame and its number; sums of deviations, of what rounding makes of them, and of frames that count.
@@ -238,10 +237,9 @@ class RowTable:
 
     def end(self, found: Found) -> None:
         """Put what was found by row in the frames that were looked at."""
-        rows = self._by_row[:, self._places].T.copy().view(_BY_ROW)[:, 0]
+        found.rows = self._by_row[:, self._places].T.copy().view(_BY_ROW)[:, 0]
         # Compiled code counts the others.
-        rows["counted"] = len(found.frames) - rows["counted"]
-        found.rows = rows
+        found.rows["counted"] = len(found.frames) - found.rows["counted"]
 
     def look(self, found: Found, k: int, ts: Any, precision: FilePrecision, masses: FloatArray | None, v: Any) -> None:
         """Put what is found in one frame, which must be finite, into the k-th place; with velocities rates, too."""
@@ -250,9 +248,8 @@ class RowTable:
         lattice, limit = self._cell_of(ts)
         frame["bare"] = limit == np.inf
         planes = np.ascontiguousarray(ts.positions.T, dtype=np.float32)
-        speeds = _NO_SPEEDS
+        speeds = np.zeros((0, 4)) if v is None else np.column_stack([v, np.zeros(len(v))])
         if v is not None:
-            speeds = np.column_stack([v, np.zeros(len(v))])
             if not np.isfinite(speeds).all():
                 atom = int(np.argmin(np.isfinite(speeds).all(axis=1)))
                 raise NonFiniteError(f"velocity of atom {atom} is {v[atom]}", item="velocity", atom=atom)

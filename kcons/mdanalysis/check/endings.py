@@ -9,7 +9,8 @@ from __future__ import annotations
 import io
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -94,22 +95,20 @@ def ending(reader: Any, path: str) -> Break | None:
     return Break(n, f"{size - end} bytes follow the last whole frame") if end < size else None
 
 
-def damage(reader: Any, path: str) -> Break | None:
-    """The first damaged frame of a DCD or text file that the reader does not refuse when it comes to it."""
+def damage(reader: Any, path: str, frames: Iterable[int] | None = None) -> Break | None:
+    """The first damaged frame of a DCD or text file, of all or of some, that the reader does not refuse itself."""
     if not isinstance(reader, DCDReader):
-        try:
+        with suppress(OSError, EOFError):
             return _text_break(path, format_of(reader), reader.n_atoms)
-        except (OSError, EOFError):
-            return None
-    file = reader._file
-    # Records are framed by their lengths, at which the reader looks itself, but for the one behind a cell; frame by
-    # frame, but for the first, which has coordinates of fixed atoms too.
-    with open(path, "rb", buffering=0 if file._framesize > io.DEFAULT_BUFFER_SIZE else -1) as opened:
-        for k in range(1, reader.n_frames if file.is_periodic else 0):
-            opened.seek(file._header_size + file._firstframesize + (k - 1) * file._framesize)
-            cell = opened.read(56)
-            if cell[:4] != cell[52:]:
-                return Break(k, DAMAGED)
+    elif (file := reader._file).is_periodic:
+        # Records are framed by their lengths, at which the reader looks itself, but for the one behind a cell.
+        with open(path, "rb", buffering=0 if file._framesize > io.DEFAULT_BUFFER_SIZE else -1) as opened:
+            for k in range(reader.n_frames) if frames is None else frames:
+                # Of fixed atoms, the first frame alone has coordinates.
+                opened.seek(file._header_size + (file._firstframesize + (k - 1) * file._framesize if k else 0))
+                cell = opened.read(56)
+                if cell[:4] != cell[52:]:
+                    return Break(k, DAMAGED)
     return None
 
 
