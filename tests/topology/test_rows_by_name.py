@@ -72,12 +72,6 @@ def test_what_is_held_by_name(kind, expected):
     assert counts(held_rows(solution(), kind)) == expected
 
 
-def test_flexible_water_has_bonds_and_an_angle():
-    assert counts(held_rows(solution(), "hangles", rigid_water=False)) == {"Distance": 10, "Angle": 6}
-    with_third = solution((*BONDS, (9, 10), (9, 11), (10, 11)))  # as CHARMM and Amber list it
-    assert counts(held_rows(with_third, "hangles", rigid_water=False)) == {"Distance": 10, "Angle": 6}
-
-
 def test_missing_bonds_are_guessed_and_said():
     with pytest.warns(UserWarning, match=r"^8 bonds were guessed from distances and covalent radii.*guess_bonds=False"):
         rows = held_rows(solution(()), "hangles")
@@ -143,11 +137,13 @@ def test_rows_on_selections_and_their_names():
 
 
 def test_virtual_sites_are_no_degrees_of_freedom():
-    m = 0.128 * (WATER[1] + WATER[2])
-    made = snapshot(["O", "H", "H", ""], np.vstack([WATER, m]), names=["OW", "HW1", "HW2", "MW"], residue_names=["SOL"])
+    """Nor are bonds held that a topology lists of them."""
+    x, bonds = np.vstack([WATER, 0.128 * (WATER[1] + WATER[2])]), [(0, 1), (0, 2), (0, 3)]
+    made = snapshot(["O", "H", "H", ""], x, bonds, names=["OW", "HW1", "HW2", "MW"], residue_names=["SOL"])
     rows = held_rows(made, "hangles")
     assert len(rows.virtual_sites) == 1
     assert Motion(rows.constraint_set, made.positions).degrees_of_freedom == 6
+    assert counts(held_rows(made, "hangles", rigid_water=False)) == {"Distance": 2, "Angle": 1}
 
 
 def test_water_whose_hydrogens_are_listed_as_bonded_is_a_rigid_body():
