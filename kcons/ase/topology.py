@@ -17,13 +17,14 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology.guessed_bonds import close_pairs, guess_bonds
 from kcons.topology.rigid_groups import water_rows
 from kcons.topology.rows_by_name import HeldRows, Holding, Options, rows_of, with_options
 from kcons.topology.topology import (
     Snapshot,
     Topology,
+    close_pairs,
     elements_of,
+    guess_bonds,
     require_kind,
     selected_numbers,
     sorted_pairs,

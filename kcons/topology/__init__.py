@@ -1,7 +1,6 @@
 """What a file says about a system, and the rows that follow from it.
 
-- `topology`: atoms, residues, bonds and masses, the same for every MD engine; molecules made whole across faces
-- `guessed_bonds`: bonds for systems that come without
+- `topology`: atoms, residues, masses, bonds, given or by distance, for every MD engine; molecules made whole
 - `rigid_groups`: rigid groups of atoms as rows; massless sites that three atoms place
 - `angle_rows`: rows that hold all angles, none too many
 - `rows_by_name`: rows by name: bonds with hydrogens, all bonds, angles, rigid water; the options for what is held

@@ -25,7 +25,6 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import lined_up
 from kcons.errors import InputError, did_you_mean
 from kcons.topology.angle_rows import STRAIGHT, angle_rows
-from kcons.topology.guessed_bonds import FAR, guess_bonds, reaches
 from kcons.topology.rigid_groups import (
     GEOMETRIES,
     WATER,
@@ -38,7 +37,7 @@ from kcons.topology.rigid_groups import (
     residue_bodies,
     water_rows,
 )
-from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
+from kcons.topology.topology import FAR, BoolArray, Snapshot, Topology, bond_angles, guess_bonds, reaches, sorted_pairs
 
 #: No bond is that long, in angstrom, whatever its atoms.
 TORN = 10.0

@@ -23,7 +23,7 @@ from kcons.errors import InfeasibleError, KconsError
 from kcons.motion import Motion, solver_sequence
 from kcons.motion.restoring import nearest_point
 from kcons.motion.restoring.kept_geometry import bonds_of
-from kcons.topology.guessed_bonds import bonds_without_elements
+from kcons.topology.topology import bonds_without_elements
 
 #: What may change: angstrom, degrees.
 BOND, ANGLE = 0.02, 2.0

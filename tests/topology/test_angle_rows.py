@@ -17,8 +17,7 @@ from kcons.constraints import Angle, Dihedral, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.topology.angle_rows import LARGEST, angle_rows, ring_rows, ring_systems
-from kcons.topology.guessed_bonds import guess_bonds
-from kcons.topology.topology import bond_angles, sorted_pairs
+from kcons.topology.topology import bond_angles, guess_bonds, sorted_pairs
 
 
 def singular_values(whole, x):

@@ -7,11 +7,11 @@ import pytest
 from snapshots import WATER, held_rows, rotations, snapshot
 
 from kcons.errors import InputError
-from kcons.topology.guessed_bonds import guess_bonds
 from kcons.topology.topology import (
     Snapshot,
     as_written,
     elements_of,
+    guess_bonds,
     require_standard_form,
     split_residues,
     whole_groups,

@@ -17,8 +17,7 @@ from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
 from kcons.plan.clusters import edge_blocks, fixed_rows
 from kcons.solvers.rank_revealing import independent
-from kcons.topology.guessed_bonds import NEAREST, across, bonds_without_elements
-from kcons.topology.topology import BoolArray, bond_angles, sorted_pairs
+from kcons.topology.topology import NEAREST, BoolArray, across, bond_angles, bonds_without_elements, sorted_pairs
 
 #: Other bonds may change by this part of their length (0.02 angstrom for C-C), other angles by this much in radian.
 BOND_KEPT, ANGLE_KEPT = 0.0125, np.radians(2.0)

@@ -85,11 +85,12 @@ MUTANTS = {
         ('(p, "«2→1»")', "nose_hoover_ensemble::a_chain_in_the_middle_is_the_same_chain_in_small_steps"),
         ("«        p.project()\n→»", "nose_hoover_ensemble::a_chain_in_the_middle_is_time_reversible"),
     ],
-    "topology/guessed_bonds.py": [
+    "topology/topology.py": [
         (
             "wrapped = y« if lattice is None else wrapped_into(y, lattice)[1]→»",
             "restoring::bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored",
         ),
+        ("if «not isinstance(given, kind)→given is None»:", "openmm/topology::what_is_no_topology_is_refused"),
     ],
     "plan/clusters.py": [
         ("single &= «~anchored→anchored >= 0»", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),
@@ -117,9 +118,6 @@ MUTANTS = {
     ],
     "solvers/tolerances.py": [
         ("FLAT = 0.0«1→»", "row_functions::a_dihedral_that_turns_over_has_no_solution_far_away"),
-    ],
-    "topology/topology.py": [
-        ("if «not isinstance(given, kind)→given is None»:", "openmm/topology::what_is_no_topology_is_refused"),
     ],
     "ase/topology.py": [
         ("where=«(masses != 0.0) | (momenta != 0.0)→masses != -1.0»", "dynamics::a_fixed_atom_needs_no_mass"),
