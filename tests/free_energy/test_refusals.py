@@ -225,8 +225,10 @@ _GRIDS = [
     ([TWO], [[1]], "coordinates", "has 2 rows; a coordinate of a scan has one"),
     *(([LENGTH], [wrong], "values", "not a list of finite numbers") for wrong in ([], [1, np.nan], [[1, 2]])),
     ([LENGTH], [["far"]], None, "values of Distance"),
-    ([LENGTH], [[1, 2, 1]], "values", "two values of .* are the same"),
-    ([LENGTH], [[1, 3, 2]], "values", "go up and down; give them in order"),
+    *(
+        ([LENGTH], [wrong], "values", "go up and down; give each once and")
+        for wrong in ([1, 2, 1], [1, 3, 2], [1, 1, 2])
+    ),
     ([TURN], [np.radians([-180, 0, 200])], "values", "span more than its period"),
 ]
 SCANS = [

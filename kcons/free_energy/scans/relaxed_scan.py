@@ -347,11 +347,9 @@ class Grid:
             axis = np.atleast_1d(np.array(as_float_array(given, f"values of {name}")))
             if axis.ndim != 1 or not len(axis) or not np.isfinite(axis).all():
                 raise InputError(f"the values of {name} are not a list of finite numbers", item="values")
-            ring, span = False, float(np.ptp(axis))
-            if np.diff(np.sort(axis)).min(initial=np.inf) <= SAME * span:
-                raise InputError(f"two values of {name} are the same; give each once", item="values")
-            if len(set(np.sign(np.diff(axis)).tolist())) > 1:
-                raise InputError(f"the values of {name} go up and down; give them in order", item="values")
+            ring, span, steps = False, float(np.ptp(axis)), np.diff(axis)
+            if (steps * np.sign(steps.sum()) <= SAME * span).any():
+                raise InputError(f"the values of {name} go up and down; give each once and in order", item="values")
             if item.period is not None and len(axis) > 1:
                 if span > item.period * (1 + SAME):
                     raise InputError(
