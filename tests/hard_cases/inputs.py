@@ -29,41 +29,20 @@ def moving_chain(n: int = 5, **changes: Any) -> Problem:
     return Problem(x, masses, bonds(n), velocities=v).but(**changes)
 
 
-_SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.2]])
-_BRACED = [(0, 1), (1, 2), (2, 3), (0, 3), (0, 2)]
+_SQUARE, _BRACED = [[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.2]], [(0, 1), (1, 2), (2, 3), (0, 3), (0, 2)]
 _UNIT, _APART = np.array([[0.0, 0, 0], [1.0, 0, 0]]), [[0, 0.1, 0], [0, -0.1, 0]]
 _CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.9, 0]])
+TWICE = Problem(_UNIT, [1.0, 1.0], [(0, 1), (0, 1)], [1.0, 1.001], velocities=_APART)
+DIAGONAL = Problem(_SQUARE, np.ones(4), _BRACED, [1.0, 1.0, 1.0, 1.0, 2.2])
+POINT = Problem(0 * _UNIT, [1.0, 1.0], [(0, 1)], [1.0], velocities=_APART)
+WIDE = Problem(_CORNERS, np.ones(3), TRIANGLE, [1.0, 1.0, 3.0], velocities=0.1 * _CORNERS)
+FIXED = Problem([*_UNIT, [1.5, 0.9, 0]], np.ones(3), [(0, 1), (1, 2)], [1.01, 1.03], fixed=[0, 1])
 for number, title, said, problem in (
-    (
-        "H02",
-        "One bond with two targets, 1.0 and 1.001",
-        "refused when it is set up, naming both",
-        Problem(_UNIT, [1.0, 1.0], [(0, 1), (0, 1)], [1.0, 1.001], velocities=_APART),
-    ),
-    (
-        "X60",
-        "Rows that contradict each other: a square with a diagonal too long",
-        "refused",
-        Problem(_SQUARE, np.ones(4), _BRACED, [1.0, 1.0, 1.0, 1.0, 2.2]),
-    ),
-    (
-        "H18",
-        "Bonded atoms at the same point",
-        "refused: the gradient is undefined; no NaN",
-        Problem(np.zeros((2, 3)), [1.0, 1.0], [(0, 1)], [1.0], velocities=_APART),
-    ),
-    (
-        "H21",
-        "Triangle inequality violated: 1, 1, 3",
-        "refused: the residual cannot go below 1/3, within 1 s",
-        Problem(_CORNERS, np.ones(3), TRIANGLE, [1.0, 1.0, 3.0], velocities=0.1 * _CORNERS),
-    ),
-    (
-        "X70",
-        "Bond between two fixed atoms, and it is off",
-        "refused",
-        Problem([*_UNIT, [1.5, 0.9, 0]], np.ones(3), [(0, 1), (1, 2)], [1.01, 1.03], fixed=[0, 1]),
-    ),
+    ("H02", "One bond with two targets, 1.0 and 1.001", "refused when it is set up, naming both", TWICE),
+    ("X60", "Rows that contradict each other: a square with a diagonal too long", "refused", DIAGONAL),
+    ("H18", "Bonded atoms at the same point", "refused: the gradient is undefined; no NaN", POINT),
+    ("H21", "Triangle inequality violated: 1, 1, 3", "refused: the residual cannot go below 1/3, within 1 s", WIDE),
+    ("X70", "Bond between two fixed atoms, and it is off", "refused", FIXED),
 ):
 
     @case(number, title, said, "raise", problem=problem)

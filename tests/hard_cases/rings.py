@@ -85,19 +85,13 @@ def porphyrin() -> tuple[Array, list[tuple[int, int]]]:
 FLIGHT = "residual 1e-10; angular momentum 1e-10; energy 1e-5; or refused"
 DEAD = "right, or refused: a mechanism at a dead center"
 FLAT = "a mechanism, flat at the start"
+PORPHYRIN = "Flat porphyrin-like ring system, bonds and 1-3 distances"
 _SHEET, _PORPHYRIN = sheet(6, 6), porphyrin()
 
 
 @case("X10", "Planar hexagon by 9 distances (sides and para)", DEAD, "warn-or-raise", body=(ring(6), SIDES + PARA))
 @case("X17", "Flat honeycomb by its bonds", FLIGHT, "warn-or-raise", body=_SHEET, said=f"{len(_SHEET[1])} bonds")
-@case(
-    "X18",
-    "Flat porphyrin-like ring system, bonds and 1-3 distances",
-    "right, or refused",
-    "warn-or-raise",
-    body=_PORPHYRIN,
-    said="flat",
-)
+@case("X18", PORPHYRIN, "right, or refused", "warn-or-raise", body=_PORPHYRIN, said="flat")
 def flexible(program: Program, quick: bool, body: tuple[Array, Pairs], said: str = FLAT) -> Outcome:
     """Invariants of free flight from tangent velocities of all directions."""
     x, masses = truths.rotated(body[0]), np.full(len(body[0]), 12.0)
