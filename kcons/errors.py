@@ -256,6 +256,7 @@ EXTRAS = {
     "openmm": "openmm",
     "MDAnalysis": "mdanalysis",
     "tblite": "xtb",
+    "sympy": "models",
     "pymbar": "free-energy",
     "torch": "torch",
     "torch_sim": "torchsim",

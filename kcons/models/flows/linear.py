@@ -10,9 +10,8 @@ there after their mean is a nilpotent matrix up to rounding, whose null spaces, 
 (Kublanovskaya's staircase) and chains of generalized eigenvectors.
 
 **Stability.** The notes' criterion Re lambda <= 0 (eq. 14) is completed: where Re lambda = 0, the Jordan blocks must be
-1 x 1, or the solution grows like a power of t. Whether a real part within its error is zero follows, of two variables,
-from trace and determinant: the entries are taken as they stand. Else, or where they have errors of their own, stability
-cannot be told.
+1 x 1, or the solution grows like a power of t. Whether a real part within its error is zero is decided in rational
+numbers, by SymPy: the entries are taken as they stand. Where they have errors of their own, stability cannot be told.
 
 References
 ----------
@@ -23,7 +22,7 @@ Wilkinson, SIAM Review 18, 578 (1976). Kagstrom and Ruhe, ACM Trans. Math. Softw
 from __future__ import annotations
 
 from enum import Enum
-from fractions import Fraction
+from importlib.util import find_spec
 from itertools import product
 from typing import NamedTuple, TypeAlias
 
@@ -48,6 +47,8 @@ NULL = 100.0
 STANDS_OUT = 10.0
 #: Eigenvalues that have no common structure are tried again as if known this many times better.
 CLOSER = 8.0
+#: Variables of the largest matrix whose eigenvalues on the imaginary axis are counted exactly.
+LARGEST = 24
 #: Equilibria closer than this, in parts of the size of the box, are one.
 SAME = 1e-6
 
@@ -302,7 +303,8 @@ class Stability(Enum):
     ASYMPTOTIC = "asymptotically stable"
     STABLE = "stable"
     UNSTABLE = "unstable"
-    #: No eigenvalue is known to lie to the right of the axis, and not all are known to lie left of it or on it.
+    #: No eigenvalue is known to lie to the right of the axis, and not all are known to lie left of it or on it; SymPy,
+    #: which would tell those on it from others, may be missing.
     UNKNOWN = "cannot be told"
 
 
@@ -339,7 +341,7 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
     matrix : array_like, shape (n, n)
     error : array_like, shape (n, n) or a number
         How far the entries may be off, beyond their rounding: of a Jacobian by differences, for example. Without any,
-        real parts of exactly zero are found for up to two variables.
+        real parts of exactly zero are found, for up to 24 variables; for more than two this needs SymPy.
     """
     A, found = _square(matrix), spectrum(matrix, error)
     groups = _clusters(found.values, found.errors)
@@ -362,15 +364,38 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
             detail = "star" if blocks[0].sizes[0] == 1 else "improper"
     stability = Stability.UNSTABLE if 1 in present else Stability.ASYMPTOTIC if present == {-1} else Stability.UNKNOWN
     if stability is Stability.UNKNOWN and not np.any(error):
-        if len(A) == 2:
-            (a, b), (c, d) = (map(Fraction, row) for row in A.tolist())
-            trace, determinant = a + d, a * d - b * c
-            if trace == 0 <= determinant or trace < 0 == determinant:
-                stability = Stability.UNSTABLE if trace == determinant else Stability.STABLE
-        if not np.any(A):
-            stability = Stability.STABLE
+        axis = (2, True) if len(A) == 2 and not zero and np.trace(A) == 0.0 else on_axis(A)
+        if axis is not None and axis[0] == np.sum(signs == 0):
+            stability = Stability.STABLE if axis[1] else Stability.UNSTABLE
     order = np.lexsort((-found.values.imag, -found.values.real))
     return Classification(kind, stability, detail, found.values[order], 0 not in present, found.errors[order])
+
+
+def on_axis(matrix: FloatArray) -> tuple[int, bool] | None:
+    """How many eigenvalues lie on the imaginary axis exactly, and whether all their Jordan blocks have size 1.
+
+    Entries count as they stand, as doubles are rational numbers. Eigenvalues on the axis are common roots of the
+    characteristic polynomials of A and -A. None where common roots lie off the axis, with too many variables, or
+    without SymPy.
+    """
+    if len(matrix) > LARGEST or not find_spec("sympy"):
+        return None
+    from sympy import QQ, Poly, Symbol
+    from sympy.polys.matrices import DomainMatrix
+
+    x, shape = Symbol("x"), matrix.shape
+    A = DomainMatrix([[QQ(*float(v).as_integer_ratio()) for v in row] for row in matrix], shape, QQ)
+    p = Poly(A.charpoly(), x, domain=QQ)
+    common = p.gcd(p.compose(Poly(-x, x, domain=QQ)))
+    once = common.sqf_part()
+    squares = Poly(once.all_coeffs()[::2], x, domain=QQ)
+    if squares.degree() > 0 and squares.count_roots(None, 0) < squares.degree():
+        return None
+    # The least polynomial of A has simple roots on the axis if this one vanishes at A.
+    least, value = p.quo(common) * once, DomainMatrix.zeros(shape, QQ)
+    for c in least.all_coeffs() if once.degree() < common.degree() else ():
+        value = value * A + QQ(c.p, c.q) * DomainMatrix.eye(shape, QQ)
+    return common.degree(), value.is_zero_matrix
 
 
 # -- equilibria ---------------------------------------------------------------------------------------

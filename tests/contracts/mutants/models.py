@@ -28,8 +28,7 @@ MUTANTS = {
     "models/flows/linear.py": [
         ("«len(A) * EPSILON * float(np.linalg.norm(balanced))→0.0»", "linear::errors_hold_and_are_not_much_too_large"),
         ("np.all(real > «off→0»)", "linear::what_is_said_is_so"),
-        ("if trace == 0 «<=→==» determinant or", "linear::names"),
-        ("UNSTABLE if trace «==→!=» determinant", "linear::purely_imaginary_blocks_that_are_defective_are_unstable"),
+        ("«p.quo(common) * →»once", "linear::eigenvalues_on_the_axis_are_counted_in_integers"),
         ("certain = «closer == 1.0 and →»kept", "linear::neighbors_that_rounding_joins_are_told_as_uncertain"),
     ],
     "models/flows/flow.py": [

@@ -22,8 +22,9 @@ from kcons.models.flows import (
     jordan_block,
     jordan_block_propagator,
     jordan_form,
+    linear,
 )
-from kcons.models.flows.linear import spectrum
+from kcons.models.flows.linear import on_axis, spectrum
 
 R = np.array([[0.0, 1.0], [-1.0, 0.0]])
 RESONANT = np.block([[R, np.eye(2)], [np.zeros((2, 2)), R]])
@@ -270,7 +271,7 @@ def test_neighbors_that_rounding_joins_are_told_as_uncertain():
         ([[0.0, 0.0], [0.0, 0.0]], "stable degenerate"),
         ([[0.0, 1.0], [0.0, 0.0]], "unstable degenerate"),
         ([[-0.1, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, 1.0]], "unstable saddle-focus"),
-        (scipy.linalg.block_diag(R, -1.0), "degenerate whose stability cannot be told"),
+        (scipy.linalg.block_diag(R, -1.0), "stable degenerate"),
         (np.diag([-1e6, -2.0, 1.0]), "unstable saddle"),
         (np.diag([-1e10, -1.0]), "asymptotically stable node"),
         # Beside a rate of 1e10 rounding hides one of 1e-10.
@@ -288,18 +289,14 @@ def test_names(matrix, name):
 
 
 def test_purely_imaginary_blocks_that_are_defective_are_unstable():
-    # Free flight, in two bases, and rest: Re lambda = 0 everywhere.
-    assert classify([[0.0, 1.0], [0.0, 0.0]]).stability is classify([[6.0, 4.0], [-9.0, -6.0]]).stability
-    assert classify([[6.0, 4.0], [-9.0, -6.0]]).stability is Stability.UNSTABLE
-    assert classify(np.zeros((3, 3))).stability is Stability.STABLE
-    # One of two equal oscillators drives the other, t cos t; rounding decides whether they are equal.
-    assert classify(np.kron(np.eye(2), R)).stability is classify(RESONANT).stability is Stability.UNKNOWN
+    # One of two equal oscillators drives the other: Re lambda = 0 everywhere, and yet t cos t.
+    assert classify(np.kron(np.eye(2), R)).stability is Stability.STABLE
+    assert classify(RESONANT).stability is Stability.UNSTABLE
 
 
 def awkward(rng, kind):
     n = int(rng.integers(1, 6))
-    if kind in (0, 5):  # small integers: many real parts of exactly zero, many defective ones
-        n = 2 if kind else n
+    if kind == 0:  # small integers: many real parts of exactly zero, many defective ones
         return rng.integers(-2, 3, (n, n)).astype(float)
     if kind == 1:  # graded over 24 decades
         return rng.normal(size=(n, n)) * 10.0 ** rng.integers(-12, 13, (n, n))
@@ -315,8 +312,8 @@ def awkward(rng, kind):
 def test_what_is_said_is_so():
     """Whatever is told about hundreds of awkward matrices is what integers say of them, entry by entry as written."""
     told = {s: 0 for s in Stability}
-    for seed in range(900):
-        A = awkward(np.random.default_rng(seed), seed % 6)
+    for seed in range(750):
+        A = awkward(np.random.default_rng(seed), seed % 5)
         left, on, right = left_axis_right(A)
         found = classify(A)
         told[found.stability] += 1
@@ -326,16 +323,16 @@ def test_what_is_said_is_so():
             assert on > 0 and right == 0, A
         elif found.stability is Stability.UNSTABLE:
             assert right > 0 or on > 1, A
-        if seed % 6 == 5 and right == 0 < on:
+        if seed % 5 == 0 and right == 0 < on:
             # Bounded, or growing like a power of t: small integers make that plain after some time.
             grown = np.abs(scipy.linalg.expm(A * 1e4)).max() > 1e3
             assert found.stability is (Stability.UNSTABLE if grown else Stability.STABLE), A
+            assert on_axis(A) is None or on_axis(A)[0] == on
         if found.hyperbolic:
             assert on == 0, A
             assert (np.sum(found.eigenvalues.real < 0), np.sum(found.eigenvalues.real > 0)) == (left, right), A
-    # The test would be empty if all were called unknown: of the rounded blocks all are, 150, of integers those of more
-    # than two variables on the axis.
-    assert told[Stability.UNKNOWN] < 260
+    # The test would be empty if all were called unknown: of the rounded blocks all are, 150.
+    assert told[Stability.UNKNOWN] < 250
     assert min(told.values()) > 20
 
 
@@ -377,3 +374,30 @@ def test_bad_matrices_and_errors_are_refused(function):
         with pytest.raises(InputError) as caught:
             function(np.eye(2), error)
         assert caught.value.item == "error"
+
+
+@pytest.mark.parametrize(
+    ("blocks", "wanted"),
+    [
+        ([[[-1.0]]], (0, True)),
+        ([R], (2, True)),
+        ([R, R, 3 * R], (6, True)),
+        ([RESONANT, [[-2.0]]], (4, False)),
+        ([np.zeros((2, 2)), -np.eye(2)], (2, True)),
+        ([[[0.0, 1.0], [0.0, 0.0]], R], (4, False)),
+        ([RESONANT, R, np.zeros((2, 2))], (8, False)),
+        ([R - np.eye(2), [[0.0]]], (1, True)),
+        # Pairs of opposite signs, real or complex, are common roots too, but not on the axis.
+        ([[[2.0]], [[-2.0]], R], None),
+        ([R + np.eye(2), R - np.eye(2), 2 * R], None),
+    ],
+)
+def test_eigenvalues_on_the_axis_are_counted_in_integers(blocks, wanted):
+    assert on_axis(scipy.linalg.block_diag(*blocks)) == wanted
+    assert on_axis(in_skew_basis(np.random.default_rng(0), blocks)) == wanted
+
+
+def test_without_sympy_it_cannot_be_told(monkeypatch):
+    monkeypatch.setattr(linear, "find_spec", lambda name: None)
+    assert str(classify(R)) == "stable center"
+    assert str(classify(scipy.linalg.block_diag(R, 3 * R))) == "center whose stability cannot be told"
