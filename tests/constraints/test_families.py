@@ -10,7 +10,7 @@ import pytest
 from ase import Atoms
 from ase.calculators.lj import LennardJones
 from ase.constraints import FixInternals
-from constraint_cases import MASSES, scattered
+from constraint_cases import APART, MASSES, ORIGIN, TRANSFER, UP, VALUES, bent, scattered, twisted
 
 from kcons import ConstraintSet, Motion
 from kcons.ase import constrain, from_ase_constraints
@@ -40,69 +40,6 @@ from kcons.constraints import (
 )
 from kcons.constraints.constraint_set import rows_like
 from kcons.errors import ImageError, InputError, SingularGeometryError
-
-ORIGIN, UP = [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]
-#: Chlorine, hydrogen, bromine: 5 apart, then 12.
-TRANSFER = [[0, 1], [1, 2]]
-APART = np.array([ORIGIN, [3.0, 4.0, 0.0], [3.0, 4.0, 12.0]])
-
-
-def bent(degrees: float, first: float = 1.0, last: float = 1.0) -> np.ndarray:
-    """Three atoms with the vertex at the origin."""
-    theta = np.radians(degrees)
-    return np.array([[first, 0, 0], [0, 0, 0], [last * np.cos(theta), last * np.sin(theta), 0]])
-
-
-def twisted(degrees: float) -> np.ndarray:
-    phi = np.radians(degrees)
-    return np.array([[1.0, 0, -0.3], [0, 0, 0], [0, 0, 1.0], [np.cos(phi), np.sin(phi), 1.4]])
-
-
-def on_ellipsoid(axes: list[float], rotation: np.ndarray) -> np.ndarray:
-    y = np.random.default_rng(1).normal(size=3)
-    return np.array([[0.5, 0.1, 0.2] + rotation @ (y / np.linalg.norm(y) * axes)])
-
-
-ROTATION = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-SCATTERED = scattered(0)
-#: What is held, where, and what the coordinate is there.
-VALUES = {
-    "distance": (Distance([0, 1]), APART, [5.0]),
-    "difference": (DistanceDifference(TRANSFER, weights=[2.0, -1.0]), APART, [-2.0]),
-    **{f"angle {a}": (Angle([0, 1, 2]), bent(a, 1.3, 0.7), [np.radians(a)]) for a in (0.001, 20, 109.5, 179.9999)},
-    **{f"dihedral {a}": (Dihedral([0, 1, 2, 3]), twisted(a), [np.radians(a)]) for a in (-179.99, -90, -0.001, 0, 180)},
-    "sphere": (Sphere(0, [1.0, 0.0, 0.0]), [[1.0, 3.0, 4.0]], [5.0]),
-    "cylinder": (Cylinder(0, [0.0, 0.0, 7.0], [0.0, 0.0, 5.0]), [[3.0, 4.0, -100.0]], [5.0]),
-    "torus": (Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 5.0, 2.5]], [2.5]),
-    "torus, inside": (Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 2.5, 1.0]], [0.5]),
-    "ellipsoid": (Ellipsoid(0, [0.5, 0.1, 0.2], [1.0, 2.0, 4.0], ROTATION), on_ellipsoid([1, 2, 4], ROTATION), [0.0]),
-    "ellipsoid, outside": (Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [[0.0, 0.0, 8.0]], [2.0]),
-    "elliptic cylinder": (
-        Ellipsoid(0, ORIGIN, [2.0, np.inf, 0.5]), [[2.0 * np.cos(0.3), 17.0, 0.5 * np.sin(0.3)]], [0.0]
-    ),
-    "plane": (Plane(0, [0.0, 3.0, 4.0]), [[9.0, 5.0, 5.0]], [7.0]),
-    "fixed": (FixedAtoms([2, 0]), APART, [3, 4, 12, 0, 0, 0]),
-    "combination": (LinearCombination([0, 1], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]]), APART, [-4.0]),
-    "relation": (LinearRelation([0], [1, 2], [0.25, 0.75]), APART, [-3.0, -4.0, -9.0]),
-    "centers": (
-        CenterDistance([0, 1, 2], [5, 7]), SCATTERED,
-        [math.dist(*(MASSES[g] @ SCATTERED[g] / MASSES[g].sum() for g in ([0, 1, 2], [5, 7])))],
-    ),
-    "center of mass": (
-        CenterOfMass([[0, 1, 2], [5, 3, 4]], axes=(2, 0)), SCATTERED,
-        [MASSES[g] @ SCATTERED[g, axis] / MASSES[g].sum() for g in ([0, 1, 2], [5, 3, 4]) for axis in (2, 0)],
-    ),
-    "formula": (Formula("sqrt((sqrt((x1 - a)**2 + (y1 + 0.1)**2) - R)**2 + (z1 - c)**2)", [4],
-                        {"a": 0.2, "R": 1.5, "c": 0.3}, None), SCATTERED,
-                [math.hypot(math.hypot(SCATTERED[4, 0] - 0.2, SCATTERED[4, 1] + 0.1) - 1.5, SCATTERED[4, 2] - 0.3)]),
-    "gyration": (
-        RadiusOfGyration([0, 1, 2]), SCATTERED,
-        [np.sqrt(np.cov(SCATTERED[:3].T, aweights=MASSES[:3], ddof=0).trace())],
-    ),
-    "gyration, equal weights": (
-        RadiusOfGyration([0, 1, 2], mass_weighted=False), SCATTERED, [np.sqrt(SCATTERED[:3].var(axis=0).sum())]
-    ),
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", VALUES)

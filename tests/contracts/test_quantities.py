@@ -208,7 +208,7 @@ def test_ase_refuses_what_is_in_nm():
         constrain(atoms, [Distance([[0, 1]], 1 * angstrom)])
     constrain(atoms, [Distance([[0, 1]])])
     for call, item in (
-        (lambda: ConstrainedDynamics(atoms, 1 * fs), "time step"),
+        (lambda: ConstrainedDynamics(atoms, 1 * fs), "timestep"),
         (lambda: ConstrainedLangevin(atoms, 1.0, 300, 0.1 / fs), "friction"),
         (lambda: ConstrainedLangevin(atoms, 1.0, 300 * unit.kelvin, 0.1), "temperature_K"),
         (lambda: draw_velocities(atoms, 300 * unit.kelvin), "temperature_K"),

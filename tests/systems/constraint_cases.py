@@ -1,11 +1,12 @@
-"""One object of every family, several rows each where that is possible, over eight atoms.
+"""One object of every family, several rows each where that is possible, over eight atoms; and values of coordinates.
 
-`CASES` maps a name to a function that builds the object; `scattered` gives positions at which no row is
-close to singular.
+`CASES` maps a name to a function that builds the object, `VALUES` to an object, a place, and what its coordinate is
+there by other means; `scattered` gives positions at which no row is close to singular.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -139,3 +140,67 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Rolling": lambda: kc.Rolling([0, 3], [1, 4], [0.7, 1.5], [1.0, 0.2, 0.1], [0.1, 0.0, 1.0]),
     "CustomVelocity": lambda: swirl([[0, 1], [6, 4]]),
 }
+
+ORIGIN, UP = [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]
+#: Chlorine, hydrogen, bromine: 5 apart, then 12.
+TRANSFER = [[0, 1], [1, 2]]
+APART = np.array([ORIGIN, [3.0, 4.0, 0.0], [3.0, 4.0, 12.0]])
+
+
+def bent(degrees: float, first: float = 1.0, last: float = 1.0) -> np.ndarray:
+    """Three atoms with the vertex at the origin."""
+    theta = np.radians(degrees)
+    return np.array([[first, 0, 0], [0, 0, 0], [last * np.cos(theta), last * np.sin(theta), 0]])
+
+
+def twisted(degrees: float) -> np.ndarray:
+    phi = np.radians(degrees)
+    return np.array([[1.0, 0, -0.3], [0, 0, 0], [0, 0, 1.0], [np.cos(phi), np.sin(phi), 1.4]])
+
+
+def on_ellipsoid(axes: list[float], rotation: np.ndarray) -> np.ndarray:
+    y = np.random.default_rng(1).normal(size=3)
+    return np.array([[0.5, 0.1, 0.2] + rotation @ (y / np.linalg.norm(y) * axes)])
+
+
+ROTATION = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+SCATTERED = scattered(0)
+TURNS = (-179.99, -90, -0.001, 0, 180)
+#: What is held, where, and what the coordinate is there.
+VALUES = {
+    "distance": (kc.Distance([0, 1]), APART, [5.0]),
+    "difference": (kc.DistanceDifference(TRANSFER, weights=[2.0, -1.0]), APART, [-2.0]),
+    **{f"angle {a}": (kc.Angle([0, 1, 2]), bent(a, 1.3, 0.7), [np.radians(a)]) for a in (0.001, 20, 109.5, 179.9999)},
+    **{f"dihedral {a}": (kc.Dihedral([0, 1, 2, 3]), twisted(a), [np.radians(a)]) for a in TURNS},
+    "sphere": (kc.Sphere(0, [1.0, 0.0, 0.0]), [[1.0, 3.0, 4.0]], [5.0]),
+    "cylinder": (kc.Cylinder(0, [0.0, 0.0, 7.0], [0.0, 0.0, 5.0]), [[3.0, 4.0, -100.0]], [5.0]),
+    "torus": (kc.Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 5.0, 2.5]], [2.5]),
+    "torus, inside": (kc.Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 2.5, 1.0]], [0.5]),
+    "ellipsoid": (kc.Ellipsoid(0, [0.5, 0.1, 0.2], [1, 2, 4], ROTATION), on_ellipsoid([1, 2, 4], ROTATION), [0.0]),
+    "ellipsoid, outside": (kc.Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [[0.0, 0.0, 8.0]], [2.0]),
+    "elliptic cylinder": (
+        kc.Ellipsoid(0, ORIGIN, [2.0, np.inf, 0.5]), [[2.0 * np.cos(0.3), 17.0, 0.5 * np.sin(0.3)]], [0.0]
+    ),
+    "plane": (kc.Plane(0, [0.0, 3.0, 4.0]), [[9.0, 5.0, 5.0]], [7.0]),
+    "fixed": (kc.FixedAtoms([2, 0]), APART, [3, 4, 12, 0, 0, 0]),
+    "combination": (kc.LinearCombination([0, 1], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]]), APART, [-4.0]),
+    "relation": (kc.LinearRelation([0], [1, 2], [0.25, 0.75]), APART, [-3.0, -4.0, -9.0]),
+    "centers": (
+        kc.CenterDistance([0, 1, 2], [5, 7]), SCATTERED,
+        [math.dist(*(MASSES[g] @ SCATTERED[g] / MASSES[g].sum() for g in ([0, 1, 2], [5, 7])))],
+    ),
+    "center of mass": (
+        kc.CenterOfMass([[0, 1, 2], [5, 3, 4]], axes=(2, 0)), SCATTERED,
+        [MASSES[g] @ SCATTERED[g, axis] / MASSES[g].sum() for g in ([0, 1, 2], [5, 3, 4]) for axis in (2, 0)],
+    ),
+    "formula": (kc.Formula("sqrt((sqrt((x1 - a)**2 + (y1 + 0.1)**2) - R)**2 + (z1 - c)**2)", [4],
+                        {"a": 0.2, "R": 1.5, "c": 0.3}, None), SCATTERED,
+                [math.hypot(math.hypot(SCATTERED[4, 0] - 0.2, SCATTERED[4, 1] + 0.1) - 1.5, SCATTERED[4, 2] - 0.3)]),
+    "gyration": (
+        kc.RadiusOfGyration([0, 1, 2]), SCATTERED,
+        [np.sqrt(np.cov(SCATTERED[:3].T, aweights=MASSES[:3], ddof=0).trace())],
+    ),
+    "gyration, equal weights": (
+        kc.RadiusOfGyration([0, 1, 2], mass_weighted=False), SCATTERED, [np.sqrt(SCATTERED[:3].var(axis=0).sum())]
+    ),
+}  # fmt: skip
