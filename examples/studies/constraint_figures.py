@@ -95,34 +95,36 @@ def wave(steps: int) -> tuple[Trajectory, float]:
 def picture(folder: Path, steps: int = 800) -> None:
     import matplotlib.pyplot as plt
 
-    figure = plt.figure(figsize=(11, 6), layout="constrained")
-    for place, (title, (found, exact)) in enumerate(
-        {
-            "KnifeEdge: a skate on a slope": skate(steps),
-            "Rolling: a point on the rim": wheel(steps),
-            "CustomVelocity: 80° from the radius": spiral(steps),
-        }.items(),
-        1,
-    ):
-        axes = figure.add_subplot(
-            2, 3, place, title=title, aspect="equal", xlabel="x", ylabel="z" if place == 2 else "y"
-        )
-        axes.plot(*exact.T, color="0.75", linewidth=5, label="closed form")
-        axes.plot(*found.T, color="#0072B2", label="kcons")
-        if place == 3:
-            axes.legend(loc="upper right")
+    figure = plt.figure(figsize=(5.2, 8.0), layout="constrained")
+    grid = figure.add_gridspec(4, 2, height_ratios=[0.7, 0.9, 2.2, 2.0])
+    beside = {
+        "KnifeEdge: a skate on a slope": (grid[0, :], "y", skate(steps)),
+        "Rolling: a point on the rim": (grid[1, :], "z", wheel(steps)),
+        "CustomVelocity:\n80° from the radius": (grid[2, 0], "y", spiral(steps)),
+    }
+    for title, (place, up, (found, exact)) in beside.items():
+        axes = figure.add_subplot(place, title=title, aspect="equal", xlabel="x", ylabel=up)
+        axes.plot(*exact.T, color="0.75", linewidth=6)
+        axes.plot(*found.T, color="#0072B2")
+        if up == "z":
+            axes.set_yticks([0, 2])
+    figure.axes[0].set_yticks([0, 0.1])
     path, _ = rounded_cube(4 * steps)
-    axes = figure.add_subplot(2, 3, 4, projection="3d", title="Custom: x⁴ + y⁴ + z⁴ = 1")
+    axes = figure.add_subplot(grid[2, 1], projection="3d", title="Custom:\nx⁴ + y⁴ + z⁴ = 1")
     axes.plot(*path.T, color="#0072B2", linewidth=0.8)
+    axes.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], zticks=[-0.5, 0.5])
     axes.set_box_aspect((1, 1, 1))
     beads, _ = wave(steps)
-    axes = figure.add_subplot(2, 3, (5, 6), title="Formula: beads on a travelling wave", xlabel="x", ylabel="z")
-    along = np.linspace(-2, 8, 200)
-    for k, shade in zip(np.linspace(0, len(beads) - 1, 4).astype(int), ("0.85", "0.7", "0.5", "0.2"), strict=True):
+    axes = figure.add_subplot(grid[3, :], title="Formula: beads on a traveling wave", xlabel="x", ylabel="z")
+    along = np.linspace(-2, 9, 200)
+    for k, shade in zip(
+        np.linspace(0, len(beads.times) - 1, 4).astype(int), ("0.85", "0.7", "0.5", "0.2"), strict=True
+    ):
         axes.plot(along, 0.3 * np.sin(along - beads.times[k]), color=shade, label=f"t = {beads.times[k]:.0f}")
     for bead in range(3):
         axes.plot(beads.positions[:, bead, 0], beads.positions[:, bead, 2], color="#D55E00")
-    axes.legend()
+    axes.set_ylim(-0.33, 0.62)
+    axes.legend(loc="upper center", ncols=4, fontsize=10, handlelength=1, columnspacing=1)
     figure.savefig(folder / "own_constraints.png", dpi=110)
 
 
@@ -133,7 +135,10 @@ def main(arguments: list[str], steps: int = 100) -> None:
     for name, held in (("Custom", rounded_cube), ("Formula", wave)):
         print(f"{name:<15} {held(steps)[1]:.1e} off the surface at most")
     if arguments:
-        picture(Path(arguments[0]))
+        from matplotlib import rc_context
+
+        with rc_context({"font.size": 11, "axes.titlesize": 12}):
+            picture(Path(arguments[0]))
 
 
 if __name__ == "__main__":
