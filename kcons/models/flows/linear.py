@@ -249,7 +249,7 @@ def _structures(
         parts = _clusters(values, found.errors[members] / (CLOSER * closer))
         return [piece for part in parts for piece in _structures(found, members[part], CLOSER * closer)]
     chains, kept = found_chains
-    certain = closer == 1.0 and kept > STANDS_OUT * NULL * noise
+    certain = closer == 1.0 and bool(kept > STANDS_OUT * NULL * noise)
     blocks = JordanBlocks(mean, tuple(chain.shape[1] for chain in chains), certain)
     return [(blocks, np.hstack([_of_unit_length(basis @ chain) for chain in chains]))]
 
