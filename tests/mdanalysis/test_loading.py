@@ -92,10 +92,8 @@ def test_endings_of_lammps(tmp_path, x, name):
 @pytest.mark.parametrize("name", ["w.rst7", "w.rst", "inpcrd", "w.crd7"])
 def test_restarts_of_amber(tmp_path, x, name):
     """In text; those in NetCDF MDAnalysis does not read, which is said."""
-    words = [f"{value:12.7f}" for value in files.whole(x)[0].ravel()]
-    lines = ["water", str(3 * N), *("".join(words[k : k + 6]) for k in range(0, len(words), 6)), ""]
     path = tmp_path / name
-    path.write_text("\n".join(lines))
+    path.write_text(files.inpcrd(files.whole(x)[0]))
     if name == "w.crd7":
         with pytest.raises(InputError, match=r"w\.crd7: its name tells no format of a trajectory .*--format NAME") as e:
             checked(path)

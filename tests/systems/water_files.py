@@ -79,13 +79,18 @@ def checked(path, n: int, constraints=None, *, run=None, masses: bool = True, **
 
 
 def write(
-    path: Path, x: np.ndarray, side: float | None = 12.0, velocities: np.ndarray | None = None, **options
+    path: Path, x: np.ndarray, side: float | list | None = 12.0, velocities: np.ndarray | None = None, **options
 ) -> Path:
-    """A trajectory of MDAnalysis' own writers, 2 ps between frames."""
+    """A trajectory of MDAnalysis' own writers or as other programs write text, 2 ps between frames, of one cell or many."""
+    if path.suffix in (".mdcrd", ".arc", ".lammpsdump"):
+        return write_text(path, x)
     n = x.shape[1]
+    cells = side if isinstance(side, list) else [side and [side, side, side, 90, 90, 90]] * len(x)
     made = mda.Universe.empty(n, trajectory=True, velocities=velocities is not None)
     if path.suffix == ".dcd":
         options.setdefault("dt", 2.0)
+    if path.suffix == ".pdb":
+        options.setdefault("multiframe", True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with mda.Writer(str(path), n, **options) as writer:
@@ -94,14 +99,17 @@ def write(
                 ts.positions = positions
                 if velocities is not None:
                     ts.velocities = velocities[k]
-                ts.dimensions = None if side is None else [side, side, side, 90, 90, 90]
+                ts.dimensions = cells[k]
                 ts.time, ts.frame, ts.dt = 2.0 * k, k, 2.0
                 writer.write(made.atoms)
     return path
 
 
-def write_text(path: Path, x: np.ndarray) -> Path:
-    """A dump of LAMMPS, coordinates of AMBER, or an archive of Tinker, as their programs write them."""
+def write_text(path: Path, x: np.ndarray, number="{:.6f}".format, columns="x y z", low=0.0, side=12.0) -> Path:
+    """XYZ, a dump of LAMMPS, coordinates of AMBER, or an archive of Tinker, as programs write them.
+
+    Numbers of XYZ and LAMMPS are written by `number`; scaled columns are parts of the box.
+    """
     lines = ["title"] if path.suffix == ".mdcrd" else []
     for k, positions in enumerate(x):
         n = len(positions)
@@ -113,12 +121,22 @@ def write_text(path: Path, x: np.ndarray) -> Path:
             lines += [
                 f"{a + 1:6d}  {'OHH'[a % 3]}  {r[0]:.6f} {r[1]:.6f} {r[2]:.6f}  1 " for a, r in enumerate(positions)
             ]
+        elif path.suffix == ".xyz":
+            rows = (" ".join(number(float(value)) for value in r) for r in positions)
+            lines += [str(n), "frame", *(f"{'OHH'[a % 3]} {row}" for a, row in enumerate(rows))]
         else:
+            numbers = positions / side if "s" in columns else positions + low
             lines += ["ITEM: TIMESTEP", str(k), "ITEM: NUMBER OF ATOMS", str(n), "ITEM: BOX BOUNDS pp pp pp"]
-            lines += ["0 12"] * 3 + ["ITEM: ATOMS id type x y z"]
-            lines += [f"{a + 1} 1 {r[0]:.6f} {r[1]:.6f} {r[2]:.6f}" for a, r in enumerate(positions)]
+            lines += [f"{low:g} {low + side:g}"] * 3 + [f"ITEM: ATOMS id type {columns}"]
+            lines += [f"{a + 1} 1 " + " ".join(number(float(value)) for value in r) for a, r in enumerate(numbers)]
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def inpcrd(x: np.ndarray) -> str:
+    """One frame as AMBER writes it in text."""
+    words = [f"{value:12.7f}" for value in x.ravel()]
+    return "\n".join(["water", str(len(x)), *("".join(words[k : k + 6]) for k in range(0, len(words), 6)), ""])
 
 
 def topology(path: Path, n: int, positions: np.ndarray, side: float = 12.0) -> Path:

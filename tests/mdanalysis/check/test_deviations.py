@@ -137,17 +137,10 @@ def test_minimum_images_of_all_cells(tmp_path, angles):
     cell = mda.lib.mdamath.triclinic_vectors(dimensions).astype(np.float64)
     shifts = np.random.default_rng(4).integers(-1, 2, size=(3, 3 * N, 3))
     x = files.whole(files.water(N, 3)) + shifts @ cell
-    made, path = files.universe(N), tmp_path / "t.dcd"
-    with mda.Writer(str(path), 3 * N) as writer:
-        for frame in x:
-            made.atoms.positions = frame
-            made.dimensions = dimensions
-            writer.write(made.atoms)
+    path = files.write(tmp_path / "t.dcd", x, [dimensions] * 3)
     result = checked(path)
     assert result.status in ("kept", "tolerated") and result.units[0].largest < 2e-5
-    made.dimensions = None
-    rows = ConstraintCheck(files.loaded(path, N), [ROWS, Angle([[1, 0, 2]], files.ANGLE)]).run().check
-    assert rows.status in ("kept", "tolerated")
+    assert checked(path, [ROWS, Angle([[1, 0, 2]], files.ANGLE)]).status in ("kept", "tolerated")
 
 
 @pytest.mark.parametrize("ending", ["dcd", "trr"])
@@ -182,15 +175,8 @@ def test_cells_that_are_none_and_cells_that_end(tmp_path, ending):
     """Files without a cell may have lengths of 1: bonds would be folded into it."""
     x = files.whole(files.water(N, 6, side=SIDE), SIDE)
     assert checked(files.write(tmp_path / f"one.{ending}", x, side=1.0)).status == "kept"
-    wrapped, path = x % SIDE, tmp_path / f"ends.{ending}"
-    made = mda.Universe.empty(3 * N, trajectory=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with mda.Writer(str(path), 3 * N) as writer:
-            for k, positions in enumerate(wrapped):
-                made.atoms.positions = positions
-                made.dimensions = [SIDE] * 3 + [90.0] * 3 if k < 4 else None
-                writer.write(made.atoms)
+    cell = [SIDE] * 3 + [90.0] * 3
+    path = files.write(tmp_path / f"ends.{ending}", x % SIDE, [cell] * 4 + [None] * 2)
     result = checked(path)
     assert result.status == "violated" and result.first_violated_frame == 4
     told = [remark for remark in result.remarks if f"2 of 6 frames of {path} have no cell" in remark]
@@ -231,7 +217,7 @@ def test_kept_to_the_precision_of_each_format_and_violated_beyond(tmp_path, endi
         if ending == "gro":
             files.topology(path, N, x[0])
         else:
-            files.write(path, x, **({"multiframe": True, "side": None} if ending == "pdb" else {}))
+            files.write(path, x, side=None if ending == "pdb" else SIDE)
         result = checked(path, tolerance=0.0)
         assert STEPS[ending] in result.precision
         if off:

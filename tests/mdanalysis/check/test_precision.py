@@ -7,11 +7,12 @@ import water_files as files
 
 from kcons.constraints import Angle, Distance, LinearRelation
 from kcons.errors import UnreadableError
-from kcons.mdanalysis import ConstraintCheck, check_trajectory, load_trajectory
+from kcons.mdanalysis import ConstraintCheck, check_trajectory
 from kcons.mdanalysis.check.precision import FilePrecision, precision_of
 
 N = 12
 BOND = Distance(files.pairs(N), files.targets(N))
+ANGLES = Angle([[3 * k + 1, 3 * k, 3 * k + 2] for k in range(N)], files.ANGLE)
 #: Rows of the molecule that is far away, and of the one that is broken: the first bond of each.
 FAR, BROKEN = 3 * 7, 3 * 2
 
@@ -148,26 +149,23 @@ def test_frames_count_as_violated_by_any_row(tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["dcd", "trr"])
-@pytest.mark.parametrize("kind", ["lengths", "angles"])
-def test_rows_of_which_nothing_can_be_told_leave_a_check_incomplete(tmp_path, ending, kind):
+@pytest.mark.parametrize("few", [3, 1], ids=["lengths", "angles"])
+def test_rows_of_which_nothing_can_be_told_leave_a_check_incomplete(tmp_path, ending, few):
     """A molecule whose coordinates are stored in steps of 8: neither kept nor violated, and in no statistics."""
     x = whole()
     calm = files.write(tmp_path / f"c.{ending}", x, side=None)
     x[5, 3 * 7 : 3 * 8] += 1e8
     wild = files.write(tmp_path / f"w.{ending}", x, side=None)
-    held = BOND if kind == "lengths" else Angle([[3 * k + 1, 3 * k, 3 * k + 2] for k in range(N)], files.ANGLE)
-    one, other = checked(calm, held), checked(wild, held)
+    one, other = (checked(path, BOND if few == 3 else ANGLES) for path in (calm, wild))
     assert one.status in ("kept", "tolerated") and other.status == "incomplete"
-    few = 3 if kind == "lengths" else 1
     assert f"up to {few} of {other.n_rows} rows in 1 of 8 frames, from frame 5" in other.verdict
     assert other.units[0].largest == pytest.approx(one.units[0].largest, rel=0.5)
     assert other.units[0].rms == pytest.approx(one.units[0].rms, rel=0.2)
     assert other.units[0].bound < 1e-4
-    row = 3 * 7 if kind == "lengths" else 7
-    assert abs(rows(other)[row].mean) < 1e-4
+    assert abs(rows(other)[few * 7].mean) < 1e-4
     x[0, 3 * 7 : 3 * 8] += 1e8 + np.array([[0, 0, 0], [8, 0, 0], [0, 8, 0]])
     result = checked(files.write(tmp_path / f"f.{ending}", x, side=None), targets="first")
-    if kind == "lengths":
+    if few == 3:
         assert "coordinates in the first frame are so large" in result.verdict and "3 of 36 rows" in result.verdict
         always = x.copy()
         always[:, 3 * 7 : 3 * 8] = x[0, 3 * 7 : 3 * 8]
@@ -177,9 +175,8 @@ def test_rows_of_which_nothing_can_be_told_leave_a_check_incomplete(tmp_path, en
 
 def test_angles_and_other_rows_have_the_rounding_of_their_own_atoms(tmp_path):
     x = whole()
-    angle = Angle([[3 * k + 1, 3 * k, 3 * k + 2] for k in range(N)], files.ANGLE)
     halves = LinearRelation(3 * np.arange(N) + 1, (3 * np.arange(N) + 2)[:, None], np.ones((N, 1)), None)
-    held = [angle, Distance(files.pairs(N)[::3], files.OH)]
+    held = [ANGLES, Distance(files.pairs(N)[::3], files.OH)]
     x[4:, 3 * 2 + 2] += [0.0, 0.0, 0.02]
     calm = checked(files.write(tmp_path / "c.dcd", x, side=None), held)
     x[5, 3 * 7 : 3 * 8] += 1e6
@@ -240,20 +237,17 @@ def test_an_atom_that_no_row_has_may_be_anything(tmp_path):
     assert result.status == "kept" and result.gaps == [] and len(result.frames) == 8
 
 
-@pytest.mark.parametrize(
-    ("what", "words"),
-    [("position", "position of atom 4"), ("velocity", "velocity of atom 4"), ("cell", "the cell is (nan")],
-)
-def test_what_is_no_number_ends_what_can_be_read(tmp_path, what, words):
+@pytest.mark.parametrize("words", ["position of atom 4", "velocity of atom 4", "the cell is (nan"])
+def test_what_is_no_number_ends_what_can_be_read(tmp_path, words):
     x, v = whole(), np.zeros((8, 3 * N, 3))
-    if what == "cell":
+    if "cell" in words:
         path = files.write(tmp_path / "a.dcd", x)
         data = bytearray(path.read_bytes())
         start = len(data) - 3 * (56 + 3 * (8 + 12 * N))
         data[start + 4 : start + 12] = np.array([np.nan]).tobytes()
         path.write_bytes(bytes(data))
     else:
-        (x if what == "position" else v)[5, 4, 1] = np.nan
+        (x if "position" in words else v)[5, 4, 1] = np.nan
         path = files.write(tmp_path / "a.trr", x, velocities=v)
     result = checked(path)
     assert result.status == "incomplete" and result.broken is not None and result.broken.frame == 5
@@ -298,10 +292,9 @@ def test_half_steps_bound_what_writers_make_of_coordinates(tmp_path):
         path = files.write(tmp_path / f"a.{ending}", x, side=None)
         if ending == "xtc":  # which rounds what is in single precision
             x = x.astype(np.float32).astype(np.float64)
-        made = files.universe(N)
-        load_trajectory(made, path)
-        precision = precision_of(path, made.trajectory.format if ending != "nc" else "NCDF")
-        for positions, ts in zip(x, made.trajectory, strict=True):
+        trajectory = files.loaded(path, N).trajectory
+        precision = precision_of(path, trajectory.format if ending != "nc" else "NCDF")
+        for positions, ts in zip(x, trajectory, strict=True):
             back = ts.positions.astype(np.float64)
             off = np.abs(precision.stored(back) - positions)
             assert (off.max(axis=1) <= precision.half_step(positions) * (1 + 1e-6)).all(), ending
@@ -321,33 +314,12 @@ def test_targets_that_are_means_have_the_mean_rounding_of_their_frames(tmp_path)
     assert np.isclose(row.allowed, once.mean() + once, rtol=1e-4).any()
 
 
-def written(path, x, number, columns="x y z", low=0.0, side=40.0):
-    """An XYZ file or a dump of LAMMPS; scaled columns are parts of the box."""
-    lines = []
-    for k, positions in enumerate(x):
-        if path.suffix == ".xyz":
-            lines += [str(len(positions)), "frame"]
-            lines += [f"{'OHH'[a % 3]} {number(r[0])} {number(r[1])} {number(r[2])}" for a, r in enumerate(positions)]
-            continue
-        numbers = positions / side if "s" in columns else positions + low
-        lines += ["ITEM: TIMESTEP", str(k), "ITEM: NUMBER OF ATOMS", str(len(positions)), "ITEM: BOX BOUNDS pp pp pp"]
-        lines += [f"{low} {low + side}"] * 3 + [f"ITEM: ATOMS id type {columns}"]
-        lines += [f"{a + 1} 1 {number(r[0])} {number(r[1])} {number(r[2])}" for a, r in enumerate(numbers)]
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
 @pytest.mark.parametrize(
     ("name", "number", "options"),
     [
-        ("w.xyz", repr, {}),
-        ("w.xyz", "{:.6g}".format, {}),
-        ("w.xyz", "{:.4f}".format, {}),
-        ("w.lammpsdump", "{:g}".format, {}),
-        ("w.lammpsdump", "{:g}".format, {"low": -20.0}),
-        ("w.lammpsdump", "{:g}".format, {"columns": "xs ys zs"}),
-        ("w.lammpsdump", "{:.6f}".format, {"columns": "xs ys zs"}),
-        ("w.lammpsdump", "{:g}".format, {"columns": "xu yu zu"}),
+        *(("w.xyz", number, {}) for number in (repr, "{:.6g}".format, "{:.4f}".format)),
+        *(("w.lammpsdump", "{:g}".format, options) for options in ({}, {"low": -20.0}, {"columns": "xu yu zu"})),
+        *(("w.lammpsdump", number.format, {"columns": "xs ys zs"}) for number in ("{:g}", "{:.6f}")),
     ],
 )
 def test_numbers_of_text_bound_what_they_lost(tmp_path, name, number, options):
@@ -355,14 +327,12 @@ def test_numbers_of_text_bound_what_they_lost(tmp_path, name, number, options):
     x = files.whole(files.water(N, 4, side=40.0), 40.0)
     x[0, :3] += [8.5, 7.0, 9.25] - x[0, 0]
     x = x.round(12)
-    path = written(tmp_path / name, x, lambda v: number(float(v)), **options)
-    result = checked(path, tolerance=0.0)
-    assert result.status == "kept", result.verdict
-    x[2, 4] += 0.1
-    path = written(tmp_path / name, x, lambda v: number(float(v)), **options)
-    assert checked(path, tolerance=0.0).status == "violated"
-    read = mda.Universe(str(path), topology_format="XYZ") if name == "w.xyz" else None
-    if read is not None:
+    for status in ("kept", "violated"):
+        path = files.write_text(tmp_path / name, x, number, side=40.0, **options)
+        assert checked(path, tolerance=0.0).status == status
+        x[2, 4] += 0.1
+    if name == "w.xyz":
+        read = mda.Universe(str(path), topology_format="XYZ")
         lost = np.abs(read.atoms.positions.astype(float) - x[0]).max(axis=1)
         assert np.all(lost <= precision_of(path, "XYZ").half_step(read.atoms.positions))
 
@@ -413,9 +383,7 @@ def test_coordinates_that_were_rounded_before_they_came_into_a_file_of_floats(tm
 def test_a_converted_xtc_says_what_the_xtc_says(tmp_path):
     """Through MDAnalysis' reader, in a cell, far from the origin."""
     path = files.write(tmp_path / "a.xtc", files.water(N, 8, seed=2) + 150.0)
-    made = files.universe(N)
-    load_trajectory(made, path)
-    frames = np.array([ts.positions.copy() for ts in made.trajectory])
+    frames = np.array([ts.positions.copy() for ts in files.loaded(path, N).trajectory])
     one, other = checked(path), checked(files.write(tmp_path / "a.dcd", frames))
     assert one.status == other.status == "kept"
     assert other.units[0].largest == pytest.approx(one.units[0].largest, abs=5e-5)
@@ -451,7 +419,6 @@ def test_frames_that_are_looked_at_have_the_grid(tmp_path):
     x = whole(12)
     x[6:] = np.round(x[6:], 2)
     path = files.write(tmp_path / "a.dcd", x, side=None)
-    assert checked(path).status == "violated"
-    assert checked(path, run={"start": 6}).status == "kept"
-    assert checked(path, run={"frames": [7, 9]}).status == "kept"
+    for run, status in (({}, "violated"), ({"start": 6}, "kept"), ({"frames": [7, 9]}, "kept")):
+        assert checked(path, run=run).status == status
     assert "single precision" in checked(path, run={"stop": 6}).precision

@@ -68,8 +68,7 @@ def test_bonds_are_looked_for_in_the_first_frame_that_is_looked_at(tmp_path, x):
 @pytest.mark.filterwarnings("ignore:DCDReader currently")
 def test_times_that_files_do_not_have_are_said(tmp_path, x, name, said):
     """A drift a ns means nothing without them."""
-    write = files.write_text if name == "w.lammpsdump" else files.write
-    path = write(tmp_path / name, files.whole(x)[:3])
+    path = files.write(tmp_path / name, files.whole(x)[:3])
     remarks = files.checked(path, N).remarks
     assert [said in remark for remark in remarks] == [True] if said else remarks == []
     made = files.loaded(path, N)
