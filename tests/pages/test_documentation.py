@@ -9,10 +9,9 @@ import shlex
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import pytest
-from committed_pages import said
+from committed_pages import ROOT, entries, said, text_of
 
 import kcons.comparison.measure  # noqa: F401  (conftest shortens its timings once it is there)
 from kcons.cli import main
@@ -20,7 +19,6 @@ from kcons.constraints import Constraint, projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
-ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 #: Scripts with tests of their own, in tests/studies and tests/batched, and those that write no table.
 OWN = {*("harness", "bare_solvers", "bare_systems", "hard_cases", "stability", "solvers_alone", "whole_comparison")}
@@ -43,14 +41,12 @@ def name_of(page):
 
 
 def snippets(language):
-    found = []
-    for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        for match in FENCE.finditer(text):
-            if match.group(1) == language:
-                line = text.count("\n", 0, match.start()) + 1
-                found.append(pytest.param(page, match.group(2), id=f"{name_of(page)}:{line}"))
-    return found
+    return [
+        pytest.param(page, match[2], id=f"{name_of(page)}:{match.string.count(chr(10), 0, match.start()) + 1}")
+        for page in PAGES
+        for match in FENCE.finditer(text_of(page))
+        if match[1] == language
+    ]
 
 
 def python_pages():
@@ -59,12 +55,8 @@ def python_pages():
     for parameter in snippets("python"):
         page, code = parameter.values
         pages.setdefault(page, []).append(code)
-    return [
-        pytest.param(
-            "\n".join(codes), id=name_of(page), marks=pytest.mark.validation if page.parent.name == "tutorials" else ()
-        )
-        for page, codes in pages.items()
-    ]
+    slow = {page: pytest.mark.validation for page in pages if page.parent.name == "tutorials"}
+    return [pytest.param("\n".join(codes), id=name_of(page), marks=slow.get(page, ())) for page, codes in pages.items()]
 
 
 @pytest.mark.parametrize("code", python_pages())
@@ -100,8 +92,7 @@ def test_example_runs(script, tmp_path, monkeypatch):
 def test_examples_are_short_and_listed_under_the_tutorials():
     """Sixteen scripts that a user reads and changes; each says what it shows and how it is run."""
     scripts = sorted((ROOT / "examples").glob("*.py"))
-    page = (ROOT / "docs" / "tutorials" / "index.md").read_text(encoding="utf-8")
-    listed = re.findall(r"\]\(\.\./\.\./examples/(\w+\.py)\)", page)
+    listed = re.findall(r"\]\(\.\./\.\./examples/(\w+\.py)\)", text_of("tutorials/index.md"))
     assert sorted(listed) == [script.name for script in scripts] and len(scripts) == 16
     for script in scripts:
         text = script.read_text(encoding="utf-8")
@@ -117,29 +108,18 @@ def test_an_example_runs_by_itself(tmp_path):
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
-        text=True,
     )
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.strip()
+    assert result.returncode == 0 and result.stdout.strip(), result.stderr
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=name_of)
-def test_links_within_the_project_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), f"{page.name} links to {target}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_all_of_a_page_is_seen(page):
+def test_links_lead_somewhere_and_all_of_a_page_is_seen(page):
     """To MyST a line that begins with % is a comment; the text of a picture loses the ends of its lines."""
-    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text_of(page)):
+        assert (page.parent / target).exists(), f"{page.name} links to {target}"
+    text = FENCE.sub("", text_of(page))
     assert not re.findall(r"^\s*%.*", text, re.MULTILINE)
     assert not re.findall(r"!\[[^\]]*\n", text)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
-    text = FENCE.sub("", page.read_text(encoding="utf-8"))
     for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
         head, *rows = table.splitlines()
         cells = len(BAR.findall(head))
@@ -148,19 +128,13 @@ def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
 
 def in_the_tables(page):
     """The pages that the tables of contents of a page name, and those that these name."""
-    found = set()
-    for listing in re.findall(
-        r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-    ):
-        for entry in listing.split():
-            if not entry.startswith(":") and (inner := (page.parent / f"{entry}.md").resolve()).is_file():
-                found |= {inner, *in_the_tables(inner)}
-    return found
+    named = [inner for entry in entries(page) if (inner := (page.parent / f"{entry}.md").resolve()).is_file()]
+    return {*named, *(found for inner in named for found in in_the_tables(inner))}
 
 
 def test_every_page_is_found_from_the_front():
     """In the tables of contents of the site, or linked from README."""
-    linked = re.findall(r"\]\((docs/[\w/-]+\.md)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    linked = re.findall(r"\]\((docs/[\w/-]+\.md)\)", text_of(ROOT / "README.md"))
     index = ROOT / "docs" / "index.md"
     found = {index, ROOT / "README.md", *in_the_tables(index), *(ROOT / page for page in linked)}
     assert sorted(page.relative_to(ROOT).as_posix() for page in set(PAGES) - found) == []
@@ -169,8 +143,7 @@ def test_every_page_is_found_from_the_front():
 
 def test_names_in_the_glossary_exist():
     owners = {"projection": projection, "Motion": Motion, "ConstraintSet": ConstraintSet, "Constraint": Constraint}
-    text = (ROOT / "docs/glossary.md").read_text(encoding="utf-8")
-    named = re.findall(r"`(projection|Motion|ConstraintSet|Constraint)\.(\w+)", text)
+    named = re.findall(r"`(projection|Motion|ConstraintSet|Constraint)\.(\w+)", text_of("glossary.md"))
     assert len(named) > 20
     for owner, name in named:
         assert hasattr(owners[owner], name), f"{owner}.{name}"

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from committed_pages import ROOT, text_of
 
 from kcons.constraints import projection
 
-ROOT = Path(__file__).parents[2]
-TEXT = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
+TEXT = text_of("equations.md")
 LAST = 168
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")]
@@ -24,46 +24,32 @@ ROWS = [
 
 
 def numbers(cell: str) -> list[int]:
-    found = []
-    for part in cell.strip("()").split(","):
-        ends = [int(n) for n in part.split("–")]
-        found += range(ends[0], ends[-1] + 1)
-    return found
+    parts = ([int(n) for n in part.split("–")] for part in cell.strip("()").split(","))
+    return [n for ends in parts for n in range(ends[0], ends[-1] + 1)]
 
 
 @cache
 def names_in(path: Path) -> set[str]:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    return {node.name for node in ast.parse(text_of(path)).body if isinstance(node, ast.FunctionDef)}
 
 
-def test_every_equation_is_there_once():
-    listed = [n for row in ROWS for n in numbers(row[0])]
-    assert listed == list(range(1, LAST + 1))
+def test_every_equation_is_there_once_and_every_script_is_linked():
+    assert [n for row in ROWS for n in numbers(row[0])] == list(range(1, LAST + 1))
+    linked = set(re.findall(r"\(\.\./examples/notes/([\w.]+)\)", TEXT))
+    scripts = {path.name for path in (ROOT / "examples" / "notes").glob("*_*.py")} - {"growth_results.py"}
+    assert linked == scripts and len(linked) == 16
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
 def test_functions_and_tests_exist(row):
-    equation, what, functions, tests = row
-    assert what
-    names = re.findall(r"`([^`]+)`", functions)
-    assert names, equation
+    _, what, functions, tests = row
+    names, checks = (re.findall(r"`([^`]+)`", cell) for cell in (functions, tests))
+    assert what and names and checks
     for name in names:
-        assert name.startswith("kcons.")
-        assert pkgutil.resolve_name(name) is not None
-    checks = re.findall(r"`([^`]+)`", tests)
-    assert checks, equation
+        assert name.startswith("kcons.") and pkgutil.resolve_name(name) is not None
     for check in checks:
         file, name = check.split("::")
-        assert name.startswith("test_")
-        assert name in names_in(ROOT / "tests" / file), check
-
-
-def test_every_script_is_linked():
-    linked = set(re.findall(r"\(\.\./examples/notes/([\w.]+)\)", TEXT))
-    scripts = {path.name for path in (ROOT / "examples" / "notes").glob("*_*.py")} - {"growth_results.py"}
-    assert linked == scripts
-    assert len(linked) == 16
+        assert name.startswith("test_") and name in names_in(ROOT / "tests" / file), check
 
 
 def test_principles_over_a_short_time():

@@ -7,10 +7,10 @@ import sys
 from importlib.util import find_spec
 
 import pytest
-from committed_pages import ROOT
+from committed_pages import DOCS, ROOT, text_of
 from PIL import Image
 
-PAGE = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+PAGE = text_of("gallery.md")
 SCRIPTS = sorted((ROOT / "examples" / "gallery").glob("*.py"))
 #: What a script needs that is not among the extras of `all`; `.ci/run` has it in an environment of its own.
 NEEDS = {"torsions_at_once": "torch_sim"}
@@ -24,14 +24,8 @@ def test_a_script_runs_and_is_on_the_page(script, tmp_path, monkeypatch):
         runpy.run_path(str(script), run_name="__main__")
         with Image.open(tmp_path / f"{script.stem}.gif") as drawn:
             assert 2 <= drawn.n_frames <= 9
-    text = script.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 60
-    assert "assert" in text
-    assert f"examples/gallery/{script.name}" in PAGE
-    assert f"](figures/{script.stem}.gif)" in PAGE
-    with Image.open(ROOT / "docs" / "figures" / f"{script.stem}.gif") as shown:
+    text = text_of(script)
+    assert len(text.splitlines()) <= 60 and "assert" in text and len(SCRIPTS) >= 5
+    assert f"examples/gallery/{script.name}" in PAGE and f"](figures/{script.stem}.gif)" in PAGE
+    with Image.open(DOCS / "figures" / f"{script.stem}.gif") as shown:
         assert shown.n_frames >= 20
-
-
-def test_all_are_there():
-    assert len(SCRIPTS) >= 5

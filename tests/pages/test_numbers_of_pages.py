@@ -8,27 +8,23 @@ import runpy
 
 import numpy as np
 import pytest
-from committed_pages import ROOT
+from committed_pages import DOCS, ROOT, blocks, text_of
 
 from kcons.openmm import SCHEMES, ProjectedIntegrator
 
-DOCS, EXAMPLES = ROOT / "docs", ROOT / "examples"
-OPENMM = (DOCS / "openmm.md").read_text(encoding="utf-8")
+EXAMPLES, OPENMM = ROOT / "examples", text_of("openmm.md")
 
 
 def test_the_table_of_steppers_is_as_it_is_made():
-    page = (DOCS / "steppers.md").read_text(encoding="utf-8")
+    page = text_of("steppers.md")
     row = "| `BlanesMoan4` | `blanes-moan4` | 4 | yes | yes | 6 | 30 | 0.398 | no |"
     renewed = runpy.run_path(str(DOCS / "make_tables.py"))["renewed"]
     assert row in page and renewed(page) == page, "run docs/make_tables.py"
 
 
-def test_listing_on_the_page_is_that_of_the_integrator():
-    (shown,) = re.findall(r"^```text\n(constraints of the System\b.*?)\n```", OPENMM, re.MULTILINE | re.DOTALL)
-    assert shown == ProjectedIntegrator(0.002, device=False).listing()
-
-
-def test_table_of_schemes():
+def test_listing_and_schemes_on_the_page_are_those_of_the_integrator():
+    (shown,) = (text for text in blocks(OPENMM, "text") if text.startswith("constraints of the System"))
+    assert shown == ProjectedIntegrator(0.002, device=False).listing() + "\n"
     rows = re.findall(r"^\| (`.*?) \| (\d) \| ([\d, ]+) \| (?!\d)", OPENMM, re.MULTILINE)
     table = {}
     for names, order, evaluations in rows:

@@ -4,44 +4,38 @@ from __future__ import annotations
 
 import re
 from importlib import import_module
-from pathlib import Path
 
 import pytest
+from committed_pages import DOCS, ROOT, entries, text_of
 
 import kcons
 from kcons.cli import main
 
-ROOT = Path(__file__).parents[2]
-DOCS = ROOT / "docs"
 NEED_TORCH = ("kcons.batched", "kcons.torchsim")
 
 
 def described():
     """Modules that the reference is made of."""
-    text = "".join(page.read_text(encoding="utf-8") for page in sorted((DOCS / "reference").glob("*.md")))
+    text = "".join(map(text_of, sorted((DOCS / "reference").glob("*.md"))))
     return re.findall(r"^\.\. automodule:: ([\w.]+)$", text, re.MULTILINE)
 
 
 def test_the_reference_has_every_package_with_public_names():
     """Those at the top, and what documents may import besides (`tests/contracts/test_layout.py`)."""
     packages = [path.parent.name for path in sorted((ROOT / "kcons").glob("*/__init__.py"))]
-    texts = {name: (ROOT / "kcons" / name / "__init__.py").read_text(encoding="utf-8") for name in packages}
+    texts = {name: text_of(ROOT / "kcons" / name / "__init__.py") for name in packages}
     public = {f"kcons.{name}" for name, text in texts.items() if re.search(r"^__all__\b", text, re.MULTILINE)}
     assert len(public) > 10
     assert public | {"kcons.models.flows", "kcons.comparison.test_systems", "kcons.errors"} <= set(described())
     assert len(described()) == len(set(described()))
 
 
-def test_the_reference_finds_all_public_names():
+def test_the_reference_finds_all_public_names_and_those_of_the_front_door_where_they_live():
     """What is imported when it is asked for is found by `dir`, of which the reference is made."""
     for name in described():
-        if name.startswith(NEED_TORCH):  # which import all names
-            continue
-        module = import_module(name)
-        assert set(getattr(module, "__all__", ())) <= set(dir(module)), name
-
-
-def test_what_the_front_door_hands_on_is_described_where_it_lives():
+        if not name.startswith(NEED_TORCH):  # which import all names
+            module = import_module(name)
+            assert set(getattr(module, "__all__", ())) <= set(dir(module)), name
     for name in kcons.__all__:
         thing = getattr(kcons, name)
         home = getattr(thing, "__module__", None) or getattr(thing, "__name__", "")
@@ -55,35 +49,22 @@ def test_each_command_has_its_help():
         assert f"usage: kcons {name}" in parser.format_help()
 
 
-def test_readme_is_short():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 100
-
-
 #: Pages whose length is that of a table of what there is.
 LISTS = {"equations.md", "glossary.md", "index.md", "solved_threads.md"}
 
 
-def pages_about_what_to_do():
-    return [page for page in sorted(DOCS.glob("*.md")) if page.name not in LISTS]
-
-
-@pytest.mark.parametrize("page", pages_about_what_to_do(), ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", sorted(page.name for page in DOCS.glob("*.md") if page.name not in LISTS))
 def test_a_page_is_read_in_one_sitting(page):
     """At most 200 lines and a picture; results are on the pages of docs/evidence, made from the result files."""
-    text = page.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 200
-    assert "](figures/" in text or page.name in {"licenses.md", "theory.md"}
+    assert len(text_of(page).splitlines()) <= 200
+    assert "](figures/" in text_of(page) or page in {"licenses.md", "theory.md"}
 
 
-def test_the_prose_stays_a_guide():
+def test_readme_and_sidebar_are_short_and_the_prose_stays_a_guide():
     """What is written by hand; docs/evidence is made from results, docs/reference from docstrings."""
+    assert len(text_of(ROOT / "README.md").splitlines()) <= 100
     pages = [*DOCS.glob("*.md"), *(DOCS / "tutorials").glob("*.md")]
-    assert sum(len(page.read_text(encoding="utf-8").splitlines()) for page in pages) <= 4500
-
-
-def test_the_sidebar_has_at_most_twenty_links():
-    text = (DOCS / "index.md").read_text(encoding="utf-8")
-    listings = re.findall(r"^```\{toctree\}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    links = [line for listing in listings for line in listing.split("\n") if line and not line.startswith(":")]
+    assert sum(len(text_of(page).splitlines()) for page in pages) <= 4500
+    links = entries(DOCS / "index.md")
     assert {"ase", "openmm", "glossary", "reference/index"} <= set(links)
     assert len(links) <= 20

@@ -81,7 +81,7 @@ def checked(path, n: int, constraints=None, *, run=None, masses: bool = True, **
 def write(
     path: Path, x: np.ndarray, side: float | list | None = 12.0, velocities: np.ndarray | None = None, **options
 ) -> Path:
-    """A trajectory of MDAnalysis' own writers or as other programs write text, 2 ps between frames, of one cell or many."""
+    """A trajectory of MDAnalysis' own writers or as programs write text, 2 ps between frames, of one cell or many."""
     if path.suffix in (".mdcrd", ".arc", ".lammpsdump"):
         return write_text(path, x)
     n = x.shape[1]
