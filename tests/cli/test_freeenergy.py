@@ -41,10 +41,14 @@ both_sides = false
 """
 
 
-def test_an_input_runs_and_goes_on(tmp_path, capsys, monkeypatch):
+@pytest.fixture(autouse=True)
+def in_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "methanol.xyz", molecule("CH3OH"))
     (tmp_path / "input.toml").write_text(INPUT)
+
+
+def test_an_input_runs_and_goes_on(tmp_path, capsys):
     assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
     shown = capsys.readouterr()
     assert "turn (degrees)" in shown.out and "wrote input/profile.png" in shown.out
@@ -64,9 +68,7 @@ steps = 40
 """
 
 
-def test_pulls_beside_windows(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / "methanol.xyz", molecule("CH3OH"))
+def test_pulls_beside_windows(tmp_path, capsys):
     (tmp_path / "input.toml").write_text(INPUT + PULLS)
     assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
     shown = capsys.readouterr().out
@@ -79,23 +81,22 @@ def test_pulls_beside_windows(tmp_path, capsys, monkeypatch):
     assert f"{difference:+.1f} standard errors" in shown
 
 
-def test_modules_of_an_input_are_allowed_by_name(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / "methanol.xyz", molecule("CH3OH"))
+def test_modules_of_an_input_are_allowed_by_name(tmp_path, capsys):
     mine = 'calculator = "lj"\nsettings = {sigma = 1.0, epsilon = 0.02, rc = 6.0}'
     other = 'calculator = "os:system"\nsettings = {command = "touch ran"}'
     assert mine in INPUT
     (tmp_path / "input.toml").write_text(INPUT.replace(mine, other))
-    assert main(["freeenergy", "input.toml"]) == 2
-    assert "--allow-module os on the command line" in capsys.readouterr().err
-    assert main(["freeenergy", "input.toml", "--allow-module", "os"]) == 2
-    assert "os:system is no calculator of ASE" in capsys.readouterr().err
+    for more, said in (
+        ([], "--allow-module os on the command"),
+        (["--allow-module", "os"], "os:system is no calculator of ASE"),
+    ):
+        assert main(["freeenergy", "input.toml", *more]) == 2
+        assert said in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["input.toml", "methanol.xyz"]
 
 
 def test_a_run_that_is_stopped_says_how_it_goes_on(tmp_path):
     """And ends within seconds, whatever its windows would take."""
-    write(tmp_path / "methanol.xyz", molecule("CH3OH"))
     (tmp_path / "input.toml").write_text(INPUT.replace("production = 64", "production = 100_000_000"))
     process = subprocess.Popen(
         [sys.executable, "-m", "kcons", "freeenergy", "input.toml", "--workers", "2"],
@@ -119,10 +120,7 @@ def test_a_run_that_is_stopped_says_how_it_goes_on(tmp_path):
     assert [path.name for path in (tmp_path / "input").iterdir()] == ["settings.json"]
 
 
-def test_two_runs_into_one_folder_and_results_of_others(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / "methanol.xyz", molecule("CH3OH"))
-    (tmp_path / "input.toml").write_text(INPUT)
+def test_two_runs_into_one_folder_and_results_of_others(tmp_path, capsys):
     given = read_input("input.toml")
     with Windows(given.sampler, "input", given.settings, **given.options).taken():
         assert main(["freeenergy", "input.toml"]) == 2
