@@ -16,6 +16,7 @@ from ase.calculators.emt import EMT
 
 import kcons.ase
 import kcons.constraints.projection
+import kcons.mdanalysis
 import kcons.motion
 import kcons.openmm
 import kcons.steppers
@@ -33,6 +34,7 @@ from kcons.errors import (
 
 X = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0], [0.3, 1.0, 1.0]])
 MASSES = [1.0, 2.0, 3.0, 4.0]
+UNITS = ("length", "time", "energy")
 
 
 def force(x: np.ndarray, t: float) -> np.ndarray:
@@ -375,6 +377,10 @@ REFUSED: list[tuple[str, ...]] = [
     ("PressureReporter(None)", "dynamics"),
     ('PressureReporter(None, virial="mol")', "virial"),
     ('PressureReporter(None, virial="atomic", temperature_K=300)', "thermal_energy"),
+    *((f"kcons.mdanalysis.RunUnits({name}=?)", name, "0.0", "-1.0", "nan", "inf") for name in UNITS),
+    # Before the folder is looked for: nothing would be written.
+    ('kcons.mdanalysis.TrajectoryWriter("nowhere/a.trr", -1)', "n_atoms"),
+    ('kcons.mdanalysis.OpenMMReporter("nowhere/a.trr", 0)', "interval"),
 ]
 #: Errors of other types.
 OTHERS: list[tuple[str, type[KconsError], str | None]] = [

@@ -10,6 +10,7 @@ import openmm
 import pytest
 from ase import Atoms, units
 from ase.build import molecule
+from ase.constraints import FixAtoms
 from host_systems import ALANINE, DHFR, VILLIN, quietly, read_universe
 from MDAnalysis.lib.mdamath import triclinic_vectors
 from openmm import app, unit
@@ -66,16 +67,7 @@ def test_universe_to_ase_to_openmm_and_back(villin, held):
     again = openmm_to_ase(made.topology, made.positions, made.system)
     np.testing.assert_allclose(again.positions, atoms.positions, rtol=0, atol=1e-12)  # double precision all the way
     np.testing.assert_array_equal(again.numbers, atoms.numbers)
-    universe, rows = from_ase(again)
-    same_rows(rows, held)
-    for name in ("names", "resnames", "resids", "masses"):
-        np.testing.assert_array_equal(getattr(universe.atoms, name), getattr(villin.atoms, name), err_msg=name)
-    np.testing.assert_allclose(universe.atoms.positions, villin.atoms.positions, atol=2e-6)
-    np.testing.assert_allclose(universe.dimensions, villin.dimensions, atol=1e-5)
-    np.testing.assert_array_equal(universe.bonds.indices, held.topology.bonds)
-
-
-def test_universe_to_openmm_and_back(villin, held):
+    # And without ASE between.
     made = to_openmm(villin, held)
     assert made.part is None
     assert made.topology.getNumResidues() == len(villin.residues)
@@ -84,11 +76,13 @@ def test_universe_to_openmm_and_back(villin, held):
     np.testing.assert_allclose(there, snapshot_of(villin).positions, atol=1e-12)
     box = made.topology.getPeriodicBoxVectors().value_in_unit(unit.angstrom)
     np.testing.assert_allclose(np.diag(np.array(box)), villin.dimensions[:3], atol=1e-5)
-    universe, rows = from_openmm(made.topology, made.positions, made.system)
-    same_rows(rows, held)
-    np.testing.assert_allclose(universe.atoms.masses, villin.atoms.masses)
-    np.testing.assert_allclose(universe.atoms.positions, villin.atoms.positions, atol=2e-6)
-    assert universe.atoms.resnames.tolist() == villin.atoms.resnames.tolist()
+    for universe, rows in (from_ase(again), from_openmm(made.topology, made.positions, made.system)):
+        same_rows(rows, held)
+        for name in ("names", "resnames", "resids", "masses"):
+            np.testing.assert_array_equal(getattr(universe.atoms, name), getattr(villin.atoms, name), err_msg=name)
+        np.testing.assert_allclose(universe.atoms.positions, villin.atoms.positions, atol=2e-6)
+        np.testing.assert_allclose(universe.dimensions, villin.dimensions, atol=1e-5)
+        np.testing.assert_array_equal(universe.bonds.indices, held.topology.bonds)
 
 
 def test_residues_in_another_order_than_in_the_universe(villin):
@@ -201,39 +195,24 @@ def test_sites_out_of_the_plane_stay_where_they_are_whatever_unit_the_rows_are_i
             np.testing.assert_allclose(x.value_in_unit(unit.angstrom), universe.atoms.positions, atol=1e-5)
 
 
-def test_targets_that_are_left_out_are_those_of_the_frame():
-    universe = ethane_cut(box=True)
-    system = to_openmm(universe, [Distance([(0, 1), (2, 3)])]).system
-    held = [system.getConstraintParameters(k) for k in range(2)]
-    assert [(i, j, round(length._value, 6)) for i, j, length in held] == [(0, 1, 0.1), (2, 3, 0.1)]
-
-
-def test_what_cannot_be_converted_is_refused(villin):
+def test_constraints_of_ase_come_along_and_what_cannot_be_converted_is_refused(villin):
     group = villin.select_atoms("protein and resid 1")
     atoms = to_ase(group)
-    atoms.rotate(30, "y", rotate_cell=True)
-    with pytest.raises(InputError, match="turn cell and positions"):
-        from_ase(atoms)
-    with pytest.raises(InputError, match="turn cell and positions"):
-        ase_to_openmm(atoms)
-    with pytest.raises(InputError, match="nonbondedCutoff is for a force field"):
-        to_openmm(group, nonbondedCutoff=1.0)
-    with pytest.raises(UnsupportedError, match="rigidWater is what"):
-        to_openmm(villin, force_field=["amber14-all.xml", "amber14/tip3pfb.xml"], rigidWater=True)
-    with pytest.raises(InputError, match="force field"):
-        to_openmm(group, force_field=["no-such-file.xml"])
-    with pytest.raises(InputError, match="positions have shape"):
-        from_openmm(app.PDBFile(str(DHFR)).topology, np.zeros((3, 3)))
-
-
-def test_ase_constraints_come_along(villin):
-    from ase.constraints import FixAtoms
-
-    atoms = to_ase(villin.select_atoms("protein and resid 1"))
     constrain(atoms, Distance([[0, 1]]))
     atoms.set_constraint([*atoms.constraints, FixAtoms([8])])
-    _, rows = from_ase(atoms)
-    assert [item.family for item in rows] == ["Distance", "FixedAtoms"]
+    assert [item.family for item in from_ase(atoms)[1]] == ["Distance", "FixedAtoms"]
+    atoms.rotate(30, "y", rotate_cell=True)
+    fields, dhfr = ["amber14-all.xml", "amber14/tip3pfb.xml"], app.PDBFile(str(DHFR)).topology
+    for kind, words, call in (
+        (InputError, "turn cell and positions", lambda: from_ase(atoms)),
+        (InputError, "turn cell and positions", lambda: ase_to_openmm(atoms)),
+        (InputError, "nonbondedCutoff is for a force field", lambda: to_openmm(group, nonbondedCutoff=1.0)),
+        (UnsupportedError, "rigidWater is what", lambda: to_openmm(villin, force_field=fields, rigidWater=True)),
+        (InputError, "force field", lambda: to_openmm(group, force_field=["no-such-file.xml"])),
+        (InputError, "positions have shape", lambda: from_openmm(dhfr, np.zeros((3, 3)))),
+    ):
+        with pytest.raises(kind, match=words):
+            call()
 
 
 def ethane_cut(box):
@@ -268,6 +247,10 @@ def test_molecules_cut_by_a_box_that_is_not_there_are_said():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         to_ase(ethane_cut(box=True))
+        # Targets that are left out are those of the frame.
+        system = to_openmm(ethane_cut(box=True), [Distance([(0, 1), (2, 3)])]).system
+        held = [system.getConstraintParameters(k) for k in range(2)]
+        assert [(i, j, round(length._value, 6)) for i, j, length in held] == [(0, 1, 0.1), (2, 3, 0.1)]
         whole = ethane_cut(box=False)
         whole.atoms[2:].positions += [10.0, 0.0, 0.0]
         to_ase(whole)
@@ -291,30 +274,23 @@ def test_rows_of_another_group_are_refused(villin):
 # -- ag.convert_to("ASE") ---------------------------------------------------------------------------
 
 
-@pytest.fixture
-def ethane():
-    universe, _ = from_ase(molecule("C2H6"))
-    universe.add_TopologyAttr("bonds", [(0, 1), (0, 2), (0, 3), (0, 4), (1, 5), (1, 6), (1, 7)])
-    return universe
-
-
-def test_converted_atoms_carry_constraints(ethane):
-    by_name = ethane.atoms.convert_to("ASE", constrain="hbonds")
-    (held,) = by_name.constraints
-    assert held.get_removed_dof(by_name) == 6
-    rows = constraints_of(ethane, "hbonds")
-    (same,) = ethane.atoms.convert_to("ASE", constraints=rows).constraints
-    assert same.get_removed_dof(by_name) == 6
-    one = ethane.select_atoms("element C").convert_to("ASE", constraints=[Distance([[0, 1]])])
-    assert len(one) == 2 and one.constraints[0].get_removed_dof(one) == 1
-    alone = ethane.atoms.convert_to("ASE", constraints=Distance([[0, 1]]))
-    assert alone.constraints[0].get_removed_dof(alone) == 1
-    with pytest.raises(InputError, match="constraints has 3"):
-        ethane.atoms.convert_to("ASE", constraints=3)
-
-
-def test_converters_take_a_name_or_a_list(ethane):
-    with pytest.raises(InputError, match="not both"):
-        ethane.atoms.convert_to("ASE", constrain="hbonds", constraints=[Distance([[0, 1]])])
-    with pytest.raises(InputError, match="rigid_water is an option of constrain"):
-        ethane.atoms.convert_to("ASE", rigid_water=False)
+def test_converted_atoms_carry_constraints():
+    ethane, _ = from_ase(molecule("C2H6"))
+    ethane.add_TopologyAttr("bonds", [(0, 1), (0, 2), (0, 3), (0, 4), (1, 5), (1, 6), (1, 7)])
+    one = Distance([[0, 1]])
+    for group, options, removed in (
+        (ethane.atoms, {"constrain": "hbonds"}, 6),
+        (ethane.atoms, {"constraints": constraints_of(ethane, "hbonds")}, 6),
+        (ethane.select_atoms("element C"), {"constraints": [one]}, 1),
+        (ethane.atoms, {"constraints": one}, 1),
+    ):
+        atoms = group.convert_to("ASE", **options)
+        (held,) = atoms.constraints
+        assert len(atoms) == len(group) and held.get_removed_dof(atoms) == removed
+    for options, words in (
+        ({"constraints": 3}, "constraints has 3"),
+        ({"constrain": "hbonds", "constraints": [one]}, "not both"),
+        ({"rigid_water": False}, "rigid_water is an option of constrain"),
+    ):
+        with pytest.raises(InputError, match=words):
+            ethane.atoms.convert_to("ASE", **options)

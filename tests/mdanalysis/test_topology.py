@@ -58,9 +58,7 @@ def test_guessed_masses_are_those_of_the_elements():
     assert topology.elements.tolist() == ["N", "Se", "C", "", "H", "H", "Ca", "Li", "Na"]
     standard = [14.007, 78.97, 12.011, 0.0, 2.014, 1.008, 40.08, 6.94, 22.99]
     np.testing.assert_allclose(topology.masses, standard, atol=0.01)
-
-
-def test_masses_that_somebody_set_stay():
+    # Those that somebody set stay.
     universe = without_elements([(name, "SER", 1) for name in ("NA", "HG", "CD")])
     universe.atoms.masses = [9.0, 3.024, 12.0]
     assert snapshot_of(universe).topology.masses.tolist() == [9.0, 3.024, 12.0]
