@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -20,10 +21,8 @@ from kcons.steppers import Rattle
 
 @pytest.fixture
 def registry():
-    before = dict(METHODS)
-    yield
-    METHODS.clear()
-    METHODS.update(before)
+    with patch.dict(METHODS):
+        yield
 
 
 @functools.cache
@@ -37,7 +36,7 @@ def table():
     return compare(chain(), ["rattle", "ase-kcons", "dop853", "verlet"], budget=20, rounds=2)
 
 
-def test_a_row_a_method_and_setting():
+def test_a_row_a_method_and_setting_and_beside_them_what_they_are_of():
     found = table()
     assert list(found.columns) == list(measure.COLUMNS)
     assert list(dict.fromkeys(found.method)) == ["rattle", "ase-kcons", "dop853", "verlet"]
@@ -52,29 +51,20 @@ def test_a_row_a_method_and_setting():
     np.testing.assert_allclose(rattle.evaluations, each, rtol=1e-9)
     np.testing.assert_allclose(rattle.seconds, each * rattle.step_seconds, rtol=1e-9)
     assert rattle.sigma.max() < 1e-13 and rattle.tangency.max() < 1e-13
-
-
-def test_what_the_table_is_of_stands_beside_it():
-    about = table().attrs
+    about = found.attrs
     assert about["atoms"] == 6 and about["rows"] == about["rank"] == 5
     assert (about["length"], about["time"], about["long_time"]) == ("Å", "fs", "ps")
     assert about["reference_error"] < 1e-9 and "BlanesMoan6" in about["reference"]
     assert about["environment"]["versions"]["numpy"]
     assert 0 <= about["force_seconds"] < 1e-2 and about["margin"] is not None
+    # The error is that of the trajectory.
+    run = METHODS["rattle"].start(chain(), chain().time_steps[1])
+    run.advance(rattle.steps.iloc[1])
+    off = run.observe()[0] - chain().reference().positions
+    assert rattle.error.iloc[1] == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=1e-6)
 
 
-def test_the_error_is_that_of_the_trajectory():
-    system = chain()
-    dt = system.time_steps[1]
-    run = METHODS["rattle"].start(system, dt)
-    run.advance(round(system.horizon / dt))
-    off = run.observe()[0] - system.reference().positions
-    found = table()
-    row = found[(found.method == "rattle") & np.isclose(found.setting, dt / system.units.time_unit)].iloc[0]
-    assert row.error == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=1e-6)
-
-
-def test_the_slope_of_the_energy_is_found():
+def test_the_slope_of_the_energy_is_found(registry):
     class Heated(Rattle):
         """Velocities grow by a fraction in each step."""
 
@@ -82,14 +72,11 @@ def test_the_slope_of_the_energy_is_found():
             after = super().step(system, state, dt)
             return replace(after, velocities=after.velocities * (1 + 1e-4))
 
-    system = chain()
-    reference = system.reference()
     heated = add_method("heated", functools.partial(on_arrays, lambda dt: Heated()))
-    try:
-        row = measure.measure(system, heated, system.time_steps[-1], reference, 10.0)
-        plain = measure.measure(system, METHODS["rattle"], system.time_steps[-1], reference, 10.0)
-    finally:
-        del METHODS["heated"]
+    row, plain = (
+        measure.measure(chain(), method, chain().time_steps[-1], chain().reference(), 10.0)
+        for method in (heated, METHODS["rattle"])
+    )
     assert row["slope"] > 10 * row["slope_error"] and row["slope"] > 100 * abs(plain["slope"])
 
 
@@ -99,7 +86,7 @@ def test_the_slope_of_the_energy_is_found():
 class Slow(Run):
     """Sleeps in each step."""
 
-    seconds = 0.05
+    seconds = 0.1
 
     def __init__(self, system, dt):
         super().__init__(dt)
@@ -115,10 +102,7 @@ class Slow(Run):
 
 
 def test_what_exceeds_the_budget_is_stopped_after_a_step(registry):
-    class Slower(Slow):
-        seconds = 0.1
-
-    add_method("slow", Slower)
+    add_method("slow", Slow)
     found = compare(chain(), ["slow", "rattle"], budget=0.4, rounds=0)
     slow = found[found.method == "slow"]
     assert "partial" in set(slow.status) and set(slow.status) <= {"ok", "partial", "not run"}
@@ -210,16 +194,10 @@ def test_the_median_of_the_rounds_is_the_time_of_a_step(monkeypatch):
     assert (row["rounds"], row["step_seconds"], row["seconds"]) == (3, 2.0, 4.0)
 
 
-def test_steps_that_cost_unevenly_are_timed_again_and_told():
-    rows = [
-        {"method": "rattle", "adaptive": False, "rounds": 3, "step_seconds": cost, "note": ""}
-        for cost in (1.0, 1.5, 2.5)
-    ]
-    assert measure._uneven(rows) == rows
-    rows[2]["step_seconds"] = 1.9
-    assert measure._uneven(rows) == []
-
-
-def test_margin_is_what_nine_tenths_of_the_medians_keep_to():
+def test_steps_that_cost_unevenly_are_timed_again_and_nine_tenths_of_the_medians_keep_to_the_margin():
+    row = {"method": "rattle", "adaptive": False, "rounds": 3, "note": ""}
+    for longest in (2.5, 1.9):
+        rows = [row | {"step_seconds": cost} for cost in (1.0, 1.5, longest)]
+        assert measure._uneven(rows) == (rows if longest == 2.5 else [])
     assert measure.margin([[1.0, 1.1], [1.0, 1.0], [2.0]]) == pytest.approx(0.09, abs=0.01)
     assert measure.margin([[1.0]]) is None and measure.margin([]) is None

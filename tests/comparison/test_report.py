@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from itertools import pairwise
 
 import pandas as pd
@@ -33,26 +34,20 @@ def test_the_text_has_at_most_thirty_lines():
 
 def test_the_sentence_names_ties_and_no_winner_within_the_scatter():
     found = rank(table())
-    tied = found.table.assign(place=1)
-    words = sentence(table(), type(found)(**{**vars(found), "table": tied}))
+    words = sentence(table(), replace(found, table=found.table.assign(place=1)))
     assert "; equally cheap within" in words and "more" in words
     none = rank(table(), limit=1e-30)
     assert sentence(table(), none).startswith("No method makes an error of at most 1e-30")
     nothing = table()[table().method == "verlet"]
     assert rank(nothing) is None and "No method reached the horizon" in sentence(nothing, None)
+    assert "no method reached the horizon" in [t.get_text() for t in figure(nothing).axes[0].texts]
 
 
-def test_a_run_of_few_steps_says_how_few_they_were():
+def test_few_steps_and_times_that_were_taken_once_are_told():
     """A step that is too long may fail later."""
-    found = rank(table())
-    few = found.table.assign(steps=2)
-    assert "made 2 steps only: see how a longer run goes" in sentence(
-        table(), type(found)(**{**vars(found), "table": few})
-    )
-    assert "steps only" not in sentence(table(), type(found)(**{**vars(found), "table": found.table.assign(steps=20)}))
-
-
-def test_times_that_were_taken_once_say_so():
+    few, more = (replace(found, table=found.table.assign(steps=n)) for found in [rank(table())] for n in (2, 20))
+    assert "made 2 steps only: see how a longer run goes" in sentence(table(), few)
+    assert "steps only" not in sentence(table(), more)
     once = table().assign(rounds=0)
     once.attrs = {**table().attrs, "force_seconds": 1.0}
     assert "once" in text(once, rank(once))
@@ -99,11 +94,6 @@ def test_a_figure_shows_few_curves_and_rattle():
     assert len(kept) == CURVES and "rattle" in kept
     ours = [name for name in kept if "kcons" in table()[table().method == name].title.iloc[0]]
     assert CURVES // 2 <= len(ours) < CURVES
-
-
-def test_a_figure_of_nothing_says_so():
-    nothing = table()[table().method == "verlet"]
-    assert "no method reached the horizon" in [t.get_text() for t in figure(nothing).axes[0].texts]
 
 
 def test_durations():

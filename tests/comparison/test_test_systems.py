@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 from importlib.util import find_spec
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -35,9 +36,9 @@ def test_a_test_system_of_ones_own():
     def two(size, rng, *, stretch=1.0):
         return replace(small("rotor"), name="mine", title=f"{size} {stretch}")
 
-    add_system("mine", two, "mine", size=3, quick_size=2, takes=("stretch",))
-    add_system("only", two, "one", unit="pair of atoms", only=True, options={"stretch": 2.0})
-    try:
+    with patch.dict(test_systems.SYSTEMS):
+        add_system("mine", two, "mine", size=3, quick_size=2, takes=("stretch",))
+        add_system("only", two, "one", unit="pair of atoms", only=True, options={"stretch": 2.0})
         assert test_systems.build("mine", stretch=4.0).title == "3 4.0"
         assert test_systems.build("mine", quick=True).horizon == small("rotor").horizon / 2
         assert test_systems.build("only").title == "1 2.0"
@@ -46,8 +47,6 @@ def test_a_test_system_of_ones_own():
         with pytest.raises(InputError, match="mine takes stretch, not bend"):
             test_systems.build("mine", bend=1.0)
         assert list(compare(test_systems.build("only"), ["rattle"], rounds=0).status) == ["ok"] * 4
-    finally:
-        del test_systems.SYSTEMS["mine"], test_systems.SYSTEMS["only"]
 
 
 @pytest.mark.parametrize("name", SMALL)

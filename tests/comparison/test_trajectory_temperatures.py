@@ -71,19 +71,16 @@ def test_what_is_said_beside_the_temperature_of_the_thermostat():
     assert trajectory_temperatures.sentences(rough)[1:] == ["errors of 1% take some 5,000 frames as far apart as these"]
 
 
-def test_bad_input(folder, tmp_path):
-    with pytest.raises(InputError, match="31 frames are too few"):
-        trajectory_temperatures.along(folder / "good.trr", folder / "t.gro", "lj", range(31))
-    with pytest.raises(InputError, match="nothing at all"):
-        trajectory_temperatures.along(folder / "good.trr", folder / "t.gro", "nothing at all", range(40))
+def test_bad_input(folder):
+    for forces, n, words in (("lj", 31, "31 frames are too few"), ("nothing at all", 40, "nothing at all")):
+        with pytest.raises(InputError, match=words):
+            trajectory_temperatures.along(folder / "good.trr", folder / "t.gro", forces, range(n))
 
 
 def test_a_box_that_changes(folder, named, tmp_path):
-    atoms = files.mda.Universe(folder / "t.gro", folder / "good.trr").atoms
-    with files.mda.Writer(str(tmp_path / "other.trr"), n_atoms=len(atoms)) as writer:
-        for k, ts in enumerate(atoms.universe.trajectory):
-            ts.dimensions = [*(ts.dimensions[:3] * (1.0 if k < 30 else 1.01)), 90, 90, 90]
-            writer.write(atoms)
+    frames = [ts.copy() for ts in files.mda.Universe(folder / "t.gro", folder / "good.trr").trajectory]
+    cells = [[*(ts.dimensions[:3] * (1.0 if k < 30 else 1.01)), 90, 90, 90] for k, ts in enumerate(frames)]
+    files.write(tmp_path / "other.trr", np.array([ts.positions for ts in frames]), cells)
     with pytest.raises(UnsupportedError, match="the box of frame 30 is another one"):
         trajectory_temperatures.along(tmp_path / "other.trr", folder / "t.gro", "lj", range(FRAMES), constrain="none")
 
