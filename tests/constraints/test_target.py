@@ -67,14 +67,6 @@ def test_derivatives_that_contradict_a_moving_target_are_refused():
             ConstraintSet(Distance([[0, 1]], target), x, masses)
 
 
-def test_a_distance_that_moves_below_zero_is_refused_there():
-    x, masses = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.ones(2)
-    held = ConstraintSet(Distance([[0, 1]], lambda t: 1 - t), x, masses)
-    assert held.target(0.9) == pytest.approx(0.1)
-    with pytest.raises(InputError, match=r"Distance\(0, 1\): target -0.5 is not positive at t = 1.5"):
-        held.target(1.5)
-
-
 def test_a_target_that_jumps_by_its_period_does_not_move_faster_there():
     x = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, -1.0, 0.0]])
 

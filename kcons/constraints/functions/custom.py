@@ -174,7 +174,7 @@ class Custom(PythonRows):
         places = r + step[:, None, None] * _along(self.width)[:, None]
         values = np.array([self.measure(place, time, first) for place in places])
         slope = np.dot(_DIFFERENCE, nearest_image(values - values[0], self.period).reshape(4, -1))
-        return np.ascontiguousarray((slope.reshape(-1, len(r)) / step).T).reshape(r.shape)
+        return np.ascontiguousarray((slope.reshape(3 * self.width, len(r)) / step).T).reshape(r.shape)
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         speed, start, length = np.sqrt(_contract(v, v)), np.zeros(self.n_rows), self._length(r)
