@@ -58,16 +58,6 @@ def test_barostat_with_a_part_that_keeps_forces():
     assert integrator.getGlobalVariableByName("worst_gap") == 0
 
 
-def test_a_barostat_that_scales_atoms_is_refused_beside_constraints():
-    system, x = water_box(64)
-    system.addForce(flexible := openmm.MonteCarloFlexibleBarostat(1.0, 300.0))
-    flexible.setScaleMoleculesAsRigid(False)
-    context = started(system, loose := ProjectedIntegrator(1e-3), x)
-    with pytest.raises(UnsupportedError, match=r"has constraints, and MonteCarloFlexibleBarostat"):
-        loose.step(1)
-    del context
-
-
 # -- force groups and seeds -------------------------------------------------------------------------
 
 
