@@ -235,10 +235,3 @@ def test_what_is_neither_a_seed_nor_a_generator(rng):
         seed_from(2**64)
     drawn = [seed_from(np.random.default_rng(3)) for _ in range(2)]
     assert drawn[0] == drawn[1] and seed_from(None) != seed_from(None) and seed_from(7) == 7
-
-
-def test_none_where_it_is_no_value():
-    """Annotations say where it is one: of `Isokinetic`, not of `Langevin`."""
-    assert Isokinetic(None).thermal_energy is None
-    with pytest.raises(InputError, match="thermal_energy is None; give a positive number"):
-        Langevin(None, 1.0, 1)

@@ -237,7 +237,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("RungeKuttaNystrom([0.5, 0.5], [1.1])", "drifts"),
     ("ReversibilityCheck(Rattle(), -1.0)", "tolerance"),
     ("ReversibilityCheck(3)", "stepper"),
-    ("Langevin(-1.0, 1.0, 1)", "thermal_energy"),
+    ("Langevin(?, 1.0, 1)", "thermal_energy", "-1.0", "None"),
     ("Langevin(1.0, ?, 1)", "friction", "-1.0", "[1.0, 2.0]", "inf"),
     ("Langevin(1.0, 1.0, ?)", "rng", "1.5", "-1", "2**64"),
     ("Langevin(1.0, 1.0, 1, substeps=?)", "substeps", "0", "1.5"),
@@ -333,6 +333,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("kcons.openmm.Langevin(300, -1.0)", "friction"),
     ("kcons.openmm.Isokinetic(0)", "temperature"),
     ("kcons.openmm.NoseHoover(300, 0)", "frequency"),
+    ("kcons.openmm.IsokineticSpheres(300.0, 0.0)", "friction"),
     ("SurfaceIntegrator(0.001, surfaces=[], system=openmm_system())", "surfaces"),
     ("hold(3, Distance([0, 1]), X)", "system"),
     ("hold(openmm_system(), Distance([0, 9]), X)", "atoms"),
@@ -404,6 +405,8 @@ OTHERS: list[tuple[str, type[KconsError], str | None]] = [
     ("NoseHooverChain(1.0, 1.0).check(MOVING)", UnsupportedError, None),
     ("Isokinetic(1.0).check(MOVING)", UnsupportedError, None),
     ("IsokineticSpheres(1.0, 1.0, 3).check(MOVING)", UnsupportedError, None),
+    ('kcons.openmm.IsokineticSpheres(300.0, 1.0, spheres="global")', UnsupportedError, None),
+    ("ProjectedIntegrator(0.01, ensemble=kcons.openmm.IsokineticSpheres(9, 1), device=False)", UnsupportedError, None),
 ]
 
 

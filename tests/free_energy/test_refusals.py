@@ -21,6 +21,7 @@ from kcons.errors import ConstraintError, InputError, NonFiniteError, SingularGe
 from kcons.free_energy import (
     AseRecorder,
     AseWindows,
+    FreeEnergy,
     HeldCoordinates,
     HeldCoordinatesReporter,
     OpenMMWindows,
@@ -188,6 +189,7 @@ PROFILES = [
     (lambda: integrate(N4, [0.0, 1.0, 2.0, 2.0], [0.0] * 4), "e", "windows at 1 have mean forces from 1 to"),
     (lambda: integrate([0.0, 90.0, 180.0], N3, [1.0] * 3, period=6.28), "period", "units"),
     (lambda: profile().next_windows(0), "count", "count is"),
+    (lambda: FreeEnergy(("a",), N3[:1], [], {"window-0": "no force"}).profile, None, "all windows fail.*-0: no force"),
     *((lambda b=b: profile().next_windows(1, below=b), "below", "below is") for b in (0.0, np.nan)),
     (lambda: surface(x=np.zeros((3, 2))), "x", r"d \+ 2 or more"),
     (lambda: surface(x=np.ones((9, 2))), "x", "one value of coordinate 0"),

@@ -41,22 +41,18 @@ def test_there_and_back():
     assert [(b[0].index, b[1].index) for b in back.bonds()] == [(0, 1), (0, 2), (3, 4), (3, 5)]
 
 
-def test_what_does_not_fit_is_refused():
+def test_what_does_not_fit_or_is_no_topology_is_refused():
     topology, x = waters()
     with pytest.raises(InputError, match="the Topology has 6 atoms, but positions have shape"):
         snapshot_of(topology, x[:5])
     with pytest.raises(InputError, match="the Topology has 6 atoms, the System 1 particles"):
         snapshot_of(topology, x, system=particles([1.0]))
-
-
-@pytest.mark.parametrize("call", [constraints_of, snapshot_of])
-def test_what_is_no_topology_is_refused(call):
-    for given in ([app.Topology()], None, openmm.System()):
-        with pytest.raises(
-            InputError, match=f"must be an openmm.app.Topology, .* not {type(given).__name__}"
-        ) as caught:
-            call(given, np.zeros((0, 3)))
-        assert caught.value.item == "topology"
+    for call in (constraints_of, snapshot_of):
+        for given in ([app.Topology()], None, openmm.System()):
+            words = f"must be an openmm.app.Topology, .* not {type(given).__name__}"
+            with pytest.raises(InputError, match=words) as caught:
+                call(given, np.zeros((0, 3)))
+            assert caught.value.item == "topology"
 
 
 def test_masses_and_box_of_the_system():

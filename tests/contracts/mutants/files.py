@@ -90,7 +90,10 @@ MUTANTS = {
             "wrapped = y« if lattice is None else wrapped_into(y, lattice)[1]→»",
             "restoring::bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored",
         ),
-        ("if «not isinstance(given, kind)→given is None»:", "openmm/topology::what_is_no_topology_is_refused"),
+        (
+            "if «not isinstance(given, kind)→given is None»:",
+            "openmm/topology::what_does_not_fit_or_is_no_topology_is_refused",
+        ),
     ],
     "plan/clusters.py": [
         ("single &= «~anchored→anchored >= 0»", "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"),

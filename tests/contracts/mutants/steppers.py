@@ -122,7 +122,7 @@ MUTANTS = {
         ('if «array.dtype.kind == "c"→False»:', "arguments::every_way_in_refuses_them"),
         ("«not 0 <= rng < 2**bits→False»", "arguments::what_is_neither_a_seed_nor_a_generator"),
         ("or «value not in words→False»:", "methods::what_is_wrong_with_a_method_is_said"),
-        ("for rule in () if «optional and→» value is None else asked:", "arguments::none_where_it_is_no_value"),
+        ("for rule in () if «optional and→» value is None else asked:", "contracts/refusals::refused"),
     ],
     "constraints/periodic/images.py": [
         ("«| (self.item.kind == RowKind.LINEAR)→»", "images::atoms_in_any_image_are_held_as_whole_ones"),

@@ -19,15 +19,16 @@ from kcons.free_energy import Settings, Windows
 
 SETTINGS = Settings(production=640, every=10)
 PLACES = np.linspace(-np.pi, np.pi, 9)[:-1]
-#: The same windows, by processes of their own.
+PATH = os.pathsep.join([str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])])
+#: The same windows, by two processes of their own.
 SCRIPT = """
 import sys
 import numpy as np
 from window_samplers import Fake
 from kcons.free_energy import Settings, Windows
 if __name__ == "__main__":
-    windows = Windows(Fake(sys.argv[1] + "/diary", wait=float(sys.argv[3])), sys.argv[1] + "/out",
-                      Settings(production=640, every=10), workers=int(sys.argv[2]))
+    windows = Windows(Fake(sys.argv[1] + "/diary", wait=1.5), sys.argv[1] + "/out",
+                      Settings(production=640, every=10), workers=2)
     windows.run(np.linspace(-np.pi, np.pi, 9)[:-1])
 """
 
@@ -136,18 +137,11 @@ def test_files_of_others_are_not_taken_for_windows(tmp_path, name):
         made(tmp_path, out=".")
 
 
-def started(folder: Path, wait: float) -> subprocess.Popen[bytes]:
-    """A run with two workers in a process of its own."""
-    path = os.pathsep.join([str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])])
-    (folder / "script.py").write_text(SCRIPT)
-    command = [sys.executable, str(folder / "script.py"), str(folder), "2", str(wait)]
-    environment = {**os.environ, "PYTHONPATH": path}
-    return subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True)
-
-
 def test_workers_end_with_what_waits_for_them(tmp_path):
     """Nothing is written any more, and nobody waits for the windows in hand; of Ctrl-C and SIGTERM see tests/cli."""
-    process = started(tmp_path, 1.5)
+    (tmp_path / "script.py").write_text(SCRIPT)
+    command, path = [sys.executable, str(tmp_path / "script.py"), str(tmp_path)], {**os.environ, "PYTHONPATH": PATH}
+    process = subprocess.Popen(command, env=path, stderr=subprocess.DEVNULL, start_new_session=True)
     while not (tmp_path / "diary").exists() or len(diary(tmp_path)) < 2:
         assert process.poll() is None
         time.sleep(0.05)
@@ -175,8 +169,7 @@ def test_a_killed_worker_changes_nothing(tmp_path):
 
 def test_a_cluster_of_dask_that_loses_a_worker(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
-    path = [str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+    monkeypatch.setenv("PYTHONPATH", PATH)
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
         distributed.Client(cluster.scheduler_address) as client,

@@ -81,11 +81,6 @@ def test_surfaces_of_a_part_of_a_turn_have_no_minima_beyond():
     assert surface.periods == (None, None) and surface.minima() == []
 
 
-def test_where_all_windows_failed_a_profile_says_why():
-    with pytest.raises(InputError, match=r"all windows failed.*window-0000-up: no force"):
-        _ = FreeEnergy(("a",), np.full(1, PERIOD), [], {"window-0000-up": "no force"}).profile
-
-
 @pytest.fixture
 def sampled(tmp_path):
     return run(tmp_path, np.linspace(-np.pi, np.pi, 9)[:-1], fails=("window-0001-up",), shift=0.4)

@@ -143,13 +143,6 @@ def test_two_parts_of_rows_in_one_integrator():
 # -- as part of an integrator and its System ----------------------------------------------------------------
 
 
-def test_rows_of_another_system_are_refused():
-    part = CollectiveRows(chain_system(), [bond(0, 3)], positions=CHAIN)
-    context = started(chain_system(), openmm.VerletIntegrator(0.001), CHAIN, np.zeros((6, 3)))
-    with pytest.raises(InputError, match="no part of this System"):
-        part.check(context)
-
-
 # -- something else in place of a Context, an integrator, a row -------------------------------------------------
 
 
@@ -170,6 +163,8 @@ def test_what_is_no_context_and_no_integrator():
             rows.set_target(integrator, row, 0.3)
     with pytest.raises(InputError, match="without a rate"):
         rows.set_target(integrator, 0, 0.3, rate=1.0)
+    with pytest.raises(InputError, match="no part of this System"):
+        rows.check(started(chain_system(), openmm.VerletIntegrator(0.001), CHAIN, np.zeros((6, 3))))
 
 
 def test_rows_that_become_singular_within_a_step_are_named_by_the_program():

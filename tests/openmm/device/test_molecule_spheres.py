@@ -130,11 +130,5 @@ def test_what_is_refused():
     with pytest.raises(InputError, match="radius 0"):
         integrator.step(1)
     del context
-    with pytest.raises(UnsupportedError, match="device=True"):
-        ProjectedIntegrator(0.001, ensemble=IsokineticSpheres(300.0, 1.0), device=False)
-    with pytest.raises(UnsupportedError, match="global"):
-        IsokineticSpheres(300.0, 1.0, spheres="global")
-    with pytest.raises(InputError, match="friction"):
-        IsokineticSpheres(300.0, 0.0)
     with pytest.raises(UnsupportedError, match="scheme of its own"):
         ProjectedIntegrator(0.001, "suzuki4", ensemble=IsokineticSpheres(300.0, 1.0), device=True)

@@ -9,7 +9,6 @@ import copy
 import warnings
 
 import numpy as np
-import openmm
 import pytest
 from ensemble_runs import in_calls_of_any_length, on_their_rows, run, twice_kinetic, two_parts, warm
 from openmm import unit
@@ -145,18 +144,14 @@ def test_parts_keep_their_rows(bath):
 # -- barostats ------------------------------------------------------------------------------------
 
 
-def pressed(barostat, ensemble):
-    system, x = water_box(27)
-    system.addForce(barostat)
-    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
-    context = started(system, integrator, x)
-    integrator.setVelocitiesToTemperature(context, 300, 1)
-    return integrator, context
-
-
 @pytest.mark.parametrize(("ensemble", "barostat"), list(zip(ENSEMBLES.values(), BAROSTATS.values(), strict=True)))
 def test_a_barostat_of_another_temperature(ensemble, barostat):
-    integrator, context = pressed(barostat(310), ensemble(300, momentum="free"))
+    """Without a temperature of the integrator there is nothing to compare."""
+    system, x = water_box(27)
+    system.addForce(barostat(310))
+    run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(momentum="free")), x, np.sin(x), 1)
+    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble(300, momentum="free"))
+    context = warm(system, integrator, x, 1)
     with pytest.warns(UserWarning, match=r"temperature of 310 K, and the integrator one of 300 K") as told:
         integrator.step(1)
     assert told[0].filename == __file__
@@ -169,8 +164,3 @@ def test_a_barostat_of_another_temperature(ensemble, barostat):
     with pytest.warns(UserWarning, match=r"temperature of 300 K, and the integrator one of 350 K") as told:
         integrator.setTemperature(350)
     assert told[0].filename == __file__
-
-
-def test_without_a_temperature_there_is_nothing_to_compare():
-    integrator, _ = pressed(openmm.MonteCarloBarostat(1.0, 310), Isokinetic(momentum="free"))
-    integrator.step(1)
