@@ -397,6 +397,10 @@ def require_on_surface(
         raise UnsupportedError(said) if by_class else InputError(said, item="positions", atoms=held.row_atoms(row))
 
 
+#: Places of the Voigt components xx, yy, zz, yz, xz, xy in a 3 x 3 matrix.
+VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
+
+
 def stress_of_rows(motion: Motion, atoms: Atoms, forces: FloatArray, time: float = 0.0) -> FloatArray:
     """Stress of the rows, Voigt order, at the present positions and momenta, which are zero where there are none.
 
@@ -414,8 +418,7 @@ def stress_of_rows(motion: Motion, atoms: Atoms, forces: FloatArray, time: float
             f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms leave "
             "them. Relax cells with FrechetCellFilter, or restore the atoms first"
         ) from error
-    virial = constraint_virial(motion, x, velocities_of(atoms), forces, time)
-    return np.asarray(-virial[(0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1)] / atoms.get_volume())
+    return np.asarray(-constraint_virial(motion, x, velocities_of(atoms), forces, time)[VOIGT] / atoms.get_volume())
 
 
 def deformation(before: FloatArray, after: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ from kcons.ase.binding import (
     FAR,
     FORCES_ONLY,
     UNKNOWN,
+    VOIGT,
     AcceptedPositions,
     Binding,
     applied_forces,
@@ -44,6 +45,7 @@ from kcons.motion.certificate import CHECK_EVERY
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.steppers.state import KICK_ROUNDING
+from kcons.thermostats.cells import constraint_virial
 
 #: Name in ASE's registry and in files.
 REGISTERED_NAME = "KconsConstraints"
@@ -654,9 +656,7 @@ class ConstrainedCalculator(Calculator):
         super().calculate(atoms, list(properties), list(system_changes))
         assert self.atoms is not None
         work = self.atoms.copy()
-        work.arrays.pop("momenta", None)
-        work.calc = self.inner
-        work.set_constraint([self.constraints])
+        work.set_constraint()  # the inner calculator need not know of them: others write them into their input
         motion = self.constraints.engine(work)
         held = motion.constraint_set
         x = work.arrays["positions"]
@@ -666,7 +666,8 @@ class ConstrainedCalculator(Calculator):
                 refuse_taken_along(motion, *before, *self._stressed)
         if held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
             motion.project_positions(x, x.copy(), out=x)
-        found = {name: self.inner.get_property(name, work) for name in sorted({*properties})}
+        wanted = {*properties, "forces"} if "stress" in properties else {*properties}
+        found = {name: self.inner.get_property(name, work) for name in sorted(wanted)}
         known = getattr(self.inner, "results", {})
         for name in ("energy", "free_energy", "forces"):
             if name not in found and name in known and not self.inner.calculation_required(work, [name]):
@@ -675,10 +676,14 @@ class ConstrainedCalculator(Calculator):
         if missing:
             raise PropertyNotImplementedError(f"{type(self.inner).__name__} has no {', '.join(missing)}")
         if "forces" in found:
-            found["forces"] = np.array(as_float_array(found["forces"], "forces of the calculator"))
+            forces = as_float_array(found["forces"], "forces of the calculator")
+            if "stress" in found:
+                stress = as_float_array(found["stress"], "stress of the calculator")
+                virial = constraint_virial(motion, x, np.zeros_like(x), forces)
+                stress = stress[VOIGT] if stress.shape == (3, 3) else stress
+                found["stress"] = stress - virial[VOIGT] / work.get_volume()
+            found["forces"] = forces.copy()
             self.constraints.adjust_forces(work, found["forces"])
-        if "stress" in found:
-            found["stress"] = work.get_stress()
         self.results |= found
         self._known = self._asked()
 

@@ -201,6 +201,7 @@ class Counting(EMT):
     def calculate(self, *args, **kwargs):
         self.calls += 1
         super().calculate(*args, **kwargs)
+        assert not self.atoms.constraints  # calculators of other programs would write them into their input
 
 
 def ethanol(inner=None) -> tuple[Atoms, ConstrainedCalculator]:
