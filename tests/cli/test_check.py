@@ -26,9 +26,8 @@ def folder(tmp_path_factory):
     files.write(folder / "good.trr", x, velocities=v)
     x[3, 7] += 0.2
     files.write(folder / "bad.xtc", x % 12.0)
-    data = (folder / "bad.xtc").read_bytes()
-    (folder / "cut.xtc").write_bytes(data[:-20])
-    (folder / "short.xtc").write_bytes((folder / "good.xtc").read_bytes()[:-20])
+    for cut, whole in (("cut", "bad"), ("short", "good")):
+        (folder / f"{cut}.xtc").write_bytes((folder / f"{whole}.xtc").read_bytes()[:-20])
     y = files.water(N, 5)
     y[3, 7] = np.nan
     files.write(folder / "nan.dcd", y)
@@ -37,11 +36,11 @@ def folder(tmp_path_factory):
 
 
 def command(folder, name, *more):
-    arguments = [str(folder / name), "--topology", str(folder / "t.gro"), "--constrain", "none"]
+    arguments = [str(folder / name), "--topology", str(folder / "t.gro"), *OPTIONS]
     return main(["check", *arguments, "--out", str(folder / f"out-{name}"), *more])
 
 
-def test_kept(folder, capsys):
+def test_kept_and_violated(folder, capsys):
     assert command(folder, "good.trr") == 0
     page = capsys.readouterr().out
     assert "5 of 5 frames, 60 atoms; 60 rows on 60 atoms" in page and "rank 60" in page
@@ -53,8 +52,7 @@ def test_kept(folder, capsys):
     assert (out / "check.png").stat().st_size > 5000
     assert data["verdict"] in (out / "check.txt").read_text()
 
-
-def test_violated_in_a_file_that_ends_too_early(folder, capsys):
+    # Violated, in a file that ends too early.
     assert command(folder, "cut.xtc") == 1
     page = capsys.readouterr().out
     assert "violated by" in page and "SOL3:OW–HW1 (6, 7)" in page and "0.001 nm" in page
@@ -115,7 +113,7 @@ def test_formats_by_option(folder, tmp_path, capsys):
 def test_the_check_of_another_trajectory_is_not_overwritten(folder, tmp_path, monkeypatch, capsys):
     """Files of one stem, and a folder that is a link."""
     monkeypatch.chdir(tmp_path)
-    words = ["--topology", str(folder / "t.gro"), "--constrain", "none"]
+    words = ["--topology", str(folder / "t.gro"), *OPTIONS]
     (tmp_path / "a").mkdir()
     for name in ("a/run.xtc", "run.xtc"):
         (tmp_path / name).write_bytes((folder / "good.xtc").read_bytes())

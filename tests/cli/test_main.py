@@ -43,10 +43,9 @@ def test_what_is_said(words, said, capsys):
 def test_list(command, capsys):
     assert run(command, "--list") == 0
     text = capsys.readouterr().out
-    for word in ("water", "chain-straight", "ethanol", "triple-pendulum", "slab", "rattle", "dop853"):
+    listed = ("  isokinetic-notes ", "  nose-hoover ", "  langevin-halfway ")
+    for word in (*listed, "water", "chain-straight", "ethanol", "triple-pendulum", "slab", "rattle", "dop853"):
         assert word in text
-    for word in ("isokinetic-notes", "nose-hoover", "langevin-halfway"):
-        assert f"  {word} " in text
     for word in ("geodesic", "yoshida4", "blanes-moan6a", "projected-verlet", "projected-rk4"):
         (line,) = (line for line in text.splitlines() if line.startswith(f"  {word} "))
         assert line.endswith("(only when named)")
@@ -115,12 +114,8 @@ def test_a_file_where_a_folder_has_to_be(place, tmp_path, capsys):
 
 
 def test_importing_the_command_imports_no_md_engine():
-    code = (
-        "import sys, kcons.cli.main; "
-        "print([m for m in ('ase', 'openmm', 'matplotlib', 'rich', 'tblite') if m in sys.modules])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+    code = "import sys, kcons.cli.main; print({'ase', 'openmm', 'matplotlib', 'rich', 'tblite'} & {*sys.modules})"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout.strip() == b"set()"
 
 
 @pytest.mark.parametrize(

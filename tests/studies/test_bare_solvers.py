@@ -11,11 +11,7 @@ from bare_solvers import CANDIDATES
 
 from kcons.errors import UnsupportedError
 
-SYSTEMS = {
-    "water": bare_systems.water(8),
-    "methyl": bare_systems.methyl(8),
-    "chain": bare_systems.chain(20),
-}
+SYSTEMS = {"water": bare_systems.water(8), "methyl": bare_systems.methyl(8), "chain": bare_systems.chain(20)}
 BY_NAME = {candidate.name: candidate for candidate in CANDIDATES}
 
 
@@ -41,8 +37,7 @@ def test_what_each_leaves(name, tolerance, positions, velocities, system):
 def test_all_find_the_same(name):
     system = SYSTEMS["chain"]
     engine, peer = BY_NAME["kcons"].make(system, 0.0), BY_NAME[name].make(system, 1e-13)
-    for task in ("positions", "velocities"):
-        start = system.moved if task == "positions" else system.thermal
+    for task, start in (("positions", system.moved), ("velocities", system.thermal)):
         ours, theirs = start.copy(), start.copy()
         getattr(engine, task)(ours)
         getattr(peer, task)(theirs)
@@ -53,7 +48,6 @@ def test_all_find_the_same(name):
 def test_lammps_holds_clusters_and_refuses_chains():
     for name in ("water", "methyl"):
         solver = BY_NAME["lammps"].make(SYSTEMS[name], 1e-10)
-        assert solver.timing("P").residual < 1e-8
-        assert solver.timing("V").residual < 1e-12
+        assert solver.timing("P").residual < 1e-8 and solver.timing("V").residual < 1e-12
     with pytest.raises(UnsupportedError, match="center"):
         BY_NAME["lammps"].make(SYSTEMS["chain"], 1e-10)

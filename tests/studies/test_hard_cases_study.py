@@ -48,11 +48,8 @@ def test_a_program_that_hangs_is_given_up(study, monkeypatch):
     child.pool.shutdown()
 
 
-def test_a_verdict_in_words(study):
+def test_a_verdict_in_words_and_unknown_cases(study, tmp_path, capsys):
     assert study.words_of({"verdict": "right", "words": "", "check": "a", "value": 0.9}) == "right: a 0.9"
-
-
-def test_unknown_cases_are_refused(study, tmp_path, capsys):
     with pytest.raises(SystemExit):
         study.main(["--only", "H99", "--out", str(tmp_path)])
     assert "there are cases H01" in capsys.readouterr().err

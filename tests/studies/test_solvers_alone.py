@@ -26,9 +26,7 @@ def test_points_of_the_scaling_come_from_processes_of_their_own():
     assert len(figure.axes) == 3
 
 
-def test_what_solvers_of_others_raise_is_a_result(monkeypatch):
-    system = solvers_alone.chain(5)
-
+def test_what_solvers_of_others_raise_is_a_result():
     class Failing:
         def __init__(self, *_):
             pass
@@ -37,6 +35,5 @@ def test_what_solvers_of_others_raise_is_a_result(monkeypatch):
             raise RuntimeError("did not converge")
 
     candidate = type("Made", (), {"make": Failing, "name": "made"})
-    assert solvers_alone.timed(system, candidate, 0.0) == {
-        "P": {"status": "failed", "words": "RuntimeError: did not converge"}
-    }
+    failed = {"P": {"status": "failed", "words": "RuntimeError: did not converge"}}
+    assert solvers_alone.timed(solvers_alone.chain(5), candidate, 0.0) == failed

@@ -33,15 +33,6 @@ def measured(system, name):
     return found
 
 
-def check_order_two(name, system):
-    """RATTLE, whoever does it: order two, and the same trajectory to the last digits that are asked for."""
-    built = test_systems.build(system, {"chain": 6, "sphere": 2}.get(system)).shortened(2)
-    found, ours = measured(built, name), measured(built, "rattle")
-    assert list(observed_orders(found).values()) == pytest.approx([2.0], abs=0.1)
-    assert list(found.error) == pytest.approx(list(ours.error), rel=1e-5)
-    assert list(found.evaluations) == pytest.approx(list(ours.evaluations))
-
-
 @pytest.mark.parametrize(
     ("name", "system"),
     [
@@ -51,7 +42,12 @@ def check_order_two(name, system):
     ],
 )
 def test_order_two(name, system):
-    check_order_two(name, system)
+    """RATTLE, whoever does it: order two, and the same trajectory to the last digits that are asked for."""
+    built = test_systems.build(system, {"chain": 6, "sphere": 2}.get(system)).shortened(2)
+    found, ours = measured(built, name), measured(built, "rattle")
+    assert list(observed_orders(found).values()) == pytest.approx([2.0], abs=0.1)
+    assert list(found.error) == pytest.approx(list(ours.error), rel=1e-5)
+    assert list(found.evaluations) == pytest.approx(list(ours.evaluations))
 
 
 @pytest.mark.parametrize(
@@ -101,13 +97,10 @@ def test_dense_rows_are_those_of_the_set():
 def test_dae_solvers_follow_their_tolerance(name, system):
     built = test_systems.build(system, 2 if system == "sphere-pendulum" else None).shortened(2)
     found = measured(built, name)
-    errors = list(found.error)
-    assert errors[0] > 10 * errors[1] > 100 * errors[2]
-    assert errors[-1] < 1e-5
-    last = found.iloc[-1]
+    errors, last = list(found.error), found.iloc[-1]
+    assert errors[0] > 10 * errors[1] > 100 * errors[2] and errors[-1] < 1e-5
     # The stabilised formulation: positions and velocities stay on the constraints.
-    assert last.sigma < 1e-9
-    assert last.tangency < 1e-9
+    assert last.sigma < 1e-9 and last.tangency < 1e-9
 
 
 # -- LAMMPS -------------------------------------------------------------------------------------------
@@ -118,13 +111,9 @@ def test_lammps_holds_rigid_water(name):
     need(name)
     system = test_systems.build("water", 8, forces="ase").shortened(2)
     held = lammps_shake.clusters(system.bonds, system.positions, system.n_atoms)
-    assert held is not None
-    assert len(held.angles) == 8
-    assert held.degrees == pytest.approx([104.52])
-    last = measured(system.with_time_steps([1.0]), name).iloc[-1]
-    ours = measured(system.with_time_steps([1.0]), "rattle").iloc[0]
-    assert last.error == pytest.approx(ours.error, rel=1e-5)
-    assert last.sigma < 1e-9
+    assert len(held.angles) == 8 and held.degrees == pytest.approx([104.52])
+    last, ours = (measured(system.with_time_steps([1.0]), method).iloc[-1] for method in (name, "rattle"))
+    assert last.error == pytest.approx(ours.error, rel=1e-5) and last.sigma < 1e-9
     assert (last.tangency < 1e-9) == (name == "lammps-rattle-1e-10")
 
 
@@ -134,8 +123,7 @@ def test_clusters_of_lammps():
     assert len(star.bonds) == 3
     np.testing.assert_allclose(star.lengths[star.bond_types], [1.0, 1.0, 1.2])
     triangle = lammps_shake.clusters(np.array([[0, 1], [1, 2], [0, 2]]), x, 5)
-    assert triangle.angles.tolist() == [[1, 0, 2]]
-    assert triangle.degrees == pytest.approx([90.0])
+    assert triangle.angles.tolist() == [[1, 0, 2]] and triangle.degrees == pytest.approx([90.0])
     for refused in (
         [[0, 1], [1, 4], [0, 2]],  # a chain of four
         [[0, 1], [1, 3], [0, 3]],  # a triangle with three different sides
