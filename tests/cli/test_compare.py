@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from host_systems import ALANINE
 
 from kcons.cli import main
 from kcons.comparison import measure, observed_orders, production, read_csv
 
-ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
 CHAIN = ("compare", "chain", "--size", 4, "--dt", "5,10,5", "--budget", 5)
 
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import ase.io
 import numpy as np
-import openmm
 import pytest
 from ase.build import molecule
-from host_systems import quietly, read_universe
+from host_systems import ALANINE, VILLIN, quietly, read_universe
 from openmm import app, unit
 
 from kcons.cli import main
@@ -19,8 +17,6 @@ from kcons.comparison.test_systems import files
 from kcons.constraints import LinearRelation
 from kcons.errors import InputError, UnsupportedError
 
-ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
-VILLIN = Path(openmm.app.__file__).parent / "data" / "test.pdb"
 from_file = test_systems.from_file
 
 

@@ -244,8 +244,7 @@ def test_a_cell_with_a_vector_turned_round_is_the_same_lattice(tmp_path, turned)
 def test_molecules_cut_by_a_box_that_is_not_there_are_said():
     with pytest.warns(UserWarning, match=r"1 bonds .* atoms 1 and 2 8\.5 angstrom.*universe\.dimensions = "):
         to_ase(ethane_cut(box=False))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         to_ase(ethane_cut(box=True))
         # Targets that are left out are those of the frame.
         system = to_openmm(ethane_cut(box=True), [Distance([(0, 1), (2, 3)])]).system

@@ -27,10 +27,8 @@ def waters(count, names=("OW", "HW1", "HW2"), **attributes):
     universe = mda.Universe.empty(
         count * width, n_residues=count, atom_resindex=np.repeat(np.arange(count), width), trajectory=True
     )
-    universe.add_TopologyAttr("names", list(names) * count)
-    universe.add_TopologyAttr("resnames", ["SOL"] * count)
-    universe.add_TopologyAttr("resids", np.arange(count) + 1)
-    for name, values in attributes.items():
+    given = {"names": list(names) * count, "resnames": ["SOL"] * count, "resids": np.arange(count) + 1}
+    for name, values in (given | attributes).items():
         universe.add_TopologyAttr(name, values)
     rng = np.random.default_rng(0)
     angle = np.radians(109.47)
@@ -45,8 +43,7 @@ def without_elements(atoms):
         f"ATOM  {k + 1:5d} {name:>4s} {residue:4s}A{number:4d}    {3.0 * k:8.3f}   0.000   0.000  1.00  0.00"
         for k, (name, residue, number) in enumerate(atoms)
     ]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return mda.Universe(StringIO("\n".join([*lines, "END\n"])), format="PDB")
 
 
@@ -193,10 +190,8 @@ def test_coordinates_left_in_nanometres_are_refused(tmp_path):
     path = tmp_path / "w.gro"
     made = waters(3)
     made.dimensions = [90.0] * 6
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        made.atoms.write(str(path))
-        universes = [mda.Universe(str(path), convert_units=convert) for convert in (True, False)]
+    quietly(made.atoms.write, str(path))
+    universes = [quietly(mda.Universe, str(path), convert_units=convert) for convert in (True, False)]
     rows = constraints_of(universes[0])
     with pytest.raises(InputError, match=r"positions are in nm, .* convert_units=False; make it without"):
         constraints_of(universes[1])

@@ -33,6 +33,7 @@ from kcons.mdanalysis import (
     ConstraintCheck,
     OpenMMReporter,
     TrajectoryWriter,
+    to_openmm,
     write_ase,
 )
 from kcons.motion import Motion
@@ -59,12 +60,7 @@ def test_core_runs(tmp_path, ending, monkeypatch):
     if ending == "scipy.nc":  # written by SciPy where netCDF4 is not installed
         monkeypatch.setattr("MDAnalysis.coordinates.TRJ.netCDF4", None)
         ending = "nc"
-    made, state, motion = system()
-    path = tmp_path / f"r.{ending}"
-    states = []
-    with TrajectoryWriter(path, 3 * N, motion=motion, interval=0.02) as writer:
-        run(made, state, 0.002, 50, observers=[writer, states.append], every=10)
-    universe = files.loaded(path, N)
+    universe, states, _ = ran(tmp_path / f"r.{ending}", 50, 10, interval=0.02)
     assert universe.trajectory.n_frames == len(states) == 6
     accuracy = 6e-3 if ending == "xtc" else 2e-6
     for ts, s in zip(universe.trajectory, states, strict=True):
@@ -95,14 +91,19 @@ def test_a_state_goes_with_its_own_cell(tmp_path):
         np.testing.assert_allclose(found, sides, rtol=1e-5)
 
 
-def test_observables_of_h5md(tmp_path):
+def ran(path, steps, every=1, **options):
+    """What a run writes, its states, and its motion."""
     made, state, motion = system()
-    path = tmp_path / "r.h5md"
     states = []
-    with TrajectoryWriter(path, 3 * N, motion=motion, forces=True) as writer:
-        run(made, state, 0.002, 10, observers=[writer, states.append], every=5)
-    last = files.loaded(path, N).trajectory[-1]
-    s = states[-1]
+    with TrajectoryWriter(path, 3 * N, motion=motion, **options) as writer:
+        run(made, state, 0.002, steps, observers=[writer, states.append], every=every)
+    return files.loaded(path, N), states, motion
+
+
+def test_observables_of_h5md(tmp_path):
+    path = tmp_path / "r.h5md"
+    universe, states, motion = ran(path, 10, 5, forces=True)
+    last, s = universe.trajectory[-1], states[-1]
     expected = motion.multipliers(s.positions, s.velocities, s.forces, s.time)
     np.testing.assert_allclose(last.data["multipliers"], expected, rtol=1e-6, atol=1e-6)
     assert np.abs(expected).max() > 1.0
@@ -113,12 +114,9 @@ def test_observables_of_h5md(tmp_path):
 
 @pytest.mark.parametrize("ending", ["trr", "h5md", "nc"])
 def test_forces_that_a_state_does_not_know_are_not_zero(ending, tmp_path):
-    made, state, motion = system()
-    assert state.forces is None
-    states = []
-    with TrajectoryWriter(tmp_path / f"f.{ending}", 3 * N, motion=motion, forces=True) as writer:
-        run(made, state, 0.002, 2, observers=[writer, states.append])
-    frames = [ts.forces.copy() for ts in files.loaded(tmp_path / f"f.{ending}", N).trajectory]
+    universe, states, _ = ran(tmp_path / f"f.{ending}", 2, forces=True)
+    frames = [ts.forces.copy() for ts in universe.trajectory]
+    assert states[0].forces is None
     assert np.isnan(frames[0]).all()
     np.testing.assert_allclose(frames[-1], states[-1].forces, rtol=1e-5, atol=1e-4)
 
@@ -177,24 +175,16 @@ def test_ase_dynamics(tmp_path):
 
 
 def test_openmm_simulations(tmp_path):
-    x = files.whole(files.water(2, 1, seed=3))[0] / 10
-    force_system = openmm.System()
-    topology = app.Topology()
-    chain = topology.addChain()
-    for k in range(2):
-        residue = topology.addResidue("HOH", chain)
-        for name, mass in (("O", 15.999), ("H1", 1.008), ("H2", 1.008)):
-            topology.addAtom(name, app.Element.getBySymbol(name[0]), residue)
-            force_system.addParticle(mass)
-        for (i, j), length in zip(files.pairs(1) + 3 * k, files.targets(1) / 10, strict=True):
-            force_system.addConstraint(int(i), int(j), float(length))
+    universe = files.universe(2)
+    universe.atoms.positions = files.whole(files.water(2, 1, seed=3))[0]
+    held = to_openmm(universe, [Distance(files.pairs(2), files.targets(2))])
+    x = universe.atoms.positions.astype(float) / 10
     integrator = openmm.VerletIntegrator(0.001)
     integrator.setConstraintTolerance(1e-8)
-    simulation = app.Simulation(topology, force_system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    simulation = app.Simulation(held.topology, held.system, integrator, openmm.Platform.getPlatformByName("Reference"))
     simulation.context.setPositions(x)
     simulation.context.setVelocitiesToTemperature(300, 1)
-    masses = np.tile([15.999, 1.008, 1.008], 2)
-    motion = Motion(ConstraintSet(Distance(files.pairs(2), files.targets(2) / 10), x, masses), x)
+    motion = Motion(ConstraintSet(Distance(files.pairs(2), files.targets(2) / 10), x, MASSES[:6]), x)
     path = tmp_path / "o.h5md"
     reporter = OpenMMReporter(path, 5, motion=motion)
     simulation.reporters.append(reporter)
@@ -238,8 +228,7 @@ def test_bad_input(tmp_path):
     bad[4, 2] = np.inf
     with pytest.raises(NonFiniteError, match=r"positions of atom 4.*nothing was written"):
         writer.write(bad)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         writer.write(x)
     assert writer.n_frames == 1
     writer.close()

@@ -62,8 +62,7 @@ def python_pages():
 @pytest.mark.parametrize("code", python_pages())
 def test_python_snippets_run(code, tmp_path, monkeypatch, request):
     if package := NEEDS.get(request.node.callspec.id):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})

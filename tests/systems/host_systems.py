@@ -17,8 +17,7 @@ def read_universe(*files):
     """MDAnalysis says much about files that is of no concern here."""
     import MDAnalysis
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return MDAnalysis.Universe(*(str(f) for f in files))
 
 
@@ -30,6 +29,5 @@ def read_atoms(file):
 
 def quietly(function, *arguments, **options):
     """Without the warnings about guessed bonds and elements, which tests of their own look at."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
+    with warnings.catch_warnings(action="ignore", category=UserWarning):
         return function(*arguments, **options)

@@ -91,17 +91,15 @@ def write(
         options.setdefault("dt", 2.0)
     if path.suffix == ".pdb":
         options.setdefault("multiframe", True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with mda.Writer(str(path), n, **options) as writer:
-            for k, positions in enumerate(x):
-                ts = made.trajectory.ts
-                ts.positions = positions
-                if velocities is not None:
-                    ts.velocities = velocities[k]
-                ts.dimensions = cells[k]
-                ts.time, ts.frame, ts.dt = 2.0 * k, k, 2.0
-                writer.write(made.atoms)
+    with warnings.catch_warnings(action="ignore"), mda.Writer(str(path), n, **options) as writer:
+        for k, positions in enumerate(x):
+            ts = made.trajectory.ts
+            ts.positions = positions
+            if velocities is not None:
+                ts.velocities = velocities[k]
+            ts.dimensions = cells[k]
+            ts.time, ts.frame, ts.dt = 2.0 * k, k, 2.0
+            writer.write(made.atoms)
     return path
 
 
@@ -144,8 +142,7 @@ def topology(path: Path, n: int, positions: np.ndarray, side: float = 12.0) -> P
     made = universe(n)
     made.atoms.positions = positions
     made.dimensions = [side, side, side, 90, 90, 90]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         made.atoms.write(str(path))
     return path
 

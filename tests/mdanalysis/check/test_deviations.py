@@ -349,8 +349,7 @@ def test_backends_agree(water, backend, ending, rows, targets):
     if backend == "dask":
         pytest.importorskip("dask")
     serial = checked(water[ending], rows, targets=targets, worst=9)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the backends themselves
+    with warnings.catch_warnings(action="ignore"):  # of the backends themselves
         run = {"backend": backend, "n_workers": 2, "n_parts": 3}
         parallel = checked(water[ending], rows, targets=targets, worst=9, run=run)
     assert serial.verdict == parallel.verdict and serial.frames == parallel.frames and serial.times == parallel.times

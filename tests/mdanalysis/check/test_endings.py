@@ -172,8 +172,7 @@ def test_compressed_files(tmp_path, x, compressed):
 
 def test_a_break_in_the_part_of_one_worker(tmp_path, x):
     path = cut(files.write(tmp_path / "whole.xtc", x), 300)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         result = checked(path, backend="multiprocessing", n_workers=2)
     assert result.frames == list(range(7)) and result.broken is not None and result.broken.frame == 7
 
@@ -278,8 +277,7 @@ def test_each_file_of_a_chain_has_an_end(tmp_path, x, ending, which):
             files.write(path, y, side=None)
 
     def whole_chain():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             made = files.universe(N).load_new([str(path) for path in paths])
             return ConstraintCheck(made, Distance(files.pairs(N), files.targets(N))).run().check
 

@@ -49,17 +49,11 @@ def test_temperature_counts_the_right_degrees_of_freedom(tmp_path):
     assert moved.units[0].rate_largest is not None and moved.units[0].rate_largest > 0.1
 
 
-def test_a_moving_center_of_mass_counts(tmp_path):
+def test_a_moving_center_of_mass_counts_and_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
     x = files.water(N, 3)
-    rng = np.random.default_rng(1)
-    v = rng.normal(size=x.shape) + 3.0
+    v = np.random.default_rng(1).normal(size=x.shape) + 3.0
     path = files.write(tmp_path / "m.trr", x, velocities=v)
     assert files.checked(path, N).degrees_of_freedom == 6 * N
-
-
-def test_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
-    x = files.water(N, 3)
-    path = files.write(tmp_path / "m.trr", x, velocities=np.ones_like(x))
     result = files.checked(path, N, masses=False)
     assert result.rank == 3 * N and result.temperature is None
     assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)

@@ -130,6 +130,9 @@ def test_parameter_files_that_are_wrong(tmp_path, text, match):
 # -- names ------------------------------------------------------------------------------------------
 
 
+HEAVY = [12.011, 35.45, 28.085, 79.904, 12.011, 15.999, 1.008]
+
+
 def seven(**attributes):
     made = mda.Universe.empty(7, n_residues=2, atom_resindex=[0, 0, 0, 1, 1, 1, 1], trajectory=True)
     for name, values in attributes.items():
@@ -151,20 +154,14 @@ def test_names_of_rows(named):
 @pytest.mark.parametrize(
     ("given", "elements"),
     [
-        ({"names": ["OW", "HW1", "HW2", "CA", "1HB", "N", "C"]}, ["O", "H", "H", "C", "H", "N", "C"]),
-        ({"names": ["CA"] * 7, "elements": ["Ca", "", *"CCCCC"]}, ["Ca", *"CCCCCC"]),
+        ({"names": ["OW", "HW1", "HW2", "CA", "1HB", "N", "C"]}, "O H H C H N C"),
+        ({"names": ["CA"] * 7, "elements": ["Ca", "", *"CCCCC"]}, "Ca C C C C C C"),
         # As everywhere: a rule for C-C is none for C-Cl.
-        (
-            {
-                "names": ["C1", "CL1", "7", "BR", "CA", "OW", "HW1"],
-                "masses": [12.011, 35.45, 28.085, 79.904, 12.011, 15.999, 1.008],
-            },
-            ["C", "Cl", "Si", "Br", "C", "O", "H"],
-        ),
+        ({"names": ["C1", "CL1", "7", "BR", "CA", "OW", "HW1"], "masses": HEAVY}, "C Cl Si Br C O H"),
     ],
 )
 def test_rules_by_element_fit_what_names_and_masses_tell(tmp_path, given, elements):
-    path = tmp_path / "p.toml"
+    path, elements = tmp_path / "p.toml", elements.split()
     rules = [f"[[length]]\nelements=['{elements[k]}', '{elements[k + 1]}']\nvalue={k + 1}\n" for k in range(6)]
     path.write_text("".join(rules))
     rows = Distance([[k, k + 1] for k in range(6)])
