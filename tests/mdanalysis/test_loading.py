@@ -126,12 +126,14 @@ def test_topologies_of_gromacs_and_amber_have_one_ending(tmp_path):
     assert "ITP" not in str(error.value)
 
 
-def test_a_format_of_the_topology_can_be_named(tmp_path, x):
+def test_a_format_of_the_topology_can_be_named_and_a_trajectory_is_none(tmp_path, x):
     path = files.topology(tmp_path / "w.gro", N, x[0]).rename(tmp_path / "confout")
     with pytest.raises(InputError, match=r"confout: its name tells no format of a topology .*--topology-format") as e:
         open_universe(path)
     assert e.value.item == "topology_format"
     trajectory = files.write(tmp_path / "w.trr", x)
+    with pytest.raises(InputError, match=r"w\.trr says nothing of its atoms, .* takes the trajectory first"):
+        check_trajectory(path, trajectory)
     assert check_trajectory(trajectory, path, "none", topology_format="GRO", rank=False).status == "kept"
     found = check_trajectory(path, path, "none", format="GRO", topology_format="gro", targets="topology", rank=False)
     assert found.status == "kept"
@@ -149,13 +151,6 @@ def test_atom_counts_that_differ(tmp_path, x, ending):
             files.loaded(path, N)
 
 
-def test_a_trajectory_is_no_topology(tmp_path, x):
-    path, top = files.write(tmp_path / "w.dcd", x), files.topology(tmp_path / "t.pdb", N, x[0])
-    with pytest.raises(InputError, match=r"w\.dcd says nothing of its atoms, .* takes the trajectory first"):
-        check_trajectory(top, path)
-    assert check_trajectory(path, top).n_atoms == 3 * N
-
-
 # -- headers that are not so ------------------------------------------------------------------------
 
 
@@ -170,11 +165,8 @@ def test_numbers_of_atoms_that_cannot_be(tmp_path, x, n):
     for run in (lambda: open_universe(path), lambda: open_universe(top, path)):
         with pytest.raises(InputError, match=r"w\.gro"):
             run()
-
-
-def test_a_reader_that_takes_the_number_of_atoms_from_the_topology(tmp_path, x):
-    """Data of LAMMPS: its header says 90 atoms, there is one."""
-    top, path = files.topology(tmp_path / "t.gro", N, x[0]), tmp_path / "w.data"
+    # A reader that takes the number from the topology. Data of LAMMPS: the header says 90 atoms, there is one.
+    path = tmp_path / "w.data"
     box = "".join(f"0 12 {a}lo {a}hi\n" for a in "xyz")
     path.write_text(f"x\n\n90 atoms\n1 atom types\n\n{box}\nMasses\n\n1 16\n\nAtoms # full\n\n1 1 1 0 1 1 1\n")
     with pytest.raises(InputError, match=r"w\.data has 1 atoms, .*t\.gro has 90"):

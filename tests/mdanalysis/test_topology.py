@@ -103,7 +103,7 @@ def test_a_universe_without_coordinates_or_masses():
 
 
 @pytest.mark.parametrize("call", [constraints_of, snapshot_of, to_ase])
-def test_what_is_no_universe_is_refused(villin, call):
+def test_what_is_no_universe_and_an_atom_that_is_twice_in_a_group_are_refused(villin, call):
     for given in ([villin], None, villin.atoms[0], ase.Atoms("H2")):
         said = f"must be a Universe or AtomGroup, .* not {type(given).__name__}"
         with pytest.raises(InputError, match=said) as caught:
@@ -111,13 +111,9 @@ def test_what_is_no_universe_is_refused(villin, call):
         assert caught.value.item == "universe"
     part = villin.residues[:2]
     assert snapshot_of(part).topology.n_atoms == len(part.atoms)
-
-
-@pytest.mark.parametrize("taken", [constraints_of, to_ase, snapshot_of])
-def test_an_atom_that_is_twice_in_a_group_is_refused(taken):
     made = waters(2, masses=[15.9994, 1.008, 1.008] * 2)
     with pytest.raises(InputError, match=r"atom 1 of its Universe twice, .* in place 3; take group.unique"):
-        taken(made.atoms[[0, 1, 2, 1, 3, 4, 5]])
+        call(made.atoms[[0, 1, 2, 1, 3, 4, 5]])
     assert constraints_of(made.atoms[[5, 0, 1, 2, 4, 3]], "none").constraint_set.n_rows == 6
 
 

@@ -358,17 +358,12 @@ def test_coordinates_of_xtc_in_memory_and_of_several_files(tmp_path, how):
 # -- grids of coordinates that were rounded before --------------------------------------------------
 
 
-def rounded(decimals, frames=8, shift=0.0):
-    """As a file with so many decimals in angstrom holds them."""
-    return np.round(whole(frames) + shift, decimals)
-
-
 @pytest.mark.parametrize("ending", ["dcd", "trr", "nc"])
 @pytest.mark.parametrize("decimals", [1, 2, 3, 4])
 @pytest.mark.parametrize("targets", ["first", "given"])
 def test_coordinates_that_were_rounded_before_they_came_into_a_file_of_floats(tmp_path, ending, decimals, targets):
     """Rigid water that was written as XTC or text first is kept; a bond that is off by more than that is not."""
-    x = rounded(decimals)
+    x = np.round(whole(), decimals)
     result = checked(files.write(tmp_path / f"a.{ending}", x, side=None), targets=targets)
     assert result.status in ("kept", "tolerated"), result.verdict
     step = 10.0**-decimals
@@ -393,7 +388,7 @@ def test_a_converted_xtc_says_what_the_xtc_says(tmp_path):
 @pytest.mark.parametrize("kind", ["floats", "one frame of them", "by hand", "few", "the precision is given"])
 def test_what_is_no_grid(tmp_path, kind):
     """A frame that lies on one among others; numbers that a person wrote; numbers that are too few to tell."""
-    x, options, row = rounded(3), {}, BOND
+    x, options, row = np.round(whole(), 3), {}, BOND
     if kind == "floats":
         x = whole()
     elif kind == "one frame of them":
