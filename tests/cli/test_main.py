@@ -18,6 +18,7 @@ needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is
 @pytest.fixture(autouse=True)
 def in_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").touch()
 
 
 def run(*arguments):
@@ -51,6 +52,7 @@ def test_list(command, capsys):
         assert line.endswith("(only when named)")
 
 
+TAKEN = "there is a file where a folder has to be; give another folder (--out)"
 #: What is wrong, and what is said of it.
 MISTAKES = [
     ("compare", "name a test system: alanine"),
@@ -68,6 +70,7 @@ MISTAKES = [
     ("compare chain --size 3 --budget -1", "budget is -1.0; give a positive number"),
     ("compare chain --size 3 --out /dev/null/x", "/dev/null"),
     ("compare chain --criterion temperature --target-error 1e-3", "leave --criterion temperature out"),
+    *((f"compare chain --size 4 --methods rattle --dt 10 --out {place}", TAKEN) for place in ("taken", "taken/below")),
 ]
 OF_MOLECULES = [
     ("compare missing.pdb", "there is no file missing.pdb"),
@@ -104,13 +107,6 @@ def test_unreadable_arguments_leave_with_status_2(words, meant, capsys):
     with pytest.raises(SystemExit) as left:
         run(*words.split())
     assert left.value.code == 2 and meant in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("place", ["taken", "taken/below"])
-def test_a_file_where_a_folder_has_to_be(place, tmp_path, capsys):
-    (tmp_path / "taken").touch()
-    assert run("compare", "chain", "--size", 4, "--methods", "rattle", "--dt", 10, "--out", tmp_path / place) == 2
-    assert "there is a file where a folder has to be; give another folder (--out)" in capsys.readouterr().err
 
 
 def test_importing_the_command_imports_no_md_engine():

@@ -83,7 +83,7 @@ def plan(*arguments, capsys):
 # -- PDB files ----------------------------------------------------------------------------------------
 
 
-def test_alanine_dipeptide(alanine):
+def test_alanine_dipeptide_and_what_is_held_of_it(alanine):
     assert (alanine.n_atoms, alanine.constraint_set.n_rows, alanine.motion.rank) == (22, 21, 21)
     assert "alanine dipeptide in vacuum, 22 atoms, allbonds: 21 Distance; 21 rows on 22 atoms, 300 K" in alanine.title
     assert alanine.openmm.home and alanine.openmm.platform == "Reference" and alanine.symbols[:2] == ["H", "C"]
@@ -94,9 +94,6 @@ def test_alanine_dipeptide(alanine):
     np.testing.assert_array_equal(same.positions, alanine.positions)
     np.testing.assert_array_equal(same.velocities, alanine.velocities)
     assert same.name == ALANINE.stem and from_file(ALANINE, quick=True).horizon == pytest.approx(alanine.horizon / 2)
-
-
-def test_what_is_held_can_be_chosen():
     for constrain, rows in (({}, 12), ({"constrain": "hangles"}, 30)):
         system = from_file(ALANINE, **constrain)
         assert system.constraint_set.n_rows == system.openmm.system.getNumConstraints() == rows

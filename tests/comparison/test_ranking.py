@@ -51,6 +51,11 @@ def test_the_cheapest_that_is_as_good_as_the_usual():
     assert list(found.table.method) == ["rattle", "blanes", "peer"]
     assert list(found.table.setting) == [2.0, 4.0, 2.0]
     assert list(found.table.place) == [1, 2, 3] and list(found.table.times) == [1.0, 2.1, 2.5]
+    # An error that is asked for.
+    found = rank(made(*ROWS), limit=2e-4)
+    assert list(found.table.method) == ["blanes"] and list(found.beyond.method) == ["rattle", "peer"]
+    none = rank(made(*ROWS), limit=1e-6)
+    assert not len(none.table) and none.beyond.iloc[0].method == "blanes"
 
 
 def test_costs_within_the_scatter_share_a_place():
@@ -58,9 +63,7 @@ def test_costs_within_the_scatter_share_a_place():
     assert list(rank(made(*rows)).table.place) == [1, 1, 3]
     assert list(rank(made(*rows, margin=0.2)).table.place) == [1, 1, 1]
     assert list(rank(made(*rows, margin=None)).table.place) == [1, 2, 3]  # 5 % at least
-
-
-def test_of_equal_ones_the_simplest_comes_first():
+    # Of equal ones the simplest comes first.
     rows = [row("blanes", 24.0, 1e-3, 2.0), row("rattle", 2.0, 1e-3, 2.1), row("peer", 1.0, 1e-3, 2.5)]
     found = rank(made(*rows)).table
     assert list(found.method) == ["rattle", "blanes", "peer"] and list(found.place) == [1, 1, 3]
@@ -76,13 +79,6 @@ def test_costs_are_times_or_force_evaluations():
     ):
         found = rank(made(*rows, **about))
         assert found.cost == cost and list(found.table.place) == places
-
-
-def test_an_error_that_is_asked_for():
-    found = rank(made(*ROWS), limit=2e-4)
-    assert list(found.table.method) == ["blanes"] and list(found.beyond.method) == ["rattle", "peer"]
-    none = rank(made(*ROWS), limit=1e-6)
-    assert not len(none.table) and none.beyond.iloc[0].method == "blanes"
 
 
 def test_what_cannot_be_ranked():

@@ -25,13 +25,11 @@ ROWS = [
 ]
 
 
-def test_costs_between_points():
+def test_costs_between_points_and_gains():
     rattle = pd.DataFrame(ROWS[:3])
     assert study.cost_at(rattle, "seconds", 5e-4) == pytest.approx(2.0 * math.sqrt(2))
     assert study.cost_at(rattle, "seconds", 1e-2) == 1.0 and study.cost_at(rattle, "seconds", 1e-5) == math.inf
-
-
-def test_gains_are_at_equal_errors():
+    # Gains are at equal errors.
     (found,) = study.winners(pd.DataFrame(ROWS)).to_dict("records")
     assert found["gain"] == pytest.approx(2.5, rel=0.05) and found["ahead of kcons"] == "none"
     faster = [{**r, "seconds": 0.1 * r["seconds"]} if r["title"] == "a peer" else r for r in ROWS]

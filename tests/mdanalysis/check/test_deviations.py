@@ -65,12 +65,12 @@ def test_xtc_is_told_to_far_better_than_single_precision_would_allow(tmp_path):
     np.testing.assert_allclose(checked(path).series["largest Å"], np.abs(off).max(axis=1), atol=1e-9)
 
 
+def near(d):
+    return d - SIDE * np.rint(d / SIDE)
+
+
 def test_rows_of_all_kinds(water):
     x = files.dcd_frames(water["dcd"])
-
-    def near(d):
-        return d - SIDE * np.rint(d / SIDE)
-
     u, w = near(x[:, 1::3] - x[:, ::3]), near(x[:, 2::3] - x[:, ::3])
     angles = np.arccos((u * w).sum(axis=2) / np.linalg.norm(u, axis=2) / np.linalg.norm(w, axis=2))
     o = 3 * np.arange(N)
@@ -100,23 +100,20 @@ def test_rows_of_all_kinds(water):
     assert all(middle_rows[r.name] == (r.largest, r.frame, r.mean) for r in plain.worst)
 
 
-@pytest.mark.parametrize("kind", ["lengths", "lengths and others"])
-def test_rates_are_those_of_the_rows(tmp_path, kind):
+def test_rates_are_those_of_the_rows(tmp_path):
     """A v, of lengths u (v_i - v_j), from velocities that are not tangent."""
     x = files.water(N, 4)
     v = np.random.default_rng(5).normal(size=x.shape)
     path = files.write(tmp_path / "v.trr", x, velocities=v)
-    ends = [files.loaded(path, N).trajectory[k] for k in range(4)]
-    d = [ts.positions.astype(float)[PAIRS[:, 0]] - ts.positions.astype(float)[PAIRS[:, 1]] for ts in ends]
-    d = np.array([a - SIDE * np.rint(a / SIDE) for a in d])
+    ends = np.array([ts.positions.astype(float) for ts in files.loaded(path, N).trajectory])
+    d = near(ends[:, PAIRS[:, 0]] - ends[:, PAIRS[:, 1]])
     w = v[:, PAIRS[:, 0]] - v[:, PAIRS[:, 1]]
     rates = np.abs((d * w).sum(axis=2)) / np.linalg.norm(d, axis=2)
-    rows = ROWS if kind == "lengths" else [ROWS, Plane([7], [0.0, 1.0, 0.0], 5.0)]
-    if kind != "lengths":
-        rates = np.concatenate([rates, np.abs(v[:, 7, 1:2])], axis=1)
-    unit = checked(path, rows, rank=False).units[0]
-    assert unit.rate_largest == pytest.approx(rates.max(), rel=1e-5)
-    assert unit.rate_rms == pytest.approx(np.sqrt((rates**2).mean()), rel=1e-5)
+    more = np.concatenate([rates, np.abs(v[:, 7, 1:2])], axis=1)
+    for rows, expected in ((ROWS, rates), ([ROWS, Plane([7], [0.0, 1.0, 0.0], 5.0)], more)):
+        unit = checked(path, rows, rank=False).units[0]
+        assert unit.rate_largest == pytest.approx(expected.max(), rel=1e-5)
+        assert unit.rate_rms == pytest.approx(np.sqrt((expected**2).mean()), rel=1e-5)
 
 
 def test_where_atoms_coincide_nothing_is_told_of_their_angle(tmp_path):
