@@ -120,10 +120,7 @@ TURN = ("--dihedral", 2, 0, 1, 3)
         (("peroxide.xyz", "--distance", 0, 1, "--from", 0, "--to", 1), "there is no distance of 0 to hold"),
         (("peroxide.xyz", "--distance", 0, 1), "give --from: only dihedrals have a range by themselves"),
         (("peroxide.xyz", "--difference", 0, 2, 2, 1, "--to", 1), "give --from: only dihedrals have a range by"),
-        (
-            ("peroxide.xyz", "--angle", 0, 1, 2, "--from", 60, "--to", 190),
-            "there is no angle of 184",
-        ),
+        (("peroxide.xyz", "--angle", 0, 1, 2, "--from", 60, "--to", 190), "there is no angle of 184"),
         (("peroxide.xyz", *TURN, "--to", 1, 2), "--to has 2 numbers for 1 coordinates"),
         (("peroxide.xyz", *TURN, "--steps", 0), "--steps is 0; give a positive number"),
         (("peroxide.xyz", *TURN, "--count-from", 1), "there is no atom 0; atoms are counted from 1"),
