@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import openmm
 import pytest
+from ase import Atoms
 from ase.build import molecule
 from ase.calculators.emt import EMT
 
@@ -28,12 +29,16 @@ from kcons.errors import (
     InputError,
     KconsError,
     NonFiniteError,
+    OverdeterminedError,
     SingularGeometryError,
     UnsupportedError,
 )
+from kcons.models import flows, growth
+from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
 
 X = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0], [0.3, 1.0, 1.0]])
 MASSES = [1.0, 2.0, 3.0, 4.0]
+OF_MATRICES = ("classify", "jordan_form", "LinearFlow")
 UNITS = ("length", "time", "energy")
 
 
@@ -51,11 +56,13 @@ def openmm_system() -> openmm.System:
 def names() -> dict[str, Any]:
     """What calls are made of; the thermostats of arrays go before those of OpenMM with the same names."""
     found: dict[str, Any] = {}
-    for room in (kcons.constraints, kcons.motion, kcons.openmm, kcons.steppers, kcons.thermostats, kcons.ase, kcons):
+    core = (kcons.constraints, kcons.motion, kcons.openmm, kcons.steppers, kcons.thermostats)
+    for room in (growth, flows, *core, kcons.ase, kcons):
         found |= {name: getattr(room, name) for name in room.__all__}
     held = kcons.ConstraintSet(kcons.constraints.Distance([0, 1]), X, MASSES)
     motion = kcons.Motion(held, X)
     system = kcons.System(motion, force)
+    bath, cell = kcons.thermostats, kcons.Motion(kcons.ConstraintSet([], X, MASSES, cell=[9.0] * 3), X)
     groups = kcons.thermostats.ForceGroups({"fast": force, "slow": lambda x, t: -2 * x})
     moving = kcons.Motion(kcons.ConstraintSet(kcons.constraints.Distance([0, 1], lambda t: 1.0 + t), X, MASSES), X)
     atoms = molecule("H2O")
@@ -63,6 +70,9 @@ def names() -> dict[str, Any]:
     return found | {
         "kcons": kcons,
         "np": np,
+        "SUZUKI_4": SUZUKI_4,
+        "KAHAN_LI_6": KAHAN_LI_6,
+        "PAIR": growth.ConstrainedGrowth(growth.Hypercycle(2)),
         "ORACLE": kcons.constraints.projection,
         "X": X,
         "LINE": np.arange(4.0)[:, None] * [1.0, 0.0, 0.0],
@@ -75,12 +85,19 @@ def names() -> dict[str, Any]:
         "HELD": held,
         "MOTION": motion,
         "SYSTEM": system,
-        "CELL": kcons.Motion(kcons.ConstraintSet([], X, MASSES, cell=[9.0] * 3), X),
+        "NO_ENERGY": kcons.System(motion, force, potential=lambda x, t: nan),
+        "CELL": cell,
+        "TRIALS": bath.ConstantPressure(bath.Langevin(1.0, 1.0, 1), bath.MonteCarloBarostat(1.0)),
+        "CELLS": kcons.thermostats.CellSystem(cell),
+        "FIXED": kcons.Motion(kcons.ConstraintSet(kcons.constraints.FixedAtoms([0]), X, MASSES, cell=[9.0] * 3), X),
         "GROUPED": kcons.System(motion, groups),
+        "GROWN": growth.Populations.from_values(0.3, [0.5, 1.5, 2.5]),
         "MOVING": kcons.System(moving, force),
         "TWO": {"temperature_K": 300, "friction": 0.1, "fast_steps": 4},
         "STATE": system.initial_state(X),
         "ATOMS": atoms,
+        "Atoms": Atoms,
+        "molecule": molecule,
         "openmm_system": openmm_system,
     }
 
@@ -233,7 +250,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("run(SYSTEM, STATE, 0.01, 1, observers=[?])", "observers", "3", "lambda: None"),
     ("run(SYSTEM, State(X, V, nan), 0.01, 1)", "time"),
     ("Geodesic(?)", "substeps", "0", "1.5"),
-    ("Composition([0.5, 0.4], 2)", "fractions"),
+    ("Composition(?, 2)", "fractions", "[0.5, 0.4]", "[]", "[0.3, 0.7]", "[0.5, 0.4, 0.5]"),
     ("RungeKuttaNystrom([0.5, 0.5], [1.1])", "drifts"),
     ("ReversibilityCheck(Rattle(), -1.0)", "tolerance"),
     ("ReversibilityCheck(3)", "stepper"),
@@ -347,7 +364,8 @@ REFUSED: list[tuple[str, ...]] = [
     ("ConstraintSet(Sphere([0, 1], [9, 9, 9], [1.0, -1.0]), X, M)", "radius"),
     ("HamiltonianMonteCarlo(1.0, 5, 1, stepper=3)", "stepper"),
     ("ConstantPressure(3, MonteCarloBarostat(1.0))", "stepper"),
-    ("Composition([0.5, 0.5], 4)", "fractions"),
+    ("Composition(?, 4)", "fractions", "[0.5, 0.5]", "[0.25, 0.5, 0.25]"),
+    ("Composition(?, 6)", "fractions", "SUZUKI_4", "[KAHAN_LI_6[k] for k in (1, 0, 2, 3, 4, 5, 6, 8, 7)]"),
     ("Splitting(?, [1.0])", "kicks", "[0.5, 0.4]", "[1.0]"),
     ("Splitting([1.0], [0.5, 0.4, 0.1])", "drifts"),
     ("MOTION.acceleration(X, V, X / 0)", "force"),
@@ -378,6 +396,85 @@ REFUSED: list[tuple[str, ...]] = [
     ("PressureReporter(None)", "dynamics"),
     ('PressureReporter(None, virial="mol")', "virial"),
     ('PressureReporter(None, virial="atomic", temperature_K=300)', "thermal_energy"),
+    ("instantaneous_pressure(SYSTEM, STATE)", "system"),
+    ('instantaneous_pressure(CELLS, STATE, "viral")', "virial"),
+    ("instantaneous_pressure(CELLS, STATE, pieces=?)", "pieces", "3", "CELLS"),
+    ("CellSystem(MOTION)", "cell"),
+    ("CellSystem(CELL, lambda x, t, cell: x)", "potential"),
+    ("TRIALS.step(CELLS, STATE, -0.1)", "dt"),
+    ("MonteCarloBarostat(1.0, cutoff=6.1).pieces(CELLS, X)", "cell"),
+    ("HamiltonianMonteCarlo(1.0, 5, 1).step(SYSTEM, STATE, 0.1)", "potential"),
+    ('IsokineticSpheres(1.0, 1.0, 1, spheres="axes", auxiliary=0).step(SYSTEM, STATE, 0.1)', "auxiliary"),
+    ("rigid_water(molecule(?))", "atoms", '"CH4"', '"CH3OH"'),
+    ("rigid_water(Atoms(?))", "atoms", '"OH2", [[nan] * 3] * 3', '"OH3", np.eye(4, 3, -1)'),
+    ('repartition_hydrogen_mass(molecule("CH4"), 4)', "mass"),
+    ("Populations.from_values(0.0, ?)", "x0", "[0.5, -0.1]", "[0.5, 0.0]", "[0.5, nan]", "[[[1.0]]]", "[0.5, 1j]"),
+    ("GrowthModel(lambda t, x: x, n=0)", "n"),
+    ("GrowthModel(lambda ?, n=2).velocity(0.0, [1.0, 1.0])", "rates", "x: x", "t, x: [1.0, 2.0, 3.0]", "t, x: x * 1j"),
+    ("Logistic(0.0)", "alpha"),
+    ("Logistic(1.0, -1.0)", "beta"),
+    ("Logistic().exact(1.0, -1.0)", "x0"),
+    ("LotkaVolterra(beta2=nan)", "beta2"),
+    ("Mixture([nan, 0.0])", "mu0"),
+    ("Mixture([0.0, 0.0], 0.0)", "kT"),
+    ("Hypercycle(1)", "n"),
+    ("Hypercycle(5, -1.0)", "k_h"),
+    ("Hypercycle(5, 1.0, [0.1, 0.2])", "mu0"),
+    ("Hypercycle().with_entropy_production(?)", "tau", "0.0", "-inf"),
+    ("Hypercycle().with_entropy_production(1.0, ?)", "budget", "-0.1", '"all"'),
+    ("EntropyRow(3, 1.0)", "mixture"),
+    ("EntropyRow(Mixture([0.1, 0.2]), 1.0).bind(GROWN)", "mixture"),
+    ("entropy_balance(solve(Hypercycle(3).?, (0.0, 0.1), GROWN.x))", "solution", "with_fixed_total()"),
+    ("entropy_balance(solve(Hypercycle(3).?, (0.0, 0.1), GROWN.x))", "solution", "without_entropy_production()"),
+    ("solve(PAIR, ?, [0.5, 0.5])", "t_span", "3.0", "(0.0, inf)", "(0.0, 1.0, 2.0)", '("a", "b")'),
+    ("solve(PAIR, (0, 1), [0.5, 0.5], method=?)", "method", '"Euler"', '["RK45"]'),
+    ("solve(PAIR, (0, 1), [0.5, 0.5], t_eval=?)", "t_eval", "[0, 2]", "[0.5, 0.2]", "[[0.5]]", "[nan]", "[0.5, 0.5]"),
+    # With a tolerance of NaN, SciPy tries the first step for ever.
+    ("solve(PAIR, (0, 1), [0.5, 0.5], rtol=?)", "rtol", "nan", "-1.0", "0.0", "1e-16", "[1e-9, 1e-9, 1e-9]"),
+    ("solve(PAIR, (0, 1), [0.5, 0.5], atol=?)", "atol", "-1e-9", "[1e-9, nan]", "[1e-9]"),
+    ("solve(PAIR, (0, 1), [0.5, 0.5], max_step=?)", "max_step", "0.0", "nan"),
+    ("solve(PAIR, (0, 1), [0.5, 0.5], first_step=?)", "first_step", "-0.1", '"short"'),
+    ("LinearRow(?)", "coefficients", "[0.0, 0.0]", "[1.0, nan]", "[[1.0]]"),
+    ("LinearRow([1.0], inf)", "target"),
+    ("LinearRow([1, 1, 1], lambda t: 1 + 0.1 * t).bind(GROWN)", "target"),
+    ("TotalPopulation(0)", "n"),
+    ("TotalPopulation(2).gradient(GROWN)", "coefficients"),
+    ("TotalPopulation(3, lambda ?).bind(GROWN)", "target", ": (1.0, 0.0)", 't: ("a", "b")'),
+    ("VelocityRow([1.0], nan)", "rate"),
+    ("VelocityRow([1.0]).gradient(GROWN)", "coefficients of velocity row"),
+    ("VelocityRow(lambda x: x)", "coefficients"),
+    ('HolonomicRow(lambda t, x: 1.0, target="x")', "target"),
+    ("HolonomicRow(3.0)", "function"),
+    ("ConstrainedGrowth(None, [])", "model"),
+    ("ConstrainedGrowth(Hypercycle(), [3.0])", "rows"),
+    ("ConstrainedGrowth(Hypercycle()).constrained_inverse(0.0, np.ones((5, 2)))", "x"),
+    ("ConstrainedGrowth(Hypercycle()).bind(GROWN)", "x0"),
+    *((f"{name}(?)", "matrix", "[[1.0, 2.0]]", "[[nan]]", "[1.0]", "np.zeros((0, 0))") for name in OF_MATRICES),
+    *((f"{name}(?)", "matrix", "1j * np.eye(2)", "np.array([[None]])") for name in OF_MATRICES),
+    *((f"{name}(np.eye(2), ?)", "error", "-1e-3", "nan", "inf", "np.ones(2)") for name in OF_MATRICES[:2]),
+    *((f"{name}(np.eye(2), ?)", "error", "np.ones((3, 2))", "1j", '"much"') for name in OF_MATRICES[:2]),
+    ("Flow(lambda t, X: X, 0)", "n"),
+    ("Flow(?, 2)", "velocity", "3", "lambda X: X"),
+    ("find_equilibria(Pendulum(), ?)", "box", "[[0.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]"),
+    ("find_equilibria(Pendulum(), [[0.0, 1.0]] * 2, starts=0)", "starts"),
+    ("Flow(lambda t, X: X, 2).velocity(0.0, ?)", "X", "[1.0]", "[1.0, nan]", "[1.0, 1j]"),
+    ("Flow(lambda t, X: ?, 2).velocity(0.0, [1.0, 1.0])", "velocity", "[1.0]", "X * 1j"),
+    ("Flow(lambda t, X: X, 2, lambda t, X: ?).jacobian(0.0, [1.0, 1.0])", "jacobian", "[1.0]", "1j * np.eye(2)"),
+    ("phase_volume(Flow(lambda t, X: X, 2), [1.0, 1.0], [0.0, 1.0, 0.5])", "times"),
+    ("Thermostat([1.0, 1.0], lambda x: ?).friction([1.0, 0.0, 1.0, 0.0])", "force", "1j * x", "[1.0, 2.0, 3.0]"),
+    ("Thermostat([1.0, 0.0], abs)", "masses"),
+    ("Thermostat([1.0, 1.0], abs).state([0.0, 0.0], [0.0, 0.0])", "v"),
+    ("Thermostat([1.0, 1.0], abs).state([1.0, 2.0, 0.3], [0.4])", "x"),
+    ("ParticleOnSphere(force=lambda x: 1j * x).acceleration([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])", "force"),
+    ("ParticleOnSphere(1.0, -1.0)", "mass"),
+    ("ParticleOnSphere().great_circle(1.0, [2.0, 0.0, 0.0], [0.0, 1.0, 0.0])", "x0"),
+    ("ParticleOnSphere().great_circle(1.0, [1.0, 0.0, 0.0], [1.0, 1.0, 0.0])", "v0"),
+    ("ParticleOnSphere().great_circle(1.0, [1.0, 0.0], [0.0, 1.0])", "X"),
+    ("DampedOscillator(0.0)", "omega"),
+    ("DampedOscillator(1.0, -0.1)", "eta"),
+    ("HarmonicOscillator(nan)", "omega"),
+    ("action(lambda q, v, t: 0.0, [0.0, 1.0], [[0.0], [1j]])", "path"),
+    ("hamiltonian(lambda q, v, t: 0.5 * v[0] ** 2, [0.0], [1j])", "p"),
     *((f"kcons.mdanalysis.RunUnits({name}=?)", name, "0.0", "-1.0", "nan", "inf") for name in UNITS),
     # Before the folder is looked for: nothing would be written.
     ('kcons.mdanalysis.TrajectoryWriter("nowhere/a.trr", -1)', "n_atoms"),
@@ -385,6 +482,7 @@ REFUSED: list[tuple[str, ...]] = [
 ]
 #: Errors of other types.
 OTHERS: list[tuple[str, type[KconsError], str | None]] = [
+    ("GrowthModel(lambda t, x: x, lambda t, x: -x, n=2).velocity(0.0, [0.0, 1.0])", NonFiniteError, "sources"),
     ("Distance([0, 1]).target_at(0.0)", ConstraintError, None),
     ("ConstraintSet([Distance([0, 1], 1.0), Distance([1, 0], 2.0)], X, M)", ContradictionError, None),
     ("ConstraintSet([Distance([[0, 1], [1, 2], [0, 2]], [1.0, 1.0, 3.0])], X, M)", InfeasibleError, None),
@@ -398,6 +496,15 @@ OTHERS: list[tuple[str, type[KconsError], str | None]] = [
     ("constrain(ATOMS.copy(), KnifeEdge(0, 1, [0, 0, 1]))", UnsupportedError, None),
     ("constrain(ATOMS.copy(), Distance([0, 1], lambda t: 1.0 + t))", UnsupportedError, None),
     ("TemperatureSplit(SYSTEM).add(X, X * nan)", NonFiniteError, "force"),
+    ("CellSystem(CELL, lambda x, t, h: x, lambda x, t, h: 0.0).stress(X, 0.0)", UnsupportedError, None),
+    ("CellSystem(CELL, *[lambda x, t, h: h] * 2, lambda x, t, h: h * nan).stress(X, 0.0)", NonFiniteError, ""),
+    ("ConstantPressure(Rattle(), MonteCarloBarostat(1.0)).step(CELLS, STATE, 0.1)", UnsupportedError, None),
+    ("TRIALS.step(SYSTEM, STATE, 0.1)", UnsupportedError, None),
+    ('MonteCarloBarostat(1.0, kind="flexible", held="stay").pieces(CellSystem(FIXED), X)', UnsupportedError, None),
+    ("HamiltonianMonteCarlo(1.0, 5, 1).check(MOVING)", UnsupportedError, None),
+    ("HamiltonianMonteCarlo(1.0, 5, 1).step(NO_ENERGY, STATE, 0.1)", NonFiniteError, "energy"),
+    ('freedom(System(FIXED, force), STATE, F, momentum="conserved")', UnsupportedError, None),
+    ("freedom(System(Motion(ConstraintSet(FixedAtoms(range(4)), X, M), X)), STATE, F)", OverdeterminedError, None),
     ("TemperatureSplit(MOVING)", UnsupportedError, None),
     ("slow_share(SYSTEM, X[None])", UnsupportedError, None),
     ('LangevinRespa(1.0, 1.0, 1, steps={"slow": 1, "fast": 4}).check(SYSTEM)', UnsupportedError, None),

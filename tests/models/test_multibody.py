@@ -136,9 +136,6 @@ def test_no_time_and_no_times():
     assert nothing.q.shape == (0, 3) and nothing.multipliers.shape == (0, 2) and nothing.evaluations > 0
 
 
-# -- the same motion in other coordinates ------------------------------------------------------------
-
-
 # -- the theory --------------------------------------------------------------------------------------
 
 

@@ -171,27 +171,6 @@ def test_a_pendulum_next_to_its_separatrix_is_refused(start) -> None:
     np.testing.assert_allclose(Pendulum().exact(30.0, near), there, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("make", "item"),
-    [
-        (lambda: ParticleOnSphere().great_circle(1.0, [2.0, 0.0, 0.0], [0.0, 1.0, 0.0]), "x0"),
-        (lambda: ParticleOnSphere().great_circle(1.0, [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]), "v0"),
-        (lambda: ParticleOnSphere().great_circle(1.0, [1.0, 0.0], [0.0, 1.0]), "state"),
-        (lambda: DampedOscillator(0.0), "omega"),
-        (lambda: DampedOscillator(1.0, -0.1), "eta"),
-        (lambda: HarmonicOscillator(np.nan), "omega"),
-        (lambda: ParticleOnSphere(1.0, -1.0), "mass"),
-        (lambda: Thermostat([1.0, 0.0], quartic), "masses"),
-        (lambda: Thermostat(MASSES, quartic).state(np.zeros(6), np.zeros(6)), "non-zero kinetic energy"),
-        (lambda: Thermostat(np.ones(2), lambda x: -x).state([1.0, 2.0, 0.3], [0.4]), "2 components each"),
-        (lambda: Thermostat(np.ones(2), lambda x: [1.0, 2.0, 3.0]).friction(np.ones(4)), "force returned shape"),
-    ],
-)
-def test_what_is_no_known_flow(make, item: str) -> None:
-    with pytest.raises(InputError, match=item):
-        make()
-
-
 # -- the thermostat --------------------------------------------------------------------------------------
 
 
