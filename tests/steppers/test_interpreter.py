@@ -8,7 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import thermostat_systems
 from stepper_systems import SYMMETRIC, assert_same, system_of
+from thermostat_systems import SHAPE, distance, springs
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import (
@@ -35,13 +37,7 @@ from kcons.steppers.operations import Evaluate, Kick, Program, Project, drifts_o
 from kcons.steppers.packed_system import MOST_ROWS
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
 
-PAIRS = [[0, 1], [0, 2], [1, 2]]
-SHAPE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])
-
-
-def springs(x, t):
-    """Each atom in a harmonic well of its own strength, and an attraction of neighboring molecules."""
-    return -np.linspace(0.1, 0.3, len(x))[:, None] * x - 0.05 * (x - np.roll(x, 3, axis=0))
+PAIRS = thermostat_systems.ROWS["triangles"]
 
 
 def homing(x, t):
@@ -57,15 +53,12 @@ def started(rows, x, masses, force, rng, *, piecewise=False, away=0.0, **options
     return system, system.initial_state(x + away, 0.3 * rng.normal(size=x.shape), project=True)
 
 
-def triangles(n: int = 11, *, ions: int = 0, at: float = 0.0, force=springs, **options) -> tuple[System, State]:
+def triangles(*, piecewise: bool = False, **options) -> tuple[System, State]:
     """Rigid triangles that turn, and free atoms after them; 11 fill one group of lanes and part of a second."""
-    rng = np.random.default_rng(3)
-    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
-    x = (np.einsum("ak,nkj->naj", SHAPE, turn) + 3.0 * np.arange(n)[:, None, None] / n).reshape(-1, 3)
-    x = np.concatenate([x, rng.normal(size=(ions, 3))]) + at
-    masses = np.concatenate([np.tile([16.0, 1.0, 1.0], n), np.full(ions, 23.0)])
-    rows = Distance((3 * np.arange(n)[:, None, None] + np.array(PAIRS)).reshape(-1, 2))
-    return started([rows], x, masses, force, rng, **options)
+    system, state = thermostat_systems.molecules("triangles", **options)
+    if piecewise:
+        system.packed = None
+    return system, state
 
 
 #: Pairs and masses of one molecule of each kind.
@@ -179,10 +172,6 @@ def one_by_one(stepper, system: System, state: State, dt: float, steps: int) -> 
     return state
 
 
-def distance(a: State, b: State) -> float:
-    return max(float(np.abs(a.positions - b.positions).max()), float(np.abs(a.velocities - b.velocities).max()))
-
-
 ALL = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
 PIECEWISE = pytest.mark.parametrize("piecewise", [False, True], ids=["kernels", "engine"])
 
@@ -234,7 +223,7 @@ def test_steps_in_kernels_are_those_of_the_engine(stepper, name) -> None:
 
 
 def test_what_is_left_to_the_engine() -> None:
-    def packed(*rows, x=SHAPE + 0.0, m=(16.0, 1.0, 1.0)):
+    def packed(*rows, x=SHAPE[:3] + 0.0, m=(16.0, 1.0, 1.0)):
         return System(Motion(ConstraintSet(rows, x, np.array(m)), x)).packed is not None
 
     lengths = np.linalg.norm(SHAPE[[0, 0, 1]] - SHAPE[[1, 2, 2]], axis=1)
@@ -271,18 +260,13 @@ def test_forces_that_depend_on_velocities() -> None:
         assert np.array_equal(end.forces, system.forces(end.positions, end.velocities, end.time, 0))
 
 
-def test_reports_show_iterations() -> None:
+def test_reports_show_iterations_and_two_systems_of_one_motion_do_not_share_rooms() -> None:
     system, state = triangles()
-    end = Rattle().step(system, state, 0.05)
+    end, other = Rattle().step(system, state, 0.05), System(system.motion, springs)
     found = system.motion.report(end.positions, condition=False)
     assert all(3 <= kind.iterations <= MANY_ITERATIONS for kind in found.kinds)
-
-
-def test_two_systems_of_one_motion_do_not_share_rooms() -> None:
-    system, state = mixed("angles")
-    other = System(system.motion, springs)
     assert not np.shares_memory(system.packed.tables, other.packed.tables)
-    assert distance(Rattle().step(system, state, 0.02), Rattle().step(other, state, 0.02)) == 0.0
+    assert distance(end, Rattle().step(other, state, 0.05)) == 0.0
 
 
 # -- programs ---------------------------------------------------------------------------------------
@@ -648,23 +632,17 @@ def test_errors_name_the_step(stepper, wrong, kind, message) -> None:
 
 
 @PIECEWISE
-def test_forces_that_a_state_carries_may_be_wrong(piecewise) -> None:
-    system, state = molecules(*GROUPS, piecewise=piecewise)
-    bad = np.zeros_like(state.positions)
-    bad[2, 1] = np.inf
-    for stepper in (Rattle(), Suzuki4()):
-        with pytest.raises(NonFiniteError, match="non-finite force at step 1 on atom 2"):
-            stepper.step(system, State(state.positions, state.velocities, forces=bad), 0.01)
-
-
-@PIECEWISE
-def test_numbers_that_overflow(piecewise) -> None:
+def test_numbers_that_overflow_and_forces_of_a_state_that_are_not_finite(piecewise) -> None:
     alone = (np.arange(34) == 33)[:, None]  # the free atom, of which the engine knows nothing
     system, state = triangles(ions=1, force=None, piecewise=piecewise)
     for stepper in (Rattle(), BlanesMoan6()):
         with pytest.raises(NonFiniteError, match="non-finite position at step 1 on atom 33"):
             stepper.step(system, State(state.positions, alone * np.full(3, 1.7e308)), 10.0)
     system, state = triangles(ions=1, force=lambda x, t: alone * np.full(3, 1e308), piecewise=piecewise)
+    bad = State(state.positions, state.velocities, forces=np.where(np.roll(alone, 3), [0.0, np.inf, 0.0], 0.0))
+    for stepper in (Rattle(), Suzuki4()):
+        with pytest.raises(NonFiniteError, match="non-finite force at step 1 on atom 2"):
+            stepper.step(system, bad, 0.01)
     start = State(state.positions, alone * np.full(3, 1.797e308), forces=np.zeros((34, 3)))
     with pytest.raises(NonFiniteError, match="non-finite velocity at step 1 on atom 33"):
         Rattle().step(system, start, 1.0)

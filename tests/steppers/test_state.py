@@ -27,6 +27,8 @@ from kcons.errors import ConvergenceError, InputError, ReversibilityError, Unsup
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, ReversibilityCheck, State, System, run
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, IsokineticSpheres, Langevin, NoseHooverChain
 
+REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
+
 
 def test_start_off_the_constraints():
     """What is within rounding is taken as given, also in single precision."""
@@ -88,16 +90,6 @@ def test_velocities_of_a_rod_that_grows(time):
 
 
 # -- saving -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
-@pytest.mark.parametrize("make", [spherical_pendulum, lambda: rotor(offset=1e6, force=lambda x, t: -(x - 1e6))])
-def test_a_run_goes_on_from_a_file_bit_for_bit(stepper, make, tmp_path: Path) -> None:
-    system, state = make()
-    whole = run(system, state, 0.1, 20, stepper=stepper)
-    run(system, state, 0.1, 10, stepper=stepper).save(tmp_path / "half.npz")
-    again, _ = make()
-    assert_same(run(again, State.load(tmp_path / "half.npz"), 0.1, 10, stepper=stepper), whole)
 
 
 def whole_state() -> State:
@@ -195,7 +187,7 @@ def test_forces_of_another_system_are_not_taken(stepper) -> None:
     assert set(asked) == {1.0} and np.array_equal(taken.positions, stepper.step(here, made, 0.05).positions)
 
 
-@pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
+@REVERSIBLE
 @pytest.mark.parametrize("by_hand", [True, False])
 def test_forces_are_nothing_to_a_system_without(stepper, by_hand) -> None:
     """Also not once steps go on: those of the state that they began from stayed in the states."""
@@ -279,7 +271,7 @@ def test_copies_know_whose_forces_they_carry() -> None:
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
-@pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
+@REVERSIBLE
 def test_energy_far_from_the_origin(stepper, offset) -> None:
     system, state = rotor(omega=1.0, offset=offset)
     start = system.total_energy(state)
@@ -297,6 +289,7 @@ def test_energy_far_from_the_origin(stepper, offset) -> None:
 )
 def test_what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place(stepper, rows) -> None:
     """Of a state that comes from another System: steps relative to an atom would look for the surface at the origin."""
+    assert rotor(omega=1.0, offset=1e5, far=np.inf)[1].remainder is None  # switched off
     there, state = rotor(omega=1.0, offset=1e5)
     state = run(there, state, 0.05, 3)
     assert state.remainder is not None
@@ -308,14 +301,7 @@ def test_what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place(stepper
     np.testing.assert_array_equal(found.velocities, expected.velocities)
 
 
-def test_far_may_be_switched_off() -> None:
-    assert rotor(offset=1e6, far=np.inf)[1].remainder is None and rotor(offset=1e6)[1].remainder is not None
-
-
 # -- what every stepper does; runs ------------------------------------------------------------------
-
-
-REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
 
 
 BATHS = [Langevin(1.0, 0.5, 1), Isokinetic(1.0), HamiltonianMonteCarlo(1.0, 2, 3), IsokineticSpheres(1.0, 0.5, 2)]
@@ -403,17 +389,12 @@ def test_check_reports_a_step_that_cannot_be_taken_back() -> None:
     assert caught.value.atoms == (0, 1) and caught.value.step == 1
 
 
-def test_check_refuses_schemes_that_are_not_reversible() -> None:
+def test_check_refuses_what_is_not_reversible_and_works_far_from_the_origin_and_at_rest() -> None:
     for stepper in PROJECTED:
         with pytest.raises(UnsupportedError, match="use Rattle, Geodesic, a Composition or a RungeKuttaNystrom"):
             ReversibilityCheck(stepper)
-
-
-def test_check_works_far_from_the_origin_and_at_rest() -> None:
-    system, state = rotor(omega=1.0, offset=1e6)
-    run(system, state, 0.05, 20, stepper=ReversibilityCheck(Geodesic(2)))
-    system, state = rotor(omega=0.0)
-    run(system, state, 0.05, 3, stepper=ReversibilityCheck(Rattle()))
+    run(*rotor(omega=1.0, offset=1e6), 0.05, 20, stepper=ReversibilityCheck(Geodesic(2)))
+    run(*rotor(omega=0.0), 0.05, 3, stepper=ReversibilityCheck(Rattle()))
 
 
 NO_CLOCK = [{"time": np.nan}, {"time": -np.inf}, {"time": 1j}, {"time": "a"}, {"time_remainder": np.nan}]

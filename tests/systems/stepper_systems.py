@@ -26,9 +26,10 @@ PROJECTED: list[Stepper] = [
 ]
 
 
-def system_of(constraints, positions, masses, force=None, time=0.0, **options) -> System:
+def system_of(constraints, positions, masses, force=None, potential=None, time=0.0, **options) -> System:
+    positions = np.asarray(positions, dtype=float)
     held = ConstraintSet(constraints, positions, masses, time=time)
-    return System(Motion(held, positions, time=time), force, **options)
+    return System(Motion(held, positions, time=time), force, potential=potential, **options)
 
 
 def gravity(masses, g=(0.0, 0.0, -1.0)) -> Callable:

@@ -8,8 +8,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+from stepper_systems import system_of as system
 
-from kcons.constraints import Constraint, Distance
+from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State, Stepper, System
@@ -26,11 +27,6 @@ ROWS = {
     "triangles": [[0, 1], [0, 2], [1, 2]],
     "tetrahedra": [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
 }
-
-
-def system(rows: list[Constraint], x, masses, force=None, potential=None, time=0.0) -> System:
-    x = np.asarray(x, dtype=float)
-    return System(Motion(ConstraintSet(rows, x, masses, time=time), x, time=time), force, potential=potential)
 
 
 def repelling(x: Array, t: float = 0.0) -> Array:

@@ -153,25 +153,6 @@ def test_without_noise_it_is_of_order_two(name):
 
 
 @pytest.mark.parametrize(
-    ("plain", "several"),
-    [
-        (Langevin(0.5, 0.0, 3), LangevinRespa(0.5, 0.0, 3, steps=TWO)),
-        (IsokineticSpheres(0.5, 1e-32, 3, auxiliary=2), IsokineticSpheres(0.5, 1e-32, 3, auxiliary=2, steps=TWO)),
-    ],
-    ids=["Langevin", "spheres"],
-)
-def test_slow_forces_of_zero_change_nothing(plain, several):
-    """But for the noise, which no friction leaves out, and the rounding of velocities, projected once more often."""
-    held, state = molecules("bent", 3, ions=1)
-    split = System(held.motion, ForceGroups({"fast": springs, "slow": lambda x, t: 0 * x}))
-    one = run(held, state, 0.02, 40, stepper=plain)
-    two = run(split, state, 0.08, 10, stepper=several)
-    np.testing.assert_allclose(one.positions, two.positions, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(one.velocities, two.velocities, rtol=0, atol=1e-13)
-    assert split.force.evaluations == {"fast": 41, "slow": 11}
-
-
-@pytest.mark.parametrize(
     ("thermostat", "away", "spread", "slope"),
     [(Isokinetic(0.5), 0.0, 2e-3, 3e-5), (NoseHooverChain(0.5, 1.0), 1.2, 5e-3, 1e-5)],
     ids=["isokinetic", "chain"],

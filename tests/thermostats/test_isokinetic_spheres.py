@@ -241,6 +241,7 @@ def test_degrees_of_freedom_by_sphere(rows, kind, wanted):
     held = system(rows, X, MASSES)
     layout = SphereLayout.of(held, X, kind)
     assert layout.freedom.tolist() == wanted
+    np.testing.assert_allclose(layout.squares(0.5, 2), 0.5 * (np.array(wanted) + 1))
     fixed = held.motion.fixed_atoms
     assert np.flatnonzero(layout.cluster < 0).tolist() == fixed.tolist() and not layout.masses[fixed].any()
 
@@ -252,12 +253,3 @@ def test_dependent_rows_count_by_rank():
     held = system([Distance(rows)], x, np.ones(len(x)))
     layout = SphereLayout.of(held, x, "cluster")
     assert sorted(layout.freedom.tolist()) == [3] * 20 + [6, 7]
-
-
-def test_radii_and_the_sphere_without_one():
-    held = system([BONDS], X, MASSES)
-    layout = SphereLayout.of(held, X, "split")
-    np.testing.assert_allclose(layout.squares(0.5, 2), 0.5 * np.array([4, 3, 4, 3, 4]))
-    axes = SphereLayout.of(held, X, "axes")
-    with pytest.raises(InputError, match="9 spheres of one degree of freedom and no auxiliary"):
-        axes.squares(0.5, 0)

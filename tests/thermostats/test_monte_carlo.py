@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from thermostat_systems import dumbbells, loaded, started, system, waves, waves_potential
 
-from kcons.constraints import Distance, Formula, MovingTarget
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.constraints import Distance, Formula
+from kcons.errors import ConvergenceError
 from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6a,
@@ -151,22 +151,6 @@ def test_a_proposal_that_explodes_is_rejected():
     counts = Counts.of(end)
     assert counts.not_finite + counts.unsolved == 1 and np.isnan(counts.change)
     assert np.array_equal(end.positions, state.positions)
-
-
-def test_systems_that_have_no_stationary_density():
-    held, state = started()
-    sampler = HamiltonianMonteCarlo(0.5, 3, 1)
-    x = state.positions
-    driven = system([Distance([[0, 1]], MovingTarget(lambda t: 1 + t, lambda t: 1.0, lambda t: 0.0))], x, np.ones(4))
-    for wrong, kind, words in (
-        (System(held.motion, waves), InputError, "has no potential"),
-        (driven, UnsupportedError, "move with time"),
-    ):
-        with pytest.raises(kind, match=words):
-            sampler.step(wrong, state, 0.1)
-    bad = System(held.motion, waves, potential=lambda x, t: math.nan)
-    with pytest.raises(NonFiniteError, match="potential energy is nan before step 1"):
-        sampler.step(bad, state, 0.1)
 
 
 def test_positions_put_into_a_state_have_their_own_energy():
