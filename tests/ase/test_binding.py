@@ -133,9 +133,6 @@ def test_cells_that_are_set():
     assert held.engine(atoms) is engine and engine.constraint_set.half_width == pytest.approx(2.95)
 
 
-# -- company ----------------------------------------------------------------------------------------
-
-
 # -- forces that are known --------------------------------------------------------------------------
 
 

@@ -259,6 +259,8 @@ def test_multipliers_by_name(ours):
     named = {"torsion": TORSION, "bonds": Distance([[1, 0], [2, 1]])}
     recorder = AseRecorder(dynamics, {"torsion": TORSION})
     logger = ConstraintLogger(dynamics, atoms, log, named, peratom=True)
+    with pytest.raises(InputError, match=r"angle, Angle\(0, 1, 2\), is not among the 3 rows"):
+        ConstraintLogger(dynamics, atoms, io.StringIO(), {"angle": Angle([[0, 1, 2]])})
     dynamics.attach(recorder)
     dynamics.attach(logger)
     dynamics.run(3)
@@ -268,8 +270,8 @@ def test_multipliers_by_name(ours):
     assert columns(log)[-1, 1] == pytest.approx(atoms.get_total_energy() / 9, abs=1e-4)
 
 
-def test_a_rod_in_tension():
-    """Two atoms that turn about each other: the multiplier is the centripetal force."""
+def test_a_rod_in_tension_and_atoms_that_are_fixed():
+    """Two atoms that turn about each other: the multiplier is the centripetal force; 0 K where nothing is free."""
     atoms, log = Atoms("Ar2", positions=[[0, 0, 0], [2.0, 0, 0]], calculator=Free()), io.StringIO()
     rod = Distance([[0, 1]])
     constrain(atoms, rod)
@@ -277,6 +279,11 @@ def test_a_rod_in_tension():
     ConstraintLogger(None, atoms, log, {"rod": rod})()
     mass = atoms.get_masses()[0]
     assert columns(log)[0, -1] == pytest.approx(-mass * 0.1**2 / 1.0, rel=1e-5)
+    atoms.set_constraint()
+    constrain(atoms, FixedAtoms([0, 1]))
+    still, dynamics = io.StringIO(), VelocityVerlet(atoms, units.fs)
+    ConstraintLogger(dynamics, atoms, still)()
+    assert columns(still)[0, 4] == 0.0 == ConstrainedDynamics(atoms, units.fs).get_temperature()
 
 
 @pytest.mark.filterwarnings("ignore:Zero mass encountered")
@@ -324,19 +331,3 @@ def test_stress_is_that_of_all_rows(held_by):
     tensor = -reporter.values[0] / units.GPa
     assert columns(log)[0, 5:11] == pytest.approx(tensor[(0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1)], abs=6e-4)
     assert abs(tensor[2, 2]) > 0.05
-
-
-def test_nothing_is_free():
-    """As `get_temperature` of the dynamics of kcons: 0."""
-    atoms, log = Atoms("Ar2", positions=[[0, 0, 0], [2.0, 0, 0]], calculator=Free()), io.StringIO()
-    constrain(atoms, FixedAtoms([0, 1]))
-    dynamics = VelocityVerlet(atoms, units.fs)
-    ConstraintLogger(dynamics, atoms, log)()
-    assert columns(log)[0, 4] == 0.0 == ConstrainedDynamics(atoms, units.fs).get_temperature()
-
-
-def test_what_is_not_held_is_refused():
-    atoms = moving()
-    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=ROWS)
-    with pytest.raises(InputError, match=r"angle, Angle\(0, 1, 2\), is not among the 3 rows"):
-        ConstraintLogger(dynamics, atoms, io.StringIO(), {"angle": Angle([[0, 1, 2]])})
