@@ -5,6 +5,7 @@ No array that was given changes.
 
 from __future__ import annotations
 
+from functools import partial
 from math import inf, nan
 from typing import Any
 
@@ -22,6 +23,7 @@ import kcons.motion
 import kcons.openmm
 import kcons.steppers
 import kcons.thermostats
+from kcons import models
 from kcons.errors import (
     ConstraintError,
     ContradictionError,
@@ -44,6 +46,10 @@ UNITS = ("length", "time", "energy")
 
 def force(x: np.ndarray, t: float) -> np.ndarray:
     return -x
+
+
+def still(q: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+    return 0 * q
 
 
 def openmm_system() -> openmm.System:
@@ -72,6 +78,9 @@ def names() -> dict[str, Any]:
         "np": np,
         "SUZUKI_4": SUZUKI_4,
         "KAHAN_LI_6": KAHAN_LI_6,
+        "Multibody": models.Multibody,
+        "still": still,
+        "BODY": partial(models.Multibody, np.eye(2), still),
         "PAIR": growth.ConstrainedGrowth(growth.Hypercycle(2)),
         "ORACLE": kcons.constraints.projection,
         "X": X,
@@ -401,6 +410,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("instantaneous_pressure(CELLS, STATE, pieces=?)", "pieces", "3", "CELLS"),
     ("CellSystem(MOTION)", "cell"),
     ("CellSystem(CELL, lambda x, t, cell: x)", "potential"),
+    ("CellSystem(CELL, *[lambda x, t, h: ?] * 2).energy(X, 0.0, 3)", "potential", "None", '"-1"', "[1.0]", "1j"),
     ("TRIALS.step(CELLS, STATE, -0.1)", "dt"),
     ("MonteCarloBarostat(1.0, cutoff=6.1).pieces(CELLS, X)", "cell"),
     ("HamiltonianMonteCarlo(1.0, 5, 1).step(SYSTEM, STATE, 0.1)", "potential"),
@@ -434,6 +444,21 @@ REFUSED: list[tuple[str, ...]] = [
     ("solve(PAIR, (0, 1), [0.5, 0.5], atol=?)", "atol", "-1e-9", "[1e-9, nan]", "[1e-9]"),
     ("solve(PAIR, (0, 1), [0.5, 0.5], max_step=?)", "max_step", "0.0", "nan"),
     ("solve(PAIR, (0, 1), [0.5, 0.5], first_step=?)", "first_step", "-0.1", '"short"'),
+    ("Multibody(?, still)", "mass", "[[1.0, 0.2], [0.1, 1.0]]", "np.ones((2, 3))", "[1.0, nan]", "[]", "[1.0, 2.0j]"),
+    ("Multibody(?, still)", "mass", "lambda q, t: q"),
+    ("Multibody(np.eye(2), ?)", "force", "None", "lambda q, v: q"),
+    ("Multibody(np.eye(2), still, ?)", "constraints", "3.0", "lambda q, t: q"),
+    ("Multibody(np.eye(2), still, np.sin, curvature=lambda q: q)", "curvature"),
+    ("Multibody(np.eye(2), still, np.sin, length=0.0)", "length"),
+    ("Multibody(np.eye(2), still, jacobian=lambda q: np.eye(2))", "jacobian"),
+    ("Multibody(?, still).solve([0.4, 0.7], [0, 0], (0, 1))", "mass", "lambda q: np.eye(3)", "lambda q: X[:2, :2] + q"),
+    ("Multibody(np.eye(2), ?).solve([0.4, 0.7], [0, 0], (0, 1))", "force", "lambda q, v, t: np.zeros(3)"),
+    ("BODY(?).solve([0.4, 0.7], [0, 0], (0, 1))", "constraints", "lambda q: np.zeros((2, 2))", 'lambda q: ["a", "b"]'),
+    ("BODY(np.sin, lambda q: ?).solve([0.4, 0.7], [0, 0], (0, 1))", "jacobian", "np.ones((1, 2))", "np.ones((2, 1))"),
+    ("BODY(np.sin, curvature=lambda q, v: q[:1]).solve([0.4, 0.7], [0, 0], (0, 1))", "curvature"),
+    ("Multibody(np.eye(2), still).solve(?, [0, 0], (0, 1))", "q", "[0.0]", "[nan, 0.7]"),
+    ("Multibody(np.eye(2), still).solve([0.4, 0.7], ?, (0, 1))", "v", "[0.0, inf]", "np.zeros((2, 1))"),
+    ("Multibody(np.eye(2), still).solve([0.4, 0.7], [0, 0], (0, 1), rtol=nan)", "rtol"),
     ("LinearRow(?)", "coefficients", "[0.0, 0.0]", "[1.0, nan]", "[[1.0]]"),
     ("LinearRow([1.0], inf)", "target"),
     ("LinearRow([1, 1, 1], lambda t: 1 + 0.1 * t).bind(GROWN)", "target"),

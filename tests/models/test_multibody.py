@@ -309,38 +309,6 @@ def test_wrong_derivatives_are_refused(name, wrong, said):
     assert caught.value.item == name
 
 
-@pytest.mark.parametrize(
-    ("item", "values"),
-    [
-        # Named at once.
-        ("mass", [[[1.0, 0.2], [0.1, 1.0]], np.ones((2, 3)), [1.0, np.nan], [], [1.0, 2.0j], lambda q, t: q]),
-        ("force", [None, lambda q, v: q]),
-        ("constraints", [3.0, lambda q, t: q]),
-        ("curvature", [curve]),
-        ("length", [0.0]),
-        # Named when they are called.
-        ("mass", [lambda q: np.eye(3), lambda q: np.array([[1.0, 0.2], [0.1, 1.0]])]),
-        ("force", [lambda q, v, t: np.zeros(3)]),
-        ("constraints", [lambda q: np.zeros((2, 2)), lambda q: ["a", "b"]]),
-        ("jacobian", [lambda q: gradient(q).T[:1], lambda q: gradient(q)[:1]]),
-        ("curvature", [lambda q, v: bend(q, v)[:1]]),
-        # Of a run.
-        ("q", [[0.0], [np.nan, 0.7]]),
-        ("v", [[0.0, np.inf], np.zeros((2, 1))]),
-        ("rtol", [np.nan]),
-    ],
-)
-def test_what_cannot_be_is_named(item, values):
-    for value in values:
-        given = {"mass": np.eye(2), "force": none, "constraints": curve, "q": Q, "v": V, "rtol": 1e-9} | {item: value}
-        run = {name: given.pop(name) for name in ("q", "v", "rtol")}
-        with pytest.raises(InputError) as caught:
-            Multibody(**given).solve(t_span=(0, 1), **run)
-        assert caught.value.item == item
-    with pytest.raises(InputError, match="there is a jacobian without constraints"):
-        Multibody(np.eye(2), none, jacobian=gradient)
-
-
 def test_functions_that_are_not_finite_are_named():
     given = {"mass": lambda q: np.eye(2), "force": none, "constraints": curve, "jacobian": gradient, "curvature": bend}
     for name, right in given.items():

@@ -45,15 +45,12 @@ def test_a_pressure_is_an_energy_over_an_area_in_a_slab():
     assert system.volume == pytest.approx(100)
 
 
-@pytest.mark.parametrize("energy", [None, "-1", [1.0], 1j, -np.inf, np.nan])
+@pytest.mark.parametrize("energy", [-np.inf, np.nan])
 def test_an_energy_that_is_none(energy):
     system, x = gas(n=2, force=no_force, potential=lambda x, t, h: energy)
-    real = isinstance(energy, float)
-    with pytest.raises(
-        NonFiniteError if real else InputError, match=f"{energy} at step 3" if real else "potential"
-    ) as e:
+    with pytest.raises(NonFiniteError, match=f"{energy} at step 3") as caught:
         system.energy(x, 0.0, 3)
-    assert not real or e.value.step == 3
+    assert caught.value.step == 3
 
 
 ALL = np.ones(3, bool)
