@@ -9,15 +9,7 @@ import pytest
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.emt import EMT
-from ase.constraints import (
-    ExternalForce,
-    FixAtoms,
-    FixBondLengths,
-    FixCartesian,
-    FixCom,
-    FixedMode,
-    FixedPlane,
-)
+from ase.constraints import ExternalForce, FixAtoms, FixBondLengths, FixCartesian, FixCom, FixedMode, FixedPlane
 from ase.md.andersen import Andersen
 from ase.md.bussi import Bussi
 from ase.md.langevin import Langevin

@@ -27,6 +27,7 @@ from kcons import models
 from kcons.errors import (
     ConstraintError,
     ContradictionError,
+    ConvergenceError,
     InfeasibleError,
     InputError,
     KconsError,
@@ -437,6 +438,9 @@ REFUSED: list[tuple[str, ...]] = [
     ("entropy_balance(solve(Hypercycle(3).?, (0.0, 0.1), GROWN.x))", "solution", "with_fixed_total()"),
     ("entropy_balance(solve(Hypercycle(3).?, (0.0, 0.1), GROWN.x))", "solution", "without_entropy_production()"),
     ("solve(PAIR, ?, [0.5, 0.5])", "t_span", "3.0", "(0.0, inf)", "(0.0, 1.0, 2.0)", '("a", "b")'),
+    ("solve(PAIR, (0, 1), ?)", "x0", "None", "[0.5, 0.5], log_x0=[0, 0]", "[0.5, 0.3, 0.2]", "[1.0, -1.0]"),
+    ("solve(PAIR, (0, 1), log_x0=[0.0, nan])", "log_x0"),
+    ("solve(PAIR, (0, 1), [0.5, 0.5], events=?)", "event", "3", "lambda t: t", "lambda t, x: x", "lambda t, x: None"),
     ("solve(PAIR, (0, 1), [0.5, 0.5], method=?)", "method", '"Euler"', '["RK45"]'),
     ("solve(PAIR, (0, 1), [0.5, 0.5], t_eval=?)", "t_eval", "[0, 2]", "[0.5, 0.2]", "[[0.5]]", "[nan]", "[0.5, 0.5]"),
     # With a tolerance of NaN, SciPy tries the first step for ever.
@@ -498,6 +502,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("DampedOscillator(0.0)", "omega"),
     ("DampedOscillator(1.0, -0.1)", "eta"),
     ("HarmonicOscillator(nan)", "omega"),
+    ("action(lambda q, v, t: 0.0, ?)", "times", "[0, 0, 1], np.zeros(3)", "[0, 1, 2], np.zeros(7)"),
     ("action(lambda q, v, t: 0.0, [0.0, 1.0], [[0.0], [1j]])", "path"),
     ("hamiltonian(lambda q, v, t: 0.5 * v[0] ** 2, [0.0], [1j])", "p"),
     *((f"kcons.mdanalysis.RunUnits({name}=?)", name, "0.0", "-1.0", "nan", "inf") for name in UNITS),
@@ -508,6 +513,7 @@ REFUSED: list[tuple[str, ...]] = [
 #: Errors of other types.
 OTHERS: list[tuple[str, type[KconsError], str | None]] = [
     ("GrowthModel(lambda t, x: x, lambda t, x: -x, n=2).velocity(0.0, [0.0, 1.0])", NonFiniteError, "sources"),
+    ("velocity_of_momentum(lambda q, v, t: float(np.tanh(v[0])), [0.0], [2.0])", ConvergenceError, None),
     ("Distance([0, 1]).target_at(0.0)", ConstraintError, None),
     ("ConstraintSet([Distance([0, 1], 1.0), Distance([1, 0], 2.0)], X, M)", ContradictionError, None),
     ("ConstraintSet([Distance([[0, 1], [1, 2], [0, 2]], [1.0, 1.0, 3.0])], X, M)", InfeasibleError, None),

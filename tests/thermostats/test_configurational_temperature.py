@@ -15,12 +15,7 @@ from kcons import ConstraintSet, Motion
 from kcons.constraints import Distance, FixedAtoms, Formula, Plane, Sphere
 from kcons.errors import InputError
 from kcons.steppers import System
-from kcons.thermostats import (
-    Estimate,
-    TemperatureSplit,
-    mean,
-    slow_share,
-)
+from kcons.thermostats import Estimate, TemperatureSplit, mean, slow_share
 from kcons.thermostats.configurational_temperature import temperature
 
 

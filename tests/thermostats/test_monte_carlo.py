@@ -11,16 +11,7 @@ from thermostat_systems import dumbbells, loaded, started, system, waves, waves_
 
 from kcons.constraints import Distance, Formula
 from kcons.errors import ConvergenceError
-from kcons.steppers import (
-    BlanesMoan4,
-    BlanesMoan6a,
-    Geodesic,
-    Rattle,
-    State,
-    Suzuki4,
-    System,
-    run,
-)
+from kcons.steppers import BlanesMoan4, BlanesMoan6a, Geodesic, Rattle, State, Suzuki4, System, run
 from kcons.thermostats import Counts, HamiltonianMonteCarlo, exchange, tune
 from kcons.thermostats.monte_carlo import CHANGE, EXCHANGE, POTENTIAL, PROPOSAL, SIZE, SUM, ReversedSteps
 from kcons.thermostats.noise import noise_generator

@@ -330,11 +330,3 @@ def test_action_is_stationary_on_the_true_path():
     # Least: both neighbors are larger, by equal amounts.
     assert S[0] > S[1] < S[2]
     assert abs(S[2] - S[0]) < 1e-2 * (S[0] + S[2] - 2 * S[1])
-
-
-def test_what_has_no_velocity_and_no_action():
-    with pytest.raises(ConvergenceError, match="guess"):
-        velocity_of_momentum(lambda q, v, t: float(np.tanh(v[0])), [0.0], [2.0])
-    for times, path in (([0.0, 0.0, 1.0], np.zeros(3)), ([0.0, 1.0, 2.0], np.zeros(7))):
-        with pytest.raises(InputError, match="times increase"):
-            action(lambda q, v, t: 0.5 * v @ v, times, path)

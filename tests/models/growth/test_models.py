@@ -7,15 +7,7 @@ from scipy.special import rel_entr
 
 from kcons.errors import InputError
 from kcons.models.flows import jacobian_by_differences
-from kcons.models.growth import (
-    ConstrainedGrowth,
-    GrowthModel,
-    Logistic,
-    LotkaVolterra,
-    Mixture,
-    Populations,
-    solve,
-)
+from kcons.models.growth import ConstrainedGrowth, GrowthModel, Logistic, LotkaVolterra, Mixture, Populations, solve
 
 MU0 = np.array([0.15, 0.2, 0.25, 0.3, 0.35])
 

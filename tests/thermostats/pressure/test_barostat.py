@@ -10,17 +10,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from pressure_systems import (
-    DUMBBELL,
-    METHANE,
-    TRIANGLE,
-    cells_of,
-    gas,
-    no_force,
-    p_value,
-    round_shape,
-    started,
-)
+from pressure_systems import DUMBBELL, METHANE, TRIANGLE, cells_of, gas, no_force, p_value, round_shape, started
 from scipy import stats
 
 from kcons.errors import NonFiniteError
