@@ -21,10 +21,8 @@ from kcons.ase import (
     ConstrainedCalculator,
     ConstrainedDynamics,
     ConstrainedLangevin,
-    ConstrainedMonteCarlo,
     ConstrainedNoseHoover,
     IsokineticDynamics,
-    MultipleTimeSteps,
     PressureReporter,
     constrain,
 )
@@ -41,7 +39,6 @@ MADE = {
     "nose-hoover": lambda a, **k: ConstrainedNoseHoover(a, 2 * FS, TEMPERATURE, 50 * FS, momentum="free", **k),
     "isokinetic": lambda a, **k: IsokineticDynamics(a, 2 * FS, TEMPERATURE, momentum="free", **k),
 }
-made = pytest.mark.parametrize("name", MADE)
 
 
 def barostats(**kwargs):
@@ -155,21 +152,6 @@ def test_a_trial_that_fails_leaves_the_atoms(which, case, error, match):
         dyn.run(200)
     assert all(np.array_equal(*pair) for pair in zip((atoms.cell.array, *state(atoms)), seen, strict=True))
     assert found.value.step == dyn.nsteps + 1
-
-
-def test_what_has_no_temperature_or_no_cell():
-    atoms, _ = gas()
-    with pytest.raises(UnsupportedError, match="keeps no temperature"):
-        ConstrainedMonteCarlo(atoms, FS, TEMPERATURE, 3, barostat=MonteCarloBarostat(0.0))
-    with pytest.raises(UnsupportedError, match=r"LangevinRespa.*does not know that the cell"):
-        two = {"fast": Free(), "slow": Free(), "fast_steps": 2, "friction": 0.1, "barostat": MonteCarloBarostat(0.0)}
-        MultipleTimeSteps(atoms, FS, temperature_K=TEMPERATURE, **two)
-    atoms.pbc = [True, True, False]
-    with pytest.raises(InputError, match=r"along z.*'lateral'"):
-        MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0))
-    atoms.cell[2] = 0.0
-    with pytest.raises(InputError, match="no volume"):
-        MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0, kind="lateral"))
 
 
 def test_a_step_that_fails_after_a_trial_leaves_the_cell(monkeypatch):

@@ -95,6 +95,7 @@ def names() -> dict[str, Any]:
         "HELD": held,
         "MOTION": motion,
         "SYSTEM": system,
+        "DRAG": kcons.System(motion, lambda x, v, t: -v, velocity_dependent=True),
         "NO_ENERGY": kcons.System(motion, force, potential=lambda x, t: nan),
         "CELL": cell,
         "TRIALS": bath.ConstantPressure(bath.Langevin(1.0, 1.0, 1), bath.MonteCarloBarostat(1.0)),
@@ -107,6 +108,10 @@ def names() -> dict[str, Any]:
         "STATE": system.initial_state(X),
         "ATOMS": atoms,
         "Atoms": Atoms,
+        "SLAB": molecule("H2O", cell=[9, 9, 9], pbc=[1, 1, 0]),
+        "FLAT": molecule("H2O", cell=[9, 9, 0], pbc=[1, 1, 0]),
+        "CRYSTAL": molecule("H2O", cell=[9, 9, 9], pbc=True),
+        "CALCS": {"fast": EMT(), "slow": EMT()},
         "molecule": molecule,
         "openmm_system": openmm_system,
     }
@@ -333,6 +338,8 @@ REFUSED: list[tuple[str, ...]] = [
     ('ConstraintLogger(None, ATOMS, None, {"a": [Distance([0, 1])]})', "coordinates['a']"),
     ("ConstrainedLangevin(ATOMS.copy(), 0.1, 300, 0.01, barostat=?)", "barostat", '"MC"', "MonteCarloBarostat", "1.0"),
     ("ConstrainedLangevin(ATOMS.copy(), 0.1, 300, 0.01, barostat=MonteCarloBarostat(0.0))", "cell"),
+    ("ConstrainedLangevin(SLAB.copy(), 0.1, 300, 0.01, barostat=MonteCarloBarostat(0.0))", "kind"),
+    ('ConstrainedLangevin(FLAT.copy(), 0.1, 300, 0.01, barostat=MonteCarloBarostat(0.0, kind="lateral"))', "cell"),
     ("rigid_water(?)", "atoms", "3", "ATOMS[:2]"),
     ("rigid_water(ATOMS, ?)", "water_geometry", '"tip9p"', "(1.0, 200.0)", "1.0"),
     ("from_ase_constraints(3)", "atoms"),
@@ -536,6 +543,14 @@ OTHERS: list[tuple[str, type[KconsError], str | None]] = [
     ("HamiltonianMonteCarlo(1.0, 5, 1).step(NO_ENERGY, STATE, 0.1)", NonFiniteError, "energy"),
     ('freedom(System(FIXED, force), STATE, F, momentum="conserved")', UnsupportedError, None),
     ("freedom(System(Motion(ConstraintSet(FixedAtoms(range(4)), X, M), X)), STATE, F)", OverdeterminedError, None),
+    ("ConstrainedMonteCarlo(CRYSTAL, 0.1, 300, 3, barostat=MonteCarloBarostat(0.0))", UnsupportedError, None),
+    ("MultipleTimeSteps(CRYSTAL, 0.1, **TWO, **CALCS, barostat=MonteCarloBarostat(0.0))", UnsupportedError, None),
+    ("run(DRAG, STATE, 0.1, 0, stepper=BlanesMoan4(), observers=[lambda s: 1 / 0])", UnsupportedError, None),
+    *((f"BlanesMoan{order}().step(DRAG, STATE, 0.1)", UnsupportedError, None) for order in ("4", "6", "6a")),
+    *(
+        (f"solve(ConstrainedGrowth(Hypercycle(2), VelocityRow({row})), (0, 1), [0.5, 0.5])", NonFiniteError, "rows")
+        for row in ("[nan, 1]", "[1, 1], lambda t, x: nan", "lambda t, x: [1, inf]")
+    ),
     ("TemperatureSplit(MOVING)", UnsupportedError, None),
     ("slow_share(SYSTEM, X[None])", UnsupportedError, None),
     ('LangevinRespa(1.0, 1.0, 1, steps={"slow": 1, "fast": 4}).check(SYSTEM)', UnsupportedError, None),

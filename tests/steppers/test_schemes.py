@@ -32,7 +32,7 @@ from kcons.constraints import (
     Sphere,
     VelocityFormula,
 )
-from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, Splitting, State, Stepper, run
 from kcons.steppers import compiled_operations as compiled
 from kcons.steppers.interpreter import Interpreter
@@ -238,17 +238,6 @@ def test_great_circles_are_exact_for_any_step(stepper, rest) -> None:
 
 
 # -- Runge-Kutta-Nystrom ----------------------------------------------------------------------------
-
-
-@SPLITTINGS
-def test_velocity_dependent_forces_are_refused(stepper) -> None:
-    system, state = rotor(force=lambda x, v, t: -v, velocity_dependent=True)
-    seen: list[State] = []
-    with pytest.raises(UnsupportedError, match="depend on the velocities; use Suzuki4 or KahanLi6"):
-        run(system, state, 0.1, 0, stepper=stepper, observers=[seen.append])
-    with pytest.raises(UnsupportedError, match="depend on the velocities"):
-        stepper.step(system, state, 0.1)
-    assert not seen
 
 
 def test_many_stages_round_once() -> None:

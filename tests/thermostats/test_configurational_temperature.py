@@ -16,7 +16,6 @@ from kcons.constraints import Distance, FixedAtoms, Formula, Plane, Sphere
 from kcons.errors import InputError
 from kcons.steppers import System
 from kcons.thermostats import Estimate, TemperatureSplit, mean, slow_share
-from kcons.thermostats.configurational_temperature import temperature
 
 
 def test_estimates():
@@ -24,10 +23,6 @@ def test_estimates():
     assert (still.off(1.0), still.off(2.0), still.off(0.5)) == (0.0, -math.inf, math.inf)
     assert Estimate(1.1, 0.05).off(1.0) == pytest.approx(2.0)
     assert Estimate(1.1, 0.03).off(1.0, 0.04) == pytest.approx(2.0)
-    rng = np.random.default_rng(0)
-    below = rng.uniform(1, 3, 10_000)
-    found, said = temperature(0.7 * below + rng.standard_normal(10_000), below)
-    assert abs(found.off(0.7)) <= 3.5 and found.error == pytest.approx(0.5 / 100, rel=0.4) and said is None
 
 
 # -- statistics -------------------------------------------------------------------------------------

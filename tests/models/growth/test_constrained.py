@@ -319,16 +319,6 @@ def test_rates_that_turn_nan_on_the_way_are_named(rows, method):
 TWO = GrowthModel(lambda t, x: [1.0, 2.0], n=2)
 
 
-def test_rows_that_are_not_finite_are_refused_at_the_start():
-    for row in (
-        VelocityRow([np.nan, 1.0]),
-        VelocityRow([1.0, 1.0], lambda t, x: np.nan),
-        VelocityRow(lambda t, x: [1.0, np.inf]),
-    ):
-        with pytest.raises(NonFiniteError, match=r"row 0 \(velocity row\) has a .* that is not finite at t = 0;"):
-            solve(ConstrainedGrowth(TWO, row), (0.0, 1.0), [0.5, 0.5])
-
-
 def test_tolerances_of_each_species_and_none() -> None:
     system = ConstrainedGrowth(TWO, [TotalPopulation(2)])
     usual = solve(system, (0.0, 1.0), [0.5, 0.5]).y[:, -1]
