@@ -189,16 +189,6 @@ def test_a_start_off_the_constraints_is_refused_and_can_be_mended():
     assert abs(free @ np.diag([2.0, 2.0, 0.0]) @ (slip - speed)) < 1e-15
 
 
-def test_no_mass_where_something_moves():
-    with pytest.raises(
-        SingularGeometryError, match=r"not positive along .* give the coordinates that move there a mass"
-    ):
-        pendulum((0.0, 0.0, 0.0)).solve(*hung(SWING), (0, 1))
-    indefinite = np.diag([2.0, 2.0, -5.0])
-    with pytest.raises(SingularGeometryError, match="not positive"):
-        pendulum(indefinite).motion(*hung(SWING))
-
-
 def test_a_crossing_of_two_ways_is_passed_straight_on():
     """Where the planes z = 0 and z = x y touch, rows depend: the step that ends there is made shorter."""
     body = Multibody(np.ones(3), none, lambda q: np.array([q[2], q[2] - q[0] * q[1]]))
