@@ -46,7 +46,7 @@ MUTANTS = {
         ("_off_grid(x, «10 * step) >→step) <=» error", "mdanalysis/check/precision::what_is_no_grid"),
     ],
     "constraints/constraint_set.py": [
-        ("agreed = np.where(«open_→False», np.repeat", "images::a_length_found_and_the_same_one_given"),
+        ("agreed = np.where(«open_→False», np.repeat", "images::lengths_found_far_away_can_be_held_near_the_origin"),
         (
             "change = change[«periodic→:»]",
             "images::directions_without_periodicity_do_not_count_as_a_change_of_the_cell",

@@ -38,8 +38,6 @@ from kcons.motion import Motion
 from kcons.openmm import SCHEMES, CollectiveRows, ProjectedIntegrator, Row, positions_of, velocities_of
 from kcons.steppers import System, run
 
-# -- held to rounding -----------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize(
     ("kind", "constrained", "platform"),
@@ -54,9 +52,6 @@ def test_rows_hold_in_positions_and_velocities(kind, constrained, platform):
         assert np.abs(part.rates(context)).max() <= 1e-12
     assert part.meets_system == constrained
     assert abs(energy_of(context, integrator) - start) < 0.02 * abs(start)
-
-
-# -- the same trajectories as other solvers -------------------------------------------------------------
 
 
 CORE = {
@@ -86,9 +81,6 @@ def test_same_trajectory_and_multipliers_as_the_core(kind, scheme):
     assert part.multipliers(context) == pytest.approx(expected, rel=1e-8, abs=1e-8)
 
 
-# -- periodic coordinates -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("target", [math.pi, -math.pi, 3 * math.pi])
 def test_dihedral_held_across_its_jump(target):
     x = np.array([[0.0, 0.1, 0.0], [0.0, 0, 0], [0.15, 0, 0], [0.15, -0.1, 0.0]])
@@ -102,9 +94,6 @@ def test_dihedral_held_across_its_jump(target):
         integrator.step(5)
         assert abs(part.residuals(context)[0]) <= 1e-12
         assert abs(part.values(context)[0]) == pytest.approx(math.pi, abs=1e-11)
-
-
-# -- failures -------------------------------------------------------------------------------------------
 
 
 def test_velocities_that_are_no_numbers_are_refused():
@@ -122,9 +111,6 @@ def test_velocities_that_are_no_numbers_are_refused():
     integrator.step(1)
 
 
-# -- how many rows, and which ---------------------------------------------------------------------------
-
-
 def test_two_parts_of_rows_in_one_integrator():
     system = chain_system()
     system.addConstraint(0, 1, float(np.linalg.norm(CHAIN[0] - CHAIN[1])))
@@ -138,12 +124,6 @@ def test_two_parts_of_rows_in_one_integrator():
     before = two.targets(context)
     one.set_target(integrator, 0, 0.31)
     assert one.targets(context) == 0.31 and two.targets(context) == before
-
-
-# -- as part of an integrator and its System ----------------------------------------------------------------
-
-
-# -- something else in place of a Context, an integrator, a row -------------------------------------------------
 
 
 def test_what_is_no_context_and_no_integrator():
@@ -177,9 +157,6 @@ def test_rows_that_become_singular_within_a_step_are_named_by_the_program():
     with pytest.raises((SingularGeometryError, ConvergenceError), match="row 0"):
         integrator.step(40)
     assert np.isfinite(state_of(context)[0]).all()
-
-
-# -- rows at the state of a Context ---------------------------------------------------------------
 
 
 def test_restore_keeps_the_constraints_of_other_molecules():

@@ -26,9 +26,6 @@ def torsion(text="theta"):
     return force
 
 
-# -- units ------------------------------------------------------------------------------------------
-
-
 def test_rows_are_in_units_of_openmm():
     system = particles([1.0] * 2)
     rows = CollectiveRows(system, [Row(bond(0, 1), 3 * unit.angstrom, rate=1 * unit.nanometer / unit.nanosecond)])
@@ -37,9 +34,6 @@ def test_rows_are_in_units_of_openmm():
     assert [settings["target1_0"], settings["rate1_0"]] == pytest.approx([0.3, 1e-3], rel=1e-15)
     with pytest.raises(InputError, match="give it in nm"):
         rows.set_target(integrator, 0, 3 * unit.degree)
-
-
-# -- terms and atoms --------------------------------------------------------------------------------
 
 
 def test_atoms_of_each_kind():
@@ -55,9 +49,6 @@ def test_atoms_of_each_kind():
     assert of(with_variable("a+b", a=bond(0, 1), b=openmm.RGForce([3]))) == {0, 1, 3}
     for force in (openmm.RGForce([]), openmm.NonbondedForce(), with_variable("a", a=openmm.RMSDForce(X, []))):
         assert of(force) == set(range(6))
-
-
-# -- plain coordinates --------------------------------------------------------------------------------
 
 
 def _two_terms():
@@ -117,9 +108,6 @@ def test_the_constraint_measures_what_the_force_does(force, kind):
     held = ConstraintSet([row], x, [system.getParticleMass(k)._value for k in range(len(x))])
     off = held.residuals(x, None, 0.0).sigma[0]
     np.testing.assert_allclose(off, rows.residuals(context)[0])
-
-
-# -- force groups -------------------------------------------------------------------------------------
 
 
 def test_free_groups_are_taken_around_those_in_use():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kcons.constraints import Angle, CenterDistance, Custom, Distance, Formula, Plane, Sphere
+from kcons.constraints import Angle, CenterDistance, Distance, Formula, Plane, Sphere
 from kcons.constraints.functions.straight_line import Function
 from kcons.constraints.target import MovingTarget
 from kcons.errors import UnsupportedError
@@ -76,6 +76,7 @@ def test_functions_of_python_are_refused_with_the_remedy(name):
     assert "device=False" in refused([item]) and "Formula" in refused([item])
     with pytest.raises(UnsupportedError, match="function of Python"):
         DeviceRows(MASSES, NONE, [item], positions=scattered(7), time=TIME)
+    assert refused([Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2", [[0, 1]])]) == ""  # what the remedy names
 
 
 def test_constraints_of_no_rows_hold_nothing():
@@ -90,7 +91,7 @@ def test_constraints_of_no_rows_hold_nothing():
 
 
 def test_what_else_is_refused():
-    assert refused([Distance([[0, 1]])]) == ""
+    assert refused([Distance([[0, 1]]), CenterDistance([0, 1], [2, 3])]) == ""
     assert "not held on the device" in refused([object()])
     with pytest.raises(UnsupportedError, match="moves, which the device does not"):
         DeviceRows(MASSES, NONE, [CASES["FixedAtoms moving"]()], positions=scattered(7), time=TIME)
@@ -294,10 +295,3 @@ def test_whole_numbers_are_not_divided_as_such():
     text = c_functions("f", Function(_divides, (2.0,)), "GLOBAL ")
     assert "1/2" not in text and "((mixed) 0.5)" in text and "GLOBAL mixed* out" in text
     assert text.count("r[") == 6
-
-
-def test_formulas_beside_custom_functions():
-    """The remedy that a refusal names: the same coordinate as a Formula is taken."""
-    item = Custom([0, 1], lambda r: float(np.sum((r[0] - r[1]) ** 2)))
-    assert refused([item]) and not refused([Formula("(x1-x2)**2+(y1-y2)**2+(z1-z2)**2", [[0, 1]], target=None)])
-    assert not refused([CenterDistance([0, 1], [2, 3])])

@@ -12,8 +12,6 @@ from openmm_systems import dumbbell, holding, started, state_of, water_box
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
 
-# -- arguments --------------------------------------------------------------------------------------
-
 
 def test_only_one_part_may_share_atoms_with_the_system():
     alone, *meeting = (holding() for _ in range(3))
@@ -22,9 +20,6 @@ def test_only_one_part_may_share_atoms_with_the_system():
         part.meets_system = True
     with pytest.raises(UnsupportedError, match="only one part"):
         ProjectedIntegrator(0.001, parts=meeting)
-
-
-# -- barostats, thermostats, center of mass ----------------------------------------------------------
 
 
 class Witness(HeldCoordinates):
@@ -58,9 +53,6 @@ def test_barostat_with_a_part_that_keeps_forces():
     assert integrator.getGlobalVariableByName("worst_gap") == 0
 
 
-# -- force groups and seeds -------------------------------------------------------------------------
-
-
 def test_force_groups_of_rows_never_act():
     integrator = ProjectedIntegrator(1e-3, parts=[holding(groups={5, 7})])
     everything = set(range(32)) - {5, 7}
@@ -84,9 +76,6 @@ def test_force_groups_of_rows_never_act():
         with pytest.raises(UnsupportedError, match="before"):
             bound.setIntegrationForceGroups(late)
     del context
-
-
-# -- restarts ---------------------------------------------------------------------------------------
 
 
 def test_restart_of_rigid_water_bit_for_bit():

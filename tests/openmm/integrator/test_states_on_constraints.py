@@ -69,9 +69,6 @@ def test_before_the_first_step_forces_tell_what_they_tell(platform):
     assert np.abs(part.residuals(context)).max() < 5e-6
 
 
-# -- temperatures ---------------------------------------------------------------------------------
-
-
 def test_degrees_of_freedom_are_counted_by_rank():
     """Five particles by all ten distances, nine of them independent: six, and three less with a motion remover."""
     x, every = 0.1 * np.random.default_rng(1).normal(size=(5, 3)), [(i, j) for i in range(5) for j in range(i)]
@@ -79,9 +76,6 @@ def test_degrees_of_freedom_are_counted_by_rank():
         system, integrator = particles([12.0] * 5, *removers, held=every, x=x), ProjectedIntegrator(0.001)
         context = started(system, integrator, x)
         assert integrator.degrees_of_freedom(context) == count and integrator.independent_momenta(context) == 6
-
-
-# -- minimization -----------------------------------------------------------------------------------
 
 
 def test_minimizer_keeps_parts():
