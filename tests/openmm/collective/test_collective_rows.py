@@ -250,22 +250,19 @@ def test_velocity_projection_is_the_nearest_in_the_mass_metric(constrained):
     assert state_of(context)[1] == pytest.approx(project_velocities(A, MASSES, v), abs=1e-12)
 
 
-def test_a_target_out_of_reach_is_infeasible():
+def test_rows_of_any_function_are_left_to_newton_and_targets_out_of_reach_refused():
     """Two atoms of one bonded chain, farther apart than its bonds and angles let them."""
-    system, x, _ = peptide()
-    rows = CollectiveRows(system, [Row(bond(4, 8), 0.6)])
-    context = started(system, ProjectedIntegrator(1e-3, parts=[rows]), x)
-    with pytest.raises(InfeasibleError):
-        rows.apply_positions(context)
-    np.testing.assert_array_equal(state_of(context)[0], x)
-
-
-def test_rows_of_any_function_are_left_to_newton():
     system, x, _ = peptide()
     rows = CollectiveRows(system, [Row(dihedral(4, 6, 8, 14, expression="sin(theta)"), 0.4)])
     context = started(system, ProjectedIntegrator(1e-3, parts=[rows]), x)
     rows.apply_positions(context)
     assert abs(rows.values(context)[0] - 0.4) < 1e-11
-    with pytest.raises(ConvergenceError):
-        far = CollectiveRows(system, [Row(dihedral(6, 8, 14, 16, expression="sin(theta)"), 1.5)])
-        far.apply_positions(started(system, openmm.VerletIntegrator(1e-3), x))
+    for force, target, error in (
+        (dihedral(6, 8, 14, 16, expression="sin(theta)"), 1.5, ConvergenceError),
+        (bond(4, 8), 0.6, InfeasibleError),
+    ):
+        far = CollectiveRows(system, [Row(force, target)])
+        context = started(system, openmm.VerletIntegrator(1e-3), x)
+        with pytest.raises(error):
+            far.apply_positions(context)
+        np.testing.assert_array_equal(state_of(context)[0], x)

@@ -14,9 +14,6 @@ from kcons.openmm import NoseHoover, NoseHooverMiddle, ProjectedIntegrator, hold
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
 
 
-# -- the chain in the middle of a step -------------------------------------------------------------------
-
-
 def test_a_chain_in_the_middle_is_the_same_chain_in_small_steps():
     """The link's velocity of both differs by the square of the time step."""
     system, x, v = alanine("HBonds")
@@ -51,18 +48,14 @@ def test_a_chain_in_the_middle_is_time_reversible():
         assert off <= limit if limit else off > 1e-4
 
 
-def test_a_chain_in_the_middle_takes_rattle_and_stays_itself():
-    for scheme in ("suzuki4", "geodesic"):
-        with pytest.raises(UnsupportedError, match=r"order|another form"):
-            ProjectedIntegrator(1e-3, scheme, ensemble=NoseHooverMiddle(300.0, 20.0))
+def test_a_chain_in_the_middle_stays_itself_and_may_have_a_relaxation_time():
     ensemble = NoseHooverMiddle(300.0, 20.0, length=2)
     assert ensemble != NoseHoover(300.0, 20.0, length=2)
     warmer = ensemble.replaced(temperature=310.0)
     assert type(warmer) is NoseHooverMiddle
     assert repr(warmer) == "NoseHooverMiddle(310 K, 20/ps, length=2)"
-
-
-# -- what is held ----------------------------------------------------------------------------------------
+    assert NoseHoover(300, 20) == NoseHoover(300 * unit.kelvin, 50 * unit.femtosecond)
+    assert NoseHoover(300, 20).frequency == pytest.approx(NoseHoover(300, 0.02 / unit.femtosecond).frequency)
 
 
 @pytest.mark.usefixtures("without_device")
@@ -100,18 +93,11 @@ def test_a_nan_leaves_the_chain_of_the_last_check():
     assert np.isfinite(state_of(context)[1]).all()
 
 
-# -- settings --------------------------------------------------------------------------------------------
-
-
-def test_frequency_or_relaxation_time():
-    assert NoseHoover(300, 20) == NoseHoover(300 * unit.kelvin, 50 * unit.femtosecond)
-    assert NoseHoover(300, 20).frequency == pytest.approx(NoseHoover(300, 0.02 / unit.femtosecond).frequency)
-
-
 def test_what_cannot_be_thermostatted_is_refused():
-    for scheme in ("suzuki4", "blanes-moan6", "isokinetic4"):
-        with pytest.raises(UnsupportedError, match="order"):
-            ProjectedIntegrator(1e-3, scheme, ensemble=NoseHoover(300.0, 20.0))
+    for scheme in ("suzuki4", "blanes-moan6", "isokinetic4", "geodesic"):
+        for kind in (NoseHoover, NoseHooverMiddle) if scheme != "geodesic" else (NoseHooverMiddle,):
+            with pytest.raises(UnsupportedError, match=r"order|another form"):
+                ProjectedIntegrator(1e-3, scheme, ensemble=kind(300.0, 20.0))
     system, x, v = dumbbell()
     with pytest.raises(InputError, match="take a frequency of at most 100/ps"):
         run(system, ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 5000.0)), x, v, 1)
