@@ -29,7 +29,7 @@ MUTANTS = {
         ("«len(A) * EPSILON * float(np.linalg.norm(balanced))→0.0»", "linear::errors_hold_and_are_not_much_too_large"),
         ("np.all(real > «off→0»)", "linear::what_is_said_is_so"),
         ("«p.quo(common) * →»once", "linear::eigenvalues_on_the_axis_are_counted_in_integers"),
-        ("certain = «closer == 1.0 and →»kept", "linear::neighbors_that_rounding_joins_are_told_as_uncertain"),
+        ("certain = «closer == 1.0 and →»bool(kept", "linear::neighbors_that_rounding_joins_are_told_as_uncertain"),
     ],
     "models/flows/flow.py": [
         ("concatenate([slope[self.f :], «-→»slope[: self", "flow::friction_by_a_hamiltonian_that_depends_on_time"),

@@ -27,7 +27,10 @@ MUTANTS = {
     "comparison/measure.py": [
         ("if «method.name not in ther→Tru»e:", "cli/compare::it_goes_on_from_the_rows_that_are_there"),
         (", max(self.seconds, 1e-3)«, RING_AGAIN→»)", "comparison/measure::what_a_finalizer_swallows_is_raised_again"),
-        ('«row["seconds"] *= step / row["step_seconds"]→pass»', "measure::a_row_a_method_and_setting"),
+        (
+            '«row["seconds"] *= step / row["step_seconds"]→pass»',
+            "measure::a_row_a_method_and_setting_and_beside_them_what_they_are_of",
+        ),
     ],
     "comparison/report.py": [
         ("height = max(height« + least→», float(", "comparison/report::no_name_is_cut_or_covers_another"),
