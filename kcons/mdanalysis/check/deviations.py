@@ -354,7 +354,8 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
                 told = where_greater(rounding, bound, zero, one)
                 off, size = where_greater(rounding, bound, zero, off), where_greater(rounding, bound, zero, size)
                 margin = where_greater(rounding, bound, splat(-np.inf), margin)
-                rate, rounding = told * rate, where_greater(rounding, bound, zero, rounding)
+                rate = where_greater(rounding, bound, zero, rate)  # where atoms coincide, no number
+                rounding = where_greater(rounding, bound, zero, rounding)
                 store(by_row, 5 * n_rows + r, load(by_row, 5 * n_rows + r) + one - told)
             total = total + off
             squares = squares + off * off

@@ -23,6 +23,8 @@ from kcons.mdanalysis.loading import READ_ERRORS, format_of
 
 #: What is said of a frame of DCD whose records are not as long as they say.
 DAMAGED = "its records are damaged"
+#: What stands before and behind a cell in DCD: its bytes, in either order.
+CELL_MARKS = tuple(struct.pack(f"{order}i", 48) for order in "<>")
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def damage(reader: Any, path: str, frames: Iterable[int] | None = None) -> Break
                 # Of fixed atoms, the first frame alone has coordinates.
                 opened.seek(file._header_size + (file._firstframesize + (k - 1) * file._framesize if k else 0))
                 cell = opened.read(56)
-                if cell[:4] != cell[52:]:
+                if cell[:4] != cell[52:] or cell[:4] not in CELL_MARKS:
                     return Break(k, DAMAGED)
     return None
 

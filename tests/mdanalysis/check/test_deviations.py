@@ -123,6 +123,10 @@ def test_where_atoms_coincide_nothing_is_told_of_their_angle(tmp_path):
     result = checked(files.write(tmp_path / "a.dcd", x, side=None), angles)
     assert result.status == "incomplete" and "up to 1 of 2 rows in 1 of 4 frames, from frame 2" in result.verdict
     assert np.isfinite(result.units[0].largest) and "or atoms coincide" in result.gaps[0]
+    v = np.zeros(x.shape)
+    v[2, 1] = x[2, 2] - x[2, 1]
+    unit = checked(files.write(tmp_path / "a.trr", x, side=None, velocities=v), angles).units[0]
+    assert unit.rate_largest > 0.1  # of the other angle in this frame
 
 
 # -- cells ------------------------------------------------------------------------------------------

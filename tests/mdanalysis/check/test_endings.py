@@ -12,6 +12,7 @@ from water_files import mda
 from kcons.constraints import Distance
 from kcons.errors import UnreadableError
 from kcons.mdanalysis import ConstraintCheck
+from kcons.mdanalysis.check.endings import DAMAGED
 
 N = 30
 
@@ -149,12 +150,14 @@ def test_records_of_all_kinds_of_dcd(tmp_path, x, kind):
         marks += [place, place + 4 + length]
         place += length + 8
     assert place == size and len(marks) == (8 if options.get("cell", 1) else 6)
-    for mark in marks:
+    for places in [*zip(marks, strict=True), marks[:2]]:
         wrong = data.copy()
-        wrong[begin + mark : begin + mark + 4] = b"\x7f\x00\x00\x7f"
+        for mark in places:
+            wrong[begin + mark : begin + mark + 4] = b"\x7f\x00\x00\x7f"
         path.write_bytes(wrong)
         result = checked(path)
-        assert result.broken.frame == 5 == len(result.frames) and result.status == "incomplete", mark
+        assert result.broken.frame == 5 == len(result.frames) and result.status == "incomplete", places
+        assert result.broken.reason == DAMAGED
 
 
 @pytest.mark.parametrize("compressed", ["gzip", "bz2"])
