@@ -283,6 +283,8 @@ def mean_force(series: Series, kT: float) -> MeanForce:
     (2000), for several; the page on free energies has the derivation with other constraints.
     """
     refuse_other(series, Series, "series", "a kcons.free_energy.Series")
+    if not series:
+        raise InputError("the series has no samples; take some while the coordinates are held", item="series")
     value = series.value
     moved = nearest_image(value - value[0], series.periods)
     for name, first, way in zip(series.names, value[0], np.abs(moved).max(axis=0), strict=True):

@@ -151,6 +151,7 @@ MEANS = [
     (lambda: mean_force(N20, 1.0), "series", r"give a kcons\.free_energy\.Series"),
     (lambda: mean_force(series([1.0] * 20), 0.0), "kT", "kT is 0.0; give a positive number"),
     (lambda: mean_force(series([1.0] * 9), 1.0), "values", "too few"),
+    (lambda: mean_force(series([1.0] * 9)[9:], 1.0), "series", "no samples"),
     (lambda: mean_force(series([1.0] * 9 + [1.1] * 9), 1.0), "r", r"r moved by 0\.1"),
     (lambda: mean_force(series([1.0] * 19 + [np.nan]), 1.0), "r", "values of r are not finite"),
     (lambda: weighted_mean(np.zeros(15)), "values", "too few"),
@@ -228,7 +229,7 @@ _GRIDS = [
     *(([LENGTH], [wrong], "values", "not a list of finite numbers") for wrong in ([], [1, np.nan], [[1, 2]])),
     ([LENGTH], [["far"]], None, "values of Distance"),
     *(
-        ([LENGTH], [wrong], "values", "go up and down; give each once and")
+        ([LENGTH], [wrong], "values", "repeat or turn back; give each once and")
         for wrong in ([1, 2, 1], [1, 3, 2], [1, 1, 2])
     ),
     ([TURN], [np.radians([-180, 0, 200])], "values", "span more than its period"),

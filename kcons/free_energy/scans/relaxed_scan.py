@@ -349,7 +349,7 @@ class Grid:
                 raise InputError(f"the values of {name} are not a list of finite numbers", item="values")
             ring, span, steps = False, float(np.ptp(axis)), np.diff(axis)
             if (steps * np.sign(steps.sum()) <= SAME * span).any():
-                raise InputError(f"the values of {name} go up and down; give each once and in order", item="values")
+                raise InputError(f"values of {name} repeat or turn back; give each once and in order", item="values")
             if item.period is not None and len(axis) > 1:
                 if span > item.period * (1 + SAME):
                     raise InputError(
