@@ -253,8 +253,7 @@ def crystal() -> Atoms:
 
 
 def filtered(cls, atoms):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
         return cls(atoms)
 
 

@@ -56,8 +56,7 @@ def test_names_say_what_elements_are():
     assert topology.masses[1] == pytest.approx(12.011) and topology.masses[3] == pytest.approx(1.008)
     assert atoms.symbols[1] == "Ca"  # until they are mended
     assert repair_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert repair_elements(atoms) == 0
     other = peptide()
     other.set_masses([14.0, 99.0, 12.0, 98.0])
@@ -126,8 +125,7 @@ def test_held_by_name():
     assert sum(item.n_rows for item in held.constraints) == 6
     assert atoms.get_number_of_degrees_of_freedom() == 27 - 6
     atoms.info["bonds"] = bonds_of(atoms)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         for name, expected in (("allbonds", [("Distance", 8)]), ("hangles", [("Distance", 8), ("Angle", 5)])):
             atoms.set_constraint()
             assert [(item.family, item.n_rows) for item in constrain(atoms, name).constraints] == expected

@@ -77,8 +77,7 @@ def test_minima_hopping(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     atoms, held = ethanol()
     BFGS(atoms, logfile=None).run(fmax=0.1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         MinimaHopping(atoms, T0=500.0, timestep=0.5, fmax=0.1, mdmin=1)(totalsteps=1)
         gc.collect()  # it leaves files open
     assert off(atoms, held) <= 1e-12

@@ -20,8 +20,7 @@ from openmm_systems import water_box
 
 from kcons.openmm import CollectiveRows, Langevin, LangevinRespa, NoseHoover, ProjectedIntegrator
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
+with warnings.catch_warnings(action="ignore"):
     openmmtools = pytest.importorskip("openmmtools", reason="openmmtools is not installed")
     from openmmtools import cache, mcmc, states
 

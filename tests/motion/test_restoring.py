@@ -520,7 +520,6 @@ def test_a_search_that_ends_before_the_nearest_point_says_so(monkeypatch: pytest
         found = motion.restore_positions(start, bonds=[])
     fulfilled(whole, found)
     assert off_the_perpendicular(whole, motion, start, found) > 1e-6
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         monkeypatch.undo()
         motion.restore_positions(start, bonds=[])

@@ -58,8 +58,7 @@ def thermal_run(name, kind, temperature, steps):
     """Kinetic and potential energies in eV, every 100 fs."""
     atoms, _, _ = MOLECULES[name]()
     draw_velocities(atoms, temperature, 8, zero_momentum=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         moving = dynamics(kind, atoms, 2 * units.fs, temperature)
     moving.run(10_000)
     series = []

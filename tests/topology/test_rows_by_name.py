@@ -76,8 +76,7 @@ def test_missing_bonds_are_guessed_and_said():
     with pytest.warns(UserWarning, match=r"^8 bonds were guessed from distances and covalent radii.*guess_bonds=False"):
         rows = held_rows(solution(()), "hangles")
     assert rows.bonds_guessed == 8
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         expected = held_rows(solution(), "hangles")
     for one, two in zip(rows, expected, strict=True):
         np.testing.assert_array_equal(one.atoms, two.atoms)
@@ -100,8 +99,7 @@ def test_hydrogens_that_get_no_bond_are_told():
         "whose faces molecules may be cut, or give bonds"
     )
     assert rows.loose_hydrogens.tolist() == [2] and counts(rows) == {"Distance": 1}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         whole = replace(cut, cell=np.diag([12.0] * 3), pbc=np.ones(3, dtype=bool))
         assert not len(held_rows(whole, "hbonds", guess_bonds=True).loose_hydrogens)
         # Not among the atoms that are asked for; an ion of its own residue.

@@ -157,8 +157,7 @@ def test_a_barostat_of_another_temperature(ensemble, barostat):
     assert told[0].filename == __file__
     name = str(told[0].message).split("'")[1]
     context.setParameter(name, 300)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         integrator.step(1)
         integrator.setTemperature(300)
     with pytest.warns(UserWarning, match=r"temperature of 300 K, and the integrator one of 350 K") as told:
