@@ -22,7 +22,7 @@ MUTANTS = {
     ],
     "comparison/ranking.py": [
         ("if «cost > leader * (1 + same) or not places→True»:", "ranking::costs_within_the_scatter_share_a_place"),
-        ("beyond = done«[~done.method.isin(good.method)]→»", "ranking::an_error_that_is_asked_for"),
+        ("beyond = done«[~done.method.isin(good.method)]→»", "ranking::the_cheapest_that_is_as_good_as_the_usual"),
     ],
     "comparison/measure.py": [
         ("if «method.name not in ther→Tru»e:", "cli/compare::it_goes_on_from_the_rows_that_are_there"),
