@@ -11,7 +11,7 @@ import pytest
 from scipy.special import ellipj, ellipk
 
 from kcons.constraints import projection
-from kcons.errors import ConstraintError, ConvergenceError, InputError, NonFiniteError, SingularGeometryError
+from kcons.errors import ConstraintError, ConvergenceError, NonFiniteError, SingularGeometryError
 from kcons.models import Multibody
 
 #: Steps of one size: no error is too large for it.
@@ -283,29 +283,6 @@ def test_differences_go_with_the_length():
     body.residuals(q, v)
     np.testing.assert_allclose(body._G(q)[0], np.cos(q / small) / small, rtol=1e-11)
     np.testing.assert_allclose(-body._b(q, v), -np.sin(q / small) * v**2 / small**2, rtol=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("name", "wrong", "said"),
-    [
-        ("jacobian", lambda q: gradient(q) * [[1, 1], [1, -1]], r"jacobian gives -0\.529.* for entry \[1, 1\]"),
-        ("curvature", lambda q, v: bend(q, v) * [1, -1], r"curvature gives .* for entry \[1\]"),
-    ],
-)
-def test_wrong_derivatives_are_refused(name, wrong, said):
-    given = {"jacobian": gradient, "curvature": bend} | {name: wrong}
-    with pytest.raises(InputError, match=said) as caught:
-        Multibody(np.eye(2), none, curve, **given).project(Q, V)
-    assert caught.value.item == name
-
-
-def test_functions_that_are_not_finite_are_named():
-    given = {"mass": lambda q: np.eye(2), "force": none, "constraints": curve, "jacobian": gradient, "curvature": bend}
-    for name, right in given.items():
-        wrong = lambda *arguments, right=right: right(*arguments) * np.nan  # noqa: E731
-        with pytest.raises(NonFiniteError, match=f"{name} is not finite at q") as caught:
-            Multibody(**(given | {name: wrong})).motion(Q, V)
-        assert caught.value.item == name
 
 
 def test_what_functions_get_cannot_be_changed_and_what_they_return_may_be_used_again():
