@@ -105,7 +105,6 @@ def observed_order(stepper: Stepper, problem: GlobalError, steps: list[int]) -> 
 
 
 COMPOSITIONS = [stepper for stepper in COMPOSED if not isinstance(stepper, Rattle | Geodesic)]
-SPLITTINGS = pytest.mark.parametrize("stepper", NYSTROM, ids=repr)
 #: Coarse, since these are so accurate that finer steps end in round-off.
 STEPS = {
     "spherical_pendulum": {4: [4, 8], 6: [1, 3]},

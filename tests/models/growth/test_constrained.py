@@ -63,20 +63,6 @@ def hill(power, *, given=False):
     return HolonomicRow(lambda t, x: x[0] ** power / (1 + x[0] ** power) + x[1], gradient if given else None)
 
 
-def test_derivatives_that_contradict_their_function_are_refused():
-    HolonomicRow(product, product_gradient, product_rate).bind(P)
-    for gradient, rate, said in (
-        (lambda t, x: 1.1 * product_gradient(t, x), product_rate, r"gradient gives 0.9\d+ for entry \[0\]"),
-        (product_gradient, None, "depends on time, but has no time_derivative"),
-        (product_gradient, lambda t, x: -product_rate(t, x), "changes with time at another rate"),
-    ):
-        with pytest.raises(InputError, match=said):
-            HolonomicRow(product, gradient, rate).bind(P)
-    LinearRow([1, 1, 1], lambda t: (1 + 0.1 * t, 0.1)).bind(P)
-    with pytest.raises(InputError, match="changes with time at another rate"):
-        LinearRow([1, 1, 1], lambda t: (1 + 0.1 * t, -5.0)).bind(P)
-
-
 def test_differences_that_cannot_serve_are_refused():
     """And derivatives that are right are not, only since differences are too coarse for them."""
     p = Populations.from_values(0.0, [1.02, 0.3])
