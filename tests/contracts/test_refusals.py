@@ -37,7 +37,7 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.models import flows, growth
-from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
+from kcons.steppers.splitting import KAHAN_LI_6, SRKN_6B, SUZUKI_4
 
 X = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0], [0.3, 1.0, 1.0]])
 MASSES = [1.0, 2.0, 3.0, 4.0]
@@ -79,6 +79,8 @@ def names() -> dict[str, Any]:
         "np": np,
         "SUZUKI_4": SUZUKI_4,
         "KAHAN_LI_6": KAHAN_LI_6,
+        "SRKN_6B": SRKN_6B,
+        "LATER": lambda f: growth.ConstrainedGrowth(growth.Hypercycle(3), growth.HolonomicRow(f)),
         "Multibody": models.Multibody,
         "still": still,
         "BENDS": lambda q: np.diag(np.cos(q)),
@@ -385,6 +387,8 @@ REFUSED: list[tuple[str, ...]] = [
     ("ConstantPressure(3, MonteCarloBarostat(1.0))", "stepper"),
     ("Composition(?, 4)", "fractions", "[0.5, 0.5]", "[0.25, 0.5, 0.25]"),
     ("Composition(?, 6)", "fractions", "SUZUKI_4", "[KAHAN_LI_6[k] for k in (1, 0, 2, 3, 4, 5, 6, 8, 7)]"),
+    # Kicks and drifts of order 4, whose order is 2 on constraints if the drifts are those of RATTLE.
+    ('type("Plain", (Splitting,), {"order": 4})(*SRKN_6B)', "flight"),
     ("Splitting(?, [1.0])", "kicks", "[0.5, 0.4]", "[1.0]"),
     ("Splitting([1.0], [0.5, 0.4, 0.1])", "drifts"),
     ("MOTION.acceleration(X, V, X / 0)", "force"),
@@ -480,6 +484,8 @@ REFUSED: list[tuple[str, ...]] = [
     ("LinearRow([1, 1, 1], lambda t: (1 + 0.1 * t, -5.0)).bind(GROWN)", "time_derivative"),
     ("HolonomicRow(lambda t, x: t * x[0], lambda t, x: [1.1 * t, 0, 0], lambda t, x: x[0]).bind(GROWN)", "gradient"),
     ("HolonomicRow(lambda t, x: t * x[0], None, ?).bind(GROWN)", "time_derivative", "None", "lambda t, x: -x[0]"),
+    # The path would be that of projections, to first order in steps that nothing controls.
+    ("solve(LATER(lambda t, x: x[0] + 0.1 * ?), (0, 1), GROWN.x)", "time_derivative", "np.cos(t)", "max(t - 0.5, 0.0)"),
     ("TotalPopulation(0)", "n"),
     ("TotalPopulation(2).gradient(GROWN)", "coefficients"),
     ("TotalPopulation(3, lambda ?).bind(GROWN)", "target", ": (1.0, 0.0)", 't: ("a", "b")'),

@@ -32,12 +32,11 @@ from kcons.constraints import (
     Sphere,
     VelocityFormula,
 )
-from kcons.errors import ConvergenceError, InputError
-from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, Splitting, State, Stepper, run
+from kcons.errors import ConvergenceError
+from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, State, Stepper, run
 from kcons.steppers import compiled_operations as compiled
 from kcons.steppers.interpreter import Interpreter
 from kcons.steppers.operations import Fly, Program
-from kcons.steppers.splitting import SRKN_6B, SUZUKI_4
 
 GlobalError = Callable[[Stepper, float], float]
 
@@ -180,15 +179,6 @@ def test_forces_that_depend_on_velocities_are_taken_back(stepper):
 
 
 # -- compositions -----------------------------------------------------------------------------------
-
-
-def test_drifts_whose_order_is_too_low_are_refused() -> None:
-    """Kicks and drifts of order 4, whose order is 2 on constraints if the drifts are those of RATTLE."""
-    plain = type("Plain", (Splitting,), {"order": 4})
-    with pytest.raises(InputError, match="powers of 3 do not cancel") as caught:
-        plain(*SRKN_6B)
-    assert caught.value.item == "flight"
-    assert plain(*SRKN_6B, SUZUKI_4).flight == SUZUKI_4
 
 
 # -- the geodesic splitting -------------------------------------------------------------------------

@@ -77,15 +77,6 @@ def test_differences_that_cannot_serve_are_refused():
         TotalPopulation(2, lambda t: (1.32 + 1e-3 * np.sin(1e5 * t), 2e2 * np.cos(1e5 * t))).bind(p)
 
 
-@pytest.mark.parametrize("change", [np.cos, lambda t: max(t - 0.5, 0.0)], ids=["flat at the start", "later"])
-def test_a_row_that_depends_on_time_later_needs_its_derivative(change):
-    """The path would be that of projections, to first order in steps that nothing controls."""
-    model = GrowthModel(lambda t, x: [1.0 - x[1], x[0] - 0.5, -x[2]], n=3)
-    row = HolonomicRow(lambda t, x: x[0] + 0.1 * change(t))
-    with pytest.raises(InputError, match="depends on time, but has no time_derivative"):
-        solve(ConstrainedGrowth(model, [row]), (0.0, 1.0), [0.5, 0.3, 0.2])
-
-
 # -- z of rows ----------------------------------------------------------------------------------------
 
 
