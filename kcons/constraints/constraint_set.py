@@ -461,15 +461,15 @@ class ConstraintSet:
         if self.images is None or self.lattice is None:
             return
         then = np.round((self.images.make_whole(x, before) - x) @ before[1])
-        changed = np.any(then != np.round((self.whole(x) - x) @ self.lattice[1]), axis=1)
-        if not changed.any():
+        changes = then - np.round((self.whole(x) - x) @ self.lattice[1])
+        if not changes.any():
             return
         for item, start in zip(self.constraints, self.starts, strict=False):
-            bad = changed[item.atoms].any(axis=1) & item.relative
+            others = (changes[item.atoms] != changes[item.atoms[:, :1]]).any(axis=2)
+            bad = others.any(axis=1) & item.relative
             if bad.any():
                 k = int(np.argmax(bad))
-                atoms = item.atoms[k]
-                raise self._image_error(int(start) + k, atoms[[0, int(np.argmax(changed[atoms]))]], numbers)
+                raise self._image_error(int(start) + k, item.atoms[k, [0, int(np.argmax(others[k]))]], numbers)
 
     @cached_property
     def _longest_plain(self) -> tuple[float, int]:
