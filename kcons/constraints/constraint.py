@@ -271,9 +271,11 @@ class Constraint:
         if not isinstance(self.target, MovingTarget):
             return self.target
         target = self.target.at(time, self.n_rows)
-        if self.positive:
+        if self.positive and not (target > 0).all():
+            k = int(np.argmin(target))  # without the number of the row, which only the set knows
             words = f"is not positive at t = {time:g}; give a function that stays above zero, or end the run before"
-            self.refuse(~(target > 0), 0, lambda k: f"{self.positive} {target[k]:g} {words}", "target")
+            said = f"{self.row_name(k)}: {self.positive} {target[k]:g} {words}"
+            raise InputError(said, item="target", atoms=self.atoms[k].tolist())
         return target
 
     def sigma(self, r: FloatArray, time: float) -> FloatArray:

@@ -406,7 +406,7 @@ REMEDIES = [
     (lambda: Dihedral([0, 1, 2, 3], 60.0).check(twisted(30.0)[None], 0.0, 0), r"give np\.radians\(60\)"),
     (
         lambda: ConstraintSet(Distance([0, 1], lambda t: 1 - t), LINE, [1.0] * 3).target(1.5),
-        "-0.5 is not positive at t = 1.5",
+        r"^Distance\(0, 1\): target -0.5 is not positive at t = 1.5",
     ),
 ]
 

@@ -86,7 +86,7 @@ MUTANTS = {
         ),
     ],
     "constraints/constraint.py": [
-        ("self.refuse(«~(target > 0)→target > 9», 0,", "families::remedies"),
+        ("«→not »self.positive and not (target > 0).all(", "families::remedies"),
     ],
     "constraints/target.py": [
         (".abs(fine - given) > «WRONG→100» * size)", "target::derivatives_that_contradict_a_moving_target_are_refused"),
