@@ -457,16 +457,24 @@ class ConstraintSet:
         )
 
     def refuse_other_images(self, x: FloatArray, before: FloatArray, numbers: IntArray | None = None) -> None:
-        """Raise `ImageError` where a changed cell gives atoms that nothing ties together other images than before."""
+        """Raise `ImageError` where a changed cell gives atoms that nothing ties together other images than before.
+
+        Positions may have been moved along with the cell, and molecules as a whole: other images are right if with them
+        the rows are fulfilled, or much nearer to that. At which time is not known: moving rows are not.
+        """
         if self.images is None or self.lattice is None:
             return
-        then = np.round((self.images.make_whole(x, before) - x) @ before[1])
-        changes = then - np.round((self.whole(x) - x) @ self.lattice[1])
+        y, then = self.whole(x), np.round((self.images.make_whole(x, before) - x) @ before[1])
+        changes = then - np.round((y - x) @ self.lattice[1])
         if not changes.any():
             return
         for item, start in zip(self.constraints, self.starts, strict=False):
             others = (changes[item.atoms] != changes[item.atoms[:, :1]]).any(axis=2)
             bad = others.any(axis=1) & item.relative
+            if bad.any() and not item.moving:
+                as_before, size = x + then @ self.lattice[0], self.scale[start : start + item.n_rows]
+                here, there = (np.abs(item.sigma(self.gather(item, x, z), 0.0)) / size for z in (y, as_before))
+                bad &= here > np.maximum(1e-9, 0.5 * there)
             if bad.any():
                 k = int(np.argmax(bad))
                 raise self._image_error(int(start) + k, item.atoms[k, [0, int(np.argmax(others[k]))]], numbers)

@@ -233,6 +233,17 @@ def test_a_cell_that_shrinks_onto_loose_atoms_is_refused():
         motion.project_positions(CHAIN, CHAIN)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_molecules_that_move_along_with_a_cell_as_a_whole_keep_their_images(known):
+    """As barostats move them: 4 apart across a face of a cell that was 9 wide and is 8.4."""
+    x, y = (np.array([[a, 0.0, 0.0], [a, 1.0, 0.0], [b, 0.0, 0.0], [b, 1.0, 0.0]]) for a, b in ((8, 3), (7.5, 3.1)))
+    held = ConstraintSet([Distance([[0, 1], [2, 3]]), CenterDistance([0, 1], [2, 3])], x, np.ones(4), cell=[9, 9, 9])
+    motion = Motion(held, x)
+    motion.set_cell(np.diag([8.4, 9, 9]), positions=y if known else None)
+    assert np.abs(motion.project_positions(y, y) - y).max() < 1e-14
+    assert motion.constraint_set.measure(y)[2] == pytest.approx(4.0)
+
+
 def test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell():
     """The vectors that stand for them are any two normals, which jump where the periodic one turns a little."""
     rng = np.random.default_rng(4)
