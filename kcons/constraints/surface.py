@@ -341,6 +341,20 @@ class Ellipsoid(Surface):
         size = np.exp(-logs / finite.sum(axis=1))
         self._keep(size=size, center=center, matrix=axes * inverse[:, :, None])
 
+    def _settle(self) -> None:
+        if not hasattr(self, "size"):  # not yet, `__init__` keeps it later
+            return
+        square = self.matrix @ self.matrix.transpose(0, 2, 1)
+        inverse = np.sqrt(np.diagonal(square, axis1=1, axis2=2))
+        across = np.abs(square) > 1e-9 * inverse[:, :, None] * inverse[:, None]
+        means = [np.exp(-np.log(each[each > 0]).mean()) if each.any() else np.nan for each in inverse]
+        if (across & ~np.eye(3, dtype=bool)).any() or not np.allclose(self.size, means, rtol=1e-9, atol=0.0):
+            raise InputError(
+                "Ellipsoid: the rows of matrix are directions at right angles over the semi-axes, and size is the "
+                "geometric mean of these",
+                item="matrix",
+            )
+
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
         # p holds s, c and the rows of B.

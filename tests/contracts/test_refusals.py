@@ -186,6 +186,13 @@ REFUSED: list[tuple[str, ...]] = [
     ("from_dict(Sphere([0, 1], [0, 0, 0], 1.0).todict() | ?)", "radius", '{"radius": 2.0}'),
     ("from_dict(Torus(0, [0, 0, 0], [0, 0, 1], 2.0).todict() | ?)", "axis", '{"axis": [[0, 3.0, 4.0]]}'),
     ("from_dict(Torus(0, [0, 0, 0], [0, 0, 1], 2.0).todict() | ?)", "major_radius", '{"major_radius": [-2.0]}'),
+    (
+        "from_dict(Ellipsoid(0, [0, 0, 0], [1, 2, 4]).todict() | {?})",
+        "matrix",
+        "'size': [3.0]",
+        "'matrix': [[[1, 0, 0], [0.1, 0.5, 0], [0, 0, 0.25]]]",
+        "'matrix': [np.zeros((3, 3))], 'size': [0.0]",
+    ),
     ("from_dict(?)", "family", "{}", '{"family": "Distanz"}', "3", '{"family": ["Distance"]}'),
     ("from_dict(RadiusOfGyration([0, 1]).todict() | {'mass_weighted': 'no'})", "mass_weighted"),
     ("from_dict(DistanceDifference([[0, 1], [1, 2]]).todict() | {?})", "slots", "'slots': 3", "'weights': 'a'"),
