@@ -15,6 +15,10 @@ MUTANTS = {
         (".where(angular, 1.0, «held.scale→1.0»)", "mdanalysis/check/precision::the_tolerance_is_a_part_of_the_length"),
         ("n_rows + r) + one« - told→»)", "deviations::targets_of_the_first_frame_and_of_the_mean"),
         (
+            "rate = «where_greater(rounding, bound, zero, rate)→told * rate»",
+            "deviations::where_atoms_coincide_nothing_is_told_of_their_angle",
+        ),
+        (
             "off, size = «where_greater(rounding, bound, zero, off)→off»,",
             "mdanalysis/check/precision::rows_of_which_nothing_can_be_told_leave_a_check_incomplete",
         ),
@@ -38,7 +42,8 @@ MUTANTS = {
         ),
     ],
     "mdanalysis/check/endings.py": [
-        ("if «cell[:4] != cell[52:]→False»:", "endings::records_of_all_kinds_of_dcd"),
+        ("if «cell[:4] != cell[52:] or→»", "endings::records_of_all_kinds_of_dcd"),
+        ("cell[52:]« or cell[:4] not in CELL_MARKS→»:", "endings::records_of_all_kinds_of_dcd"),
         ('"GRO": «n_atoms + 3→2 * n_atoms + 6»,', "endings::what_lies_behind_the_only_frame_that_is_read"),
         ("word.isdigit()« and int(word) == n_atoms→»", "endings::a_frame_with_another_number_of_atoms"),
     ],
