@@ -5,36 +5,10 @@ occurs once in the file. Tests are written as ``file::name`` for `test_file.py::
 file has the name, several parted by blanks; parameters in brackets are left out where any will do.
 """
 
+from importlib import import_module
 from pathlib import Path
 
-from mutants import (
-    ase_dynamics,
-    batched,
-    device,
-    files,
-    free_energies,
-    models,
-    openmm_programs,
-    solvers,
-    steppers,
-    studies,
-    torchsim,
-)
-
 TESTS = Path(__file__).resolve().parents[2]
-MODULES = (
-    solvers,
-    openmm_programs,
-    models,
-    steppers,
-    files,
-    studies,
-    free_energies,
-    ase_dynamics,
-    device,
-    torchsim,
-    batched,
-)
 
 
 def both(text: str) -> tuple[str, str]:
@@ -56,7 +30,7 @@ def found(test: str) -> str:
 #: (file in kcons/, its text, the wrong text, tests that must fail).
 MUTANTS = [
     (file, *both(text), " ".join(map(found, tests.split())))
-    for module in MODULES
-    for file, rows in module.MUTANTS.items()
-    for text, tests in rows
+    for path in sorted(Path(__file__).parent.glob("[a-z]*.py"))
+    for file, rows in import_module(f"mutants.{path.stem}").MUTANTS.items()
+    for text, tests in rows.items()
 ]

@@ -1,81 +1,71 @@
 """Mutants of dynamics in ASE."""
 
 MUTANTS = {
-    "ase/dynamics.py": [
-        (
-            "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                last = replace",
-            "binding::time_that_is_set_is_no_way_of_moving_targets",
+    "ase/dynamics.py": {
+        "«require_on_surface(system.motion.constraint_set, x, self.time)→pass»\n                last = replace": (
+            "binding::time_that_is_set_is_no_way_of_moving_targets"
         ),
-        (
-            'step == self.nsteps« and np.array_equal(self.atoms.arrays["momenta"], self._momenta)→»',
-            "dynamics::with_noise_the_log_is_of_the_middle_of_the_step",
+        'step == self.nsteps« and np.array_equal(self.atoms.arrays["momenta"], self._momenta)→»': (
+            "dynamics::with_noise_the_log_is_of_the_middle_of_the_step"
         ),
-        (
-            "replace(state.copied(), **known«, forces=None, origin=None→»)",
-            "thermostat_dynamics::a_restart_asks_the_calculator_for_forces",
+        "replace(state.copied(), **known«, forces=None, origin=None→»)": (
+            "thermostat_dynamics::a_restart_asks_the_calculator_for_forces"
         ),
-        (
-            "if last is not None and «not all(map(is_, asked, self._asked))→asked[0] is not self._asked[0]»:",
-            "binding::forces_of_the_same_calculator_that_changed",
+        "if last is not None and «not all(map(is_, asked, self._asked))→asked[0] is not self._asked[0]»:": (
+            "binding::forces_of_the_same_calculator_that_changed"
         ),
-        ('("numbers",« "initial_charges", "initial_magmoms"→»)', "binding::forces_of_the_same_calculator_that_changed"),
-        ("if «gone > 0→False» and self._more", "binding::what_was_given_by_numbers_of_atoms_is_no_longer_of_these"),
-        ("row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)", "dynamics::multipliers_by_name"),
-    ],
-    "ase/thermostat_dynamics.py": [
-        (
-            "known[POTENTIAL] = «self._systems().potential_energy(state.positions, state.time)→math.nan»",
-            "thermostat_dynamics::a_state_of_monte_carlo_knows_its_energy_where_calculators_give_new_results",
+        '("numbers",« "initial_charges", "initial_magmoms"→»)': "binding::forces_of_the_same_calculator_that_changed",
+        "if «gone > 0→False» and self._more": "binding::what_was_given_by_numbers_of_atoms_is_no_longer_of_these",
+        "row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)": "dynamics::multipliers_by_name",
+    },
+    "ase/thermostat_dynamics.py": {
+        "known[POTENTIAL] = «self._systems().potential_energy(state.positions, state.time)→math.nan»": (
+            "thermostat_dynamics::a_state_of_monte_carlo_knows_its_energy_where_calculators_give_new_results"
         ),
-    ],
-    "thermostats/langevin.py": [
-        ("if self.thermostat.friction >«→=» 0:", "dynamics::without_noise_the_log_is_of_the_end[0.0]"),
-    ],
-    "ase/constraints_object.py": [
-        ("for item in self.constraints« if item.n_rows→»]", "translation::objects_without_rows_are_left_out_of_files"),
-        ("if «not self._own→False» and cell.tobytes() != bound.cell", "binding::copies_in_cells_of_their_own"),
-        ("«WithFixedAtoms if fixed else Constraints→»  #", "translation::files_of_other_programs_have_the_fixed_atoms"),
-        (
-            "«        accepted.between_steps = True\n→»\n    def get_removed_dof",
-            "binding::an_edit_is_named_before_a_class",
+    },
+    "thermostats/langevin.py": {
+        "if self.thermostat.friction >«→=» 0:": "dynamics::without_noise_the_log_is_of_the_end[0.0]",
+    },
+    "ase/constraints_object.py": {
+        "for item in self.constraints« if item.n_rows→»]": "translation::objects_without_rows_are_left_out_of_files",
+        "if «not self._own→False» and cell.tobytes() != bound.cell": "binding::copies_in_cells_of_their_own",
+        "«WithFixedAtoms if fixed else Constraints→»  #": "translation::files_of_other_programs_have_the_fixed_atoms",
+        "«        accepted.between_steps = True\n→»\n    def get_removed_dof": (
+            "binding::an_edit_is_named_before_a_class"
         ),
-        (
-            "if «found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x)→False»:",
-            "binding::frames_on_the_constraints_are_taken",
+        "if «found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x)→False»:": (
+            "binding::frames_on_the_constraints_are_taken"
         ),
-    ],
-    "ase/binding.py": [
-        ("(item, «holding(item)→None») for", "dynamics::what_constraints_hold_changed_between_steps_is_taken"),
-        ("name«, arrays[name].tobytes()→»", "dynamics::masses_of_free_atoms_changed_between_steps_are_taken"),
-        ("scaled = «changed and self._scaled(motion, x, cell)→True»", "binding::an_edit_between_runs_is_refused"),
-        (
-            "«not (changed or elsewhere or differ(self._positions, x))→self._cell is not None»",
-            "binding::an_edit_between_runs_is_refused",
+    },
+    "ase/binding.py": {
+        "(item, «holding(item)→None») for": "dynamics::what_constraints_hold_changed_between_steps_is_taken",
+        "name«, arrays[name].tobytes()→»": "dynamics::masses_of_free_atoms_changed_between_steps_are_taken",
+        "scaled = «changed and self._scaled(motion, x, cell)→True»": "binding::an_edit_between_runs_is_refused",
+        "«not (changed or elsewhere or differ(self._positions, x))→self._cell is not None»": (
+            "binding::an_edit_between_runs_is_refused"
         ),
-        ("        if «along < stayed→False»:", "ase/pressure::filters_beside_atoms_that_stay_are_refused"),
-        ("if «self._again and self._repeats→False»:", "binding::classes_that_move_atoms_past_constraints_are_found"),
-    ],
-    "constraints/arguments.py": [
-        ("«array.setflags(write=False)→pass»", "constraint::arrays_cannot_be_changed"),
-    ],
-    "thermostats/cells.py": [
-        ("motion.multipliers(x, v, f«, time→»)", "measured::a_rod_that_is_made_longer"),
-    ],
-    "thermostats/freedom.py": [
-        ("«turns.see(*next(places))→break»", "freedom::angular_momentum_about_the_axes_of_what_is_held_is_said"),
-        (
-            "share = BALANCED« if len(self._motions) == 6 else EXACT→»",
-            "freedom::a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster",
+        "        if «along < stayed→False»:": "ase/pressure::filters_beside_atoms_that_stay_are_refused",
+        "if «self._again and self._repeats→False»:": "binding::classes_that_move_atoms_past_constraints_are_found",
+    },
+    "constraints/arguments.py": {
+        "«array.setflags(write=False)→pass»": "constraint::arrays_cannot_be_changed",
+    },
+    "thermostats/cells.py": {
+        "motion.multipliers(x, v, f«, time→»)": "measured::a_rod_that_is_made_longer",
+    },
+    "thermostats/freedom.py": {
+        "«turns.see(*next(places))→break»": "freedom::angular_momentum_about_the_axes_of_what_is_held_is_said",
+        "share = BALANCED« if len(self._motions) == 6 else EXACT→»": (
+            "freedom::a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster"
         ),
-    ],
-    "steppers/state.py": [
-        (
-            "if state.remainder is None« or self._free_of_origin is None→»:",
-            "state::what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place",
+    },
+    "steppers/state.py": {
+        "if state.remainder is None« or self._free_of_origin is None→»:": (
+            "state::what_is_kept_of_places_far_away_is_nothing_to_rows_with_a_place"
         ),
-    ],
-    "steppers/stepper.py": [
-        ("if not residual <«= self.tolerance→ 1e300»:", "state::check_finds_a_stepper_that_is_not_reversible"),
-        (': «None if name in ("_known", "_left") else →»', "state::copies_leave_behind_what_was_found_for_a_system"),
-    ],
+    },
+    "steppers/stepper.py": {
+        "if not residual <«= self.tolerance→ 1e300»:": "state::check_finds_a_stepper_that_is_not_reversible",
+        ': «None if name in ("_known", "_left") else →»': "state::copies_leave_behind_what_was_found_for_a_system",
+    },
 }

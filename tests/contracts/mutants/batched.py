@@ -1,34 +1,32 @@
 """Batches on PyTorch: iterations, derivatives, elimination by levels, images, failures; they need torch."""
 
 MUTANTS = {
-    "batched/clusters.py": [
-        ("torch.where(d > «0→-9e99», 0.0, torch.inf)", "batched/batch::a_bond_that_has_turned_is_no_solution"),
-        ("_each(operator.«neg→pos», self.spread(slope, a)", "batched/gradients::derivatives_are_those_of_the_solution"),
-        ("start=of.start «+→-» moved)", "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]"),
-        ("(d @ d.mT, «lam→2 * lam».T", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
-        ("(0, numbers, terms, alpha=«-1→1»)", "batched/against_the_engine::chains_and_rows_that_depend_on_others"),
-    ],
-    "batched/groups.py": [
-        ("if «not n→False»:", "batched/batch::constraints_of_no_rows_hold_nothing"),
-        ("sums = «-→+»torch.round(", "batched/against_the_engine::rows_take_the_images_that_the_engine_takes"),
-    ],
-    "batched/row_functions.py": [
-        (
-            "(value * places[«item.width :→: item.width»]).sum()",
-            "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-CustomVelocity]",
+    "batched/clusters.py": {
+        "torch.where(d > «0→-9e99», 0.0, torch.inf)": "batched/batch::a_bond_that_has_turned_is_no_solution",
+        "_each(operator.«neg→pos», self.spread(slope, a)": "batched/gradients::derivatives_are_those_of_the_solution",
+        "start=of.start «+→-» moved)": "batched/gradients::derivatives_are_those_of_the_solution[lanes-blade]",
+        "(d @ d.mT, «lam→2 * lam».T": "batched/against_the_engine::chains_and_rows_that_depend_on_others",
+        "(0, numbers, terms, alpha=«-1→1»)": "batched/against_the_engine::chains_and_rows_that_depend_on_others",
+    },
+    "batched/groups.py": {
+        "if «not n→False»:": "batched/batch::constraints_of_no_rows_hold_nothing",
+        "sums = «-→+»torch.round(": "batched/against_the_engine::rows_take_the_images_that_the_engine_takes",
+    },
+    "batched/row_functions.py": {
+        "(value * places[«item.width :→: item.width»]).sum()": (
+            "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-CustomVelocity]"
         ),
-    ],
-    "batched/batch.py": [
-        ("«group.worst→size», size / group.scale", "batched/batch::a_failure_names_copy_and_row_when_it_is_looked_for"),
-        ("if «getattr(self, item) is not own or own._version→False»:", "batched/batch::what_is_refused"),
-        (
-            "torch.where(self._is_position, held, «flight→1.0» * middle)",
-            "batched/against_the_engine::families_are_held_as_the_engine_holds_them",
+    },
+    "batched/batch.py": {
+        "«group.worst→size», size / group.scale": "batched/batch::a_failure_names_copy_and_row_when_it_is_looked_for",
+        "if «getattr(self, item) is not own or own._version→False»:": "batched/batch::what_is_refused",
+        "torch.where(self._is_position, held, «flight→1.0» * middle)": (
+            "batched/against_the_engine::families_are_held_as_the_engine_holds_them"
         ),
-    ],
-    "batched/steps.py": [
-        ("if «given.shape != x.shape→False»:", "batched/batch::what_is_refused"),
-        ("v + «found.push→0.5 * found.push»", "batched/batch::rattle_is_that_of_the_engine_and_reversible"),
-        ("(1 - kept * «kept→1»)", "torchsim/torchsim_dynamics::short_runs_have_the_temperature_of_the_bath[langevin]"),
-    ],
+    },
+    "batched/steps.py": {
+        "if «given.shape != x.shape→False»:": "batched/batch::what_is_refused",
+        "v + «found.push→0.5 * found.push»": "batched/batch::rattle_is_that_of_the_engine_and_reversible",
+        "(1 - kept * «kept→1»)": "torchsim/torchsim_dynamics::short_runs_have_the_temperature_of_the_bath[langevin]",
+    },
 }

@@ -1,56 +1,48 @@
 """Mutants of steps on the device."""
 
 MUTANTS = {
-    "openmm/device/kernels.py": [
-        ("_replace(share=done[-1].share «+→-» op.share", "device_integrator::operations_are_joined_where_nobody_looks"),
-        ("step+({op.begun}), {{}}, «seed[0]→7»);", "device_integrator::noise_belongs_to_particle_and_step"),
-        ("link[k] = (link[k]*damp+h*push«/2→»)*damp;", "device_integrator::settings_change_what_is_done"),
-        ("scale = 1+(1«-→+»cosine)*twice/2;", "molecule_spheres::trajectories_are_those_on_arrays"),
-    ],
-    "openmm/device/rows.py": [
-        ("if «not item.n_rows→False»:", "rows::constraints_of_no_rows_hold_nothing"),
-        (
-            "np.isin(pairs, fixed).all(axis=1) «& rounded→»",
-            "kernel_rows::fixed_atoms_of_rigid_water_in_single_precision",
+    "openmm/device/kernels.py": {
+        "_replace(share=done[-1].share «+→-» op.share": "device_integrator::operations_are_joined_where_nobody_looks",
+        "step+({op.begun}), {{}}, «seed[0]→7»);": "device_integrator::noise_belongs_to_particle_and_step",
+        "link[k] = (link[k]*damp+h*push«/2→»)*damp;": "device_integrator::settings_change_what_is_done",
+        "scale = 1+(1«-→+»cosine)*twice/2;": "molecule_spheres::trajectories_are_those_on_arrays",
+    },
+    "openmm/device/rows.py": {
+        "if «not item.n_rows→False»:": "rows::constraints_of_no_rows_hold_nothing",
+        "np.isin(pairs, fixed).all(axis=1) «& rounded→»": "kernel_rows::fixed_atoms_of_rigid_water_in_single_precision",
+        "#define ROWS_PIVOT ((mixed) {«PIVOT_SINGLE→PIVOT»})": "kernel_rows::multipliers_in_single_precision",
+        "{volatile mixed y_ = -(impulse)«-rows_lost[row]→», t_": "kernel_rows::multipliers_in_single_precision",
+        "part._engine._integrator = «weakref.ref(integrator)→other»": (
+            "kernel_rows::states_with_energies_of_rows_of_hold_that_move"
         ),
-        ("#define ROWS_PIVOT ((mixed) {«PIVOT_SINGLE→PIVOT»})", "kernel_rows::multipliers_in_single_precision"),
-        ("{volatile mixed y_ = -(impulse)«-rows_lost[row]→», t_", "kernel_rows::multipliers_in_single_precision"),
-        (
-            "part._engine._integrator = «weakref.ref(integrator)→other»",
-            "kernel_rows::states_with_energies_of_rows_of_hold_that_move",
+    },
+    "openmm/device/plugin/program_integrator.cpp": {
+        "numbers.time = «→(float) »c.getTime()-shared.origin;": "kernel_rows::targets_move_late_in_a_long_run",
+        '!(exactly || array.name == «"memory"→""»)': "device_integrator::states_of_other_rows_are_refused",
+    },
+    "openmm/device/build.py": {
+        "if not (accelerated() «or→and» is_built()):": "device_integrator::which_steps_are_made_on_the_device",
+    },
+    "plan/clusters.py": {
+        "for k in left if not «(k in last and coupled[k] - last)→False»]": "rows::levels_have_rows_that_share_no_entry",
+        "if «k not in beside→True» and count": "rows::levels_have_rows_that_share_no_entry",
+    },
+    "openmm/device/clusters.c": {
+        "if («missed > 0→1») {": "rows::rows_without_a_solution_are_told",
+    },
+    "openmm/device/clusters.py": {
+        "off[bad]«/unit[bad]→»); return": "rows::rows_without_a_solution_are_told",
+        "'+' if one[a] «==→!=» other[a] else": "rows::clusters_of_all_sizes",
+        '"there« && last→»"': "surface_integrator::the_device_holds_the_same_surfaces",
+    },
+    "openmm/device/device_integrator.py": {
+        "array in «arrays→rows.arrays» if array.saved": "molecule_spheres::a_failure_puts_auxiliary_variables_back",
+        "self._advance(context, again«→ - 1»)": "device_integrator::a_failure_leaves_the_state_before_the_step",
+        "yield x, v, f, time + (k «+ 1→+ 0») * every * self": "device_integrator::records_are_the_states_after_steps",
+        "part.left «!=→is None and» guard.context.getTime(": "kernel_rows::multipliers_are_summed_where_the_rows_are",
+        "part if part.program is None «else copy.deepcopy(part)→else part»": (
+            "kernel_rows::parts_serve_integrators_of_other_systems"
         ),
-    ],
-    "openmm/device/plugin/program_integrator.cpp": [
-        ("numbers.time = «→(float) »c.getTime()-shared.origin;", "kernel_rows::targets_move_late_in_a_long_run"),
-        ('!(exactly || array.name == «"memory"→""»)', "device_integrator::states_of_other_rows_are_refused"),
-    ],
-    "openmm/device/build.py": [
-        ("if not (accelerated() «or→and» is_built()):", "device_integrator::which_steps_are_made_on_the_device"),
-    ],
-    "plan/clusters.py": [
-        (
-            "for k in left if not «(k in last and coupled[k] - last)→False»]",
-            "rows::levels_have_rows_that_share_no_entry",
-        ),
-        ("if «k not in beside→True» and count", "rows::levels_have_rows_that_share_no_entry"),
-    ],
-    "openmm/device/clusters.c": [
-        ("if («missed > 0→1») {", "rows::rows_without_a_solution_are_told"),
-    ],
-    "openmm/device/clusters.py": [
-        ("off[bad]«/unit[bad]→»); return", "rows::rows_without_a_solution_are_told"),
-        ("'+' if one[a] «==→!=» other[a] else", "rows::clusters_of_all_sizes"),
-        ('"there« && last→»"', "surface_integrator::the_device_holds_the_same_surfaces"),
-    ],
-    "openmm/device/device_integrator.py": [
-        ("array in «arrays→rows.arrays» if array.saved", "molecule_spheres::a_failure_puts_auxiliary_variables_back"),
-        ("self._advance(context, again«→ - 1»)", "device_integrator::a_failure_leaves_the_state_before_the_step"),
-        ("yield x, v, f, time + (k «+ 1→+ 0») * every * self", "device_integrator::records_are_the_states_after_steps"),
-        ("part.left «!=→is None and» guard.context.getTime(", "kernel_rows::multipliers_are_summed_where_the_rows_are"),
-        (
-            "part if part.program is None «else copy.deepcopy(part)→else part»",
-            "kernel_rows::parts_serve_integrators_of_other_systems",
-        ),
-        ("if told[_FAILED]«→ and False»:", "device_integrator::a_failure_leaves_the_state_before_the_step"),
-    ],
+        "if told[_FAILED]«→ and False»:": "device_integrator::a_failure_leaves_the_state_before_the_step",
+    },
 }
