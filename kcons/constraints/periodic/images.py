@@ -271,7 +271,7 @@ class _Links:
             for k in np.flatnonzero(doubtful):
                 a, b = (held[[atom]] for atom in self.item.atoms[k])
                 doubtful[k] = not a.multiply(b).nnz
-            words = "apart across the boundary, and farther along the rows that tie them together. Give its target"
+            words = "apart across the boundary, and farther along the rows that tie them. Give the target of this row"
             apart = self._nearest[:, 0]
             self.item.refuse(
                 doubtful,
