@@ -66,6 +66,11 @@ def test_a_failed_step_is_taken_back_and_not_counted(scheme):
         assert caught.value.step == 8
     np.testing.assert_array_equal(state_of(context), before)
     assert context.getStepCount() == 7 and context.getTime() / PS == pytest.approx(0.007, rel=1e-12)
+    integrator.setGlobalVariableByName("reluctant", 0.0)
+    integrator.step(5)
+    undisturbed = ProjectedIntegrator(1e-3, scheme, parts=[Reluctant([0], 2, x[0, 2], 22)], tolerance=1e-13)
+    other = run(system, undisturbed, x, v, 12)
+    np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-12)
 
 
 #: Kinds whose steps of a picosecond fail, and the platform.
