@@ -33,7 +33,7 @@ from kcons.errors import InputError
 
 StrArray = NDArray[np.str_]
 
-#: Standard atomic masses in dalton, for recognising elements.
+#: Standard atomic masses in dalton, for recognizing elements.
 MASSES: dict[str, float] = {
     "H": 1.008, "He": 4.0026, "Li": 6.94, "Be": 9.0122, "B": 10.81, "C": 12.011, "N": 14.007, "O": 15.999,
     "F": 18.998, "Ne": 20.180, "Na": 22.990, "Mg": 24.305, "Al": 26.982, "Si": 28.085, "P": 30.974, "S": 32.06,
