@@ -216,7 +216,9 @@ def _measured(chosen: argparse.Namespace, thermal: bool, **options: Any) -> tupl
         table = measure.compare(system, chosen.methods, rounds=rounds, reference=reference, **options)
         if (target := chosen.target_error) is not None:
             rows = ranking.find_steps(system, table, target, reference, budget=budget, watcher=watcher)
-            table = measure.table_of([*table.to_dict("records"), *rows], table.attrs)
+            if rows:  # the first time of a step has what is set up in it
+                rows = [*table.to_dict("records"), *rows]
+                table = measure.timed(system, rows, table.attrs, rounds=rounds, budget=budget, watcher=watcher)
         production = _production(chosen, system, budget, watcher)
         found = ranking.rank(table, limit=target)
     code = ""

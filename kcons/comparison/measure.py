@@ -131,7 +131,20 @@ def compare(
         reference = reference_of(system, watching)
     about = {**described(system, reference), "budget": budget}
     rows = run_pending(chosen, lambda m: all_settings(system, m, reference, budget, watching), about, done, keep)
-    timing = Rounds(system, rounds, min(ROUND_SHARE * budget, ROUND_SECONDS), PATIENCE * budget, watching)
+    return timed(system, rows, about, rounds=rounds, budget=budget, watcher=watching)
+
+
+def timed(
+    system: TestSystem,
+    rows: list[dict[str, Any]],
+    about: dict[str, Any],
+    *,
+    rounds: int,
+    budget: float,
+    watcher: Watcher,
+) -> pd.DataFrame:
+    """A table of rows whose short runs are timed together, in rounds."""
+    timing = Rounds(system, rounds, min(ROUND_SHARE * budget, ROUND_SECONDS), PATIENCE * budget, watcher)
     return table_of(rows, {**about, "margin": timing.time(rows)})
 
 
@@ -478,7 +491,8 @@ class Rounds:
 
 
 def _note(row: dict[str, Any], words: str) -> None:
-    row["note"] = "; ".join(filter(None, [row["note"], words]))
+    if words not in row["note"]:
+        row["note"] = "; ".join(filter(None, [row["note"], words]))
 
 
 def _uneven(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -50,7 +50,7 @@ def test_a_target_error_is_reached(tmp_path, capsys):
     assert run("compare", "chain", "--size", 4, "--budget", 5, *words) == 0
     assert "for an error of at most 1e-06 Å (asked for)" in capsys.readouterr().out
     table = read_csv(tmp_path / "compare.csv")
-    assert (table.error.iloc[-3:] <= 1e-6).any()
+    assert (table.error.iloc[-3:] <= 1e-6).any() and (table.rounds > 0).all()  # found steps take turns with the others
 
 
 def test_it_goes_on_from_the_rows_that_are_there(tmp_path, monkeypatch, capsys):
