@@ -7,7 +7,7 @@ import io
 import sys
 from pathlib import Path
 
-from kcons.cli.terminal import Command, Option, rendered, say_written, show
+from kcons.cli.terminal import HELD, Command, Option, rendered, say_written, show
 from kcons.constraints.arguments import positive
 from kcons.errors import InputError, KconsError, UnreadableError
 
@@ -78,24 +78,16 @@ COMMANDS = (
             Option("--topology", "any topology that MDAnalysis reads", type=Path, required=True),
             Option("--format", "of the trajectory, where its name does not tell: LAMMPSDUMP, ...", metavar="NAME"),
             Option("--topology-format", "of the topology, where its name does not tell", metavar="NAME"),
-            Option(
-                "--constrain", "hbonds (default), allbonds, hangles, allangles, none", default="hbonds", metavar="NAME"
-            ),
+            Option("--constrain", f"{', '.join(HELD)}, none (default hbonds)", default="hbonds", metavar="NAME"),
             Option("--select", "rows within this selection only (MDAnalysis' language)", default="all"),
             Option("--no-rigid-water", "do not expect water to be rigid", action="store_true"),
-            Option(
-                "--targets", "first (frame, default), mean, topology (coordinates), or a TOML file", default="first"
-            ),
+            Option("--targets", "first (frame; default), mean, topology (coordinates), TOML file", default="first"),
             Option("--tolerance", "relative, of the engine (default 1e-4)", type=float, default=1e-4),
             Option("--precision", "step of the coordinates in the file, Å, where not known", type=float),
             Option("--frames", "frames to look at (default all)", metavar="A:B:STEP"),
             Option("--workers", "processes (default 1)", type=int, default=1),
-            Option(
-                "--forces", "also temperatures of the configurations: forces as for compare (amber14-all, gfn2, ...)"
-            ),
-            Option(
-                "--temperature", "with --forces: say whether the temperatures are this one", type=float, metavar="K"
-            ),
+            Option("--forces", "also temperatures of the configurations, by forces as for compare (gfn2, ...)"),
+            Option("--temperature", "with --forces: whether the temperatures are this one", type=float, metavar="K"),
             Option("--out", "folder for check.json, .png and .txt (default ./check-TRAJECTORY)", type=Path),
         ),
         _check,

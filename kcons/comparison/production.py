@@ -100,8 +100,7 @@ def sentence(rows: Sequence[Mapping[str, Any]], unit: str, kelvin: float = 300.0
         known_to = float(f"{200 * _worst(doubt)[2]:.2g}")  # 140, not 1.4e+02
         return (
             f"{before} {doubt['setting']:g} {unit} the temperature of configurations is known to "
-            f"{known_to:g} % only (two standard errors): give a larger --budget to know it to "
-            f"{100 * RIGHT:g} %."
+            f"{known_to:g} % only (two standard errors): a larger --budget makes it {100 * RIGHT:g} %."
         )
     last = rows[-1]
     if last["status"] != "ok":

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from time import monotonic
-from typing import Any, Self
+from typing import Self
 
 
 class Watcher:
@@ -19,48 +19,40 @@ class Watcher:
     pause = 60.0
 
     def __init__(self, shown: bool = False) -> None:
-        self._bars: Any = None
-        self._task: Any = None
-        if shown:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-            columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-            self._bars = Progress(*columns, console=Console(stderr=True), transient=True)
+        columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+        self._shown = shown
+        self._bars = Progress(*columns, console=Console(stderr=True), transient=True, disable=not shown)
 
     def __enter__(self) -> Self:
-        if self._bars is not None:
-            self._bars.start()
+        self._bars.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bars is not None:
-            self._bars.stop()
+        self._bars.stop()
 
     @contextmanager
     def piece(self, what: str, total: float) -> Iterator[None]:
         """A piece of work of `total` units, which is over at the end of the block."""
-        if self._bars is not None:
-            self._say(what)
-            self._task = self._bars.add_task(what, total=total)
+        self._say(what)
+        task = self._bars.add_task(what, total=total)
         try:
             yield
         finally:
-            if self._task is not None:
-                self._bars.remove_task(self._task)
-                self._task = None
+            self._bars.remove_task(task)
 
     def advance(self, done: float) -> None:
         """So much of the piece in hand is done."""
-        if self._task is not None:
-            self._bars.update(self._task, completed=done)
+        for task in self._bars.tasks if self._shown else ():
+            self._bars.update(task.id, completed=done)
             if monotonic() - self._said >= self.pause:
-                (task,) = self._bars.tasks
                 self._say(f"{task.description}: {task.percentage:.0f} %")
 
     def _say(self, line: str) -> None:
         self._said = monotonic()
-        if not self._bars.console.is_terminal:
+        if self._shown and not self._bars.console.is_terminal:
             print(line, file=sys.stderr, flush=True)
 
 

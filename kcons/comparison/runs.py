@@ -182,7 +182,4 @@ class InOpenMM(Run):
 def seen(context: openmm.Context) -> tuple[FloatArray, FloatArray]:
     """Positions and velocities of a Context, nm and nm/ps."""
     state = context.getState(positions=True, velocities=True)
-    return (
-        np.array(state.getPositions(asNumpy=True)._value),
-        np.array(state.getVelocities(asNumpy=True)._value),
-    )
+    return np.array(state.getPositions(asNumpy=True)._value), np.array(state.getVelocities(asNumpy=True)._value)

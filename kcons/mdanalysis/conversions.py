@@ -311,12 +311,9 @@ def _snapshot(universe: Any) -> Snapshot:
     snapshot = snapshot_of(universe)
     reader = universe.atoms.universe.trajectory
     if reader.ts.has_velocities and not velocities_known(reader):
-        warnings.warn(
-            f"velocities of {format_of(reader)} files have no unit: they are left out; set them where they are needed, "
-            "or give a file that has one (TRR, H5MD, NetCDF)",
-            UserWarning,
-            stacklevel=3,
-        )
+        remedy = "set them where they are needed, or give TRR, H5MD or NetCDF"
+        said = f"velocities of {format_of(reader)} files have no unit: they are left out; {remedy}"
+        warnings.warn(said, UserWarning, stacklevel=3)
     return snapshot
 
 

@@ -51,14 +51,6 @@ class RunUnits:
         for name in ("length", "time", "energy"):
             positive(getattr(self, name), name)
 
-    @property
-    def velocity(self) -> float:
-        return self.length / self.time
-
-    @property
-    def force(self) -> float:
-        return self.energy / self.length
-
 
 #: ASE: Å, Å √(u/eV), eV. OpenMM: nm, ps, kJ/mol.
 ASE_UNITS = RunUnits(1.0, 0.010180505717, 96.4853321233, "Å, Å √(u/eV), eV")
@@ -184,7 +176,8 @@ class TrajectoryWriter:
         """
         if self._writer is None:
             raise InputError(f"{self.path} is closed", item="path")
-        units = {"positions": self.units.length, "velocities": self.units.velocity, "forces": self.units.force}
+        length, energy = self.units.length, self.units.energy
+        units = {"positions": length, "velocities": length / self.units.time, "forces": energy / length}
         given = {"positions": positions, "velocities": velocities, "forces": forces}
         arrays = {name: self._array(a, name, units[name]) for name, a in given.items() if a is not None}
         if self._decimals is not None:
@@ -192,7 +185,6 @@ class TrajectoryWriter:
         box = None
         if cell is not None:
             matrix = np.asarray(cell, dtype=np.float64) * self.units.length
-            matrix = np.diag(matrix) if matrix.shape == (3,) else matrix
             check_box(matrix)
             box = dimensions_of(matrix)
         time = finite_number(time, "time")
@@ -318,8 +310,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     whole_number(interval, "interval")
 
     def box() -> FloatArray | None:
-        cell: FloatArray = atoms.cell.array
-        return cell if atoms.pbc.any() and atoms.cell.rank == 3 else None
+        return atoms.cell.array if atoms.pbc.any() and atoms.cell.rank == 3 else None
 
     if (cell := box()) is not None:
         check_box(cell, atoms.pbc, stacklevel=3)  # before there is a file

@@ -258,6 +258,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
 class _Uncopied(Timestep):  # type: ignore[misc]
     """Has coordinates where the reader of DCD put them, all x before all y: to copy them takes longer than to read."""
 
+    cell = b""
+
     @property
     def positions(self) -> Any:
         return self.given
@@ -265,6 +267,17 @@ class _Uncopied(Timestep):  # type: ignore[misc]
     @positions.setter
     def positions(self, given: Any) -> None:
         self.given = given
+
+    def read(self, reader: Any) -> _Uncopied:
+        """Take the next frame. The reader turns the cell of each into lengths and angles; here only one that is new."""
+        frame, reader.ts = reader._file.read(), self
+        reader._frame = self.frame = reader._frame + 1
+        if frame.unitcell.tobytes() != self.cell:
+            reader._frame_to_ts(frame, self)
+            header, self.cell = reader._file.header, frame.unitcell.tobytes()
+            self.first = header["istart"] / header["nsavc"]
+        self.given, self.time = frame.xyz, (self.frame + self.first) * self.dt
+        return self
 
 
 def _in_place(reader: Any) -> bool:
@@ -309,7 +322,7 @@ class _Frames:
                         if not 0 <= previous == number - 1:
                             ts = trajectory[number]
                         else:
-                            ts = trajectory.next() if own is None else trajectory._read_next_timestep(own)
+                            ts = trajectory.next() if own is None else own.read(trajectory)
                         previous = number
                         v = ts.velocities if ts.has_velocities and self.velocities else None
                         self.rows.look(found, k, ts, self.precision[number], self.masses, v)

@@ -50,6 +50,7 @@ SECOND_ORDER = 1.1
 _ROOT_THREE = np.sqrt(3.0)
 #: Bits of the exponent of a single, which are the power of two below it; all of them are set where it is no number.
 _EXPONENT = np.int32(0x7F800000)
+_NO_SPEEDS = np.zeros((0, 4))
 
 #: Over all frames, by row: the largest excess over what was allowed (negative where there was none), the absolute
 #: deviation in that frame and its number; sums of deviations, of what rounding makes of them, and of frames that count.
@@ -165,7 +166,7 @@ class RowTable:
         self._offsets, self._targets = offsets.swapaxes(0, 1).astype(np.uint32, "C"), self._placed(targets)
         self._rows = np.flatnonzero(~self._lengths)
         self._given = np.zeros((3, self._n_places if len(self._rows) else 0))
-        self.others: ConstraintSet | None = None
+        self.others: Any = None
         if len(self._rows):
             self.others, self._atoms = held.subset(self._rows)
         self._is_held = np.zeros(held.n_atoms, dtype=bool)
@@ -246,10 +247,11 @@ class RowTable:
         frame = found.frames[k]
         frame["time"] = time = float(ts.time)
         lattice, limit = self._cell_of(ts)
-        frame["bare"] = limit == np.inf
-        planes = np.ascontiguousarray(ts.positions.T, dtype=np.float32)
-        speeds = np.zeros((0, 4)) if v is None else np.column_stack([v, np.zeros(len(v))])
+        if limit == np.inf:
+            frame["bare"] = True
+        planes, speeds = np.ascontiguousarray(ts.positions.T, dtype=np.float32), _NO_SPEEDS
         if v is not None:
+            speeds = np.column_stack([v, np.zeros(len(v))])
             if not np.isfinite(speeds).all():
                 atom = int(np.argmin(np.isfinite(speeds).all(axis=1)))
                 raise NonFiniteError(f"velocity of atom {atom} is {v[atom]}", item="velocity", atom=atom)
@@ -275,7 +277,6 @@ class RowTable:
         """Put deviation, rounding and rate of the rows that are no lengths where compiled code finds them."""
         others, rows, atoms = self.others, self._rows, self._atoms
         given = self._given[:, self._places[rows]]
-        assert others is not None
         others.lattice = lattice
         here = precision.stored(x[atoms])
         with np.errstate(all="ignore"):
@@ -310,23 +311,21 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
     cell = lattice_numbers(lattice)
     offsets, targets, slack, most, given, runs = held
     n_atoms, n_rows = len(is_held), len(targets)
-    powers = np.empty(n_atoms, dtype=np.float32)
-    exponents, least, worst = powers.view(np.int32), np.float32(reach).view(np.int32), np.int32(0)
+    # Coordinates as the file holds them, and the power of two below the largest.
+    quads, inverse = np.empty((n_atoms, 4)), 1.0 / step if step > 0.0 else 0.0
+    least, worst = np.float32(reach).view(np.int32), np.int32(0)
     for a in range(n_atoms):
         exponent = max(max(bits[0, a] & _EXPONENT, bits[1, a] & _EXPONENT), bits[2, a] & _EXPONENT)
         worst = max(worst, exponent)
-        exponents[a] = exponent if exponent >= least else 0
-    if worst == _EXPONENT:
-        for a in range(n_atoms):
-            if is_held[a] and exponents[a] == _EXPONENT:
-                return a
-    # Coordinates as the file holds them, and the power of two below the largest.
-    quads, inverse = np.empty((n_atoms, 4)), 1.0 / step if step > 0.0 else 0.0
-    for a in range(n_atoms):
         p, q, r = np.float64(x[0, a]), np.float64(x[1, a]), np.float64(x[2, a])
         if step > 0.0:
             p, q, r = np.rint(p * inverse) * step, np.rint(q * inverse) * step, np.rint(r * inverse) * step
-        quads[a, 0], quads[a, 1], quads[a, 2], quads[a, 3] = p, q, r, powers[a]
+        power = np.int32(exponent if exponent >= least else 0).view(np.float32)
+        quads[a, 0], quads[a, 1], quads[a, 2], quads[a, 3] = p, q, r, power
+    if worst == _EXPONENT:
+        for a in range(n_atoms):
+            if is_held[a] and not np.isfinite(quads[a, 0] + quads[a, 1] + quads[a, 2]):
+                return a
     lanes, zero, one = np.empty(8 * WIDTH), splat(0.0), splat(1.0)
     for run in range(len(runs)):
         begin, end, unit, lengths = runs[run]

@@ -63,9 +63,8 @@ def _units(result: CheckResult) -> Table:
     for unit in result.units:
         drift = ""
         if unit.drift is not None and unit.drift_error is not None:  # in parentheses where it may be none
-            drift = (
-                f"{1000 * unit.drift:.1e}" if abs(unit.drift) > 3 * unit.drift_error else f"({1000 * unit.drift:.1e})"
-            )
+            drift = f"{1000 * unit.drift:.1e}"
+            drift = drift if abs(unit.drift) > 3 * unit.drift_error else f"({drift})"
         cells = [unit.unit, str(unit.n_rows), f"{unit.largest:.2e}", f"{unit.rms:.2e}", f"{unit.rounding_rms:.2e}"]
         cells += [f"{unit.mean:.1e}", f"{unit.largest_mean:.1e}", drift]
         if rates:

@@ -38,7 +38,6 @@ from kcons.topology.topology import Topology
 #: Entries by the family of rows that they are for, and how many atoms these have.
 _KINDS = {"Distance": ("length", 2), "Angle": ("angle", 3)}
 _UNITS = {"angstrom": 1.0, "Å": 1.0, "A": 1.0, "nm": 10.0, "nanometer": 10.0}
-_KEYS = {"atoms", "elements", "residue", "value"}
 
 
 def label(topology: Topology, atoms: Sequence[int]) -> str:
@@ -109,7 +108,7 @@ def read_targets(path: str | Path) -> dict[str, list[Rule]]:
 
 
 def _rule(kind: str, width: int, where: str, entry: Any, scale: float) -> Rule:
-    if not isinstance(entry, dict) or not set(entry) <= _KEYS or "value" not in entry:
+    if not (isinstance(entry, dict) and "value" in entry and set(entry) <= {"atoms", "elements", "residue", "value"}):
         raise InputError(f"{where} needs value, and atoms or elements; residue is optional", item="targets")
     by = [key for key in ("atoms", "elements") if key in entry]
     if len(by) != 1:

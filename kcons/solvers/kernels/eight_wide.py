@@ -73,18 +73,15 @@ def _load_rows(builder: Any, points: Any, table: Any, start: Any) -> list[Any]:
     return [masked_point(builder, at) for at in _places(builder, points, table, start)]
 
 
-def _columns(builder: Any, rows: list[Any]) -> list[Any]:
-    """Vectors x, y, z of eight rows."""
-    pairs = [shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in range(0, 8, 2)]
-    low_xy = shuffle(builder, pairs[0], pairs[1], [0, 4, 8, 12, 1, 5, 9, 13])
-    high_xy = shuffle(builder, pairs[2], pairs[3], [0, 4, 8, 12, 1, 5, 9, 13])
-    low_z = shuffle(builder, pairs[0], pairs[1], [2, 6, 10, 14])
-    high_z = shuffle(builder, pairs[2], pairs[3], [2, 6, 10, 14])
-    return [
-        shuffle(builder, low_xy, high_xy, [0, 1, 2, 3, 8, 9, 10, 11]),
-        shuffle(builder, low_xy, high_xy, [4, 5, 6, 7, 12, 13, 14, 15]),
-        shuffle(builder, low_z, high_z, list(range(8))),
-    ]
+def _columns(builder: Any, rows: list[Any], last: tuple[int, ...] = (2,)) -> list[Any]:
+    """Vectors x, y and what is `last` of eight rows."""
+    pairs, columns = [shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in range(0, 8, 2)], []
+    for wanted in ((0, 1), last):
+        mask, size = [4 * k + c for c in wanted for k in range(4)], 4 * len(wanted)
+        low, high = (shuffle(builder, pairs[k], pairs[k + 1], mask) for k in (0, 2))
+        for c in range(0, size, 4):
+            columns.append(shuffle(builder, low, high, [*range(c, c + 4), *range(size + c, size + c + 4)]))
+    return columns
 
 
 def _rows(builder: Any, x: Any, y: Any, z: Any) -> list[Any]:
@@ -145,8 +142,7 @@ def gather_ends(builder, quads, table, start, other):
     )
     signs = ir.Constant(quad, [1.0, 1.0, 1.0, -1.0])
     rows = [builder.fsub(a, builder.fmul(b, signs), flags=FLAGS) for a, b in zip(left, right, strict=True)]
-    last = _EIGHT.of(builder, [builder.extract_element(row, INT32(3)) for row in rows])
-    return [*_columns(builder, rows), last]
+    return _columns(builder, rows, (2, 3))
 
 
 @instruction(types.void, None, None, types.int64, *(lanes_type,) * 3)
