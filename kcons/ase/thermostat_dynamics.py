@@ -44,7 +44,6 @@ from kcons.thermostats.cells import (
     instantaneous_pressure,
     refuse_virial,
 )
-from kcons.thermostats.freedom import Momentum
 from kcons.thermostats.monte_carlo import POTENTIAL
 
 _BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a reporter, which take energies alone"
@@ -91,23 +90,35 @@ class AtomsSystem(CellSystem):
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
-    """What the thermostats share: temperature and barostat; `make` gives a stepper that keeps a kT in eV."""
+    """What the thermostats share: temperature and barostat; `kind` makes a stepper that keeps a kT in eV.
+
+    It gets the keywords that it knows.
+
+    Attributes
+    ----------
+    seed : int
+        Of the noise, where there is any: what `rng` was, or what was drawn from it.
+    """
 
     def __init__(
         self,
         atoms: Atoms,
         timestep: float,
         temperature_K: float | None,
-        make: Callable[[Any], Stepper],
+        kind: Callable[..., Stepper],
         *,
         barostat: Barostat | None = None,
         **kwargs: Any,
     ) -> None:
-        self._make = make
+        known = signature(kind).parameters
+        options = {name: kwargs.pop(name) for name in known if name in kwargs}
+        if "rng" in known:
+            options["rng"] = self.seed = seed_from(options.get("rng"))
+        self._make = partial(kind, **options)
         if barostat is not None:
             require_barostat(barostat)
         self.barostat = barostat
-        stepper = make(None if temperature_K is None else _thermal(temperature_K))
+        stepper = self._make(None if temperature_K is None else _thermal(temperature_K))
         super().__init__(atoms, timestep, stepper, **kwargs)
 
     def set_temperature(self, temperature_K: float) -> None:
@@ -203,18 +214,8 @@ class IsokineticDynamics(ThermostattedDynamics):
         g is 1.
     """
 
-    def __init__(
-        self,
-        atoms: Atoms,
-        timestep: float,
-        temperature_K: float | None = None,
-        *,
-        order: Literal[2, 4, 6] = 2,
-        momentum: Momentum = "auto",
-        **kwargs: Any,
-    ) -> None:
-        make = partial(Isokinetic, order=order, momentum=momentum)
-        super().__init__(atoms, timestep, temperature_K, make, **kwargs)
+    def __init__(self, atoms: Atoms, timestep: float, temperature_K: float | None = None, **kwargs: Any) -> None:
+        super().__init__(atoms, timestep, temperature_K, Isokinetic, **kwargs)
 
     def set_temperature(self, temperature_K: float) -> None:
         super().set_temperature(temperature_K)
@@ -248,21 +249,8 @@ class ConstrainedLangevin(ThermostattedDynamics):
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
     """
 
-    def __init__(
-        self,
-        atoms: Atoms,
-        timestep: float,
-        temperature_K: float,
-        friction: float,
-        *,
-        rng: Rng = None,
-        substeps: int = 3,
-        **kwargs: Any,
-    ) -> None:
-        #: Seed of the noise.
-        self.seed = seed_from(rng)
-        make = partial(Langevin, friction=friction, rng=self.seed, substeps=substeps)
-        super().__init__(atoms, timestep, temperature_K, make, **kwargs)
+    def __init__(self, atoms: Atoms, timestep: float, temperature_K: float, friction: float, **kwargs: Any) -> None:
+        super().__init__(atoms, timestep, temperature_K, Langevin, friction=friction, **kwargs)
 
 
 class ConstrainedNoseHoover(ThermostattedDynamics):
@@ -285,18 +273,10 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
     """
 
     def __init__(
-        self,
-        atoms: Atoms,
-        timestep: float,
-        temperature_K: float,
-        tdamp: float,
-        *,
-        tchain: int = 3,
-        momentum: Momentum = "auto",
-        **kwargs: Any,
+        self, atoms: Atoms, timestep: float, temperature_K: float, tdamp: float, *, tchain: int = 3, **kwargs: Any
     ) -> None:
-        make = partial(NoseHooverChain, period=2 * math.pi * positive(tdamp, "tdamp"), length=tchain, momentum=momentum)
-        super().__init__(atoms, timestep, temperature_K, make, **kwargs)
+        period = 2 * math.pi * positive(tdamp, "tdamp")
+        super().__init__(atoms, timestep, temperature_K, NoseHooverChain, period=period, length=tchain, **kwargs)
 
 
 class ConstrainedMonteCarlo(ThermostattedDynamics):
@@ -325,24 +305,9 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
     """
 
     def __init__(
-        self,
-        atoms: Atoms,
-        timestep: float,
-        temperature_K: float,
-        steps: int | tuple[int, int],
-        *,
-        stepper: Stepper | None = None,
-        keep: float = 0.0,
-        rng: Rng = None,
-        tolerance: float = 1e-9,
-        **kwargs: Any,
+        self, atoms: Atoms, timestep: float, temperature_K: float, steps: int | tuple[int, int], **kwargs: Any
     ) -> None:
-        #: Seed of the random numbers.
-        self.seed = seed_from(rng)
-        make = partial(
-            HamiltonianMonteCarlo, steps=steps, rng=self.seed, stepper=stepper, keep=keep, tolerance=tolerance
-        )
-        super().__init__(atoms, timestep, temperature_K, make, **kwargs)
+        super().__init__(atoms, timestep, temperature_K, HamiltonianMonteCarlo, steps=steps, **kwargs)
 
     @property
     def state(self) -> State:
@@ -394,8 +359,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
     Raises
     ------
     InputError
-        One calculator given twice; options of the other bath. While it runs: calculators of other atoms, or the atoms
-        got another calculator.
+        One calculator given twice. While it runs: the atoms got another calculator.
     """
 
     @checked
@@ -410,22 +374,10 @@ class MultipleTimeSteps(ThermostattedDynamics):
         friction: float,
         fast_steps: int,
         bath: Literal["langevin", "spheres"] = "langevin",
-        rng: Rng = None,
         difference: bool = False,
         **kwargs: Any,
     ) -> None:
         require_atoms(atoms)
-        kinds: dict[str, Callable[..., Any]] = {"langevin": LangevinRespa, "spheres": IsokineticSpheres}
-        kind = kinds.pop(bath)
-        options = {name: kwargs.pop(name) for name in signature(kind).parameters if name in kwargs}
-        for name in set(signature(*kinds.values()).parameters) & set(kwargs):
-            raise InputError(f"{name} is no option with bath={bath!r}; leave it out", item=name)
-        #: Seed of the noise.
-        self.seed = seed_from(rng)
-        steps = {"slow": 1, "fast": fast_steps}
-        make = partial(kind, friction=friction, rng=self.seed, steps=steps, **options)
-        make(_thermal(temperature_K))  # what it refuses comes first
-        self._parts = fast_steps
         if fast is slow:
             raise InputError(
                 "fast and slow are the same calculator: its forces would count twice. Give two, or use "
@@ -436,16 +388,15 @@ class MultipleTimeSteps(ThermostattedDynamics):
             if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
                 raise InputError(f"{name} is {calculator!r:.80}; give an ASE calculator", item=name)
         self._calculators = fast, slow
-        cheap, expensive = self._forces_of(fast, True), self._forces_of(slow, difference)
-        if difference:
-            self.groups = ForceGroups.difference(cheap, expensive)
-        else:
-            self.groups = ForceGroups({"fast": cheap, "slow": expensive})
+        forces = {"fast": self._forces_of(fast, True), "slow": self._forces_of(slow, difference)}
+        self.groups = ForceGroups.difference(*forces.values()) if difference else ForceGroups(forces)
         self._force = self.groups  # type: ignore[method-assign, assignment]
+        kind = IsokineticSpheres if bath == "spheres" else LangevinRespa
+        kwargs |= {"friction": friction, "steps": {"slow": 1, "fast": fast_steps}}
         before = atoms.calc
         atoms.calc = self._whole = slow if difference else SumCalculator([fast, slow])
         try:
-            super().__init__(atoms, timestep, temperature_K, make, **kwargs)
+            super().__init__(atoms, timestep, temperature_K, kind, **kwargs)
         except BaseException:
             atoms.calc = before
             raise
