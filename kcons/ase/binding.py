@@ -34,9 +34,6 @@ from kcons.thermostats.cells import constraint_virial, rows_open
 #: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta: what the digits of
 #: most files leave. Farther off they are refused.
 START_TOLERANCE = 1e-6
-#: Digits after the point that coordinates in Angstrom may have in a file, where they are looked for: GROMACS and PDB
-#: files have 2 and 3; what more than 6 leave is within START_TOLERANCE.
-DIGITS = (2, 3, 4, 5, 6)
 #: Residual of asked positions, relative to the scale of the row, that no usable time step produces ...
 ABSURD = 0.3
 #: ... and how many steps in a row it takes to say so.
@@ -105,10 +102,7 @@ class Binding:
             self.cell = content
 
     def kernel_array(self, values: NDArray[Any], what: str) -> FloatArray:
-        """The array itself where kernels can write to it, else a copy; refused where the engine would not see it.
-
-        That are integers, and numbers of atoms that no row holds and that are not finite.
-        """
+        """The array itself where kernels can write to it, else a copy; integers and what is not finite are refused."""
         array = values
         if values.dtype is not _FLOAT or not values.flags.c_contiguous:
             # The answer is written into `values`, which would cut it; that for momenta and forces of 0 is 0.
@@ -259,19 +253,12 @@ def with_added(atoms: Atoms, given: Any) -> FloatArray:
 class AcceptedPositions:
     """The positions that the constraints last accepted: what differs from them was moved past the constraints.
 
-    Also what was last asked for, before it was corrected: an MD engine that goes on from its own copy of the positions
-    asks for uncorrected ones again.
-
-    Attributes
-    ----------
-    asked : ndarray, shape (n_atoms, 3)
-        Positions as they were asked for last.
-    between_steps : bool
-        Whether forces were asked for last: all dynamics and optimizers of ASE end their steps so. Who moves atoms then
-        is a person, and otherwise most often the dynamics class.
+    Also those that were asked for: an MD engine that goes on from its own copy asks for uncorrected ones again.
     """
 
     def __init__(self, n_atoms: int) -> None:
+        #: Whether forces were asked for last: all dynamics and optimizers of ASE end their steps so. Who moves atoms
+        #: then is a person, and otherwise most often the dynamics class.
         self.between_steps = True
         self._cell: bytes | None = None  # of the accepted positions
         #: Positions as they were accepted, as they were accepted before, and as they were asked for.
@@ -305,7 +292,7 @@ class AcceptedPositions:
         good = not (changed or elsewhere or differ(self._positions, x))
         if not good:
             scaled = changed and self._scaled(motion, x, cell)
-            good = _worst_row(motion.constraint_set, x)[0] < 0
+            good = fulfilled(motion.constraint_set, x)
             if good:
                 self.know(x, cell)
             elif not scaled:
@@ -454,15 +441,8 @@ def refuse_taken_along(
 
 
 def fulfilled(held: ConstraintSet, x: FloatArray) -> bool:
-    """Whether positions fulfill the rows: to rounding, or to the digits that they come with."""
-    if _worst_row(held, x)[0] < 0:
-        return True
-    for digits in DIGITS:
-        written = x[held.touched] * 10.0**digits
-        if np.abs(written - np.round(written)).max(initial=0.0) <= 1e-3:  # also those that were float32 in between
-            reach = np.asarray(abs(held.jacobian(x)).sum(axis=1)).ravel()
-            return bool(np.all(np.abs(held.value(x)) <= 0.5 * 10.0**-digits * reach + START_TOLERANCE * held.scale))
-    return False
+    """Whether positions fulfill the rows, up to START_TOLERANCE."""
+    return _worst_row(held, x)[0] < 0
 
 
 def differ(a: FloatArray, b: FloatArray) -> bool:

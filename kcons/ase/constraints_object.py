@@ -71,8 +71,7 @@ class Constraints(FixConstraint):
     Raises
     ------
     UnsupportedError
-        At the first use: a target that moves with time, or a velocity constraint. ASE tells constraints
-        neither the time nor the time step; `ConstrainedDynamics` takes these.
+        At the first use: a target that moves with time, or a velocity constraint; `ConstrainedDynamics` takes these.
 
     Notes
     -----
@@ -152,8 +151,7 @@ class Constraints(FixConstraint):
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
         """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails.
 
-        A frame that fulfills the constraints already, and to which these gradients need not lead, is taken as it is,
-        but for what the digits of its file leave.
+        A frame that fulfills the constraints already, and to which these gradients need not lead, is taken as it is.
 
         Raises
         ------
@@ -396,13 +394,7 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
 
     @property
     def index(self) -> IntArray:  # type: ignore[override]
-        """The fixed atoms, in ascending order.
-
-        Warns
-        -----
-        UserWarning
-            Other rows are held, too, of which a program that asks for fixed atoms alone knows nothing.
-        """
+        """The fixed atoms, in ascending order; with a warning where other rows are held, of which they tell nothing."""
         others = sum(item.n_rows for item in self.constraints if not item.fixes_atoms)
         if others:
             warnings.warn(
@@ -554,8 +546,7 @@ def to_ase_constraints(atoms: Atoms) -> list[FixConstraint]:
 def attach(atoms: Atoms) -> Constraints:
     """Put one object of kcons in the place of all constraint objects on `atoms`, which holds what they hold.
 
-    For atoms that were read from a file: where one object of ASE holds what a `Constraints` held, the file names that
-    object, and ASE makes it. kcons' own dynamics classes take either.
+    For atoms that were read from a file, which has an object of ASE where one holds the same.
 
     Parameters
     ----------
@@ -572,10 +563,6 @@ def attach(atoms: Atoms) -> Constraints:
     ------
     UnsupportedError
         An object that has no counterpart in kcons, named; nothing is changed.
-
-    See Also
-    --------
-    constrain : new constraints, with a look at the positions.
     """
     require_atoms(atoms)
     others = [item for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
@@ -589,14 +576,11 @@ class ConstrainedCalculator(Calculator):
     """Energies and forces of another calculator on the constraints.
 
     On the constraints, forces are f + z with b = 0 (no momenta enter: ASE caches by positions) and everything else
-    is the inner calculator's. Positions off the constraints are first brought onto them along the rows'
-    gradients there (in the mass metric), and energy and forces are those at that point: so the energy is a
-    function of the constrained motions alone, and finite differences of the forces (`Vibrations`, `Phonons`)
-    give the Hessian of the energy *on* the constraints, curvature of the constraints included, with
-    zeros along the held directions.
+    is the inner calculator's. Positions off the constraints are first brought onto them along the rows' gradients
+    there, in the mass metric. So the energy is a function of the constrained motions alone, and finite differences of
+    forces (`Vibrations`, `Phonons`) give its Hessian *on* the constraints, with zeros along held directions.
 
-    For optimizers, saddle searches and phonons. For dynamics attach the constraints to the atoms, or use
-    `ConstrainedDynamics`.
+    For optimizers, saddle searches and phonons; for dynamics take `constrain` or `ConstrainedDynamics`.
 
     Parameters
     ----------
@@ -668,10 +652,8 @@ class ConstrainedCalculator(Calculator):
             motion.project_positions(x, x.copy(), out=x)
         wanted = {*properties, "forces"} if "stress" in properties else {*properties}
         found = {name: self.inner.get_property(name, work) for name in sorted(wanted)}
-        known = getattr(self.inner, "results", {})
-        for name in ("energy", "free_energy", "forces"):
-            if name not in found and name in known and not self.inner.calculation_required(work, [name]):
-                found[name] = known[name]
+        known = getattr(self.inner, "results", {})  # of the same place, as what was asked for
+        found = {name: known[name] for name in ("energy", "free_energy", "forces") if name in known} | found
         missing = [name for name, value in found.items() if value is None]
         if missing:
             raise PropertyNotImplementedError(f"{type(self.inner).__name__} has no {', '.join(missing)}")

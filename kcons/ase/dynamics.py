@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -14,7 +12,6 @@ import numpy as np
 from ase import Atoms, units
 from ase.md.logger import MDLogger
 from ase.md.md import MolecularDynamics
-from ase.stress import full_3x3_to_voigt_6_stress
 
 from kcons.ase.binding import (
     FORCES_ONLY,
@@ -29,24 +26,20 @@ from kcons.ase.binding import (
     unchanged_on_failure,
 )
 from kcons.ase.constraints_object import Constraints, listed
-from kcons.ase.topology import kinetic_energy_of, require_atoms, velocities_of
+from kcons.ase.topology import require_atoms, velocities_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import finite_array, finite_number, refuse_other
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint_set import rows_like
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError
+from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed, require_stepper
-from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, NoseHooverChain
+from kcons.thermostats import Isokinetic
 from kcons.thermostats.barostats import Barostat, ConstantPressure, in_cell
-from kcons.thermostats.monte_carlo import POTENTIAL
-
-#: Steps longer than this are asked about: 20 fs, above which no motion of molecules at room temperature is followed.
-LONGEST = 20.0 * units.fs * (1 + 1e-12)
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 FAR = 128.0
@@ -102,8 +95,6 @@ class ConstrainedDynamics(MolecularDynamics):
 
     #: Besides that of the atoms.
     _calculators: tuple[Any, ...] = ()
-    #: Equal parts of a step in which the atoms move.
-    _parts = 1
     #: What changes the cell, beside a stepper that keeps a temperature.
     barostat: Barostat | None = None
 
@@ -120,7 +111,6 @@ class ConstrainedDynamics(MolecularDynamics):
         **kwargs: Any,
     ) -> None:
         require_atoms(atoms)
-        self._check_timestep(timestep)
         self._check_every, self._spare = checked_every(check_every)
         self.time = finite_number(time, "time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
@@ -133,7 +123,8 @@ class ConstrainedDynamics(MolecularDynamics):
         self._cell: tuple[bytes, ...] = ()
         self._asked: tuple[Any, ...] = ()  # calculators, and where each keeps what it found
         self._momenta = self._masses = np.zeros((0, 3))  # momenta as written last; masses, 0 for fixed atoms
-        self.atoms, self.dt, self.nsteps = atoms, timestep, 0
+        self.atoms, self.nsteps = atoms, 0
+        self.set_timestep(timestep)
         with unchanged_on_failure(atoms):
             if not atoms.has("momenta"):
                 atoms.set_momenta(np.zeros((len(atoms), 3)), apply_constraint=False)
@@ -145,7 +136,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self._begin()
             # Files last: to open one for writing ends what an older run left there.
             steps, logfile = self.nsteps, kwargs.pop("logfile", None)
-            super().__init__(atoms, timestep, **kwargs)
+            super().__init__(atoms, self.dt, **kwargs)
             self.nsteps = steps
             if logfile:
                 log = self.closelater(ConstraintLogger(self, atoms, logfile, comm=self.comm))
@@ -158,19 +149,7 @@ class ConstrainedDynamics(MolecularDynamics):
 
     def set_timestep(self, timestep: float) -> None:
         """Use another time step from now on."""
-        self._check_timestep(timestep)
-        self.dt = timestep
-
-    def _check_timestep(self, timestep: float) -> None:
-        """Refuse what is no time; ask where the steps that move the atoms are as long as from a slip of units."""
-        shortest = abs(finite_number(timestep, "timestep")) / self._parts
-        if shortest > LONGEST:
-            warnings.warn(
-                f"the atoms move in steps of {shortest / units.fs:.4g} fs. Is that meant? ASE's unit of time is "
-                f"{1 / units.fs:.4g} fs: give 2 fs as 2 * ase.units.fs",
-                UserWarning,
-                stacklevel=3,
-            )
+        self.dt = finite_number(timestep, "timestep")
 
     def get_time(self) -> float:
         """The time reached, in ASE's unit; right also if the time step was changed."""
@@ -199,7 +178,7 @@ class ConstrainedDynamics(MolecularDynamics):
         step, energy = getattr(self.stepper, "exchanged", None) or (-1, 0.0)
         if step == self.nsteps and np.array_equal(self.atoms.arrays["momenta"], self._momenta):
             return float(energy)
-        return kinetic_energy_of(self.atoms)
+        return float(self.atoms.get_kinetic_energy())
 
     def get_temperature(self) -> float:
         """Kinetic temperature in K by `degrees_of_freedom`, which counts all rows; 0 if there are none."""
@@ -239,14 +218,11 @@ class ConstrainedDynamics(MolecularDynamics):
                 after = self._mover.step(system, state, self.dt)
                 if self._check_every and self.dt and getattr(self.stepper, "holds", True):
                     system.schedule.made(1, self._check_every, after, self.dt, spare=self._spare)
-        except BaseException as error:
+        except BaseException:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
             self.atoms.cell[...] = np.frombuffer(self._cell[0]).reshape(3, 3)  # which barostats change
             self._bound.cell = b""  # type: ignore[union-attr]  # the engine takes it again
-            if not isinstance(error, KconsError) and self.atoms.get_number_of_degrees_of_freedom():
-                # A calculator can do nothing with what too long steps have made.
-                error.add_note(f"the kinetic temperature was {self.atoms.get_temperature():.0f} K there")
             raise
         v = self._put(after.positions, after.velocities)
         self.time = after.time
@@ -258,15 +234,11 @@ class ConstrainedDynamics(MolecularDynamics):
             self._cell = surroundings(self.atoms)
 
     def _refresh_properties(self) -> None:
+        """Have forces for someone who looks."""
         if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
             with in_step(self.nsteps):
-                self._ask_calculators()
+                self.atoms.get_forces(apply_constraint=False)  # with which some steppers do not end
             self._asked = self._calculators_now()
-
-    def _ask_calculators(self) -> None:
-        """Have forces at the last positions, with which some steppers do not end, for someone who looks."""
-        state = self._start(self._systems())
-        self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
 
     def _start(self, system: System) -> State:
         """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""
@@ -277,7 +249,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if last is not None and not all(map(is_, asked, self._asked)):
             # Another calculator, or one that was reset or asked elsewhere since: it is asked again.
             last = replace(last, forces=None)
-            if asked[0] is not self._asked[0] or isinstance(self.stepper, HamiltonianMonteCarlo):
+            if asked[0] is not self._asked[0]:
                 last = replace(last, thermostat=self._thermostat_after_change(last))
             self._state, self._asked = last, asked
         cell = surroundings(atoms)
@@ -331,12 +303,8 @@ class ConstrainedDynamics(MolecularDynamics):
         """What a thermostat goes on with where somebody moved the atoms: the isokinetic one begins anew."""
         if last is None or last.thermostat is None or isinstance(self.stepper, Isokinetic):
             return None
-        if not isinstance(self.stepper, NoseHooverChain | HamiltonianMonteCarlo):
-            return last.thermostat
-        held = last.thermostat.copy()  # at which the chain sees that momenta may be new
-        if isinstance(self.stepper, HamiltonianMonteCarlo):
-            held[POTENTIAL] = math.nan  # to be asked for again
-        return held
+        # A copy shows a chain that momenta may be new, and Monte Carlo that the energy may be.
+        return last.thermostat.copy()
 
     def _calculators_now(self) -> tuple[Any, ...]:
         """The calculators, and where each keeps what it found last: another object after other questions."""
@@ -499,24 +467,21 @@ class ConstraintLogger(MDLogger):
         """Write a line."""
         atoms: Atoms = self.atoms
         dyn: Any = self.dyn
+        ours = hasattr(dyn, "degrees_of_freedom")
+        seen, time = dyn if ours else atoms, 0.0 if dyn is None else dyn.get_time()
         count = len(atoms) if self.peratom else 1
-        whole = dyn.get_kinetic_energy() if hasattr(dyn, "motion") else kinetic_energy_of(atoms)
-        potential, kinetic = atoms.get_potential_energy() / count, whole / count
-        row = [] if dyn is None else [dyn.get_time() / (1000 * units.fs)]
-        row += [potential + kinetic, potential, kinetic]
-        if hasattr(dyn, "degrees_of_freedom"):
-            row.append(dyn.get_temperature())
-        else:
-            freedom = atoms.get_number_of_degrees_of_freedom()
-            row.append(2 * whole / (freedom * units.kB) if freedom else 0.0)
+        potential, kinetic = atoms.get_potential_energy() / count, seen.get_kinetic_energy() / count
+        row = [] if dyn is None else [time / (1000 * units.fs)]
+        row += [potential + kinetic, potential, kinetic, seen.get_temperature()]
         if self.stress:
-            gas = atoms.get_momenta().T @ velocities_of(atoms) / atoms.get_volume()
-            row += ((_stress(dyn, atoms) - full_3x3_to_voigt_6_stress(gas)) / units.GPa).tolist()
+            stress = atoms.get_stress(apply_constraint=not ours, include_ideal_gas=True)
+            if ours:  # that of all rows that the dynamics holds
+                stress = stress + stress_of_rows(dyn.motion, atoms, applied_forces(atoms), time)
+            row += (stress / units.GPa).tolist()
         if self.coordinates:
             motion = _motion(dyn, atoms)
-            x, v = atoms.positions, velocities_of(atoms)
-            time = 0.0 if dyn is None else dyn.get_time()
-            row += motion.multipliers(x, v, applied_forces(atoms), time)[self._rows(motion)].tolist()
+            multipliers = motion.multipliers(atoms.positions, velocities_of(atoms), applied_forces(atoms), time)
+            row += multipliers[self._rows(motion)].tolist()
         self.logfile.write(self.fmt % tuple(row))
         self.logfile.flush()
 
@@ -527,14 +492,6 @@ class ConstraintLogger(MDLogger):
             rows = [row for name, item in self.coordinates.items() for row in rows_like(held, item, name)]
             self._known = motion, rows
         return self._known[1]
-
-
-def _stress(dyn: Any, atoms: Atoms) -> FloatArray:
-    """Without that of momenta; the constraints' part is of all rows that a dynamics class of kcons holds."""
-    if not hasattr(dyn, "motion"):
-        return np.asarray(atoms.get_stress())
-    rows = stress_of_rows(dyn.motion, atoms, applied_forces(atoms), dyn.get_time())
-    return np.asarray(atoms.get_stress(apply_constraint=False)) + rows
 
 
 def _motion(dyn: Any, atoms: Atoms) -> Motion:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kcons.ase.binding import with_added
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
-from kcons.ase.topology import kinetic_energy_of, require_atoms
+from kcons.ase.topology import require_atoms
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import Rng, as_float_array, checked, generator_of, positive, refuse_other, seed_from
 from kcons.constraints.target import FloatArray
@@ -44,7 +44,6 @@ from kcons.thermostats.cells import (
     instantaneous_pressure,
     refuse_virial,
 )
-from kcons.thermostats.monte_carlo import POTENTIAL
 
 _BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a reporter, which take energies alone"
 
@@ -90,14 +89,9 @@ class AtomsSystem(CellSystem):
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
-    """What the thermostats share: temperature and barostat; `kind` makes a stepper that keeps a kT in eV.
+    """What the thermostats share: temperature, barostat, and a stepper that `kind` makes for a kT in eV.
 
-    It gets the keywords that it knows.
-
-    Attributes
-    ----------
-    seed : int
-        Of the noise, where there is any: what `rng` was, or what was drawn from it.
+    It gets the keywords that it knows; what became of `rng` is in `seed`.
     """
 
     def __init__(
@@ -310,17 +304,6 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         super().__init__(atoms, timestep, temperature_K, HamiltonianMonteCarlo, steps=steps, **kwargs)
 
     @property
-    def state(self) -> State:
-        """As that of the other dynamics; it knows its potential energy, for which a calculator may be asked again."""
-        state = super().state
-        held = state.thermostat
-        if held is None or not math.isnan(held[POTENTIAL]):
-            return state
-        known = held.copy()
-        known[POTENTIAL] = self._systems().potential_energy(state.positions, state.time)
-        return replace(state, thermostat=known).read_only()
-
-    @property
     def counts(self) -> Counts:
         """What became of the proposals."""
         return Counts.of(self._start(self._systems()))
@@ -405,10 +388,11 @@ class MultipleTimeSteps(ThermostattedDynamics):
         """Forces of one calculator, with those of ASE objects that only add forces where asked for."""
 
         def force(x: FloatArray, time: float) -> FloatArray:
-            atoms = self.atoms
-            atoms.arrays["positions"][...] = x
-            found = calculator.get_forces(atoms)
-            return with_added(atoms, found) if others else np.array(as_float_array(found, "forces of the calculator"))
+            self.atoms.arrays["positions"][...] = x
+            found = calculator.get_forces(self.atoms)
+            return (
+                with_added(self.atoms, found) if others else np.array(as_float_array(found, "forces of the calculator"))
+            )
 
         return force
 
@@ -440,12 +424,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         if not isinstance(stepper, IsokineticSpheres):
             return super().get_temperature()
         expected = stepper.kinetic_energy(self._systems(), self.atoms.positions)
-        return float(kinetic_energy_of(self.atoms) / expected * stepper.thermal_energy / units.kB)
-
-    def _ask_calculators(self) -> None:
-        """A step ends with both forces where the atoms are, which are added up for someone who looks."""
-        self.atoms.get_potential_energy(apply_constraint=False)
-        self.atoms.get_forces(apply_constraint=False)
+        return float(self.atoms.get_kinetic_energy() / expected * stepper.thermal_energy / units.kB)
 
 
 def draw_velocities(

@@ -14,15 +14,12 @@ from numpy.typing import NDArray
 from kcons.constraints import Distance
 from kcons.constraints.arguments import check_pairs, positive
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology.rigid_groups import water_rows
 from kcons.topology.rows_by_name import HeldRows, Holding, Options, rows_of, with_options
 from kcons.topology.topology import (
     Snapshot,
     Topology,
-    close_pairs,
     elements_of,
     guess_bonds,
     require_kind,
@@ -36,8 +33,6 @@ from kcons.topology.topology import (
 BONDS = "bonds"
 #: ASE's unit of time in ps, to the power that velocities need.
 PS = 1000 * units.fs
-#: O-H lengths that water has, in Angstrom.
-_SHORTEST, _REACH = 0.5, 1.3
 _ITEM = f"atoms.info[{BONDS!r}]"
 _REMEDY = f"put pairs of atoms into {_ITEM}"
 
@@ -61,10 +56,9 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
 
 
 def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None) -> Distance:
-    """Hold all water molecules rigid: three distances each.
+    """Hold all water molecules rigid, and nothing else: three distances each.
 
-    A water is an oxygen with two hydrogens within 1.3 Angstrom of it (minimum image), which are near no other oxygen,
-    and without a third; wherever they are in the list of atoms.
+    They are found as by `constraints_of`: by the names of residues, without these by their bonds, which are guessed.
 
     Parameters
     ----------
@@ -76,36 +70,11 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None)
     Raises
     ------
     InputError
-        No water, or one whose hydrogens are nearer than any are (positions in nm).
+        No water, or one that is odd.
     """
-    require_atoms(atoms)
-    shape = None if geometry is None else Holding("none", water_geometry=geometry).geometry()[0]
-    part = np.flatnonzero(np.isin(atoms.numbers, (1, 8)) & np.isfinite(atoms.positions).all(axis=1))
-    lattice = lattice_of(atoms.cell.array if atoms.pbc.any() else None, atoms.pbc)
-    pairs, apart = close_pairs(atoms.positions[part], lattice, _REACH)
-    oxygen = atoms.numbers[part] == 8
-    mixed = oxygen[pairs].sum(axis=1) == 1
-    pairs, apart = pairs[mixed], apart[mixed]
-    pairs = np.where(oxygen[pairs[:, :1]], pairs, pairs[:, ::-1])  # oxygen, hydrogen
-    count = np.bincount(pairs.ravel(), minlength=len(part))
-    pairs = pairs[(count[pairs] == (2, 1)).all(axis=1)]
-    pairs = pairs[np.lexsort(pairs.T[::-1])]
-    whole = np.bincount(pairs[:, 0], minlength=len(part))[pairs[:, 0]] == 2
-    triples = part[np.concatenate([pairs[whole][::2], pairs[whole][1::2, 1:]], axis=1)]
-    if len(triples) == 0:
-        raise InputError(
-            f"no water found: an oxygen with two hydrogens within {_REACH} Angstrom that are near no other oxygen; "
-            "hold other molecules with Distance",
-            item="atoms",
-        )
-    if apart.min() < _SHORTEST:
-        raise InputError(
-            f"a hydrogen is {apart.min():.3g} Angstrom away from the oxygen of its water; positions of Atoms are in "
-            "Angstrom: multiply by 10 where these are in nm",
-            item="atoms",
-            atoms=triples[:, 0],
-        )
-    return water_rows(triples, shape)
+    (rows,) = constraints_of(atoms, "none", water_geometry=geometry, guess_bonds=True)
+    assert isinstance(rows, Distance)
+    return rows
 
 
 def require_atoms(atoms: object) -> None:
@@ -119,11 +88,6 @@ def velocities_of(atoms: Atoms) -> FloatArray:
     return np.divide(momenta, masses, out=np.zeros_like(momenta), where=(masses != 0.0) | (momenta != 0.0))
 
 
-def kinetic_energy_of(atoms: Atoms) -> float:
-    """As ``atoms.get_kinetic_energy()``, but with `velocities_of`."""
-    return 0.5 * float(np.vdot(atoms.get_momenta(), velocities_of(atoms)))
-
-
 def snapshot_of(atoms: Atoms) -> Snapshot:
     """Topology and positions of `atoms`.
 
@@ -135,18 +99,14 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     arrays = atoms.arrays
     symbols = np.array(chemical_symbols)[atoms.numbers]
     elements = np.where(atoms.numbers == 0, "", symbols)
-    names = np.asarray(arrays["atomtypes"]).astype(str) if "atomtypes" in arrays else symbols
-    names = np.char.strip(names)
+    names = np.char.strip(np.asarray(arrays.get("atomtypes", symbols)).astype(str))
+    called, chains = (np.asarray(arrays.get(each, [""] * n)).astype(str) for each in ("residuenames", "chainids"))
+    called, numbers = np.char.strip(called), np.asarray(arrays.get("residuenumbers", np.ones(n, np.int64)))
     known = "residuenames" in arrays
+    residues, first = np.zeros(n, np.int64), np.arange(min(n, 1))
     if known:
-        called = np.char.strip(np.asarray(arrays["residuenames"]).astype(str))
-        numbers = np.asarray(arrays["residuenumbers"]) if "residuenumbers" in arrays else np.zeros(n, np.int64)
-        chains = np.asarray(arrays["chainids"]).astype(str) if "chainids" in arrays else np.full(n, "")
         residues, first = split_residues(names, called, numbers, chains)
-        residue_names, ids, chains = called[first], numbers[first].astype(str), chains[first]
-    else:
-        residues = np.zeros(n, np.int64)
-        residue_names, ids, chains = np.array([""] * min(n, 1)), np.array(["1"] * min(n, 1)), np.array([""] * min(n, 1))
+    residue_names, ids, chains = called[first], numbers[first].astype(str), chains[first]
     if known and "atomtypes" in arrays:
         elements = _repaired(elements, names, residues, residue_names)
     masses = atoms.get_masses()

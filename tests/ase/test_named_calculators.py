@@ -51,18 +51,6 @@ def test_what_tells_calculators_from_each_other():
     assert described(same, Atoms()) == described(other, Atoms())
 
 
-def test_weights_in_a_file_belong_to_a_calculator(tmp_path):
-    calculator, model, log = LennardJones(), tmp_path / "net.model", tmp_path / "out.txt"
-    model.write_bytes(b"weights")
-    log.write_text("one")
-    calculator.parameters.update(model=str(model), log=str(log))
-    before = described(calculator, Atoms())
-    log.write_text("another")
-    assert described(calculator, Atoms()) == before
-    model.write_bytes(b"others!")
-    assert described(calculator, Atoms()) != before
-
-
 # -- what names a calculator may be somebody else ---------------------------------------------------
 
 MODULE = """

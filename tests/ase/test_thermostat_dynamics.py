@@ -340,11 +340,3 @@ def test_drawn_velocities():
     with pytest.raises(InputError, match="atoms are off row"):
         draw_velocities(atoms, 300)
     assert np.array_equal(atoms.get_momenta(), before[1])
-
-
-def test_a_state_of_monte_carlo_knows_its_energy_where_calculators_give_new_results():
-    dyn = made("monte carlo", waters())
-    dyn.run(3)
-    for shift in (0.0, 0.3):
-        dyn.atoms.positions += shift
-        assert dyn.state.thermostat[0] == pytest.approx(dyn.atoms.get_potential_energy(), abs=1e-12)

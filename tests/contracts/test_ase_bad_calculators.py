@@ -92,17 +92,6 @@ def test_dynamics(name, case, tmp_path):
     assert equal(state(atoms), state(good))
 
 
-def test_bad_forces_for_an_observer():
-    # This one does not end with the forces at the last positions, which are computed for observers only.
-    atoms, _ = water(Field(how=no_numbers))
-    dyn = ConstrainedDynamics(atoms, FS, stepper := BlanesMoan6a())
-    dyn.attach(atoms.get_potential_energy, interval=2)
-    dyn.run(1)
-    atoms.calc.bad = atoms.calc.calls + stepper.force_evaluations
-    with pytest.raises(NonFiniteError, match="at step 2"):
-        dyn.run(1)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("atom", [0, 8])
 def test_atoms_that_are_not_held_count_too(atom, bad):

@@ -16,11 +16,11 @@ MUTANTS = {
         ),
         '("numbers",« "initial_charges", "initial_magmoms"→»)': "binding::forces_of_the_same_calculator_that_changed",
         "if «gone > 0→False» and self._more": "binding::what_was_given_by_numbers_of_atoms_is_no_longer_of_these",
-        "row += motion.multipliers(x, v, «applied_forces(atoms)→0 * x», time)": "dynamics::multipliers_by_name",
+        "velocities_of(atoms), «applied_forces(atoms)→0 * atoms.positions», time)": "dynamics::multipliers_by_name",
     },
     "ase/thermostat_dynamics.py": {
-        "known[POTENTIAL] = «self._systems().potential_energy(state.positions, state.time)→math.nan»": (
-            "thermostat_dynamics::a_state_of_monte_carlo_knows_its_energy_where_calculators_give_new_results"
+        'options["rng"] = self.seed = seed_from(«options.get("rng")→None»)': (
+            "thermostat_dynamics::several_time_steps_are_those_of_the_core"
         ),
     },
     "thermostats/langevin.py": {

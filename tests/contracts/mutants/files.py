@@ -111,7 +111,7 @@ MUTANTS = {
         "FLAT = 0.0«1→»": "row_functions::a_dihedral_that_turns_over_has_no_solution_far_away",
     },
     "ase/topology.py": {
-        "where=«(masses != 0.0) | (momenta != 0.0)→masses != -1.0»": "dynamics::a_fixed_atom_needs_no_mass",
+        "where=«(masses != 0.0) | (momenta != 0.0)→masses != -1.0»": "ase/topology::velocities_of_atoms_without_mass",
     },
     "openmm/collective/collective_rows.py": {
         "self._clock(holder) «=→>»= 0.0": "row_program::a_state_of_another_program_has_no_time_of_targets",
