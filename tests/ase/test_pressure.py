@@ -21,8 +21,6 @@ from kcons.ase import (
     ConstrainedCalculator,
     ConstrainedDynamics,
     ConstrainedLangevin,
-    ConstrainedNoseHoover,
-    IsokineticDynamics,
     PressureReporter,
     constrain,
 )
@@ -34,11 +32,10 @@ KT = units.kB * TEMPERATURE
 N, SIDE = 60, 40.0
 CUBE = np.diag([SIDE] * 3).tolist()
 PRESSURE = (N + 1) * KT / SIDE**3
-MADE = {
-    "langevin": lambda a, **k: ConstrainedLangevin(a, 2 * FS, TEMPERATURE, 0.1 / FS, rng=1, **k),
-    "nose-hoover": lambda a, **k: ConstrainedNoseHoover(a, 2 * FS, TEMPERATURE, 50 * FS, momentum="free", **k),
-    "isokinetic": lambda a, **k: IsokineticDynamics(a, 2 * FS, TEMPERATURE, momentum="free", **k),
-}
+
+
+def langevin(atoms, **options):
+    return ConstrainedLangevin(atoms, 2 * FS, TEMPERATURE, 0.1 / FS, rng=1, **options)
 
 
 def barostats(**kwargs):
@@ -56,14 +53,14 @@ def test_a_run_goes_on_without_its_barostat_in_its_cell():
     """Also where it is refused, the cell of the atoms is their own."""
     atoms, _ = gas()
     other = atoms.copy()
-    whole = MADE["langevin"](atoms, barostat=barostats(every=1)["monte carlo"])
+    whole = langevin(atoms, barostat=barostats(every=1)["monte carlo"])
     whole.run(5)
     other.calc = Free()
-    MADE["langevin"](other, state=whole.state).run(3)
+    langevin(other, state=whole.state).run(3)
     assert other.cell.array.tolist() == atoms.cell.array.tolist() != CUBE
     third, _ = gas()
     with pytest.raises(InputError, match="another barostat"):
-        MADE["langevin"](third, barostat=barostats(kind="lateral")["monte carlo"], state=whole.state)
+        langevin(third, barostat=barostats(kind="lateral")["monte carlo"], state=whole.state)
     assert third.cell.array.tolist() == CUBE
     with pytest.raises(InputError, match="off row"):
         ConstrainedDynamics(third, FS, state=replace(whole.state, positions=1.1 * atoms.positions))
@@ -107,7 +104,7 @@ def test_trials_are_judged_by_the_energy_that_forces_belong_to():
     """They went by the energy that is extrapolated to cold electrons."""
     atoms, _ = gas()
     atoms.calc = WarmElectrons()
-    dyn = MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0, every=1, width=0.01, rng=1))
+    dyn = langevin(atoms, barostat=MonteCarloBarostat(0.0, every=1, width=0.01, rng=1))
     volumes = follow(dyn, atoms.get_volume, 100)
     assert 0 < np.abs(volumes / SIDE**3 - 1).max() < 0.06
 
@@ -141,7 +138,7 @@ def test_a_trial_that_fails_leaves_the_atoms(which, case, error, match):
         constrain(atoms, Distance(np.arange(2 * N).reshape(-1, 2)))
     atoms.calc = {"energy": Torn, "stress": lambda: Field(0.0)}.get(case, Free)()
     barostat = barostats(**({"cutoff": SIDE / 2 - 0.5} if case == "cutoff" else {}))[which]
-    dyn, seen = MADE["langevin"](atoms, barostat=barostat), []
+    dyn, seen = langevin(atoms, barostat=barostat), []
 
     def remember():
         seen[:] = [atoms.cell.array.copy(), atoms.positions.copy(), atoms.get_momenta()]
@@ -157,7 +154,7 @@ def test_a_trial_that_fails_leaves_the_atoms(which, case, error, match):
 def test_a_step_that_fails_after_a_trial_leaves_the_cell(monkeypatch):
     """Also where the trial itself was accepted."""
     atoms, _ = gas()
-    dynamics = MADE["langevin"](atoms, barostat=MonteCarloBarostat(PRESSURE, every=1, width=0.2), check_every=1)
+    dynamics = langevin(atoms, barostat=MonteCarloBarostat(PRESSURE, every=1, width=0.2), check_every=1)
     cell, x = atoms.cell.array.copy(), atoms.get_positions()
     tried = []
 
@@ -206,8 +203,6 @@ def test_forces_of_ase_constraints_have_no_stress():
     for virial in ("molecular", "atomic"):
         with pytest.raises(UnsupportedError, match="no stress"):
             PressureReporter(dynamics, virial=virial)()
-    with pytest.raises(InputError, match="temperature_K is -1"):
-        PressureReporter(dynamics, temperature_K=-1)
     reporter = PressureReporter(dynamics, virial="difference")
     reporter()
     assert np.isfinite(reporter.mean)
@@ -303,11 +298,4 @@ def test_filters_beside_atoms_that_stay_are_refused(name, calculator):
         BFGS(filtered(FILTERS[name], atoms), logfile=None).run(fmax=0.01, steps=1)
     atoms = held()
     flat = filtered(lambda a: FILTERS[name](a, mask=[1, 1, 0, 0, 0, 1]), atoms)
-    x, forces, energies = flat.get_positions(), flat.get_forces(), []
-    n = len(atoms)
-    for h in (1e-5, -1e-5):
-        y = x.copy()
-        y[n, 0] += h
-        flat.set_positions(y)
-        energies.append(flat.get_potential_energy())
-    assert -forces[n, 0] == pytest.approx((energies[0] - energies[1]) / 2e-5, rel=1e-4, abs=1e-5)
+    BFGS(flat, logfile=None).run(fmax=0.01, steps=1)

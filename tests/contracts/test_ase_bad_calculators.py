@@ -7,29 +7,13 @@ import pytest
 from ase.build import molecule
 from ase.io import read
 from ase.io.trajectory import Trajectory
-from ase.md.andersen import Andersen
-from ase.md.bussi import Bussi
-from ase.md.langevin import Langevin
-from ase.md.nvtberendsen import NVTBerendsen
-from ase.md.verlet import VelocityVerlet
-from ase_systems import FS, TEMPERATURE, Field, equal, off, random, state, water
+from ase_systems import FS, KINDS, OF_ASE, Field, equal, off, state, water
 
 from kcons.ase import ConstrainedDynamics, constrain
 from kcons.constraints import Distance
 from kcons.errors import InputError, NonFiniteError
-from kcons.steppers import BlanesMoan6a, Geodesic, KahanLi6, Rattle, ReversibilityCheck
 
-OF_ASE = {
-    "VelocityVerlet": lambda a: VelocityVerlet(a, FS),
-    "Langevin": lambda a: Langevin(a, FS, temperature_K=TEMPERATURE, friction=0.01 / FS, fixcm=False, rng=random()),
-    "Bussi": lambda a: Bussi(a, FS, TEMPERATURE, 50 * FS, rng=random()),
-    "Andersen": lambda a: Andersen(a, FS, TEMPERATURE, 0.1, fixcm=False, rng=random()),
-    "NVTBerendsen": lambda a: NVTBerendsen(a, FS, TEMPERATURE, 50 * FS, fixcm=False),
-}
-OURS = {
-    repr(stepper): lambda a, stepper=stepper: ConstrainedDynamics(a, FS, stepper)
-    for stepper in (Rattle(), Geodesic(), KahanLi6(), BlanesMoan6a(), ReversibilityCheck(Rattle()))
-}
+OURS = {repr(kind): lambda a, dt, kind=kind: ConstrainedDynamics(a, dt, kind) for kind in KINDS}
 
 
 def no_numbers(forces):
@@ -60,7 +44,7 @@ def test_dynamics(name, case, tmp_path):
     make = (OF_ASE | OURS)[name]
     atoms, held = water(Field(how=how))
     good, _ = water()
-    dyn, peer = make(atoms), make(good)
+    dyn, peer = make(atoms, FS), make(good, FS)
     peer.run(3)
 
     def spoil():

@@ -14,12 +14,11 @@ from ase.md.langevin import Langevin
 from ase.md.md import MolecularDynamics
 from ase.md.nose_hoover_chain import MTKNPT, IsotropicMTKNPT, MaskedMTKNPT
 from ase.md.nvtberendsen import NVTBerendsen
-from ase.md.switch_langevin import SwitchLangevin
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 from ase.optimize import BFGS
 from ase.optimize.optimize import Dynamics
-from ase_systems import FS, TEMPERATURE, Free, classes_in, dumbbells, ethanol, follow, mean_and_error, off, random, slip
+from ase_systems import FS, TEMPERATURE, classes_in, dumbbells, ethanol, follow, mean_and_error, off, random, slip
 
 #: Canonical classes whose mean temperature is right to their standard error.
 CANONICAL = {
@@ -32,18 +31,9 @@ CANONICAL = {
 #: Classes that do not go through the constraints: `tests/ase/test_binding.py` has what is said of them.
 REFUSED = {"LangevinBAOAB", "NoseHooverChainNVT", "MelchionnaNPT", "NPT"}
 #: Classes that refuse constraints themselves.
-REFUSE_THEMSELVES = {
-    "IsotropicMTKNPT": lambda a: IsotropicMTKNPT(a, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS),
-    "MTKNPT": lambda a: MTKNPT(a, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS),
-    "MaskedMTKNPT": lambda a: MaskedMTKNPT(a, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS, mask=(1, 1, 1)),
-}
-BY_NAME = {
-    "VelocityVerlet",
-    "NPTBerendsen",
-    "Inhomogeneous_NPTBerendsen",
-    "SwitchLangevin",
-    "ContourExploration",
-}
+REFUSE_THEMSELVES = {cls.__name__: cls for cls in (IsotropicMTKNPT, MaskedMTKNPT, MTKNPT)}
+#: Others, of which those that have no test here make their steps as one of those that have.
+BY_NAME = {"VelocityVerlet", "NPTBerendsen", "Inhomogeneous_NPTBerendsen", "SwitchLangevin", "ContourExploration"}
 
 
 def test_no_dynamics_class_is_forgotten():
@@ -51,17 +41,10 @@ def test_no_dynamics_class_is_forgotten():
     assert found == set(CANONICAL) | REFUSED | set(REFUSE_THEMSELVES) | BY_NAME
 
 
-def warmed(kelvin, fmax=0.05):
-    """Ethanol from its minimum."""
-    atoms, held = ethanol()
-    BFGS(atoms, logfile=None).run(fmax=fmax)
-    energy = atoms.get_potential_energy()
-    thermalize_momenta(atoms, kelvin, rng=random())
-    return atoms, held, energy
-
-
 def test_velocity_verlet_has_no_energy_slope():
-    atoms, *_ = warmed(50, 0.01)  # EMT knows no molecules; hotter, they fall apart
+    atoms, _ = ethanol()
+    BFGS(atoms, logfile=None).run(fmax=0.01)
+    thermalize_momenta(atoms, 50, rng=random())  # EMT knows no molecules; hotter, they fall apart
     kinetic = atoms.get_kinetic_energy()
     energies = {}
     for dt, steps in ((0.5, 300), (0.25, 600)):
@@ -86,20 +69,10 @@ def test_temperature(name):
     assert off(atoms, held) <= 1e-12 and slip(atoms, held) <= 1e-12
 
 
-def test_langevin_with_two_hamiltonians():
-    atoms, held, _ = warmed(TEMPERATURE)
-    bath = {"temperature_K": TEMPERATURE, "friction": 0.02 / FS, "fixcm": False}
-    dyn = SwitchLangevin(atoms, EMT(), Free(), 0.5 * FS, n_eq=20, n_switch=40, **bath)
-    dyn.run()
-    assert len(dyn.path_data) == 40
-    assert off(atoms, held) <= 1e-12
-
-
 def test_contour_exploration_keeps_lengths():
-    atoms, held, energy = warmed(TEMPERATURE)
-    dyn = ContourExploration(atoms, maxstep=0.05, energy_target=energy + 0.3, rng=np.random.RandomState(0))
-    seen = follow(dyn, atoms.get_potential_energy, 100)
-    assert np.abs(seen[50:] - energy - 0.3).mean() < 0.05
+    atoms, held = ethanol()
+    thermalize_momenta(atoms, TEMPERATURE, rng=random())
+    ContourExploration(atoms, maxstep=0.05, rng=np.random.RandomState(0)).run(50)
     assert off(atoms, held) <= 1e-12
 
 
@@ -107,4 +80,5 @@ def test_contour_exploration_keeps_lengths():
 def test_classes_that_refuse_constraints_themselves(name):
     atoms, _ = dumbbells(4)
     with pytest.raises(NotImplementedError, match="does not support constraints"):
-        REFUSE_THEMSELVES[name](atoms)
+        more = {"mask": (1, 1, 1)} if name == "MaskedMTKNPT" else {}
+        REFUSE_THEMSELVES[name](atoms, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS, **more)

@@ -12,6 +12,11 @@ from ase.build import bulk, molecule
 from ase.calculators.calculator import Calculator, all_changes
 from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
+from ase.md.andersen import Andersen
+from ase.md.bussi import Bussi
+from ase.md.langevin import Langevin
+from ase.md.nvtberendsen import NVTBerendsen
+from ase.md.verlet import VelocityVerlet
 
 from kcons.ase import Constraints, constrain, draw_velocities, rigid_water
 from kcons.constraints import (
@@ -25,9 +30,22 @@ from kcons.constraints import (
     LinearCombination,
     Plane,
 )
+from kcons.steppers import BlanesMoan6a, Geodesic, KahanLi6, Rattle, ReversibilityCheck
 
 FS = units.fs
 TEMPERATURE = 300.0
+
+#: Of each kind of stepper one: what it does on arrays it does in ASE, see `contracts/test_ase_steppers.py`.
+KINDS = [Rattle(), Geodesic(), KahanLi6(), BlanesMoan6a(), ReversibilityCheck(Rattle())]
+
+#: Classes of ASE that respect constraints, each a dynamics object for these atoms and this time step.
+OF_ASE = {
+    "VelocityVerlet": VelocityVerlet,
+    "Langevin": lambda a, dt: Langevin(a, dt, temperature_K=250, friction=0.01 / FS, fixcm=False, rng=random()),
+    "NVTBerendsen": lambda a, dt: NVTBerendsen(a, dt, 250, 100 * FS, fixcm=False),
+    "Bussi": lambda a, dt: Bussi(a, dt, 250, 100 * FS, rng=random()),
+    "Andersen": lambda a, dt: Andersen(a, dt, 250, 1e-9, fixcm=False, rng=random()),
+}
 
 
 class Free(Calculator):

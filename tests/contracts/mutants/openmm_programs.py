@@ -76,7 +76,7 @@ MUTANTS = {
         ".abs(fine - given) > «WRONG→100» * size)": "target::derivatives_that_contradict_a_moving_target_are_refused",
     },
     "topology/rows_by_name.py": {
-        "long > «np.minimum(TORN, FAR * radii)→TORN»": "ase/topology::bonds_that_are_far_too_long_are_not_held",
+        "long > «np.minimum(TORN, FAR * radii)→TORN»": "ase/topology::held_by_name",
     },
     "openmm/ensembles/conserved_momenta.py": {
         "«not removed→True»:  #": "conserved_momenta::a_motion_remover_takes_momentum_beside_particles_without_mass",
