@@ -389,10 +389,8 @@ class MultipleTimeSteps(ThermostattedDynamics):
 
         def force(x: FloatArray, time: float) -> FloatArray:
             self.atoms.arrays["positions"][...] = x
-            found = calculator.get_forces(self.atoms)
-            return (
-                with_added(self.atoms, found) if others else np.array(as_float_array(found, "forces of the calculator"))
-            )
+            found = np.array(as_float_array(calculator.get_forces(self.atoms), "forces of the calculator"))
+            return with_added(self.atoms, found) if others else found
 
         return force
 

@@ -162,7 +162,6 @@ def test_hydrogens_take_mass_from_the_atoms_that_they_are_bonded_to():
     light = wet.get_masses()
     assert repartition_hydrogen_mass(wet) == 4
     assert np.array_equal(wet.get_masses()[:3], light[:3])
-    assert repartition_hydrogen_mass(molecule("H2")) == 0
 
 
 # -- rigid water -----------------------------------------------------------------------------------
