@@ -58,7 +58,7 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
 def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None) -> Distance:
     """Hold all water molecules rigid, and nothing else: three distances each.
 
-    They are found as by `constraints_of`: by the names of residues, without these by their bonds, which are guessed.
+    A water is an oxygen with two hydrogens so near that they are bonded to it, whatever names and bonds atoms have.
 
     Parameters
     ----------
@@ -72,7 +72,11 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None)
     InputError
         No water, or one that is odd.
     """
-    (rows,) = constraints_of(atoms, "none", water_geometry=geometry, guess_bonds=True)
+    require_atoms(atoms)
+    numbers = np.where(np.isin(atoms.numbers, (1, 8)), atoms.numbers, atomic_numbers["Ar"])  # which has no bonds
+    others = Atoms(numbers, atoms.positions, masses=atoms.get_masses(), cell=atoms.cell, pbc=atoms.pbc)
+    with warnings.catch_warnings(action="ignore"):  # of hydrogens elsewhere
+        (rows,) = constraints_of(others, "none", water_geometry=geometry, guess_bonds=True)
     assert isinstance(rows, Distance)
     return rows
 

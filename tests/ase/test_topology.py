@@ -168,11 +168,12 @@ def test_hydrogens_take_mass_from_the_atoms_that_they_are_bonded_to():
 
 
 def test_rigid_water_finds_water_only():
-    """In any order of its atoms."""
+    """In any order of its atoms, whatever it is called."""
     atoms = molecule("H2O") + molecule("CH3CH2OH") + molecule("OH") + bulk("Cu") + molecule("H2O")[[1, 0, 2]]
     n = len(atoms)
     atoms.positions[:3] += 20
     atoms.positions[n - 3 :] -= 20
+    atoms.new_array("residuenames", np.array(["MOL"] * n))  # as in PDB files of ASE
     rows = rigid_water(atoms).atoms
     assert np.array_equal(rows, [[0, 1], [0, 2], [1, 2], [n - 2, n - 3], [n - 2, n - 1], [n - 3, n - 1]])
 
