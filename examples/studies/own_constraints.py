@@ -26,7 +26,6 @@ from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import (
     Constraint,
     Custom,
-    CustomVelocity,
     Cylinder,
     Distance,
     Ellipsoid,
@@ -70,11 +69,6 @@ HELD: dict[str, Callable[[np.ndarray], Constraint]] = {
 }
 
 
-@numba.njit
-def around(r):
-    return np.array([[-r[0, 1] - 0.2 * r[0, 0], r[0, 0] - 0.2 * r[0, 1], 0.0]])
-
-
 UP, ALONG = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 TURNS = np.radians([[0], [120], [240]])
 BLADE = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
@@ -91,8 +85,6 @@ BODIES: dict[str, tuple[np.ndarray, list[Constraint]]] = {
         ],
     ),
     "VelocityFormula": (ALONG[None], [Plane([0], UP), VelocityFormula(SPIRAL, 0)]),
-    "CustomVelocity, Numba": (ALONG[None], [Plane([0], UP), CustomVelocity(0, around)]),
-    "CustomVelocity, Python": (ALONG[None], [Plane([0], UP), CustomVelocity(0, around.py_func)]),
 }
 
 

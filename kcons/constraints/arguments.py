@@ -177,10 +177,6 @@ def refuse_other(value: Any, kind: type | tuple[type, ...], item: str, remedy: s
         raise InputError(f"{item} is {value!r:.120}; give {remedy}", item=item)
 
 
-#: What to say of functions of constraints that were given other arguments.
-TAKES_TIME = "; say time_dependent=True for functions that take the time t as well"
-
-
 def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str = "", needed: bool = False) -> None:
     """Refuse what is no function, or cannot be called with `arguments`; None, where none is needed, passes.
 
@@ -330,7 +326,6 @@ NUMBER = Kind("a plain number", ())
 LENGTH = Kind("nm", (("length", 1),))
 SPEED = Kind("nm/ps", (("length", 1), ("time", -1)))
 ANGLE = Kind("radian", (("angle", 1),))
-TIME = Kind("ps", (("time", 1),))
 #: A vector of which only the direction counts.
 DIRECTION = Kind("one unit for all components", None)
 #: What the family of a constraint says of its targets.
@@ -339,7 +334,6 @@ HELD = Kind("what is held", None)
 Lengths: TypeAlias = Annotated[ArrayLike, LENGTH]
 PositiveLengths: TypeAlias = Annotated[ArrayLike, LENGTH, all_positive]
 Directions: TypeAlias = Annotated[ArrayLike, DIRECTION, unit]
-Duration: TypeAlias = Annotated[float, TIME, positive]
 
 
 def has_units(values: Any) -> bool:

@@ -9,11 +9,9 @@ import pytest
 
 from kcons.constraints import (
     Custom,
-    CustomVelocity,
     Distance,
     Ellipsoid,
     FixedAtoms,
-    ImplicitSurface,
     LinearCombination,
     LinearRelation,
     Plane,
@@ -108,8 +106,6 @@ WAYS = {
     "coefficients": lambda m, bad: LinearCombination([0, 1, 2], bad),
     "weights": lambda m, bad: LinearRelation([3], [0, 1, 2], bad if isinstance(bad, list) else bad[0]),
     "a gradient": lambda m, bad: held([Custom([0, 1, 2], lambda r: 1.0, lambda r: bad)]),
-    "gradients of a surface": lambda m, bad: held([ImplicitSurface([0, 1, 2], lambda r: r[:, 0], lambda r: bad)]),
-    "coefficients by a function": lambda m, bad: held([CustomVelocity([0, 1, 2], lambda r: bad)]),
 }
 
 
@@ -163,11 +159,8 @@ def of_velocities(motion, force, stepper) -> None:
 CALLS = {
     "potential": lambda m, f: System(m, lambda x, t: PULL, potential=f).total_energy(State(X, 0 * X)),
     **{f"force of v, {each!r}": partial(of_velocities, stepper=each) for each in (Rattle(), Suzuki4(), Geodesic(3))},
-    "CustomVelocity": lambda m, f: held([CustomVelocity([0], f)]),
     "Custom": lambda m, f: held([Custom([0], f)]),
     "Custom, gradient": lambda m, f: held([Custom([0], lambda r: r[0, 0], f)]),
-    "ImplicitSurface": lambda m, f: held([ImplicitSurface([0], f, target=None)]),
-    "ImplicitSurface, gradient": lambda m, f: held([ImplicitSurface([0], lambda r: r[:, 0], f, target=None)]),
 }
 
 

@@ -12,27 +12,19 @@ from openmm import Vec3, unit
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, constrain, draw_velocities
-from kcons.constraints import FAMILIES, CustomVelocity, Distance, from_dict
-from kcons.constraints.arguments import ANGLE, ANY, DIRECTION, HELD, LENGTH, MD_UNITS, NUMBER, SPEED, TIME, rules_of
+from kcons.constraints import FAMILIES, Distance, from_dict
+from kcons.constraints.arguments import ANGLE, ANY, DIRECTION, HELD, LENGTH, MD_UNITS, NUMBER, SPEED, rules_of
 from kcons.errors import InputError
 
 nm, angstrom, fs = unit.nanometer, unit.angstrom, unit.femtosecond
 
 
 def height(r):
-    return r[0, 2] if r.ndim == 2 else None
+    return r[0, 2]
 
 
 def up(r):
     return np.array([[0.0, 0.0, 1.0]])
-
-
-def heights(r):
-    return r[:, 2]
-
-
-def ups(r):
-    return np.tile([0.0, 0.0, 1.0], (len(r), 1))
 
 
 #: Arguments of each family, in nm, ps, radian.
@@ -59,14 +51,9 @@ MADE = {
     },
     "Plane": {"atoms": [0], "normal": [1.0, 0.0, 1.0], "offset": 0.3},
     "Line": {"atoms": [0], "point": [0.1, 0.2, 0.3], "direction": [1.0, 0.0, 1.0]},
-    "ImplicitSurface": {
-        **{"atoms": [0, 1], "function": heights, "gradient": ups, "target": 0.3},
-        **{"time_dependent": False, "length": 0.5, "time_step": 0.1},
-    },
     "Custom": {
         **{"atoms": [[0]], "function": height, "gradient": up, "target": 0.3},
-        **{"time_dependent": False, "translation_invariant": False, "period": 2.0},
-        **{"length": 0.5, "time_step": 0.1},
+        **{"translation_invariant": False, "period": 2.0, "length": 0.5},
     },
     "Formula": {
         **{"formula": "z1 - a*x1", "atoms": [0], "parameters": {"a": 2.0}, "target": 0.3, "period": 2.0},
@@ -77,28 +64,23 @@ MADE = {
         **{"hub": [0], "rim": [1], "radius": 0.2, "heading": [1.0, 0, 0], "normal": [0, 0, 1.0]},
         **{"target": 0.1},
     },
-    "CustomVelocity": {
-        **{"atoms": [[0]], "coefficients": up, "target": 0.1, "time_dependent": False},
-        **{"translation_invariant": False, "length": 0.5, "time_step": 0.1},
-    },
 }
 #: Arguments that are no measured numbers: atoms, functions, flags.
 OTHERS = {
     *("self", "pairs", "triples", "quads", "atoms", "bases", "groups", "axes", "group_a", "group_b", "back", "front"),
     *("hub", "rim", "function", "gradient", "formula", "parameters"),
-    *("mass_weighted", "time_dependent", "translation_invariant"),
+    *("mass_weighted", "translation_invariant"),
 }
 #: How a number of each kind is written with a unit: what it is multiplied with, and the unit.
 WRITTEN = {
     LENGTH: (10.0, angstrom),
     ANGLE: (180 / np.pi, unit.degree),
     SPEED: (0.01, angstrom / fs),
-    TIME: (1e3, fs),
     NUMBER: (1.0, unit.dimensionless),
     DIRECTION: (10.0, angstrom),
     ANY: (10.0, angstrom),
 }
-WRONG = {LENGTH: unit.kelvin, ANGLE: nm, SPEED: nm, TIME: nm, NUMBER: nm}
+WRONG = {LENGTH: unit.kelvin, ANGLE: nm, SPEED: nm, NUMBER: nm}
 
 
 def kind_of(family, name):
@@ -107,11 +89,7 @@ def kind_of(family, name):
 
 
 def measured(family):
-    return [n for n in inspect.signature(family.__init__).parameters if n not in OTHERS and not callable_at(family, n)]
-
-
-def callable_at(family, name):
-    return family is CustomVelocity and name == "coefficients"
+    return [n for n in inspect.signature(family.__init__).parameters if n not in OTHERS]
 
 
 OWN = {name: family for name, family in FAMILIES.items() if family.__module__.startswith("kcons.")}

@@ -16,7 +16,7 @@ from scan_systems import chain, threefold
 
 from kcons import ConstraintSet
 from kcons.ase import Constraints
-from kcons.constraints import Angle, CenterDistance, CustomVelocity, Dihedral, Distance, FixedAtoms, KnifeEdge, Plane
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, FixedAtoms, KnifeEdge, Plane, VelocityFormula
 from kcons.errors import ConstraintError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.free_energy import (
     AseRecorder,
@@ -218,7 +218,7 @@ def scanned(coordinates, values, **how):
     return scan(chain(4, threefold), coordinates, values, **how)
 
 
-STRAIGHT, SPEED = chain(4, threefold), CustomVelocity([[0, 1]], lambda r: np.ones((2, 3)))
+STRAIGHT, SPEED = chain(4, threefold), VelocityFormula("vx1 + vy2", [[0, 1]])
 STRAIGHT.positions[:3] = [[0, 0, 0], [1.4, 0, 0], [2.8, 0, 0]]
 _WRONG = [{"fmax": "x"}, {"fmax": 0}, {"evaluations": 2.5}, {"held": 3}, {"held": [TURN, None]}, {"folder": 3}]
 _GRIDS = [

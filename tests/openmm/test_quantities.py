@@ -7,7 +7,7 @@ from collective_cases import bond, with_variable
 from openmm import unit
 from openmm_systems import dumbbell, particles, started, state_of
 
-from kcons.constraints import Angle, CustomVelocity, Distance, FixedAtoms, ImplicitSurface, KnifeEdge, Sphere
+from kcons.constraints import Angle, Custom, Distance, FixedAtoms, KnifeEdge, Sphere
 from kcons.errors import InputError
 from kcons.openmm import (
     CarriedConstraints,
@@ -64,8 +64,8 @@ def test_rows_are_held_at_what_was_written():
 def test_functions_give_plain_numbers():
     for wrong in (
         Distance([[0, 1]], lambda t: 0.1 * nm),
-        ImplicitSurface([3], lambda r: r[:, 2] * nm),
-        CustomVelocity([[0]], lambda r: np.array([[0, 0, 1.0]]) * unit.dimensionless),
+        Custom([3], lambda r: r[0, 2] * nm),
+        Custom([3], lambda r: r[0, 2], lambda r: np.array([[0, 0, 1.0]]) * unit.dimensionless),
     ):
         with pytest.raises(InputError, match=r"has units \(.*give plain numbers in .* \(nm and ps in OpenMM\)"):
             sigma([wrong])

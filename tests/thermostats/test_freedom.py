@@ -18,7 +18,6 @@ from kcons.constraints import (
     Ellipsoid,
     FixedAtoms,
     Formula,
-    ImplicitSurface,
     Plane,
     Sphere,
 )
@@ -185,9 +184,7 @@ def test_a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster():
 
 def test_a_surface_that_ends_nearby_has_a_place():
     x = np.array([[0.5, 0.0, 0.0], [3.0, 0.2, 0.1]])
-    edge = ImplicitSurface(
-        [0], lambda x: np.sqrt(0.5 - x[:, 0]), lambda x: np.c_[-0.5 / np.sqrt(0.5 - x[:, 0]), 0 * x[:, 1:]]
-    )
+    edge = Formula("sqrt(0.5 - x1)", [0])
     near = ConstraintSet([edge], x - np.array([0.01, 0, 0]), [1.0, 1.0])
     motion = Motion(near, x - np.array([0.01, 0, 0]))
     assert open_directions(motion, x - np.array([0.0001, 0, 0])).shape == (0, 3)

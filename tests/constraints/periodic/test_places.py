@@ -11,7 +11,6 @@ from kcons.constraints import (
     CenterDistance,
     CenterOfMass,
     Custom,
-    CustomVelocity,
     Cylinder,
     Dihedral,
     Distance,
@@ -24,6 +23,7 @@ from kcons.constraints import (
     RadiusOfGyration,
     Sphere,
     Torus,
+    VelocityFormula,
 )
 
 CELL = np.array([[10.0, 0, 0], [1.0, 9.0, 0], [-2.0, 1.0, 11.0]])
@@ -60,7 +60,7 @@ PLACES = {
         FixedAtoms(3),
         Formula("x1*(y2 - a) - b*y2", [[4, 3]], {"a": s[3, 1], "b": s[4, 0]}, target=None),
     ),
-    "CustomVelocity": lambda s: CustomVelocity([[1]], lambda r: np.array([[1.0, r[0, 0] - s[1, 0], 0.0]]), target=0.0),
+    "VelocityFormula": lambda s: VelocityFormula("vx1 + (x1 - a)*vy1", 1, {"a": s[1, 0]}),
 }
 TIES = {
     "gyration": RadiusOfGyration([[0, 1, 2]]),
