@@ -189,8 +189,9 @@ def row_function(item: Constraint, numbers: FloatArray) -> Any:
     if item.row is not None:
         return _compiled(item.row)
     assert isinstance(item, Custom)
-    if is_jitted(item.function) and is_jitted(item.gradient_function):
-        return _of_jitted(item.function, item.gradient_function, item.width)
+    gradient = item.gradient_function
+    if gradient is not None and is_jitted(item.function) and is_jitted(gradient):
+        return _of_jitted(item.function, gradient, item.width)
     return CalledRows(item, numbers)
 
 
