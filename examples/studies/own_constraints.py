@@ -26,7 +26,6 @@ from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import (
     Constraint,
     Custom,
-    Cylinder,
     Distance,
     Ellipsoid,
     Formula,
@@ -56,7 +55,7 @@ def quartic_gradient(r):
 #: Name -> what holds these atoms, each on a surface of its own through where it is.
 HELD: dict[str, Callable[[np.ndarray], Constraint]] = {
     "Sphere": lambda atoms: Sphere(atoms, [0, 0, 0]),
-    "Cylinder": lambda atoms: Cylinder(atoms, [0, 0, 0], [0, 0, 1.0]),
+    "Cylinder": lambda atoms: Ellipsoid(atoms, [0, 0, 0], [1.0, 1.0, np.inf], target=None),
     "Plane": lambda atoms: Plane(atoms, [0, 0, 1.0]),
     "Ellipsoid": lambda atoms: Ellipsoid(atoms, [0, 0, 0], AXES, target=None),
     "Torus": lambda atoms: Torus(atoms, [0, 0, 0], [0, 0, 1.0], 0.5),

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import ANGLE, as_float_array, atom_array, read_only, refuse_other, whole_number
 from kcons.constraints.constraint import Constraint, Fault, IntArray, RowKind
-from kcons.constraints.surface import LinearRows
+from kcons.constraints.periodic.one_piece import spanning_tree
+from kcons.constraints.surface import LinearCombination
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, norm
 from kcons.errors import InputError
@@ -154,7 +155,7 @@ class DistanceDifference(Internal):
             raise InputError(f"DistanceDifference: a pair names atom {named} twice", item="pairs")
         if len({frozenset(pair) for pair in self.slots}) < n:
             raise InputError("DistanceDifference: a pair comes twice; name it once and add the weights", item="pairs")
-        self.links = read_only(np.array(_walk(self.slots)[1], dtype=np.int64))
+        self.links = read_only(_walk(self.slots)[1])
         self.alike = 2 + 3 * n
         self.positive = "target" if min(self.weights) > 0 else ""
 
@@ -196,28 +197,15 @@ class DistanceDifference(Internal):
         yield size < COLLINEAR * np.abs(self.weights).max(), lambda k: self.singular
 
 
-def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], list[tuple[int, int]]]:
-    """Atoms that pairs name, and pairs that lead to each atom from one before it, by their places in this list.
-
-    Along a path, pairs lead from each atom to the next; see `Constraint.links`.
-    """
-    neighbors: dict[int, list[int]] = {}
-    for i, j in pairs:
-        neighbors.setdefault(i, []).append(j)
-        neighbors.setdefault(j, []).append(i)
-    place: dict[int, int] = {}
-    links = []
-    for root in sorted(neighbors, key=lambda atom: len(neighbors[atom])):  # an end of a path first
-        ways = [(root, root)]
-        while ways:
-            before, atom = ways.pop()
-            if atom in place:
-                continue
-            place[atom] = len(place)
-            if atom != before:
-                links.append((place[before], place[atom]))
-            ways += [(atom, other) for other in reversed(neighbors[atom])]
-    return list(place), links
+def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], IntArray]:
+    """Atoms that pairs name, along a path one after the other, and `Constraint.links` by their places in this list."""
+    named = list(dict.fromkeys(atom for pair in pairs for atom in pair))
+    ends = np.array([[named.index(atom) for atom in pair] for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    ends_first = np.argsort(np.bincount(ends.ravel()), kind="stable")
+    atoms, parents = spanning_tree(ends, len(named), ends_first)
+    place = np.argsort(atoms)
+    links = np.stack([place[parents], place[atoms]], axis=1)
+    return [named[k] for k in atoms.tolist()], links[parents != atoms]
 
 
 def angle_between(ux: Any, uy: Any, uz: Any, wx: Any, wy: Any, wz: Any) -> tuple[Any, ...]:
@@ -371,7 +359,7 @@ class MassWeighted(Constraint, base=True):
         yield from super().faults(r, time)
 
 
-class CenterOfMass(MassWeighted, LinearRows):
+class CenterOfMass(MassWeighted, LinearCombination):
     """Cartesian components of the center of mass of a group, q = n . sum_i m_i r_i/M.
 
     Positions are taken as they are (unwrapped), in periodic cells too.

@@ -23,7 +23,6 @@ from kcons.constraints.arguments import (
     atom_array,
     atom_table,
     check_range,
-    read_only,
     unit,
 )
 from kcons.constraints.constraint import Constraint, Fault, RowKind
@@ -31,7 +30,6 @@ from kcons.constraints.target import MovingTarget, Target
 from kcons.errors import InputError
 
 __all__ = [
-    "Cylinder",
     "Ellipsoid",
     "FixedAtoms",
     "Line",
@@ -45,37 +43,11 @@ __all__ = [
 _VECTOR = (3,)
 
 
-class LinearRows(Constraint, base=True):
-    """Rows q = sum_a c_a . r_a with constant coefficients, shape (n_rows, width, 3), which are their parameters.
+class LinearCombination(Constraint):
+    """A combination of Cartesian coordinates, q = sum_a c_a . r_a, one row; it has no curvature.
 
-    They have no curvature. Minimum images apply if a common shift of all atoms leaves every row of the
-    object unchanged (coefficients that sum to zero); otherwise the positions are taken as they are.
-    """
-
-    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
-    kind = RowKind.LINEAR
-    coefficients: FloatArray
-
-    def _settle(self) -> None:
-        c = self.coefficients
-        self.translation_invariant = bool(
-            self.width > 1 and np.all(np.abs(c.sum(axis=1)) <= 1e-12 * np.abs(c).sum(axis=1).max(initial=0.0))
-        )
-        self.refuse_zero(c)
-
-    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-        slope = self.parameters().reshape(r.shape)
-        return np.asarray(np.einsum("kai,kai->k", slope, r)), slope
-
-    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
-        return np.zeros(self.n_rows)
-
-    def parameters(self) -> FloatArray:
-        return self.coefficients.reshape(self.n_rows, 3 * self.width)
-
-
-class LinearCombination(LinearRows):
-    """A combination of Cartesian coordinates, q = sum_a c_a . r_a, one row.
+    Minimum images apply if a common shift of all atoms leaves every row of the object unchanged (coefficients that sum
+    to zero); otherwise the positions are taken as they are.
 
     Parameters
     ----------
@@ -95,11 +67,32 @@ class LinearCombination(LinearRows):
     1
     """
 
+    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
+    kind = RowKind.LINEAR
+    coefficients: FloatArray
+
     def __init__(self, atoms: ArrayLike, coefficients: ArrayLike, target: Target = None) -> None:
         super().__init__(atoms, target, coefficients=coefficients)
 
+    def _settle(self) -> None:
+        c = self.coefficients
+        self.translation_invariant = bool(
+            self.width > 1 and np.all(np.abs(c.sum(axis=1)) <= 1e-12 * np.abs(c).sum(axis=1).max(initial=0.0))
+        )
+        self.refuse_zero(c)
 
-class LinearRelation(LinearRows):
+    def value_and_gradient(self, r: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        slope = self.parameters().reshape(r.shape)
+        return np.asarray(np.einsum("kai,kai->k", slope, r)), slope
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        return np.zeros(self.n_rows)
+
+    def parameters(self) -> FloatArray:
+        return self.coefficients.reshape(self.n_rows, 3 * self.width)
+
+
+class LinearRelation(LinearCombination):
     """An atom at a fixed combination of others, r_a = sum_i w_i r_i: three rows (x, y, z) an atom.
 
     What holds a linear rigid group (two bases) or a planar one (three bases) where distances alone would
@@ -138,14 +131,11 @@ class LinearRelation(LinearRows):
                 item="weights",
             ) from None
         factors = np.hstack([np.ones((len(w), 1)), -w])
-        super().__init__(
-            np.repeat(np.hstack([dependent, base]), 3, axis=0),
-            target,
-            coefficients=np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, factors.shape[1], 3),
-        )
+        coefficients = np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, factors.shape[1], 3)
+        super().__init__(np.repeat(np.hstack([dependent, base]), 3, axis=0), coefficients, target)
 
 
-class FixedAtoms(LinearRows):
+class FixedAtoms(LinearCombination):
     """Atoms held at given points: three rows (x, y, z) an atom, in the order of `atoms`.
 
     The engine gives them infinite mass; their multipliers are the reaction forces. Each may be named once.
@@ -166,9 +156,7 @@ class FixedAtoms(LinearRows):
         if not callable(target) and not isinstance(target, MovingTarget | None):
             place = as_float_array(target, "target")
             target = np.tile(place, len(column)) if place.shape == (3,) else place
-        super().__init__(
-            np.repeat(column, 3, axis=0), target, coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :]
-        )
+        super().__init__(np.repeat(column, 3, axis=0), np.tile(np.eye(3), (len(column), 1))[:, None, :], target)
         values, counts = np.unique(column, return_counts=True)
         if len(values) < len(column):
             atom = int(values[np.argmax(counts > 1)])
@@ -210,37 +198,6 @@ class Sphere(Surface):
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
         x, y, z = r[0] - p[0], r[1] - p[1], r[2] - p[2]
-        q = sqrt(x * x + y * y + z * z)
-        out[0], out[1], out[2], out[3] = q, x / q, y / q, z / q
-
-
-class Cylinder(Surface):
-    """Distance from an axis, q = |d - (d.n) n|, d = r - p.
-
-    Parameters
-    ----------
-    atoms : int or array_like of int, shape (n_rows,)
-        The atoms; each is one row.
-    point : array_like, shape (3,) or (n_rows, 3)
-        A point p of the axis.
-    axis : array_like, shape (3,) or (n_rows, 3)
-        Direction n of the axis, of any length.
-    radius : float, array_like, callable of time, MovingTarget or None
-        Distance held; None takes the initial one.
-    """
-
-    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"point": _VECTOR, "axis": _VECTOR}
-    length_powers = {"point": 1}
-    singular = "atom {atom} lies on the axis of the cylinder: gradient undefined; move the atom"
-
-    def __init__(self, atoms: ArrayLike, point: Lengths, axis: Directions, radius: Target = None) -> None:
-        super().__init__(atoms, radius, point=point, axis=axis)
-
-    @staticmethod
-    def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        x, y, z = r[0] - p[0], r[1] - p[1], r[2] - p[2]
-        along = x * p[3] + y * p[4] + z * p[5]
-        x, y, z = x - along * p[3], y - along * p[4], z - along * p[5]
         q = sqrt(x * x + y * y + z * z)
         out[0], out[1], out[2], out[3] = q, x / q, y / q, z / q
 
@@ -293,8 +250,8 @@ class Torus(Surface):
 class Ellipsoid(Surface):
     """Level of an ellipsoid, q = s (|y| - 1), y_i = (e_i . (r - c))/a_i; the surface is q = 0.
 
-    s is the geometric mean of the semi-axes, so that q is a length and its gradient of order one: s/a_i at
-    the ends of the axes.
+    n/s^2 is the sum of 1/a_i^2 over the n finite semi-axes, so that q is a length and its gradient of order one: s/a_i
+    at the ends of the axes. A cylinder of radius R is one of semi-axes R, R and infinity, with q its distance from it.
 
     Parameters
     ----------
@@ -303,7 +260,7 @@ class Ellipsoid(Surface):
     center : array_like, shape (3,) or (n_rows, 3)
         Center c.
     semi_axes : array_like, shape (3,) or (n_rows, 3)
-        Semi-axes a_i. An infinite one makes it an elliptic cylinder along that axis.
+        Semi-axes a_i. An infinite one makes it a cylinder along that axis.
     rotation : array_like, shape (3, 3) or (n_rows, 3, 3), optional
         Orthonormal directions e_i of the axes, as columns; x, y, z by default.
     target : float, array_like, callable of time, MovingTarget or None
@@ -334,26 +291,16 @@ class Ellipsoid(Surface):
                 "Ellipsoid: the columns of rotation are not orthonormal; give unit vectors at right angles",
                 item="rotation",
             )
-        finite = inverse > 0
-        if not np.all(finite.any(axis=1)):
-            raise InputError("Ellipsoid: a row has no finite positive semi-axis", item="semi_axes")
-        logs = np.log(np.where(finite, inverse, 1.0)).sum(axis=1)
-        size = np.exp(-logs / finite.sum(axis=1))
-        self._keep(size=size, center=center, matrix=axes * inverse[:, :, None])
+        if not np.all(inverse.any(axis=1)):
+            raise InputError("Ellipsoid: a row has no finite semi-axis", item="semi_axes")
+        matrix = axes * inverse[:, :, None]
+        self._keep(size=_size(matrix), center=center, matrix=matrix)
 
     def _settle(self) -> None:
         if not hasattr(self, "size"):  # not yet, `__init__` keeps it later
             return
-        square = self.matrix @ self.matrix.transpose(0, 2, 1)
-        inverse = np.sqrt(np.diagonal(square, axis1=1, axis2=2))
-        across = np.abs(square) > 1e-9 * inverse[:, :, None] * inverse[:, None]
-        means = [np.exp(-np.log(each[each > 0]).mean()) if each.any() else np.nan for each in inverse]
-        if (across & ~np.eye(3, dtype=bool)).any() or not np.allclose(self.size, means, rtol=1e-9, atol=0.0):
-            raise InputError(
-                "Ellipsoid: the rows of matrix are directions at right angles over the semi-axes, and size is the "
-                "geometric mean of these",
-                item="matrix",
-            )
+        if not np.allclose(_size(self.matrix), self.size, rtol=1e-9):
+            raise InputError("Ellipsoid: size and matrix do not belong together", item="matrix")
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
@@ -380,7 +327,12 @@ class Ellipsoid(Surface):
             yield ~(target > -self.size), lambda k: f"target {target[k]:g} {words}", "target"
 
 
-class Plane(LinearRows):
+def _size(matrix: FloatArray) -> FloatArray:
+    with np.errstate(all="ignore"):  # of files
+        return np.asarray(np.sqrt(matrix.any(axis=2).sum(axis=1) / np.square(matrix).sum(axis=(1, 2))))
+
+
+class Plane(LinearCombination):
     """Distance along a normal, q = n . r.
 
     Parameters
@@ -390,30 +342,22 @@ class Plane(LinearRows):
     normal : array_like, shape (3,) or (n_rows, 3)
         Normal of the plane, of any length; n is its unit vector.
     offset : float, array_like, callable of time, MovingTarget or None
-        n . r of the plane.
-    point : array_like, shape (3,) or (n_rows, 3), optional
-        A point of the plane, instead of `offset`. Without either, each atom keeps its initial plane.
+        n . r of the plane; None lets each atom keep its initial plane.
     """
 
     kind = RowKind.FUNCTION  # which is as fast as others of one atom, and faster than linear rows of any width
     row_width = 1
 
-    def __init__(
-        self, atoms: ArrayLike, normal: Directions, offset: Target = None, *, point: Lengths | None = None
-    ) -> None:
-        if offset is not None and point is not None:
-            raise InputError("Plane: give either offset or point, not both", item="point")
+    def __init__(self, atoms: ArrayLike, normal: Directions, offset: Target = None) -> None:
         n = np.asarray(normal)
-        super().__init__(atoms, offset, coefficients=n if n.ndim == 1 else n[:, None])
-        if point is not None:
-            self.target = _held(self, point)
+        super().__init__(atoms, n if n.ndim == 1 else n[:, None], offset)
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
         out[0], out[1], out[2], out[3] = p[0] * r[0] + p[1] * r[1] + p[2] * r[2], p[0], p[1], p[2]
 
 
-class Line(LinearRows):
+class Line(LinearCombination):
     """Atoms on a straight line: two rows an atom, q = e_1 . r and e_2 . r, e_1 and e_2 normal to it.
 
     Parameters
@@ -434,19 +378,14 @@ class Line(LinearRows):
         # Normal to the line and to the coordinate axis it is farthest from.
         first = unit(np.cross(along, np.eye(3)[np.argmin(np.abs(along), axis=1)]), "direction")
         both = np.stack([first, np.cross(along, first)], axis=1).reshape(-1, 1, 3)
-        super().__init__(np.repeat(column, 2, axis=0), None, coefficients=both)
-        if point is not None:
-            self.target = _held(self, np.repeat(_for_each(point, len(column), "point"), 2, axis=0))
+        places = None if point is None else np.repeat(_for_each(point, len(column), "point"), 2, axis=0)
+        target = None if places is None else np.einsum("ki,ki->k", both[:, 0], places)
+        super().__init__(np.repeat(column, 2, axis=0), both, target)
 
 
 def _for_each(vectors: ArrayLike, count: int, name: str) -> FloatArray:
     array = as_float_array(vectors, name)
     if array.shape not in ((3,), (count, 3)):
         raise InputError(f"{name} has shape {array.shape}; give (3,) or ({count}, 3)", item=name)
+    check_range(array, f"{name} of row {{row}}", name)
     return np.broadcast_to(array, (count, 3))
-
-
-def _held(item: LinearRows, point: ArrayLike) -> FloatArray:
-    points = _for_each(point, item.n_rows, "point")
-    check_range(points, f"{item.family}: point of row {{row}}", "point")
-    return read_only(np.asarray(np.einsum("ki,ki->k", item.coefficients[:, 0], points)))

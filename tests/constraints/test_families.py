@@ -19,7 +19,6 @@ from kcons.constraints import (
     CenterDistance,
     CenterOfMass,
     Custom,
-    Cylinder,
     Dihedral,
     Distance,
     DistanceDifference,
@@ -30,7 +29,6 @@ from kcons.constraints import (
     Line,
     LinearCombination,
     LinearRelation,
-    Plane,
     RadiusOfGyration,
     Rolling,
     Sphere,
@@ -104,14 +102,13 @@ def test_a_line_is_two_orthonormal_rows_normal_to_it(direction):
 
 
 def test_targets_are_where_they_are_put():
-    assert ConstraintSet(Plane(0, [0.0, 3.0, 4.0], point=[0.0, 5.0, 5.0]), [UP], np.ones(1)).target()[0] == 7.0
     places = np.arange(6.0).reshape(2, 3)
     assert FixedAtoms([5, 2], places).target.tolist() == list(range(6))
     assert FixedAtoms([5, 2], [1.0, 2.0, 3.0]).target.tolist() == [1, 2, 3, 1, 2, 3]
     moving = CenterOfMass([[0, 1], [2, 3]], target=lambda t: places * t)
     assert moving.target_at(2.0).tolist() == (2 * places.ravel()).tolist()
     assert ConstraintSet(LinearRelation(0, [1, 2], [0.5, 0.5]), APART, np.ones(3)).target().tolist() == [0, 0, 0]
-    assert ConstraintSet(Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [UP], np.ones(1)).scale == pytest.approx([2.0])
+    assert ConstraintSet(Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [UP], np.ones(1)).scale == pytest.approx(4 / 7**0.5)
     assert Distance([3, 4]).atoms.tolist() == [[3, 4]] and FixedAtoms(5).atoms.tolist() == [[5], [5], [5]]
 
 
@@ -355,7 +352,6 @@ SINGULAR = [
     (Dihedral([0, 1, 2, 3]), BENDS, "row 0, Dihedral.*: .*atoms 1, 2, 3 are collinear"),
     (Dihedral([3, 2, 1, 0]), BENDS, "row 0, Dihedral.*: .*atoms 3, 2, 1 are collinear"),
     (Sphere(0, COINCIDENT[0]), COINCIDENT, "row 0, .*: atom 0 lies at the center of the sphere"),
-    (Cylinder(0, ORIGIN, [1.0, 2.0, 3.0]), COINCIDENT, "atom 0 lies on the axis of the cylinder"),
     (Torus(0, ORIGIN, [1.0, 2.0, 3.0], 2.0), COINCIDENT, "atom 0 lies on the axis or on the core"),
     (Torus(1, ORIGIN, UP, 1.0), CROSS, "atom 1 lies on the axis or on the core"),
     (Ellipsoid(0, COINCIDENT[0], [1.0, 2.0, 3.0]), COINCIDENT, "atom 0 lies at the center of the ellipsoid"),
@@ -363,8 +359,8 @@ SINGULAR = [
     (RadiusOfGyration([3, 4]), CROSS, "row 0.*all of its atoms coincide"),
     (KnifeEdge(1, 2, UP), BENDS, r"row 0, KnifeEdge\(1, 2\): the blade is normal to its plane"),
     (Rolling(1, 2, 1.0, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]), BENDS, "the rim atom lies on the axle"),
-    (VelocityFormula("x1*vy1 - y1*vx1", 1), BENDS, "its gradient is zero at the start"),
-    (VelocityFormula("vy1/x1", 1), BENDS, "1 / x1 is inf"),
+    (VelocityFormula("x1*vy1 - y1*vx1", 1), BENDS, "the gradient not zero"),
+    (VelocityFormula("vy1/x1", 1), BENDS, "must be finite"),
     (Custom([[0], [2]], lambda r: r[0, 0] ** 2, lambda r: 2 * r * UP[::-1]), CROSS, "row 1, .*the gradient not zero"),
     # Differences leave rounding of a gradient that vanishes, in whose direction the atom was held.
     (Custom(0, lambda r: (np.sum(r * r) - 1) ** 2, target=0.0), ROUNDED, "it vanishes, or the function varies faster"),

@@ -40,7 +40,6 @@ MADE = {
     "CenterDistance": {"group_a": [0, 1], "group_b": [2, 3], "target": 0.3},
     "RadiusOfGyration": {"atoms": [0, 1, 2], "target": 0.2, "mass_weighted": True},
     "Sphere": {"atoms": [0, 1], "center": [0.1, 0.2, 0.3], "radius": 0.5},
-    "Cylinder": {"atoms": [0], "point": [0.1, 0.2, 0.3], "axis": [0.0, 1.0, 1.0], "radius": 0.5},
     "Torus": {
         **{"atoms": [0], "center": [0.1, 0.2, 0.3], "axis": [0.0, 1.0, 1.0]},
         **{"major_radius": 0.9, "minor_radius": 0.2},

@@ -17,7 +17,6 @@ from kcons.constraints import (
     Angle,
     CenterDistance,
     Custom,
-    Cylinder,
     Dihedral,
     Distance,
     Ellipsoid,
@@ -100,7 +99,7 @@ BUTANE = np.array([[0.0, 0, 0], [1.5, 0, 0], [2.0, 1.4, 0], [3.5, 1.4, 0.5]])
 BONDS = [[0, 1], [1, 2], [2, 3]]
 #: Name -> rows on a chain of four atoms and two atoms apart, fixed atoms among them, and further options.
 MIXED = {
-    "cylinder": ([Cylinder([4], [0.0, 0, 0], [0, 0, 1.0])], {}),
+    "cylinder": ([Ellipsoid([4], [0.0, 0, 0], [1.0, 1.0, np.inf], target=None)], {}),
     "two surfaces": ([Ellipsoid([4], [0, 0, 0], [1.0, 2, 3], target=None), Plane([5], [0, 0.6, 0.8])], {}),
     "angles": ([Distance(BONDS), Angle([[0, 1, 2], [1, 2, 3]])], {}),
     "dihedral and a surface": ([Distance(BONDS), Dihedral([[0, 1, 2, 3]]), Sphere([4], [0.0, 0, 0])], {}),

@@ -65,7 +65,6 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Angle": lambda: kc.Angle([[0, 1, 2], [3, 4, 5], [7, 1, 6]]),
     "Dihedral": lambda: kc.Dihedral([[0, 1, 2, 3], [7, 6, 2, 4]]),
     "Sphere": lambda: kc.Sphere([0, 3], [[0.1, 0.2, -0.3], [1.0, 0.0, 3.0]]),
-    "Cylinder": lambda: kc.Cylinder([1, 2], [3.0, 0.2, -0.3], [[1.0, 2.0, 0.5], [0.0, 0.0, -2.0]]),
     "Torus": lambda: kc.Torus([1, 2, 5], [0.1, 0.0, 0.2], [0.1, 0.2, 1.0], [1.5, 0.9, 3.0]),
     "Ellipsoid": lambda: kc.Ellipsoid([4, 5], [0.1, 0.2, 0.3], [1.0, 2.0, 3.0], _rotation(), target=None),
     "Elliptic cylinder": lambda: kc.Ellipsoid([4, 5], [0.0, 0.0, 0.0], [1.0, np.inf, 3.0], target=None),
@@ -133,11 +132,11 @@ VALUES = {
     **{f"angle {a}": (kc.Angle([0, 1, 2]), bent(a, 1.3, 0.7), [np.radians(a)]) for a in (0.001, 20, 109.5, 179.9999)},
     **{f"dihedral {a}": (kc.Dihedral([0, 1, 2, 3]), twisted(a), [np.radians(a)]) for a in TURNS},
     "sphere": (kc.Sphere(0, [1.0, 0.0, 0.0]), [[1.0, 3.0, 4.0]], [5.0]),
-    "cylinder": (kc.Cylinder(0, [0.0, 0.0, 7.0], [0.0, 0.0, 5.0]), [[3.0, 4.0, -100.0]], [5.0]),
+    "cylinder": (kc.Ellipsoid(0, [0.0, 0.0, 7.0], [2.0, 2.0, np.inf]), [[3.0, 4.0, -100.0]], [3.0]),
     "torus": (kc.Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 5.0, 2.5]], [2.5]),
     "torus, inside": (kc.Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 2.5, 1.0]], [0.5]),
     "ellipsoid": (kc.Ellipsoid(0, [0.5, 0.1, 0.2], [1, 2, 4], ROTATION), on_ellipsoid([1, 2, 4], ROTATION), [0.0]),
-    "ellipsoid, outside": (kc.Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [[0.0, 0.0, 8.0]], [2.0]),
+    "ellipsoid, outside": (kc.Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [[0.0, 0.0, 8.0]], [4 / math.sqrt(7)]),
     "elliptic cylinder": (
         kc.Ellipsoid(0, ORIGIN, [2.0, np.inf, 0.5]), [[2.0 * np.cos(0.3), 17.0, 0.5 * np.sin(0.3)]], [0.0]
     ),

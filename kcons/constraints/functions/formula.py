@@ -51,7 +51,6 @@ _SAME = 1e-9
 _COORDINATE = re.compile(r"(v?)[xyz]([1-9][0-9]{0,5})")
 _OPERATIONS: dict[type, Callable[[Any, Any], Any]]
 _OPERATIONS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power}
-_PI = {"pi": np.float64(np.pi)}
 
 
 def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tuple[ast.expr, set[int]]:
@@ -108,9 +107,6 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
                 hint = "; a power is written **" if isinstance(node, ast.BinOp) else ""
                 allowed = f"use + - * / **, numbers, names and functions{hint}"
                 raise wrong(repr(ast.unparse(node)), f"is not allowed; {allowed}", "formula")
-    undefined = undefined_part(tree, _PI)
-    if undefined is not None:
-        raise InputError(f"Formula: {undefined} in {formula!r:.200}; give numbers with a finite value", item="formula")
     return tree, found
 
 
@@ -122,40 +118,21 @@ def _too_large(
     return InputError(f"Formula: {formula!r:.60} {what}; {remedy}", item="formula")
 
 
-def _value(tree: ast.expr, numbers: Mapping[str, Any], constant: Callable[[Any], Any] = np.float64) -> Any:
+def _value(tree: ast.expr, numbers: Mapping[str, Any]) -> Any:
     """The value of a tree, with numbers for names."""
     match tree:
-        case ast.Constant(value=value):
-            return constant(value)
+        case ast.Constant(value=int() | float() as value):
+            return float(value)
         case ast.Name(id=name):
             return numbers[name]
         case ast.Call(func=ast.Name(id=name), args=args):
-            return FUNCTIONS[name](*(_value(each, numbers, constant) for each in args))
+            return FUNCTIONS[name](*(_value(each, numbers) for each in args))
         case ast.BinOp(left=left, op=operation, right=right):
-            return _OPERATIONS[type(operation)](_value(left, numbers, constant), _value(right, numbers, constant))
+            return _OPERATIONS[type(operation)](_value(left, numbers), _value(right, numbers))
         case ast.UnaryOp(op=sign, operand=operand):
-            value = _value(operand, numbers, constant)
+            value = _value(operand, numbers)
             return -value if isinstance(sign, ast.USub) else value
     raise AssertionError(ast.dump(tree))
-
-
-def undefined_part(tree: ast.expr, numbers: Mapping[str, float]) -> str | None:
-    """The smallest part of a tree, among those that have names of `numbers` only, without a finite value, in words."""
-    known: dict[ast.AST, bool] = {}
-    for node in reversed(list(ast.walk(tree))):  # parts before what they are parts of
-        function = isinstance(node, ast.Name) and node.id in FUNCTIONS
-        known[node] = function or all(known[part] for part in ast.iter_child_nodes(node))
-        if isinstance(node, ast.Name) and not function:
-            known[node] = node.id in numbers
-        if not isinstance(node, ast.expr) or function or not known[node]:
-            continue
-        with np.errstate(all="ignore"):
-            value = _value(node, numbers)
-            if not np.isfinite(value):
-                inside = node.args[:1] if isinstance(node, ast.Call) else []
-                of = "".join(f" where {ast.unparse(each)} = {_value(each, numbers):g}" for each in inside)
-                return f"{ast.unparse(node)} is {value}{of}"
-    return None
 
 
 class Code:
@@ -174,12 +151,12 @@ class Code:
             if not atoms:
                 what = "no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of the second"
             raise InputError(f"Formula: {formula!r} names {what}", item="formula")
-        self.tree, self.width, n = tree, width, 3 * width
+        self.width, n = width, 3 * width
         names = [f"{kind}{axis}{atom}" for kind in ["", "v"] for atom in range(1, width + 1) for axis in "xyz"]
 
         def value(r: Any, p: Any, t: Any) -> Any:
             known = {name: r[k] for k, name in enumerate(names)} | {name: p[k] for k, name in enumerate(parameters)}
-            return _value(tree, {**known, "t": t, "pi": math.pi}, float)
+            return _value(tree, {**known, "t": t, "pi": math.pi})
 
         with np.errstate(all="ignore"):  # of constants
             tape = differentiated(value, n + n * speeds)
@@ -247,8 +224,11 @@ def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bo
     with np.errstate(all="ignore"):
         value, *slopes = looked(r)
         steep, slope = np.array(slopes[:n]), np.array(slopes[n:] or slopes)
-        seen = np.isfinite(slopes).all(axis=0)
-        if seen.all() and not slope.any():
+        if not np.isfinite([value, *slopes]).all(axis=0).any():
+            raise InputError(
+                f"Formula: {formula!r:.200} is finite nowhere; give numbers with a finite value", item="formula"
+            )
+        if np.isfinite(slopes).all() and not slope.any():
             what = "velocities: it has none of them" if speeds else "positions: its gradient is zero"
             raise InputError(
                 f"Formula: {formula!r} does not change with the {what}; write one that does", item="formula"
@@ -350,6 +330,7 @@ class Formula(Constraint):
     """
 
     held = ANY
+    singular = "value and gradient must be finite, and the gradient not zero; move the atoms, or write another formula"
     shared: ClassVar[tuple[str, ...]] = ("formula", "names", "period")
     per_row: Mapping[str, tuple[int, ...]] = {"values": ()}  # type: ignore[misc]
     values: FloatArray
@@ -398,16 +379,6 @@ class Formula(Constraint):
     @property
     def rate(self) -> Any:  # type: ignore[override]
         return self.code().rate
-
-    def undefined(self, k: int, r: FloatArray, time: float) -> str:
-        axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
-        numbers = dict(zip([*axes, "t", *self.names], [*r.ravel(), time, *self.values[k]], strict=True))
-        numbers |= {f"v{axis}": 1.0 for axis in axes} | {"pi": np.pi}
-        what = undefined_part(self.code().tree, {name: np.float64(value) for name, value in numbers.items()})
-        if what is None:
-            flat = not self.select([k]).gradient(r[None], time).any()
-            what = f"its gradient is {'zero' if flat else 'not finite'}"
-        return f"{self.formula!r}: {what} at the start; move the atoms, or write another formula"
 
     @classmethod
     def _rebuilt(cls, data: Mapping[str, Any]) -> Self:

@@ -29,14 +29,15 @@ from kcons.errors import InputError, SingularGeometryError
 
 #: What takes for ever or all memory, or is no formula in other ways: some text, and what is said of it.
 FROM_OTHERS = {
-    "x1*9**9**9": r"9 \*\* 9 \*\* 9 is inf",
+    "x1*9**9**9": "is finite nowhere",
     "x1*10**-9**9": "its gradient is zero",
-    "x1+2**2**40": "is inf",
-    "pi**pi**pi**pi*x1": "is inf",
+    "x1+2**2**40": "is finite nowhere",
+    "pi**pi**pi**pi*x1": "is finite nowhere",
+    "x1*1e200*1e200": "is finite nowhere",
     "x1*1e999": "a number that is too large",
     "x1+" + "9" * 400: "a number that is too large",
     "x1+0x" + "f" * 4000: "a number that is too large",
-    "x1+log(0)": "is -inf",
+    "x1+log(0)": "is finite nowhere",
     "x999999": "names atom 999999 of a row and not atom 1",
     "x99999999999999999999999": "is not known",
     "+".join(["x1"] * 900): "more than 200 levels",
@@ -69,10 +70,7 @@ def row_of(formula, r, t=0.0):
     ("formula", "value"),
     [
         ("x1**(2**40)", 1.0),
-        ("(((9*x1)**99)**99)**99", np.inf),
         ("(" * 40 + "x1" + "**99)" * 40, 1.0),
-        ("exp(1000*(1000*(1000*log(9*x1))))", np.inf),
-        ("x1*1e200*1e200", np.inf),
         ("x1*12345678901234567890*1e100 + (9*x1)**40", 12345678901234567890e100 + 9.0**40),
         ("sin(" * 60 + "0*x1" + ")" * 60 + "+ x1", 1.0),
     ],
@@ -201,21 +199,17 @@ def test_files_keep_formulas():
 
 
 @pytest.mark.parametrize(
-    ("formula", "x1", "message"),
-    [
-        ("sqrt(1 - x1**2) - z1", 2.0, r"sqrt\(1 - x1 \*\* 2\) is nan where 1 - x1 \*\* 2 = -3 at the start"),
-        ("log(x1)", 0.0, r"log\(x1\) is -inf where x1 = 0"),
-        ("a/x1 + y1", 0.0, r"a / x1 is inf"),
-        ("x1**2", 0.0, "its gradient is zero"),
-        ("sqrt(x1) + y1", 0.0, "its gradient is not finite"),
-    ],
+    ("formula", "x1"),
+    [("sqrt(1 - x1**2) - z1", 2.0), ("log(x1)", 0.0), ("a/x1 + y1", 0.0), ("x1**2", 0.0), ("sqrt(x1) + y1", 0.0)],
 )
-def test_what_is_undefined_at_the_start_is_named(formula, x1, message):
+def test_what_is_undefined_at_the_start_is_refused(formula, x1):
     row = Formula(formula, 1, {"a": 1.0}, target=None)
     x = np.array([[0.0, 0.0, 0.0], [x1, 0.0, 0.0]])
-    with pytest.raises((SingularGeometryError, InputError), match=message) as caught:
+    with pytest.raises(
+        SingularGeometryError, match=r"row 1, Formula\(1\): value and gradient must be finite"
+    ) as caught:
         ConstraintSet([Sphere(0, [1.0, 0, 0]), row], x, np.ones(2), time=TIME)
-    assert caught.value.atoms in ((1,), ())
+    assert caught.value.atoms == (1,)
 
 
 # -- linear in the velocities ------------------------------------------------------------------------------

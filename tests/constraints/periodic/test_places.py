@@ -11,7 +11,6 @@ from kcons.constraints import (
     CenterDistance,
     CenterOfMass,
     Custom,
-    Cylinder,
     Dihedral,
     Distance,
     Ellipsoid,
@@ -36,7 +35,6 @@ UP = np.array([0.3, -0.5, 0.8])
 #: Each takes by how much its atoms are moved from the whole molecule, shape (5, 3).
 PLACES = {
     "Sphere": lambda s: Sphere(1, WHOLE[1] + s[1] + UP, None),
-    "Cylinder": lambda s: Cylinder(1, WHOLE[1] + s[1] + UP, [0, 1.0, 0.3], None),
     "Plane": lambda s: Plane(1, UP, None),
     "Torus": lambda s: Torus(1, WHOLE[1] + s[1] + UP, [0, 0, 1.0], 0.5, None),
     "Ellipsoid": lambda s: Ellipsoid(1, WHOLE[1] + s[1] + UP, [1.0, 2.0, 1.5], target=None),

@@ -12,7 +12,7 @@ import pytest
 from constraint_cases import CASES, MASSES, TIME, scattered
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Angle, Custom, Cylinder, Dihedral, Distance, Plane, RowKind, Sphere
+from kcons.constraints import Angle, Custom, Dihedral, Distance, Ellipsoid, Plane, RowKind, Sphere
 from kcons.errors import InputError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
@@ -44,7 +44,7 @@ COUPLED = [
     Dihedral([[0, 1, 2, 3], [1, 2, 3, 4]]),
     Plane([4], [0.0, 0.6, 0.8]),
     Sphere([6], [5.0, 5.0, 5.0]),
-    Cylinder([7], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]),
+    Ellipsoid([7], [0.0, 1.0, 0.0], [np.inf, 1.0, 1.0], target=None),
 ]
 CELL = np.array([[40.0, 0, 0], [6, 36, 0], [-4, 8, 44]])
 
