@@ -22,7 +22,6 @@ from kcons.motion import Motion
 from kcons.topology import Holding
 from kcons.topology.rigid_groups import (
     GEOMETRIES,
-    VirtualSites,
     body_rows,
     find_waters,
     listed_bodies,
@@ -382,32 +381,8 @@ def test_oxygens_alone_are_left_and_odd_waters_named():
         find_waters(snapshot(["O", "H"], WATER[:2], residue_names=["HOH"]))
 
 
-# -- sites --------------------------------------------------------------------------------------------
-
-
-def sites():
-    """M of TIP4P, and the two lone pairs of TIP5P."""
-    return VirtualSites(
-        np.array([3, 4, 5]),
-        np.tile([0, 1, 2], (3, 1)),
-        np.array([[0.128, 0.128, 0.0], [-0.34, -0.34, 0.64], [-0.34, -0.34, -0.64]]),
-    )
-
-
-def test_spread_forces_do_the_same_work():
-    x = sites().place(np.concatenate([WATER, np.zeros((3, 3))]))
-    f = RNG.normal(size=(6, 3))
-    spread = sites().spread_forces(x, f)
-    assert not spread[3:].any()
-    for _ in range(3):
-        direction = np.concatenate([RNG.normal(size=(3, 3)), np.zeros((3, 3))])
-        h = 1e-6
-        moved = (sites().place(x + h * direction) - sites().place(x - h * direction)) / (2 * h)
-        np.testing.assert_allclose(np.sum(spread * direction), np.sum(f * moved), rtol=0, atol=1e-8)
-    np.testing.assert_allclose(spread.sum(0), f.sum(0), atol=1e-13)
-    np.testing.assert_allclose(np.cross(x, spread).sum(0), np.cross(x, f).sum(0), atol=1e-13)
-
-
 def test_sites_in_other_units():
-    x = sites().place(np.concatenate([WATER, np.zeros((3, 3))]) + 3.0)
-    np.testing.assert_allclose(sites().in_unit(0.1).place(x / 10), x / 10, atol=1e-14)
+    """Lone pairs as they are: heights are lengths, their coefficients are not."""
+    made = lone_pairs(())
+    sites, x = find_waters(made).sites, made.positions
+    np.testing.assert_allclose(sites.in_unit(0.1).place(x / 10), x / 10, atol=1e-14)
