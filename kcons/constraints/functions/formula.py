@@ -18,7 +18,7 @@ import re
 import sys
 import tempfile
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from keyword import iskeyword
@@ -53,8 +53,8 @@ _OPERATIONS: dict[type, Callable[[Any, Any], Any]]
 _OPERATIONS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power}
 
 
-def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tuple[ast.expr, set[int]]:
-    """The tree of a formula, which may have velocities or not, and the atoms in it."""
+def parsed(formula: str) -> ast.expr:
+    """The tree of a formula that is neither too long nor too deep."""
     if len(formula) > MAX_LENGTH:
         raise _too_large(formula, f"has {len(formula)} characters, and at most {MAX_LENGTH} are read")
     try:
@@ -70,44 +70,7 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
         level = [child for node in level for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
     if level:
         raise _too_large(formula, f"is nested in more than {MAX_DEPTH} levels")
-
-    def wrong(part: str, what: str, item: str) -> InputError:
-        return InputError(f"Formula: {part} in {formula!r} {what}", item=item)
-
-    found, called = set(), set()
-    for node in ast.walk(tree):  # what contains something comes before it
-        match node:
-            case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
-                called.add(node.func)
-                if name not in FUNCTIONS or len(args) != 1 + (name == "atan2"):
-                    known = f"{', '.join(sorted(FUNCTIONS))}, of one number each, atan2 of two"
-                    raise wrong(ast.unparse(node), f"is no function of formulas; these are {known}", name)
-            case ast.Name(id=name):
-                known_as = _COORDINATE.fullmatch(name)
-                if known_as and (speeds or not known_as[1]):
-                    found.add(int(known_as[2]))
-                elif known_as:
-                    held = "what is linear in velocities is held by VelocityFormula"
-                    raise wrong(repr(name), f"is a velocity; {held}", name)
-                elif name in FUNCTIONS and node not in called:
-                    raise wrong(name, f"is a function; write what it is of, as in {name}(x1)", name)
-                elif name not in (*FUNCTIONS, *parameters, "t", "pi"):
-                    places = "x1, y1, z1, x2, ..." + (", vx1, vy1, ..." if speeds else "")
-                    known = ", ".join([places, "t", "pi", *parameters])
-                    remedy = f"Give it as a parameter: parameters={{{name!r}: ...}}"
-                    raise wrong(repr(name), f"is not known; known are {known}. {remedy}", name)
-            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
-                if not value <= sys.float_info.max:
-                    raise _too_large(formula, "has a number that is too large", "write it in other units")
-            case ast.BinOp(op=operation) if type(operation) in _OPERATIONS:
-                pass
-            case ast.UnaryOp(op=ast.USub() | ast.UAdd()) | ast.operator() | ast.unaryop() | ast.expr_context():
-                pass
-            case _:
-                hint = "; a power is written **" if isinstance(node, ast.BinOp) else ""
-                allowed = f"use + - * / **, numbers, names and functions{hint}"
-                raise wrong(repr(ast.unparse(node)), f"is not allowed; {allowed}", "formula")
-    return tree, found
+    return tree
 
 
 def _too_large(
@@ -118,21 +81,45 @@ def _too_large(
     return InputError(f"Formula: {formula!r:.60} {what}; {remedy}", item="formula")
 
 
-def _value(tree: ast.expr, numbers: Mapping[str, Any]) -> Any:
-    """The value of a tree, with numbers for names."""
+def _value(tree: ast.expr, numbers: Mapping[str, Any], formula: str) -> Any:
+    """The value of a part of a formula, with numbers for names."""
+
+    def value(part: ast.expr) -> Any:
+        return _value(part, numbers, formula)
+
     match tree:
-        case ast.Constant(value=int() | float() as value):
-            return float(value)
-        case ast.Name(id=name):
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            if not number <= sys.float_info.max:
+                raise _too_large(formula, "has a number that is too large", "write it in other units")
+            return float(number)
+        case ast.Name(id=name) if name in numbers:
             return numbers[name]
-        case ast.Call(func=ast.Name(id=name), args=args):
-            return FUNCTIONS[name](*(_value(each, numbers) for each in args))
-        case ast.BinOp(left=left, op=operation, right=right):
-            return _OPERATIONS[type(operation)](_value(left, numbers), _value(right, numbers))
-        case ast.UnaryOp(op=sign, operand=operand):
-            value = _value(operand, numbers)
-            return -value if isinstance(sign, ast.USub) else value
-    raise AssertionError(ast.dump(tree))
+        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in FUNCTIONS and len(args) == 1 + (
+            name == "atan2"
+        ):
+            return FUNCTIONS[name](*map(value, args))
+        case ast.BinOp(left=left, op=operation, right=right) if type(operation) in _OPERATIONS:
+            return _OPERATIONS[type(operation)](value(left), value(right))
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -value(operand)
+        case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+            return value(operand)
+    item = "formula"
+    match tree:
+        case ast.Call(func=ast.Name(id=item)):
+            known = f"{', '.join(sorted(FUNCTIONS))}, of one number each, atan2 of two"
+            what = f"is no function of formulas; these are {known}"
+        case ast.Name(id=item) if item in FUNCTIONS:
+            what = f"is a function; write what it is of, as in {item}(x1)"
+        case ast.Name(id=item) if _COORDINATE.fullmatch(item):
+            what = "is a velocity; what is linear in velocities is held by VelocityFormula"
+        case ast.Name(id=item):
+            known = ", ".join(["x1, y1, z1, x2, ...", *(name for name in numbers if not _COORDINATE.fullmatch(name))])
+            what = f"is not known; known are {known}. Give it as a parameter: parameters={{{item!r}: ...}}"
+        case _:
+            hint = "; a power is written **" if isinstance(tree, ast.BinOp) else ""
+            what = f"is not allowed; use + - * / **, numbers, names and functions{hint}"
+    raise InputError(f"Formula: {ast.unparse(tree)!r} in {formula!r:.200} {what}", item=item)
 
 
 class Code:
@@ -143,23 +130,28 @@ class Code:
     """
 
     def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool = False) -> None:
-        tree, atoms = parsed(formula, parameters, speeds)
-        width = max(atoms, default=0)
-        if len(atoms) < max(width, 1):
-            least = min({*range(1, width + 1)} - atoms, default=0)
+        tree = parsed(formula)
+        places = [_COORDINATE.fullmatch(node.id) for node in ast.walk(tree) if isinstance(node, ast.Name)]
+        atoms = {int(place[2]) for place in places if place and (speeds or not place[1])}
+        self.width = width = max(atoms, default=0)
+        if len(atoms) < width:
+            least = min({*range(1, width + 1)} - atoms)
             what = f"atom {width} of a row and not atom {least}; number them from 1 on"
-            if not atoms:
-                what = "no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of the second"
             raise InputError(f"Formula: {formula!r} names {what}", item="formula")
-        self.width, n = width, 3 * width
-        names = [f"{kind}{axis}{atom}" for kind in ["", "v"] for atom in range(1, width + 1) for axis in "xyz"]
+        n = 3 * width
+        names = [
+            f"{kind}{axis}{atom}" for kind in ("", "v")[: 1 + speeds] for atom in range(1, width + 1) for axis in "xyz"
+        ]
 
         def value(r: Any, p: Any, t: Any) -> Any:
             known = {name: r[k] for k, name in enumerate(names)} | {name: p[k] for k, name in enumerate(parameters)}
-            return _value(tree, {**known, "t": t, "pi": math.pi})
+            return _value(tree, {**known, "t": t, "pi": math.pi}, formula)
 
         with np.errstate(all="ignore"):  # of constants
             tape = differentiated(value, n + n * speeds)
+        if not atoms:
+            what = "no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of the second"
+            raise InputError(f"Formula: {formula!r} names {what}", item="formula")
         found, *slopes, moves = (_text(each) for each in tape.results)
         steep, slope = slopes[:n], slopes[n:] or slopes
         self.invariant = _look(formula, tape, n, speeds, len(parameters)) and width > 1

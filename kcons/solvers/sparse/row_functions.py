@@ -172,7 +172,7 @@ def _function_of(item: Custom) -> Callable[[int, FloatArray], tuple[float, Float
         r = place.copy()
         r.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
         here, value, before = r.tobytes(), item.row_value(k, r), last.get(k)
-        if before is not None and before[:2] == (here, value):
+        if before is not None and before[0] == here and before[1] == value:
             return value, before[2]
         slope = item.row_gradient(k, r)
         last[k] = here, value, slope.copy()

@@ -44,7 +44,7 @@ FROM_OTHERS = {
     "x1+" * 5000 + "x1": "at most 10000",
     "-" * 3000 + "x1": "nested",
     "(" * 3000 + "x1" + ")" * 3000: "nested",
-    "x1*sin": "sin in .* is a function; write what it is of",
+    "x1*sin": "'sin' in .* is a function; write what it is of",
     "x1*True": "is not allowed",
     "x1\ud800": "cannot be read",
     "x1\0": "cannot be read",
