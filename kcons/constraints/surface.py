@@ -7,7 +7,7 @@ taken from the positions as they are: surfaces are not repeated in periodic cell
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,20 +25,11 @@ from kcons.constraints.arguments import (
     check_range,
     unit,
 )
-from kcons.constraints.constraint import Constraint, Fault, RowKind
-from kcons.constraints.target import MovingTarget, Target
+from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.target import Target
 from kcons.errors import InputError
 
-__all__ = [
-    "Ellipsoid",
-    "FixedAtoms",
-    "Line",
-    "LinearCombination",
-    "LinearRelation",
-    "Plane",
-    "Sphere",
-    "Torus",
-]
+__all__ = ["Ellipsoid", "FixedAtoms", "Line", "LinearCombination", "LinearRelation", "Plane", "Sphere", "Torus"]
 
 _VECTOR = (3,)
 
@@ -57,14 +48,6 @@ class LinearCombination(Constraint):
         What each coordinate is multiplied with.
     target : float, array_like, callable of time, MovingTarget or None
         Value held.
-
-    Examples
-    --------
-    Two atoms kept at the same height:
-
-    >>> level = LinearCombination([0, 1], [[0, 0, 1], [0, 0, -1]], target=0.0)
-    >>> level.n_rows
-    1
     """
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
@@ -108,14 +91,6 @@ class LinearRelation(LinearCombination):
         w_i. With weights that sum to 1 the relation is independent of the origin, and minimum images apply.
     target : array_like of shape (n, 3), callable of time, MovingTarget, or None
         What r_a - sum_i w_i r_i is held at; zero by default, None takes the initial value.
-
-    Examples
-    --------
-    The carbon of CO2 in the middle of its oxygens:
-
-    >>> relation = LinearRelation(0, [1, 2], [0.5, 0.5])
-    >>> relation.n_rows, relation.translation_invariant
-    (3, True)
     """
 
     def __init__(self, atoms: ArrayLike, bases: ArrayLike, weights: ArrayLike, target: Target = 0.0) -> None:
@@ -153,9 +128,6 @@ class FixedAtoms(LinearCombination):
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
         column = atom_table(atoms, self.family, 1)
-        if not callable(target) and not isinstance(target, MovingTarget | None):
-            place = as_float_array(target, "target")
-            target = np.tile(place, len(column)) if place.shape == (3,) else place
         super().__init__(np.repeat(column, 3, axis=0), np.tile(np.eye(3), (len(column), 1))[:, None, :], target)
         values, counts = np.unique(column, return_counts=True)
         if len(values) < len(column):
@@ -190,7 +162,6 @@ class Sphere(Surface):
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR}
     length_powers = {"center": 1}
     singular = "atom {atom} lies at the center of the sphere: gradient undefined; move the atom"
-    center: FloatArray
 
     def __init__(self, atoms: ArrayLike, center: Lengths, radius: Target = None) -> None:
         super().__init__(atoms, radius, center=center)
@@ -222,7 +193,6 @@ class Torus(Surface):
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR, "axis": _VECTOR, "major_radius": ()}
     length_powers = {"center": 1, "major_radius": 1}
     singular = "atom {atom} lies on the axis or on the core circle of the torus: gradient undefined; move the atom"
-    major_radius: FloatArray
 
     def __init__(
         self,
@@ -271,9 +241,7 @@ class Ellipsoid(Surface):
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"size": (), "center": _VECTOR, "matrix": (3, 3)}
     length_powers = {"size": 1, "center": 1, "matrix": -1}
     singular = "atom {atom} lies at the center of the ellipsoid: gradient undefined; move the atom"
-    #: s, and B with y = B (r - c), whose rows are e_i/a_i.
-    size: FloatArray
-    matrix: FloatArray
+    size: FloatArray  # s; the rows of the matrix are e_i/a_i
 
     def __init__(
         self,
@@ -293,14 +261,8 @@ class Ellipsoid(Surface):
             )
         if not np.all(inverse.any(axis=1)):
             raise InputError("Ellipsoid: a row has no finite semi-axis", item="semi_axes")
-        matrix = axes * inverse[:, :, None]
-        self._keep(size=_size(matrix), center=center, matrix=matrix)
-
-    def _settle(self) -> None:
-        if not hasattr(self, "size"):  # not yet, `__init__` keeps it later
-            return
-        if not np.allclose(_size(self.matrix), self.size, rtol=1e-9):
-            raise InputError("Ellipsoid: size and matrix do not belong together", item="matrix")
+        size = np.sqrt(np.count_nonzero(inverse, axis=1) / np.square(inverse).sum(axis=1))
+        self._keep(size=size, center=center, matrix=axes * inverse[:, :, None])
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
@@ -319,17 +281,6 @@ class Ellipsoid(Surface):
 
     def scale(self, time: float = 0.0) -> FloatArray:
         return self.size
-
-    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
-        yield from super().faults(r, time)
-        if self.target is not None:
-            target, words = self.target_at(time), "lies beyond the center of the ellipsoid; use 0 for its surface"
-            yield ~(target > -self.size), lambda k: f"target {target[k]:g} {words}", "target"
-
-
-def _size(matrix: FloatArray) -> FloatArray:
-    with np.errstate(all="ignore"):  # of files
-        return np.asarray(np.sqrt(matrix.any(axis=2).sum(axis=1) / np.square(matrix).sum(axis=(1, 2))))
 
 
 class Plane(LinearCombination):

@@ -55,7 +55,7 @@ def spread(atoms: object, *, given: bool = True) -> kc.Custom:
 CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Distance": lambda: kc.Distance([[0, 1], [2, 3], [7, 1]]),
     "Distance moving": lambda: kc.Distance([[4, 6], [5, 0]], lambda t: [1 + 0.1 * np.sin(t), 2.0]),
-    "DistanceDifference": lambda: kc.DistanceDifference([[[0, 1], [1, 2]], [[3, 5], [5, 6]]]),
+    "DistanceDifference": lambda: kc.DistanceDifference([[3, 5], [5, 6]]),
     "DistanceDifference of a star and a pair": lambda: kc.DistanceDifference(
         [[1, 0], [1, 2], [7, 1], [4, 6]], weights=[1.0, -0.5, 2.0, -1.0]
     ),

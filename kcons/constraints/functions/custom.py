@@ -9,15 +9,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import (
-    ANY,
-    LENGTH,
-    FloatArray,
-    as_float_array,
-    check_call,
-    positive,
-    read_only_view,
-)
+from kcons.constraints.arguments import ANY, LENGTH, FloatArray, as_float_array, check_call, positive, read_only_view
 from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.target import FIRST_4, WRONG, Target, first_derivative_4, nearest_image, second_derivative
 from kcons.errors import InputError
@@ -156,16 +148,15 @@ class Custom(Constraint):
 
         def worst(k: int) -> str:
             a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - other[k]))), other[k].shape)
-            one, finer, step = slope[k, a, i], other[k, a, i], 1e-3 * self._length(r[k])
+            found, finer = f"{slope[k, a, i]:.6g} for {'xyz'[i]} of its atom {self.atoms[k, a]}", other[k, a, i]
             if given:
                 return (
-                    f"gradient gives {one:.6g} for {'xyz'[i]} of its atom {self.atoms[k, a]}, but differences of the "
-                    f"function give {finer:.6g}; correct it, or give the length over which the function varies "
-                    "(length=...)"
+                    f"gradient gives {found}, but differences of the function give {finer:.6g}; correct it, or give "
+                    "the length over which the function varies (length=...)"
                 )
             return (
-                f"differences with steps of {step:g} and half of that disagree about the gradient, {one:.3g} and "
-                f"{finer:.3g}: it vanishes, or the function varies faster. Move the atoms, give the length over which "
+                f"differences give {found}, and with half of their step {finer:.6g}: the gradient vanishes, or the "
+                f"function varies faster than over {self._length(r[k]):g}. Move the atoms, give the length over which "
                 "it varies (length=...), or its gradient"
             )
 

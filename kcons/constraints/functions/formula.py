@@ -403,9 +403,7 @@ class VelocityFormula(Formula):
     Raises
     ------
     InputError
-        As `Formula`; a formula that is not linear in the velocities.
-    SingularGeometryError
-        When put into a set: coefficients that are all zero, or not finite.
+        A formula that is not linear in the velocities; else as `Formula`.
 
     Examples
     --------

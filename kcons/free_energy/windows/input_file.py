@@ -37,7 +37,7 @@ MOST_WINDOWS = 100_000
 #: How many atoms each kind of coordinate has, and what it becomes.
 FAMILIES: dict[str, tuple[int, Callable[[ArrayLike], Constraint]]] = {
     "distance": (2, Distance),
-    "difference": (4, lambda rows: DistanceDifference(np.reshape(rows, (-1, 2, 2)))),
+    "difference": (4, lambda rows: DistanceDifference(np.reshape(rows, (-1, 2)))),
     "angle": (3, Angle),
     "dihedral": (4, Dihedral),
 }
