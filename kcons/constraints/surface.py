@@ -162,6 +162,7 @@ class Sphere(Surface):
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR}
     length_powers = {"center": 1}
     singular = "atom {atom} lies at the center of the sphere: gradient undefined; move the atom"
+    center: FloatArray
 
     def __init__(self, atoms: ArrayLike, center: Lengths, radius: Target = None) -> None:
         super().__init__(atoms, radius, center=center)

@@ -230,8 +230,6 @@ def test_what_is_left_to_the_engine() -> None:
     assert packed(Distance(PAIRS[:2]), FixedAtoms([0])) and packed(Distance([[0, 1]]), Angle([[1, 0, 2]]))
     assert packed(Distance([[0, 1]]), Plane(2, [0, 0, 1.0]))
     assert not packed(Distance([[0, 1]]), Plane(2, [0, 0, 1.0], MovingTarget(lambda t: 0.1 * t)))
-    wavy = Custom([[0], [2]], lambda r: r[0, 2] ** 3 + r[0, 2], lambda r: (3 * r**2 + 1) * [0, 0, 1.0])
-    assert not packed(wavy)
     many = np.arange(6.0 * (MOST_ROWS + 1)).reshape(-1, 3)
     pairs, particles = np.arange(2 * MOST_ROWS + 2).reshape(-1, 2), np.arange(MOST_ROWS + 1)
     for begin, known in ((0, False), (1, True)):

@@ -9,7 +9,7 @@ from rows_in_cells import CHAIN, MASSES, ROWS
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, FixedAtoms, LinearCombination, MovingTarget
 from kcons.constraints.periodic.one_piece import follow_parents, lattice_of, make_whole, spanning_tree
-from kcons.errors import ContradictionError, ImageError, InputError
+from kcons.errors import ImageError, InputError
 
 CELLS = {
     "box": (np.diag([9.0, 11.0, 10.0]), (True, True, True)),
@@ -112,22 +112,6 @@ def test_atoms_that_nothing_ties_raise_before_their_image_flips(wrapped):
     assert set(caught.value.atoms) <= {0, 1, 2, 3}
     assert "time step" not in str(caught.value)
     assert np.array_equal(state.positions % 10.0 if wrapped else state.positions, before)
-
-
-def test_rows_between_fixed_atoms_that_begin_to_move():
-    """They are fulfilled at set-up, and asked for what the fixed atoms do not do later."""
-    x = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    late = MovingTarget(lambda t: 1 + max(0.0, t - 1) ** 2, lambda t: 2 * max(0.0, t - 1), lambda t: 2.0 * (t > 1))
-    motion = Motion(ConstraintSet([FixedAtoms([0, 1]), Distance([[0, 1]], late), Distance([[1, 2]])], x, np.ones(3)), x)
-    nothing = np.zeros((3, 3))
-    assert np.array_equal(motion.project_velocities(x, nothing, time=0.5), nothing)
-    for call in (
-        lambda: motion.project_positions(x, x, time=2.0),
-        lambda: motion.project_velocities(x, nothing, time=2.0),
-        lambda: motion.acceleration(x, nothing, nothing, 2.0),
-    ):
-        with pytest.raises(ContradictionError, match=r"Distance\(0, 1\) lies between fixed atoms"):
-            call()
 
 
 def test_conversions_are_visible():
@@ -256,15 +240,6 @@ def test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell():
 # -- what hangs together in one piece ---------------------------------------------------------------------
 
 LATTICE = np.array([[7.0, 0, 0], [2.0, 8.0, 0], [-1.0, 3.0, 9.0]])
-
-
-def test_a_tree_is_walked_breadth_first_from_its_roots():
-    pairs = np.array([[0, 1], [1, 2], [2, 3], [5, 4]])
-    atoms, parents = spanning_tree(pairs, 7, np.array([2, 6, 5, 0, 1, 3, 4]))
-    assert dict(zip(atoms.tolist(), parents.tolist(), strict=True)) == {2: 2, 1: 2, 3: 2, 0: 1, 6: 6, 5: 5, 4: 5}
-    place = np.argsort(atoms)
-    assert np.all(place[parents] <= place[atoms])
-    assert spanning_tree(np.zeros((0, 2), np.int64), 2)[0].tolist() == [0, 1]
 
 
 def test_whole_pieces_are_rounded_once():

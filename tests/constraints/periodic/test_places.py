@@ -13,15 +13,12 @@ from kcons.constraints import (
     Custom,
     Dihedral,
     Distance,
-    Ellipsoid,
     FixedAtoms,
     Formula,
-    Line,
     LinearCombination,
     Plane,
     RadiusOfGyration,
     Sphere,
-    Torus,
     VelocityFormula,
 )
 
@@ -36,15 +33,11 @@ UP = np.array([0.3, -0.5, 0.8])
 PLACES = {
     "Sphere": lambda s: Sphere(1, WHOLE[1] + s[1] + UP, None),
     "Plane": lambda s: Plane(1, UP, None),
-    "Torus": lambda s: Torus(1, WHOLE[1] + s[1] + UP, [0, 0, 1.0], 0.5, None),
-    "Ellipsoid": lambda s: Ellipsoid(1, WHOLE[1] + s[1] + UP, [1.0, 2.0, 1.5], target=None),
-    "Line": lambda s: Line(1, None, UP),
     "FixedAtoms": lambda s: FixedAtoms(1),
     "Formula": lambda s: Formula(
         "(x1 - a)**2 + (y1 - b)*(z1 - c)", 1, dict(zip("abc", s[1] + [8.0, 1.0, 2.0], strict=True)), target=None
     ),
     "Custom": lambda s: Custom(1, lambda r: float(np.sin(r[0, 0] - s[1, 0]) + r[0, 1]), target=None),
-    "CenterOfMass": lambda s: CenterOfMass([[1]]),
     "CenterOfMass of three": lambda s: CenterOfMass([[1, 2, 4]], axes=(0, 2)),
     "LinearCombination": lambda s: LinearCombination([[1, 3]], [[1.0, 2.0, 0.0], [0.5, 0.0, 1.0]]),
     "Custom of two": lambda s: Custom(
