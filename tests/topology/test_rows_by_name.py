@@ -165,12 +165,7 @@ def test_no_masses_no_hydrogens_and_torn_molecules():
 @pytest.mark.parametrize(
     ("atom", "shift", "said", "options"),
     [
-        (
-            10,
-            26.0,
-            r"H of HOH 2 \(atom 10\) are bonded and 27 angstrom apart; give the periodic cell",
-            {},
-        ),
+        (10, 26.0, r"H of HOH 2 \(atom 10\) are bonded and 27 angstrom apart; give the periodic cell", {}),
         (10, 6.0, "give the periodic cell", {"water_geometry": "TIP3P"}),
         (0, 26.0, r"C of EOH 1 \(atom 0\) and C of EOH 1 \(atom 1\)", {"rigid_residues": ["EOH"]}),
         (0, 26.0, r"C of EOH 1 \(atom 0\) and C of EOH 1 \(atom 1\)", {"rigid_bodies": [np.arange(4)]}),

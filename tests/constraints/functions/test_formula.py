@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +17,9 @@ from kcons.constraints import (
     Sphere,
     from_dict,
 )
-from kcons.constraints.functions import formula as formulas
 from kcons.constraints.functions.formula import FUNCTIONS, code_of
 from kcons.errors import InputError, SingularGeometryError
+from kcons.solvers.sparse.row_functions import row_function
 
 #: What takes for ever or all memory, or is no formula in other ways: some text, and what is said of it.
 FROM_OTHERS = {
@@ -129,36 +126,14 @@ def test_every_function_is_differentiated_exactly():
         np.testing.assert_allclose(found, bend, rtol=1e-7, atol=1e-7, err_msg=name)
 
 
-PROGRAM = """
-import numpy as np
-from kcons import ConstraintSet, Motion
-from kcons.constraints import Formula
-x = np.array([[0.3, 0.2, 0.1]])
-motion = Motion(ConstraintSet(Formula("x1**2 + a*y1 - z1", 0, {"a": 2.0}, None), x, [1.0]), x)
-print(motion.project_positions(x + 0.01, x)[0].tolist())
-"""
-
-
-def projected(folder: Path) -> tuple[str, str]:
-    """What the program prints, and what it says besides."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=Path(formulas.__file__).parents[3],
-        env={**os.environ, "XDG_CACHE_HOME": str(folder), "NUMBA_CACHE_DIR": ""},
-    )
-    return done.stdout, done.stderr
-
-
-def test_another_process_needs_no_compiler(tmp_path):
-    """What the first one wrote serves the second one."""
-    first, _ = projected(tmp_path)
-    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    assert {path.suffix for path in files} == {".py", ".nbi", ".nbc"}
-    assert projected(tmp_path) == (first, "")
-    assert files == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+def test_what_is_compiled_is_found_again(tmp_path, monkeypatch):
+    """By the name of its module, which is the same in each process."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    hits = []
+    for _ in range(3):  # Numba sees the new folder after the first
+        code_of.cache_clear()
+        hits.append(row_function(Formula("x1 + 0.375*y1", 0), np.zeros(1)).cache_hits)
+    assert hits == [0, 0, 1]
 
 
 def test_a_file_that_is_damaged_is_written_anew(tmp_path, monkeypatch):
