@@ -1,4 +1,4 @@
-"""Which images rows mean: atoms stored anywhere, long bodies, frameworks, drifting apart; rows with a place in space."""
+"""Which images rows mean: atoms stored anywhere, long bodies, frameworks, drifting apart; rows that know a place."""
 
 from __future__ import annotations
 
