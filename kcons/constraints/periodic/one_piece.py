@@ -24,18 +24,21 @@ def lattice_of(cell: FloatArray | None, pbc: bool | Sequence[bool] | BoolArray) 
 
     Directions without periodicity get a unit vector normal to the others. None without a periodic direction.
     """
-    periodic = np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
+    periodic = np.zeros(3, dtype=bool) | np.asarray(pbc, dtype=bool)
     if cell is None or not periodic.any():
         return None
-    full = cell.copy()
-    basis = cell[periodic]
-    _, singular, vh = np.linalg.svd(basis)
-    if singular.min() < 1e-10 * max(singular.max(), np.finfo(float).tiny):
-        raise InputError("the periodic cell vectors are zero or not independent", item="cell")
-    full[~periodic] = vh[len(basis) :]
-    inverse = np.linalg.inv(full)
+    full, basis = cell.copy(), cell[periodic]
+    if len(basis) < 3:
+        full[~periodic] = np.linalg.svd(basis)[2][len(basis) :]
+    singular = InputError("the periodic cell vectors are zero or not independent", item="cell")
+    try:
+        inverse = np.linalg.inv(full)
+    except np.linalg.LinAlgError:
+        raise singular from None
     inverse[:, ~periodic] = 0.0
-    return np.ascontiguousarray(np.stack([full, inverse]))
+    if not np.vdot(basis, basis) * np.vdot(inverse, inverse) < 1e20:
+        raise singular
+    return np.array([full, inverse])
 
 
 def minimum_image(d: FloatArray, lattice: FloatArray | None) -> FloatArray:
@@ -101,7 +104,7 @@ def make_whole(x: FloatArray, atoms: IntArray, parents: IntArray, lattice: Float
     """
     y = x.copy()
     if lattice is not None:
-        plain_if_small(follow_parents, 3 * len(atoms))(y, atoms, parents, lattice)
+        plain_if_small(follow_parents, 30 * len(atoms))(y, atoms, parents, lattice)
     return y
 
 
