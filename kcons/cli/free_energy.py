@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -131,29 +130,18 @@ OF_FAMILIES = [
 def _free_energy(chosen: argparse.Namespace) -> int:
     from kcons.comparison.progress import Watcher
     from kcons.free_energy import Windows, read_input
-    from kcons.steppers.files import text, write_files
 
     given = read_input(chosen.input, allow_modules=chosen.allow_module or ())
     folder: Path = chosen.out or Path(chosen.input.stem)
-    how = {**given.options, "workers": chosen.workers}
-    windows, pulls, ways = Windows(given.sampler, folder, given.settings, **how), None, given.pulls
-    if ways:  # a folder belongs to settings, and pulls are slower than the way to a window
-        slow = replace(given.settings, pull=ways.pop("steps"))
-        pulls = Windows(given.sampler, folder / "pulls", slow, **how)
+    windows = Windows(given.sampler, folder, given.settings, workers=chosen.workers, **given.options)
     watcher = Watcher(shown=True)
     with windows.taken(), watcher, watcher.piece(f"{len(given.targets)} windows in {folder}", 1.0):
-        for each in filter(None, (windows, pulls)):
-            each.progress = lambda done, total: watcher.advance(done / total)
+        windows.progress = lambda done, total: watcher.advance(done / total)
         found = windows.run(given.targets)
         if given.improve and not found.failed:
             found = windows.improve(**given.improve)
-        # Before pulls, which may fail.
-        written, said = found.write(folder), [found.summary()]
-        if ways and pulls:
-            numbers, beside = found.beside(pulls.pull(**ways), ways["start"], ways["end"])
-            written += write_files(folder, {"pulls.json": text(numbers).encode()})
-            said.append(beside)
-    show(found.table(), "\n".join(said))
+        written = found.write(folder)
+    show(found.table(), found.summary())
     say_written(written)
     return INCOMPLETE if found.failed else 0
 
