@@ -217,6 +217,7 @@ SCANS = [
     *((partial(Grid, rows, values), item, said) for rows, values, item, said in _GRIDS),
     *((partial(scanned, TURN, [0.1], **how), None, next(iter(how))) for how in _WRONG),
     (lambda: scanned(None, [0.1]), None, "coordinates has None"),
+    (lambda: scanned([TURN, LENGTH], 3.0), "values", "2 coordinates have 1 lists of values; give one list for each"),
     (
         lambda: methanol({"t": _ENDS}).at([1.0, 2.0]),
         "targets",
