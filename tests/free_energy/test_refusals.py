@@ -81,7 +81,7 @@ SAMPLERS = [
     (lambda: methanol({"turn": 90}), "turn", "'turn' is 90; give a kcons constraint of one row"),
     (lambda: methanol({"q": Distance([[0, 1], [1, 3]])}), "q", "'q' is .*; give a kcons constraint of one row"),
     (lambda: methanol({"q": KnifeEdge(0, 1, (0, 0, 1))}), "q", "velocity constraint.*holds no coordinate"),
-    (lambda: AseWindows(molecule("C2H2"), CALCULATOR, {"t": _ENDS}), None, "undefined", SingularGeometryError),
+    (lambda: AseWindows(molecule("C2H2"), CALCULATOR, {"t": _ENDS}), None, "collinear", SingularGeometryError),
     (lambda: two_particles({"r": Distance([[0, 9]])}), "atoms", "no atom 9; the System has 2 part"),
     (lambda: two_particles({"r": LENGTH}, 0), "topology", "Topology has 0 atoms and the System 2 particle"),
     (lambda: recorder("t", TURN), "dynamics", r"no kcons\.ase\.Constraints objects"),
