@@ -4,19 +4,18 @@ Clusters of equal shape are solved side by side, across copies and molecules, on
 said by the engines (`kcons.Motion`) of the systems. Gradients go through positions, velocities, masses and lengths, by
 the equations at the solution.
 
-- `row_functions`: families of constraints on tensors
-- `clusters`: the equations of clusters that look alike, number by number or in one tensor, by sparse elimination
-- `groups`: where the clusters of a batch are in its tensors
-- `batch`: many systems, what is asked of them, and projections that torch differentiates
+- `clusters`: families of constraints on tensors, and the equations of clusters that look alike, number by number or in
+  one tensor, by sparse elimination
+- `batch`: many systems, what is asked of them, where their clusters are, and projections that torch differentiates
 - `steps`: RATTLE and Langevin dynamics
 """
 
 from kcons.errors import with_extra
 
 try:
-    from kcons.batched.batch import Batch, Solved
+    from kcons.batched.batch import Batch
     from kcons.batched.steps import gbaoab, rattle
 except ModuleNotFoundError as error:
     raise with_extra(error, "kcons.batched") from error
 
-__all__ = ["Batch", "Solved", "gbaoab", "rattle"]
+__all__ = ["Batch", "gbaoab", "rattle"]

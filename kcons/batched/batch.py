@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
-from itertools import pairwise
+from functools import lru_cache
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from kcons.batched.clusters import Problem
-from kcons.batched.groups import Group, kinds_of
-from kcons.constraints.arguments import IntArray, whole_number
+from kcons.batched.clusters import Lanes, Levels, Pattern, Problem, Row, tape_of
+from kcons.constraints.arguments import FloatArray, IntArray, whole_number
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
+from kcons.plan.clusters import Alike, alike
 
 #: Parts of its scale that a row may be off by, and so many roundings in single precision.
 ACCEPTED, ROUNDINGS = 1e-10, 1e3
@@ -28,14 +29,6 @@ MAX_ITERATIONS, UNWATCHED = 30, 5
 ENOUGH = 2
 
 
-class Solved(NamedTuple):
-    """Positions on the rows, by how much atoms were moved, M^-1 A^T Lambda, and Lambda by row in natural units."""
-
-    positions: Tensor
-    push: Tensor
-    multipliers: Tensor
-
-
 class Batch:
     """Constrained motion of many systems at once, on PyTorch tensors, differentiable.
 
@@ -45,7 +38,7 @@ class Batch:
     Parameters
     ----------
     motions : Motion or sequence of Motion
-        Engines of the systems, one a system; the same object may come any number of times.
+        Engines of the systems, one a system.
     copies : int
         How many times all of these are there.
     device : str or torch.device
@@ -53,7 +46,7 @@ class Batch:
         torch.float64 or torch.float32.
     compiled : bool
         Whether steps for small clusters are compiled by `torch.compile`, once for each shape: some ten seconds, after
-        which a projection takes a third of the time on a processor, and a few launches on a GPU.
+        which a projection takes a third of the time, and a few launches on a GPU.
     check_every : int, optional
         Projections of positions after which failures are looked for: 1 on a processor, and 100 on a GPU, where looking
         waits for the device.
@@ -69,13 +62,12 @@ class Batch:
         System of each atom.
     masses : Tensor, shape (n_atoms,)
     targets : Tensor, shape (n_rows,)
-        What rows are held at; of moving targets, at time 0.
-    ranks, degrees_of_freedom : Tensor, shape (n_systems,)
+        What rows are held at.
 
     Raises
     ------
     UnsupportedError
-        A function of a user that cannot be run on tensors.
+        A row that moves with time, or a function of a user that cannot be run on tensors.
     InputError
         No systems, no copies, or another type of number.
     """
@@ -106,23 +98,19 @@ class Batch:
         self._numbers: dict[Motion, list[int]] = {}
         for number, each in enumerate(self.systems):
             self._numbers.setdefault(each, []).append(number)
-        self.system_idx = torch.as_tensor(
-            np.repeat(np.arange(self.n_systems), np.diff(self.atom_starts)), device=self.device
-        )
+        self.system_idx = self._joined(lambda each: np.zeros(each.n_atoms), torch.int64, range(self.n_systems))
         self.masses = self._joined(lambda each: each.masses)
         self.targets = self._joined(lambda each: each.constraint_set.target(0.0))
-        self.ranks = self._joined(lambda each: [each.rank], torch.int64)
-        self.degrees_of_freedom = self._joined(lambda each: [each.degrees_of_freedom], torch.int64)
-        self._still, self._calls = torch.zeros_like(self.targets), 0
+        self._calls = 0
         # Fixed atoms, in the order of their rows.
         self._fixed_rows = self._joined(lambda each: each.plan.pinned_rows, torch.int64, self.row_starts)
-        self._fixed = self._joined(_fixed_atoms, torch.int64, self.atom_starts)
+        self._fixed = self._joined(lambda each: each.plan.pinned, torch.int64, self.atom_starts)
         self._free = self.masses > 0
         self._free[self._fixed] = False
         self._inverse_masses = self._inverse(self.masses)
-        self._moving = any(each.constraint_set.moving for each in self._numbers)
         self._is_position = self._joined(lambda each: each.constraint_set.holonomic, torch.bool)
         self._holonomic = bool(self._is_position.all())
+        self._rates = torch.where(self._is_position, 0.0, self.targets)
         self._set_lattices()
         self._given, self._known = (self.masses, self.targets), dict[bool, list[Group]]()
         self._groups(True)
@@ -145,8 +133,7 @@ class Batch:
                 for pattern, kind in kinds_of(motion, velocity_rows).items():
                     where = np.stack([numbers, self.atom_starts[numbers], self.row_starts[numbers]], axis=1)
                     parts.setdefault(pattern, []).append((kind, where))
-            own = [self._inverse_masses], [self.targets, self._still]
-            self._known[velocity_rows] = [Group(pattern, each, own, self.compiled) for pattern, each in parts.items()]
+            self._known[velocity_rows] = [Group(pattern, each, self) for pattern, each in parts.items()]
         return self._known[velocity_rows]
 
     # -- cells ----------------------------------------------------------------------------------------
@@ -182,22 +169,17 @@ class Batch:
     # -- what is given --------------------------------------------------------------------------------
 
     def _flat(self, x: Tensor, item: str) -> Tensor:
-        if not isinstance(x, Tensor) or x.shape[-1:] != (3,) or x.numel() != 3 * self.n_atoms:
-            shape = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
-            wanted = f"a tensor of shape ({self.n_atoms}, 3) or (copies, atoms, 3)"
-            raise InputError(f"{item} must be {wanted}, not {shape}", item=item)
-        if x.dtype != self.dtype or x.device.type != self.device.type:
-            here = f"{self.dtype} on {self.device}; convert it"
-            raise InputError(f"{item}: {x.dtype} on {x.device}, but this batch is {here}", item=item)
+        right = isinstance(x, Tensor) and x.shape[-1:] == (3,) and x.numel() == 3 * self.n_atoms
+        if not right or x.dtype != self.dtype or x.device.type != self.device.type:
+            here = f"{self.dtype} on {self.device}"
+            wanted = f"a tensor of shape ({self.n_atoms}, 3) or (copies, atoms, 3), {here}; convert it"
+            raise InputError(f"{item} must be {wanted}", item=item)
         return x.reshape(-1, 3)
 
     def _all(self, values: Tensor, count: int, item: str) -> Tensor:
-        """Numbers of all systems, from those or from the numbers of one of many copies."""
-        sizes = {count, count // self.n_systems} if len(self._numbers) == 1 else {count}
-        if not isinstance(values, Tensor) or values.ndim != 1 or len(values) not in sizes:
-            wanted = f"({count},), or those of one system where all are copies"
-            raise InputError(f"{item} must be a tensor of shape {wanted}", item=item)
-        return values.to(self.dtype).repeat(count // max(len(values), 1))
+        if not isinstance(values, Tensor) or values.shape != (count,):
+            raise InputError(f"{item} must be a tensor of shape ({count},), one for each in all systems", item=item)
+        return values.to(self.dtype)
 
     def weights(self, masses: Tensor | None = None) -> Tensor:
         """Inverse masses, 0 for fixed atoms, shape (n_atoms,); of other `masses` than those of the engines.
@@ -209,27 +191,18 @@ class Batch:
         """
         if masses is None:
             return self._inverse_masses
-        for item in (item for motion in self._numbers for item in motion.constraint_set.constraints):
-            if item.uses_masses:
-                raise UnsupportedError(f"{item!r} is defined by the masses of its Motion; make another with other ones")
+        for item in (
+            each for motion in self._numbers for each in motion.constraint_set.constraints if each.uses_masses
+        ):
+            raise UnsupportedError(f"{item!r} is defined by the masses of its Motion; make another with other ones")
         return self._inverse(self._all(masses, self.n_atoms, "masses"))
 
-    def _targets_at(self, time: float) -> Tensor:
-        return self._joined(lambda each: each.constraint_set.target(time)) if self._moving else self.targets
-
-    def _rates_at(self, time: float, order: int) -> Tensor:
-        if not self._moving and self._holonomic:
-            return self._still
-        return self._joined(lambda each: each.constraint_set.target_rates(time, order))
-
-    def _task(self, of_positions: bool, time: float, start: float, flight: float = 0.0) -> Task:
+    def _task(self, of_positions: bool, flight: float = 0.0) -> Task:
         for item, own in zip(("masses", "targets"), self._given, strict=True):
             if getattr(self, item) is not own or own._version:  # numbers that follow from them are kept
                 raise InputError(f"{item} of a Batch were written to; give other ones as {item}= of a call", item=item)
-        new = partial(torch.full, (), dtype=self.dtype, device=self.device)
-        t, t_start = (each if isinstance(each, Tensor) else new(each) for each in (time, start))
         flies = bool(not self._holonomic and flight != 0)
-        return Task(self, self._groups(self._holonomic or flies or not of_positions), of_positions, flies, t, t_start)
+        return Task(self, self._groups(self._holonomic or flies or not of_positions), of_positions, flies)
 
     def _with_fixed(self, y: Tensor, rows: Tensor) -> Tensor:
         """With what the rows of fixed atoms say of these."""
@@ -237,17 +210,19 @@ class Batch:
 
     # -- what is asked --------------------------------------------------------------------------------
 
+    def project_positions(self, x_new: Tensor, x_reference: Tensor, **options: Any) -> Tensor:
+        """Positions on the rows: those of `solve_positions`, which tells the options and the errors."""
+        return self.solve_positions(x_new, x_reference, **options)[0]
+
     def solve_positions(
         self,
         x_new: Tensor,
         x_reference: Tensor,
         *,
-        time: float = 0.0,
-        reference_time: float | None = None,
         flight: float = 0.0,
         targets: Tensor | None = None,
         masses: Tensor | None = None,
-    ) -> Solved:
+    ) -> tuple[Tensor, Tensor]:
         """Solve sigma(x_new + M^-1 A(x_reference)^T Lambda) = 0 for each system, by Newton's method.
 
         Derivatives are those of the solution, by one solve with the transposed matrix.
@@ -256,18 +231,17 @@ class Batch:
         ----------
         x_new, x_reference : Tensor, shape (n_atoms, 3) or (copies, atoms, 3)
             Positions to correct, and those whose gradients give the directions.
-        time, reference_time : float
-            Times of both; `reference_time` defaults to `time`.
         flight : float
             Time from `x_reference` to `x_new`, for rows of velocities; see `Motion.project_positions`.
-        targets : Tensor, shape (n_rows,) or (rows of one system,), optional
+        targets : Tensor, shape (n_rows,), optional
             What rows are held at, in place of what the engines say.
-        masses : Tensor, shape (n_atoms,) or (atoms of one system,), optional
+        masses : Tensor, shape (n_atoms,), optional
 
         Returns
         -------
-        Solved
-            Velocities are to change by ``push/dt``, which knows nothing of the rounding of positions.
+        positions, push : Tensor
+            Those on the rows, and M^-1 A^T Lambda: velocities are to change by ``push/dt``, which knows nothing of the
+            rounding of positions.
 
         Raises
         ------
@@ -277,56 +251,44 @@ class Batch:
             Another shape or type of number.
         """
         x, start = self._flat(x_new, "x_new"), self._flat(x_reference, "x_reference")
-        reference_time = time if reference_time is None else reference_time
-        held = self._targets_at(time) if targets is None else self._all(targets, self.n_rows, "targets")
+        held = self.targets if targets is None else self._all(targets, self.n_rows, "targets")
         if not self._holonomic:
-            middle = held if targets is not None else self._targets_at(0.5 * (time + reference_time))
-            held = torch.where(self._is_position, held, flight * middle)
-        task = self._task(True, time, reference_time, flight)
-        found = Projection.apply(self._with_fixed(x, held), start, held, self.weights(masses), task)
+            held = torch.where(self._is_position, held, flight * held)
+        task = self._task(True, flight)
+        found, push = Projection.apply(self._with_fixed(x, held), start, held, self.weights(masses), task)
         self._calls += 1
         if self._calls >= self.check_every:
             self.check()
-        positions, push, multipliers = found
-        return Solved(positions.reshape(x_new.shape), push.reshape(x_new.shape), _by_copy(multipliers, x_new))
+        return found.reshape(x_new.shape), push.reshape(x_new.shape)
 
-    def project_positions(self, x_new: Tensor, x_reference: Tensor, **options: Any) -> Tensor:
-        """Positions on the rows: those of `solve_positions`, which tells the options and the errors."""
-        return self.solve_positions(x_new, x_reference, **options).positions
-
-    def project_velocities(self, x: Tensor, v: Tensor, *, time: float = 0.0, masses: Tensor | None = None) -> Tensor:
+    def project_velocities(self, x: Tensor, v: Tensor, *, masses: Tensor | None = None) -> Tensor:
         """Nearest admissible velocities in the mass metric: A v = c.
 
-        Shapes and `masses` are as for `solve_positions`, the `time` is that of positions.
+        Shapes and `masses` are as for `solve_positions`.
         """
-        here, task = self._flat(x, "x"), self._task(False, time, time)
-        rates = self._rates_at(time, 1)
-        speeds = self._with_fixed(self._flat(v, "v"), rates)
-        return Projection.apply(speeds, here, rates, self.weights(masses), task)[0].reshape(v.shape)
+        here, task = self._flat(x, "x"), self._task(False)
+        speeds = self._with_fixed(self._flat(v, "v"), self._rates)
+        return Projection.apply(speeds, here, self._rates, self.weights(masses), task)[0].reshape(v.shape)
 
-    def multipliers(
-        self, x: Tensor, v: Tensor, forces: Tensor, *, time: float = 0.0, masses: Tensor | None = None
-    ) -> Tensor:
+    def multipliers(self, x: Tensor, v: Tensor, forces: Tensor, *, masses: Tensor | None = None) -> Tensor:
         """lambda of the constraint forces A^T lambda, in natural units; of least norm where rows depend on each other.
 
         Shapes are as for `solve_positions`; the result has shape (n_rows,) or (copies, rows).
         """
         here, speed, f = self._flat(x, "x"), self._flat(v, "v"), self._flat(forces, "forces")
-        w, rates, task = self.weights(masses), self._rates_at(time, 2), self._task(False, time, time)
-        a = self._with_fixed(w[:, None] * f, rates)
-        lam, held = torch.zeros_like(rates), f.reshape(-1)
+        w, rest, task = self.weights(masses), torch.zeros_like(self._rates), self._task(False)
+        a = self._with_fixed(w[:, None] * f, rest)
+        lam, held = rest, f.reshape(-1)
         for group in task.groups:
-            of = task.problem(group, here, here, rates, w)
-            of = of._replace(held=of.held.expand(group.rows.shape))
+            of = task.problem(group, here, here, rest, w)
             each, force = group.solver.respond(of, speed.reshape(-1)[group.flat], a.reshape(-1)[group.flat])
             lam = lam.index_put((group.rows,), each)
             held = held.index_add(0, group.flat.reshape(-1), force.reshape(-1))
-        if len(self._fixed):
-            # What fixed atoms' rows supply: M a less the forces and those of the other rows.
-            inert = self.masses if masses is None else self._all(masses, self.n_atoms, "masses")
-            rest = (inert[:, None] * a - held.reshape(-1, 3))[self._fixed]
-            lam = lam.index_copy(0, self._fixed_rows, rest.reshape(-1))
-        return _by_copy(lam, x)
+        # What fixed atoms' rows supply: M a less the forces and those of the other rows.
+        inert = self.masses if masses is None else self._all(masses, self.n_atoms, "masses")
+        lacking = (inert[:, None] * a - held.reshape(-1, 3))[self._fixed]
+        lam = lam.index_copy(0, self._fixed_rows, lacking.reshape(-1))
+        return lam.reshape(x.shape[0], -1) if x.ndim == 3 else lam
 
     # -- what is told ---------------------------------------------------------------------------------
 
@@ -362,52 +324,169 @@ class Batch:
         error.copy = copy
         raise error
 
-    def report(self, x: Tensor, v: Tensor | None = None, *, time: float = 0.0) -> list[Report]:
+    def report(self, x: Tensor, v: Tensor | None = None) -> list[Report]:
         """What each system's engine reports of its positions, and velocities: residuals, rank, kinds of clusters."""
-        both = (x, x) if v is None else (x, v)
-        here, speed = (self._flat(each, "x or v").detach().cpu().double().numpy() for each in both)
-        parts = [slice(*ends) for ends in pairwise(self.atom_starts)]
-        return [
-            motion.report(here[some], None if v is None else speed[some], time, condition=False)
-            for motion, some in zip(self.systems, parts, strict=True)
-        ]
 
-    def __repr__(self) -> str:
-        return f"<Batch: {self.n_rows} rows on {self.n_atoms} atoms of {self.n_systems} systems>"
+        def parts(values: Tensor, item: str) -> list[FloatArray]:
+            return np.split(self._flat(values, item).detach().cpu().double().numpy(), self.atom_starts[1:-1])
+
+        speeds: Any = [None] * self.n_systems if v is None else parts(v, "v")
+        some = zip(self.systems, parts(x, "x"), speeds, strict=True)
+        return [motion.report(here, speed, condition=False) for motion, here, speed in some]
 
 
-def _fixed_atoms(motion: Motion) -> list[int]:
-    return [motion.constraint_set.row_atoms(row)[0] for row in motion.plan.pinned_rows[::3]]
+# -- clusters of a batch by pattern ---------------------------------------------------------------------
 
 
-def _by_copy(rows: Tensor, like: Tensor) -> Tensor:
-    return rows.reshape(like.shape[0], -1) if like.ndim == 3 else rows
+#: Clusters of one pattern in one system: atoms and rows, and by cluster parameters, scales, and cells of images.
+Kind = tuple[Alike, Any, Any, Any]
+_KNOWN: WeakKeyDictionary[Motion, dict[bool, dict[Pattern, Kind]]] = WeakKeyDictionary()
+
+
+def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
+    """Clusters of an engine by pattern, with or without rows of velocities; looked for once.
+
+    Refuses rows that move or cannot be run on tensors, and those that depend on others where it is not known which.
+    """
+    known = _KNOWN.setdefault(motion, {})
+    if velocity_rows in known:
+        return known[velocity_rows]
+    held, plan = motion.constraint_set, motion.plan
+    missing = int(((plan.labels >= 0) & ~plan.eliminate_last).sum()) + len(plan.pinned_rows) - motion.rank
+    if missing:
+        raise UnsupportedError(
+            f"{missing} rows depend on others, in clusters of so many rows that nobody knows which; leave out what "
+            "others hold (Motion.report names the kinds of clusters)"
+        )
+    what: list[tuple[Row, bool]] = []
+    atoms: list[IntArray] = []
+    parameters: list[FloatArray] = []
+    offsets: list[FloatArray] = []
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        n = item.n_rows
+        if not n:
+            continue
+        if item.moving:
+            raise UnsupportedError(f"{item!r} moves with time; hold it at rest, and give each step its targets=")
+        table = item.parameters().reshape(n, -1)
+        cells = np.zeros((*item.atoms.shape, 3)) if item.cell_offsets is None else 1.0 * item.cell_offsets
+        offsets += list((cells - cells[:, :1])[:, 1 if item.relative else item.width :])
+        atoms, parameters = atoms + list(item.atoms), parameters + list(table)
+        whole, last = np.zeros(n) if item.whole is None else item.whole, plan.eliminate_last[start : start + n]
+        tape: Any = None if item.fixes_atoms else tape_of(item)
+        row = Row(tape, (), item.holonomic, item.relative, False, item.period or 0.0, table.shape[1])
+        what += [(row._replace(whole=bool(w)), bool(l)) for w, l in zip(whole, last, strict=True)]
+    labels = plan.labels if velocity_rows else np.where(held.holonomic, plan.labels, -1)
+    found: dict[Pattern, Kind] = {}
+    for key, clusters in alike(labels, plan.eliminate_last, what, atoms).items():
+        rows = tuple(row._replace(atoms=local) for (row, _), local in key)
+        pattern = Pattern(rows, sum(not last for (_, last), _ in key), clusters.atoms.shape[1])
+        p, cells = (
+            np.array([np.concatenate([t[k] for k in some]) for some in clusters.rows]) for t in (parameters, offsets)
+        )
+        found[pattern] = clusters, p, held.scale[clusters.rows], cells
+    known[velocity_rows] = found
+    return found
+
+
+@lru_cache(512)
+def solver_of(pattern: Pattern, device: torch.device, compiled: bool) -> Lanes:
+    """The equations of a pattern; of small ones compiled where that is asked for."""
+    made = Lanes(pattern) if pattern.small else Levels(pattern, device)
+    if compiled and pattern.small:
+        for name in ("newton", "tangent", "adjoint"):
+            setattr(made, name, torch.compile(getattr(made, name), dynamic=True))
+    return made
+
+
+class Group:
+    """All clusters of one pattern in a batch.
+
+    `parts` are kinds, with the numbers of their systems, and where atoms and rows of these begin. What has a last axis
+    of n is by cluster: `atoms`, (n_atoms, n), their coordinates `flat`, (3 n_atoms, n), `rows`, (n_rows, n), `systems`,
+    (n,), and `worst`, (n_rows, n), by how much rows were off at most since that was looked at, in parts of their scale.
+    """
+
+    def __init__(self, pattern: Pattern, parts: Sequence[tuple[Kind, IntArray]], batch: Batch) -> None:
+        like = batch._inverse_masses
+        self.pattern, self.solver = pattern, solver_of(pattern, like.device, batch.compiled)
+
+        def of_all(of: Any, dtype: torch.dtype = torch.int64) -> Tensor:
+            """Numbers of clusters in all systems, the last axis by cluster."""
+            whole = np.concatenate([of(kind, *where) for kind, some in parts for where in some])
+            return torch.as_tensor(np.ascontiguousarray(np.moveaxis(whole, 0, -1)), device=like.device, dtype=dtype)
+
+        self.atoms = of_all(lambda kind, system, atom, row: kind[0].atoms + atom)
+        self.rows = of_all(lambda kind, system, atom, row: kind[0].rows + row)
+        self.systems = of_all(lambda kind, system, atom, row: np.full(len(kind[2]), system))
+        self.p, self.scale, self._offsets = (
+            _once(of_all(lambda kind, *_, k=k: kind[k], like.dtype)) for k in (1, 2, 3)
+        )
+        #: Numbers by atom and by row that do not change.
+        self._own = {id(like): _once(like[self.atoms])}
+        self._own |= {id(each): _once(each[self.rows]) for each in (batch.targets, batch._rates)}
+        self.flat = _flat(self.atoms)
+        # Of relative rows each atom but the first, the one before it, and the first.
+        slots = [(row, i) for row in pattern.rows if row.relative for i in range(1, len(row.atoms))]
+        which = [[row.atoms[i], row.atoms[i - 1], row.atoms[0]] for row, i in slots]
+        self._now, self._before, self._first = (_flat(self.atoms[[each[k] for each in which]]) for k in range(3))
+        self._begin = torch.tensor([k - i + 1 for k, (_, i) in enumerate(slots)], device=like.device)
+        self._whole = torch.tensor([row.whole for row, _ in slots], device=like.device)[:, None]
+        self._any_whole = any(row.whole for row, _ in slots)
+        self.worst = torch.zeros(self.rows.shape, dtype=like.dtype, device=like.device)
+
+    def lanes(self, values: Tensor, numbers: Tensor) -> Tensor:
+        """Values of all atoms or rows by cluster."""
+        found = self._own.get(id(values))
+        return values[numbers] if found is None else found
+
+    def coordinates(self, x: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
+        """Of the atoms of clusters, and by how much the images that relative rows mean stand off: see `Problem`."""
+        flat, n = x.reshape(-1), self.atoms.shape[1]
+        if batch._lattice is None or not len(self._begin):
+            return flat[self.flat], None
+
+        def apart(values: Tensor, others: Tensor) -> Tensor:
+            return (values[self._now] - values[others]).reshape(3, -1, n)
+
+        cell, inverse = batch._lattice[self.systems].unbind(1)
+        sums = -torch.round(torch.einsum("xen,nxy->yen", apart(flat, self._before), inverse)).cumsum(1)
+        cells = sums - torch.cat([torch.zeros_like(sums[:, :1]), sums], 1)[:, self._begin]
+        if self._any_whole:
+            found = apart(batch._tree_cells(x).reshape(-1), self._first) + self._offsets.movedim(1, 0)
+            cells = torch.where(self._whole, found, cells)
+        return flat[self.flat], torch.einsum("xen,nxy->eyn", cells, cell).reshape(-1, n)
+
+
+def _once(values: Tensor) -> Tensor:
+    """Values by cluster, one where real ones are all alike."""
+    some = values[..., :1].contiguous()
+    return some if bool((values == some).all()) else values
+
+
+def _flat(atoms: Tensor) -> Tensor:
+    """Numbers of coordinates, x before y and z, shape (3 n_atoms, n)."""
+    return (3 * atoms + torch.arange(3, device=atoms.device)[:, None, None]).flatten(0, 1)
 
 
 # -- projections as functions that torch differentiates ------------------------------------------------
 
 
 class Task(NamedTuple):
-    """What is solved for: `of_positions` or of velocities, and whether rows of velocities count in positions (`flies`).
-
-    At times of what is projected and of where directions are taken.
-    """
+    """What is solved for: `of_positions` or velocities, and whether rows of velocities count in positions (`flies`)."""
 
     batch: Batch
     groups: Sequence[Group]
     of_positions: bool
     flies: bool
-    t: Tensor
-    t_start: Tensor
 
     def problem(self, group: Group, x: Tensor, start: Tensor, held: Tensor, w: Tensor) -> Problem:
         """Of the clusters of a group, at positions x with directions of a start, which may be the same tensor."""
-        batch = self.batch
-        there = group.coordinates(start, batch._lattice, batch._tree_cells)
-        here = there if x is start else group.coordinates(x, batch._lattice, batch._tree_cells)
-        flies = self.flies and any(not row.function.holonomic for row in group.pattern.rows)
+        there = group.coordinates(start, self.batch)
+        here = there if x is start else group.coordinates(x, self.batch)
+        flies = self.flies and any(not row.holonomic for row in group.pattern.rows)
         weights, wanted = group.lanes(w, group.atoms), group.lanes(held, group.rows)
-        return Problem(here[0], there[0], here[1], there[1], flies, weights, wanted, group.p, self.t, self.t_start)
+        return Problem(here[0], there[0], here[1], there[1], flies, weights, wanted, group.p)
 
 
 def _solve(group: Group, of: Problem) -> tuple[Tensor, Tensor]:
@@ -431,7 +510,7 @@ def _solve(group: Group, of: Problem) -> tuple[Tensor, Tensor]:
 
 
 class Projection(torch.autograd.Function):
-    """Positions or velocities on the rows, by how much they were moved, and multipliers by row.
+    """Positions or velocities on the rows, and by how much they were moved.
 
     Of what is projected, of positions whose gradients give the directions, of what rows are held at, and of inverse
     masses. Derivatives are those of the equations at the solution; nothing of the iterations is kept.
@@ -452,10 +531,11 @@ class Projection(torch.autograd.Function):
         ctx.task = task
         ctx.save_for_backward(found, place, held, w, multipliers)
         ctx.set_materialize_grads(False)
-        return found, push, multipliers
+        return found, push
 
     @staticmethod
-    def backward(ctx: Any, by_found: Any, by_push: Any, by_multipliers: Any) -> Any:
+    @once_differentiable
+    def backward(ctx: Any, by_found: Any, by_push: Any) -> Any:
         found, place, held, w, multipliers = ctx.saved_tensors
         task = ctx.task
         by_found = torch.zeros_like(found) if by_found is None else by_found
@@ -464,11 +544,9 @@ class Projection(torch.autograd.Function):
         for group in task.groups:
             of = task.problem(group, found if task.of_positions else place, place, held, w)
             rows = group.rows[: group.pattern.rank]
-            bent = torch.zeros_like(multipliers[rows]) if by_multipliers is None else by_multipliers[rows]
             v = None if task.of_positions else found.reshape(-1)[group.flat]
-            parts = group.solver.adjoint(of, multipliers[rows], pushed.reshape(-1)[group.flat], bent, v)
-            for k, (part, index) in enumerate(zip(parts, (group.flat, group.flat, rows, group.atoms), strict=True)):
+            parts = group.solver.adjoint(of, multipliers[rows], pushed.reshape(-1)[group.flat], v)
+            for total, part, index in zip(sums, parts, (group.flat, group.flat, rows, group.atoms), strict=True):
                 # Atoms that are fixed may belong to several clusters.
-                flat = sums[k].reshape(-1).index_add(0, index.reshape(-1), part.expand(index.shape).reshape(-1))
-                sums[k] = flat.reshape(sums[k].shape)
+                total.view(-1).index_add_(0, index.reshape(-1), part.expand(index.shape).reshape(-1))
         return by_found + sums[0], *sums[1:], None

@@ -1,5 +1,8 @@
 """Clusters that look alike, side by side: the equations of their multipliers, by positions, velocities and gradients.
 
+Rows are computed by what the declaration of their family does, operation by operation, for many at once. Functions of
+users that are written with NumPy become such a list too.
+
 What is done with vectors is written once, by tables of numbers. Vectors of small clusters are lists with a tensor of
 shape (clusters,) for each number (`Lanes`), so that one kernel does all of a step; those of larger ones are tensors, in
 which rows that share nothing are eliminated together (`Levels`).
@@ -8,15 +11,17 @@ which rows that share nothing are eliminated together (`Levels`).
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import accumulate
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from kcons.batched.row_functions import RowFunction
+from kcons.constraints.functions.straight_line import Tape, differentiated, function_of
+from kcons.errors import UnsupportedError
 from kcons.plan.clusters import elimination
 
 #: Rows, and atoms in all rows, up to which a vector is a list.
@@ -29,19 +34,64 @@ Table = Any
 Slope = tuple[Vector, Vector, Vector]
 
 
+#: Names of NumPy's functions among those of `operator`, which take plain numbers too, and of torch.
+_NAMES = {"subtract": "sub", "multiply": "mul", "divide": "truediv", "negative": "neg", "power": "pow", "rint": "round"}
+_NAMES |= {"absolute": "abs", "arcsin": "asin", "arccos": "acos", "arctan": "atan", "arctan2": "atan2"}
+
+
+def tape_of(item: Any) -> Tape:
+    """Value and gradient of a constraint's rows; refuses what is not written with NumPy's elementary functions.
+
+    Of velocities a function of the middle of a flight and of the way; its gradient is by where the flight ends.
+    """
+    found = function_of(item)
+    if found is not None:
+        return found.tape()
+    n, function = 3 * item.width, item.function
+
+    def row(r: Any, p: Any, t: Any) -> Any:
+        value = function(np.array([r[k] for k in range(n)], dtype=object).reshape(-1, 3))
+        return value.item() if isinstance(value, np.ndarray) else value
+
+    try:
+        tape = differentiated(row, n)
+    except (TypeError, AttributeError, IndexError, ValueError) as error:
+        raise UnsupportedError(
+            f"{item!r} cannot be run on tensors ({error}); write it with elementary functions of NumPy without "
+            "branches, or as a Formula"
+        ) from error
+    return tape._replace(results=tape.results[:-1])
+
+
 class Row(NamedTuple):
     """A row of a pattern: what computes it, its atoms in the cluster, and how it takes them.
 
-    A `relative` row takes places from its first atom. Its atoms stand in the images of a tree where it is `whole`, and
-    else each beside the one before it.
+    The `tape` is that of `tape_of`. A `relative` row takes places from its first atom. Its atoms
+    stand in the images of a tree where it is `whole`, and else each beside the one before it.
     """
 
-    function: RowFunction
+    tape: Tape
     atoms: tuple[int, ...]
+    holonomic: bool
     relative: bool
     whole: bool
     period: float
     parameters: int
+
+    def evaluate(self, r: Sequence[Any], p: Sequence[Any]) -> tuple[Any, list[Any]]:
+        """Value, and gradient by where the flight ends, of tensors of any one shape.
+
+        `r` are coordinates x, y, z by atom, and the way behind them for velocity rows; `p` are parameters.
+        """
+
+        def perform(name: str, *given: Any) -> Any:
+            name = _NAMES.get(name, name)
+            if hasattr(operator, name):
+                return getattr(operator, name)(*given)
+            return getattr(torch, name)(*(each if isinstance(each, Tensor) else r[-1] * 0 + each for each in given))
+
+        value, *slope = self.tape.run(r, p, 0.0, perform)
+        return value, slope
 
 
 class Pattern(NamedTuple):
@@ -72,12 +122,10 @@ class Problem(NamedTuple):
     w: Tensor
     held: Tensor
     p: Tensor
-    t: Tensor
-    t_start: Tensor
 
     @property
     def at_start(self) -> Problem:
-        return self._replace(x=self.start, images=self.start_images, flies=False, t=self.t_start)
+        return self._replace(x=self.start, images=self.start_images, flies=False)
 
 
 class Lanes:
@@ -95,12 +143,11 @@ class Lanes:
 
     def __init__(self, pattern: Pattern) -> None:
         self.pattern, rows, n = pattern, pattern.rows, pattern.n_atoms
-        self.timed = any(row.function.timed and row.function.holonomic for row in rows)
         images = [0, *accumulate(3 * (len(row.atoms) - 1) * row.relative for row in rows)]
         parameters = [0, *accumulate(row.parameters for row in rows)]
         alike: dict[Any, list[int]] = {}
         for k, row in enumerate(rows):
-            key = k < pattern.rank, row.function, row.relative, row.period
+            key = k < pattern.rank, row.tape, row.relative, row.period
             alike.setdefault(key if self.together else k, []).append(k)
         #: Rows that are computed at once: one, and of all their numbers, those of coordinates, images and parameters.
         self.kinds: list[tuple[Row, Table, Table, Table, Table]] = []
@@ -148,9 +195,6 @@ class Lanes:
 
     # -- rows -----------------------------------------------------------------------------------------
 
-    def weights(self, w: Tensor) -> Vector:
-        return self.unpacked(w.repeat(3, 1))
-
     def _places(self, kind: tuple[Row, Any, Any, Any, Any], x: Vector, apart: Tensor | None) -> list[Any]:
         """Coordinates of the atoms of rows; of relative ones how far they are from the first, and `apart` beside it."""
         row, _, coordinates, images, _ = kind
@@ -165,7 +209,7 @@ class Lanes:
         values, slopes = [], []
         for kind in self.kinds:
             row, numbers, coordinates, _, parameters = kind
-            flies = of.flies and not row.function.holonomic
+            flies = of.flies and not row.holonomic
             r = self._places(kind, of.x, of.images)
             if u is not None:
                 r = _added(r, self._places(kind, u, None))
@@ -174,22 +218,13 @@ class Lanes:
                 r = [0.5 * (a + b) for a, b in zip(r, there, strict=True)]
                 way = _each(operator.sub, list(self.take(of.x, coordinates)), list(self.take(of.start, coordinates)))
                 r += way if u is None else _added(way, list(self.take(u, coordinates)))
-            elif not row.function.holonomic:
+            elif not row.holonomic:
                 r += [0.0] * len(coordinates)
-            t = 0.5 * (of.t + of.t_start) if flies else of.t
-            value, slope = row.function(r, list(self.take(of.p, parameters)), t)
+            value, slope = row.evaluate(r, list(self.take(of.p, parameters)))
             off = value - of.held[numbers]
             values.append(off - row.period * torch.round(off / row.period) if row.period else off)
             slopes.append(slope)
         return self.joined(values, slopes, of.x)
-
-    def rates(self, of: Problem, moved: Tensor | None = None) -> Tensor:
-        """What A v is to be: what is held, less dq/dt of rows with the time in them, where atoms rest."""
-        if not self.timed:
-            return of.held
-        u = None if moved is None else self.unpacked(moved)
-        along = (of.t,), (torch.ones_like(of.t),)
-        return of.held - torch.func.jvp(lambda t: self.packed(self.evaluate(of._replace(t=t), u)[0], of.x), *along)[1]
 
     # -- vectors --------------------------------------------------------------------------------------
 
@@ -244,7 +279,7 @@ class Lanes:
         return self.summed(reduce(_added, parts), entry, self.n_entries)
 
     def solve(self, s: Vector, b: Vector) -> Vector:
-        take, s, b = self.take, _copied(s), _copied(b)
+        take, (s, b) = self.take, (v.clone() if isinstance(v, Tensor) else [*v] for v in (s, b))
         for (entry, here, there, _), (which, beside, taken) in self.levels:
             factor = _each(operator.truediv, take(s, entry), take(s, here))
             self.subtract(s, taken, _times(take(factor, which), take(s, beside)))
@@ -261,7 +296,7 @@ class Lanes:
 
         That is how far they move the atoms, and by how much all rows are off then, infinite where one has turned.
         """
-        weights, known, rank = self.weights(of.w), self.unpacked(lam), self.pattern.rank
+        weights, known, rank = self.unpacked(of.w.repeat(3, 1)), self.unpacked(lam), self.pattern.rank
         there = self.evaluate(of.at_start)[1]
         u = _times(weights, self.spread(there, known))
         off, slope = self.evaluate(of, u)
@@ -274,21 +309,22 @@ class Lanes:
 
     def tangent(self, of: Problem, v: Tensor) -> tuple[Tensor, Tensor]:
         """Multipliers of velocities with A v as it is held, and by how much these change."""
-        weights, slope = self.weights(of.w), self.evaluate(of)[1]
-        off = _each(operator.sub, self.unpacked(self.rates(of)), self.contract(slope, self.unpacked(v)))
+        weights, slope = self.unpacked(of.w.repeat(3, 1)), self.evaluate(of)[1]
+        off = _each(operator.sub, self.unpacked(of.held), self.contract(slope, self.unpacked(v)))
         mu = self.solve(self.couple(slope, slope, weights), off[: self.pattern.rank])
         return self.packed(mu, of.x), self.packed(_times(weights, self.spread(slope, mu)), of.x)
 
-    def adjoint(self, of: Problem, lam: Tensor, pushed: Tensor, bent: Tensor, v: Tensor | None) -> tuple[Tensor, ...]:
+    def adjoint(self, of: Problem, lam: Tensor, pushed: Tensor, v: Tensor | None) -> tuple[Tensor, ...]:
         """Derivatives at the solution, positions `of.x` or velocities v there, by one solve with the transposed matrix.
 
         By what is projected, by positions of which directions are taken, by what is held and by inverse masses; of
-        derivatives by how far atoms (or velocities) are `pushed`, and by multipliers (`bent`).
+        derivatives by how far atoms (or velocities) are `pushed`.
         """
-        rank, known, h, weights = self.pattern.rank, self.unpacked(lam), self.unpacked(pushed), self.weights(of.w)
-        at, slope = of.at_start if v is None else of, self.evaluate(of)[1]
+        rank, known, h = self.pattern.rank, self.unpacked(lam), self.unpacked(pushed)
+        weights, slope = self.unpacked(of.w.repeat(3, 1)), self.evaluate(of)[1]
+        at = of.at_start if v is None else of
         there = self.evaluate(at)[1] if v is None else slope
-        b = _added(self.contract(there, _times(weights, h))[:rank], self.unpacked(bent))
+        b = self.contract(there, _times(weights, h))[:rank]
         a = self.solve(self.couple(there, slope, weights), b)
         back = _each(operator.neg, self.spread(slope, a))
         z = _added(h, back)
@@ -298,13 +334,10 @@ class Lanes:
             found = self.evaluate(at, self.unpacked(moved))[1]
             total: Tensor = _dot(self.contract(found, wz)[:rank], known)
             if v is not None:
-                off = self.contract(found, self.unpacked(v))
-                off = _each(operator.sub, off, self.unpacked(self.rates(of, moved))) if self.timed else off
-            elif of.flies:  # the way and the middle of the flight change with where it starts
-                off = self.evaluate(of._replace(start=of.start + moved))[0]
-            else:
-                return total
-            return total - _dot(off[:rank], a)
+                return total - _dot(self.contract(found, self.unpacked(v))[:rank], a)
+            if of.flies:  # the way and the middle of the flight change with where it starts
+                return total - _dot(self.evaluate(of._replace(start=of.start + moved))[0][:rank], a)
+            return total
 
         by_place = torch.func.grad(of_place)(torch.zeros_like(pushed))
         force = self.packed(self.spread(there, known), of.x) * self.packed(z, of.x)
@@ -318,32 +351,23 @@ class Lanes:
 
         A (a + W A^T lambda) is what is held, less the curvature along v.
         """
-        weights, slope = self.weights(of.w), self.evaluate(of)[1]
+        count, rank, speeds = len(self.pattern.rows), self.pattern.rank, self.unpacked(v)
+        weights, slope = self.unpacked(of.w.repeat(3, 1)), self.evaluate(of)[1]
         s = self.couple(slope, slope, weights)
 
-        def speeds(moved: Tensor, time: Tensor) -> Tensor:
-            there = of._replace(t=time)
-            found = self.contract(self.evaluate(there, self.unpacked(moved))[1], self.unpacked(v))
-            return self.packed(found, v) - self.rates(there, moved)
+        def along(moved: Tensor) -> Tensor:
+            return self.packed(self.contract(self.evaluate(of, self.unpacked(moved))[1], speeds), v)
 
-        bend = torch.func.jvp(speeds, (torch.zeros_like(v), of.t), (v, torch.ones_like(of.t)))[1]
+        bend = torch.func.jvp(along, (torch.zeros_like(v),), (v,))[1]
         b = of.held - bend - self.packed(self.contract(slope, self.unpacked(a)), v)
-        lam = self.packed(self.solve(s, self.unpacked(b)[: self.pattern.rank]), v)
-        lam = self._least_norm(slope, s, weights, lam)
+        lam = self.packed(self.solve(s, self.unpacked(b)[:rank]), v)
+        if count > rank:  # the last rows are sums of the others: of all x with D x = lambda those of least norm
+            units = torch.eye(count, dtype=v.dtype, device=v.device)[:, :, None].expand(-1, -1, v.shape[-1])
+            forces = (_times(weights, self.spread(slope, self.unpacked(unit))) for unit in units)
+            sums = [self.packed(self.solve(s, self.contract(slope, force)[:rank]), v) for force in forces]
+            d = torch.stack(sums, 1).permute(2, 0, 1)
+            lam = (d.mT @ torch.linalg.solve(d @ d.mT, lam.T.unsqueeze(-1))).squeeze(-1).T
         return lam, self.packed(self.spread(slope, self.unpacked(lam)), v)
-
-    def _least_norm(self, slope: Slope, s: Vector, weights: Vector, lam: Tensor) -> Tensor:
-        """Multipliers of all rows with the same force, where the last ones are sums of those that are solved for."""
-        count, rank = len(self.pattern.rows), self.pattern.rank
-        if count == rank:
-            return lam
-        sums = []
-        for unit in torch.eye(count, dtype=lam.dtype, device=lam.device):
-            force = _times(weights, self.spread(slope, self.unpacked(unit[:, None].expand(count, lam.shape[-1]))))
-            sums.append(self.packed(self.solve(s, self.contract(slope, force)[:rank]), lam))
-        # Of all multipliers x with D x = lambda those of least norm.
-        d = torch.stack(sums, 1).permute(2, 0, 1)
-        return (d.mT @ torch.linalg.solve(d @ d.mT, lam.T.unsqueeze(-1))).squeeze(-1).T
 
 
 def _each(act: Callable[..., Any], *vectors: Vector) -> Any:
@@ -357,10 +381,6 @@ def _added(one: Vector, other: Vector) -> Vector:
 
 def _times(one: Vector, other: Vector) -> Vector:
     return _each(operator.mul, one, other)
-
-
-def _copied(vector: Vector) -> Vector:
-    return vector.clone() if isinstance(vector, Tensor) else [*vector]
 
 
 def _dot(one: Vector, other: Vector) -> Any:

@@ -9,11 +9,7 @@ import torch
 from torch import Tensor
 
 from kcons.batched.batch import Batch
-from kcons.constraints.arguments import positive
 from kcons.errors import InputError
-
-#: Forces, of the shape of positions.
-Force = Callable[[Tensor], Tensor]
 
 
 def _pushed(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: Any, masses: Tensor | None) -> Tensor:
@@ -24,42 +20,32 @@ def _pushed(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: Any, masses: 
     return v + h * batch.weights(masses).reshape(*x.shape[:-1], 1) * forces
 
 
-def kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: Any, time: Any = 0.0, masses: Any = None) -> Tensor:
+def kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: Any, masses: Tensor | None = None) -> Tensor:
     """The same, on the rows."""
-    return batch.project_velocities(x, _pushed(batch, x, v, forces, h, masses), time=time, masses=masses)
+    return batch.project_velocities(x, _pushed(batch, x, v, forces, h, masses), masses=masses)
 
 
-def drift(batch: Batch, x: Tensor, v: Tensor, h: Any, time: Any = 0.0, **held: Any) -> tuple[Tensor, Tensor]:
+def drift(batch: Batch, x: Tensor, v: Tensor, h: Any, **held: Any) -> tuple[Tensor, Tensor]:
     """Positions a time h later on the rows, and velocities with the impulse that has kept them there."""
-    found = batch.solve_positions(x + h * v, x, time=time + h, reference_time=time, flight=h, **held)
-    return found.positions, v + found.push / (h if isinstance(h, Tensor) else h or 1.0)
+    found, push = batch.solve_positions(x + h * v, x, flight=h, **held)
+    return found, v + push / h
 
 
 def drift_in_bath(
-    batch: Batch, x: Tensor, v: Tensor, dt: Any, bath: tuple[Any, Any, Any], time: Any = 0.0, **held: Any
+    batch: Batch, x: Tensor, v: Tensor, dt: Any, bath: tuple[Any, Any, Any], **held: Any
 ) -> tuple[Tensor, Tensor]:
     """Half a flight, friction and noise, half a flight: g-BAOAB without its kicks; of a kT, a friction, a generator."""
-    kT, friction, generator = bath
-    half, w = 0.5 * dt, batch.weights(held.get("masses")).reshape(*x.shape[:-1], 1)
-    x, v = drift(batch, x, v, half, time, **held)
+    (kT, friction, generator), masses = bath, held.get("masses")
+    w = batch.weights(masses).reshape(*x.shape[:-1], 1)
+    x, v = drift(batch, x, v, 0.5 * dt, **held)
     kept = torch.exp(-friction * dt * torch.ones((), dtype=x.dtype, device=x.device))
     noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
     v = kept * v + torch.sqrt((1 - kept * kept) * kT * w) * noise
-    v = batch.project_velocities(x, v, time=time + half, masses=held.get("masses"))
-    return drift(batch, x, v, half, time + half, **held)
+    return drift(batch, x, batch.project_velocities(x, v, masses=masses), 0.5 * dt, **held)
 
 
 def rattle(
-    batch: Batch,
-    force: Force,
-    x: Tensor,
-    v: Tensor,
-    forces: Tensor,
-    dt: float,
-    *,
-    time: float = 0.0,
-    targets: Tensor | None = None,
-    masses: Tensor | None = None,
+    batch: Batch, force: Callable[[Tensor], Tensor], x: Tensor, v: Tensor, forces: Tensor, dt: float, **held: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One step of RATTLE: order two, reversible; differentiable in all that are tensors.
 
@@ -70,10 +56,9 @@ def rattle(
         Forces at positions, of the same shape.
     x, v, forces : Tensor, shape (n_atoms, 3) or (copies, atoms, 3)
         Positions and velocities on the rows, and the forces there.
-    dt, time : float
-        The step, and the time at its beginning.
-    targets, masses : Tensor, optional
-        As for `Batch.solve_positions`.
+    dt : float
+    **held : Tensor
+        `targets` and `masses`, as for `Batch.solve_positions`.
 
     Returns
     -------
@@ -84,15 +69,15 @@ def rattle(
     ----------
     H. C. Andersen, J. Comput. Phys. 52, 24 (1983).
     """
-    v = _pushed(batch, x, v, forces, 0.5 * dt, masses)
-    x, v = drift(batch, x, v, dt, time, targets=targets, masses=masses)
+    masses = held.get("masses")
+    x, v = drift(batch, x, _pushed(batch, x, v, forces, 0.5 * dt, masses), dt, **held)
     forces = force(x)
-    return x, kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces
+    return x, kick(batch, x, v, forces, 0.5 * dt, masses), forces
 
 
 def gbaoab(
     batch: Batch,
-    force: Force,
+    force: Callable[[Tensor], Tensor],
     x: Tensor,
     v: Tensor,
     forces: Tensor,
@@ -101,7 +86,6 @@ def gbaoab(
     friction: float,
     *,
     generator: torch.Generator | None = None,
-    time: float = 0.0,
     **held: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One step of Langevin dynamics, g-BAOAB; differentiable as `rattle`, which tells what else is given.
@@ -114,16 +98,13 @@ def gbaoab(
         Rate at which velocities are forgotten.
     generator : torch.Generator, optional
         Of the noise.
-    **held : Tensor
-        Targets and masses.
 
     References
     ----------
     B. Leimkuhler and C. Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
-    positive(dt, "dt")  # noise cannot be taken back
     masses = held.get("masses")
-    v = kick(batch, x, v, forces, 0.5 * dt, time, masses)
-    x, v = drift_in_bath(batch, x, v, dt, (kT, friction, generator), time, **held)
+    v = kick(batch, x, v, forces, 0.5 * dt, masses)
+    x, v = drift_in_bath(batch, x, v, dt, (kT, friction, generator), **held)
     forces = force(x)
-    return x, kick(batch, x, v, forces, 0.5 * dt, time + dt, masses), forces
+    return x, kick(batch, x, v, forces, 0.5 * dt, masses), forces

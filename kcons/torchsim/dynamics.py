@@ -1,6 +1,7 @@
 """Dynamics on constraints for `torch_sim.integrate`: constant energy, Langevin dynamics, Nosé-Hoover chains.
 
-Each is a pair (init, step) with the arguments and units of TorchSim's own. A failed step leaves the state as it was.
+Each is a pair (init, step) with the arguments and units of TorchSim's own. A step gives a new state, and leaves the one
+that it is given as it was.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import copy
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch_sim import SimState, calc_kinetic_energy
@@ -19,18 +20,14 @@ from torch_sim.models.interface import ModelInterface
 from torch_sim.units import unit_factor_from_annotation
 
 from kcons.batched.steps import drift_in_bath, kick, rattle
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.thermostats.freedom import open_directions
-from kcons.torchsim.holding import Constraints, array_of, constraints_of
-
-__all__ = ["Integrator", "NoseHooverState", "langevin", "nose_hoover", "nve"]
+from kcons.torchsim.holding import array_of, constraints_of
 
 #: Without other settings, as in TorchSim: tau over time step, and friction times time step.
 PERIODS, FRICTION = 10.0, 0.01
 #: Farther from the constraints (in TorchSim's unit) atoms are not brought onto them without a word.
 FAR = 1e-3
-
-State = TypeVar("State", bound=MDState)
 
 
 class Integrator(NamedTuple):
@@ -75,10 +72,8 @@ class NoseHooverState(MDState):
 
 def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = True, **_: Any) -> MDState:
     """A state with forces, on the constraints, its momenta projected, or drawn if it has none."""
-    held = constraints_of(state)
-    held.check_fits(state)
     start = copy.copy(state)
-    start.positions = _placed(state, held)
+    start.positions = _placed(state)
     masses = state.masses[:, None]
     given = getattr(state, "momenta", None)
     if given is None:
@@ -89,7 +84,7 @@ def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = T
             sums = torch.zeros((state.n_systems, 4), dtype=state.dtype, device=state.device)
             sums = sums.index_add(0, state.system_idx, torch.cat([given, masses], dim=1))
             given = given - masses * (_free(state)[:, None] * sums[:, :3] / sums[:, 3:])[state.system_idx]
-    momenta = masses * held.batch(state).project_velocities(start.positions, given / masses)
+    momenta = masses * constraints_of(state).batch(state).project_velocities(start.positions, given / masses)
     output = model(start)
     _check_forces(state, output["forces"])
     made = MDState.from_state(start, momenta=momenta, energy=output["energy"], forces=output["forces"])
@@ -97,9 +92,9 @@ def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = T
     return made
 
 
-def _placed(state: SimState, held: Constraints) -> torch.Tensor:
+def _placed(state: SimState) -> torch.Tensor:
     """Positions on the constraints; refuses those that somebody has moved off them."""
-    batch = held.batch(state)
+    batch = constraints_of(state).batch(state)
     found = batch.project_positions(state.positions, state.positions)
     batch.check()
     away = (found - state.positions).abs().amax(1)
@@ -116,19 +111,17 @@ def _placed(state: SimState, held: Constraints) -> torch.Tensor:
 def _check_forces(state: SimState, forces: torch.Tensor) -> None:
     bad = (~torch.isfinite(forces).all(dim=1)).nonzero().ravel()
     if len(bad):
-        atom, system = int(bad[0]), int(state.system_idx[bad[0]])
         raise NonFiniteError(
-            f"force of atom {atom} (in system {system}) is not finite: look at what the model returned; the state is "
-            "as before the step",
+            f"force of atom {int(bad[0])} (in system {int(state.system_idx[bad[0]])}) is not finite: look at what the "
+            "model returned; the state is as before the step",
             item="force",
-            atom=atom,
+            atom=int(bad[0]),
         )
 
 
 def _free(state: SimState) -> torch.Tensor:
     """1 for systems whose rows know no place in space, else 0; shape (n_systems,)."""
-    free = torch.ones(state.n_systems, dtype=torch.long, device=state.device)
-    held = constraints_of(state)
+    held, free = constraints_of(state), torch.ones(state.n_systems, dtype=torch.long, device=state.device)
     for motion, k in zip(held.motions, held.system_idx.tolist(), strict=True):
         free[k] = all(item.translation_invariant for item in motion.constraint_set.constraints)
     return free
@@ -140,25 +133,15 @@ def _each(state: SimState, value: Any, atoms: bool = False) -> torch.Tensor:
     return numbers[state.system_idx, None] if atoms else numbers.clone()
 
 
-def _whole(step: Callable[..., State]) -> Callable[..., State]:
-    """A step that fails leaves the state as it was; forces that are not finite are told as such."""
+def _whole(step: Callable[..., Any]) -> Callable[..., Any]:
+    """A step that leaves the state that it is given as it was, and gives another."""
 
     @functools.wraps(step)
-    def made(state: State, model: ModelInterface, **settings: Any) -> State:
-        before, held = dict(state.__dict__), constraints_of(state)
-        if held.left is None or state.positions is not held.left[0] or state.positions._version != held.left[1]:
-            _placed(state, held)
-        try:
-            return step(state, model, **settings)
-        except BaseException as error:
-            forces = state.forces
-            state.__dict__.clear()
-            state.__dict__.update(before)
-            if not isinstance(error, ConvergenceError):
-                raise
-            _check_forces(state, forces)
-            error.add_note("In TorchSim: take a smaller timestep; the state is as before the step")
-            raise
+    def made(state: MDState, model: ModelInterface, **settings: Any) -> Any:
+        left = constraints_of(state).left
+        if left is None or state.positions is not left[0] or state.positions._version != left[1]:
+            _placed(state)
+        return step(copy.copy(state), model, **settings)
 
     return made
 
@@ -169,15 +152,14 @@ def _evaluate(state: MDState, model: ModelInterface, positions: torch.Tensor) ->
     held.batch(state).check()
     state.positions = positions
     output = model(state)
-    if state.device.type == "cpu":  # elsewhere looking waits for the device: the next step tells
-        _check_forces(state, output["forces"])
+    _check_forces(state, output["forces"])
     held.left = positions, positions._version
     state.energy, state.forces = output["energy"], output["forces"]
     state.store_model_extras(output)
     return state.forces
 
 
-def _rattle(state: State, model: ModelInterface, *, dt: Any, **_: Any) -> State:
+def _rattle(state: MDState, model: ModelInterface, *, dt: Any, **_: Any) -> MDState:
     batch, given = constraints_of(state).batch(state), (state.positions, state.velocities, state.forces)
     _, v, _ = rattle(batch, functools.partial(_evaluate, state, model), *given, _each(state, dt, atoms=True))
     state.momenta = state.masses[:, None] * v
@@ -199,7 +181,6 @@ def _nose_hoover_init(
     state: SimState, model: ModelInterface, *, kT: Any, dt: Any, tau: Any = None, chain_length: int = 3
 ) -> NoseHooverState:
     held, free = constraints_of(state), _free(state)
-    held.check_fits(state)
     for motion, k in zip(held.motions, held.system_idx.tolist(), strict=True):
         x = array_of(state.positions[state.system_idx == k])
         if not free[k] and len(axes := open_directions(motion, x)):
@@ -222,7 +203,7 @@ def _nose_hoover_step(state: NoseHooverState, model: ModelInterface, *, dt: Any,
         momenta, chain = half_step(state.momenta, state.chain, state.target_kT, state.system_idx)
         state.momenta, state.chain_positions, state.chain_momenta = momenta, chain.positions, chain.momenta
         if first:
-            state = _rattle(state, model, dt=dt)
+            _rattle(state, model, dt=dt)
     return state
 
 

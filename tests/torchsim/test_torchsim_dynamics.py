@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import torch
 import torch_sim as ts
-from scipy.integrate import quad
-from torch_models import FS, Butanes, Drops, Free, K, butane, drop, off, state_of, total_energy
+from torch_models import FS, Drops, Free, K, drop, off, total_energy
 
-from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.steppers import Rattle, State, System, run
 from kcons.torchsim import hold, langevin, nose_hoover, nve
@@ -94,22 +92,6 @@ def error_of(means):
     return np.std(means, ddof=1) / np.sqrt(len(means))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("pair", [langevin, nose_hoover], ids=["langevin", "nose_hoover"])
-def test_short_runs_have_the_temperature_of_the_bath(pair):
-    """64 copies of butane for 0.2 ps, bonds to hydrogen held."""
-    state = ts.concatenate_states([butane()] * 64)
-    hold(state, "hbonds")
-    state.rng = 1
-    model, kT = Butanes(), 300 * K
-    warm = go_on(langevin, langevin.init(state, model, kT=kT), model, 200, 1 * FS, kT=kT, gamma=0.03 / FS)
-    settings = {"kT": kT} | ({"gamma": 0.02 / FS} if pair is langevin else {})
-    start = warm if pair is langevin else pair.init(warm, model, dt=1 * FS, tau=20 * FS, kT=kT)
-    means = temperatures(pair, start, model, 200, 1 * FS, 0, **settings)
-    assert abs(means.mean() - 300) < 4 * error_of(means)
-    assert error_of(means) < 8
-
-
 @pytest.mark.validation
 @pytest.mark.parametrize("pair", [langevin, nose_hoover], ids=["langevin", "nose_hoover"])
 def test_temperature_over_20_ps(pair):
@@ -155,39 +137,6 @@ def test_each_copy_may_have_its_own_temperature():
     assert np.abs(found / [100, 300, 900] - 1).max() < 4 * np.sqrt(2 / (48 * 10))
 
 
-@pytest.mark.slow
-def test_angles_of_free_chains_have_the_distribution_of_the_surface():
-    """Three atoms, two lengths held: the density of the cosine goes with the root of det A M^-1 A^T."""
-    masses = [1.0, 2.0, 1.0]
-    copies = [state_of(chain(k), [6, 6, 6], masses) for k in range(400)]
-    state = ts.concatenate_states(copies)
-    hold(state, Distance([[0, 1], [1, 2]]))
-    state.rng = 5
-    root = lambda c: np.sqrt(1.5**2 - (0.5 * c) ** 2)  # noqa: E731
-    norm = quad(root, -1, 1)[0]
-    wanted = quad(lambda c: c * c * root(c), -1, 1)[0] / norm
-    start = langevin.init(state, Free(), kT=300 * K)
-    found = []
-
-    def look(k, now):
-        if k >= 100 and k % 50 == 0:
-            u = now.positions.reshape(-1, 3, 3)
-            a, b = u[:, 0] - u[:, 1], u[:, 2] - u[:, 1]
-            found.append(((a * b).sum(1) ** 2).numpy())
-
-    go_on(langevin, start, Free(), 700, 2 * FS, look=look, kT=300 * K, gamma=0.2 / FS)
-    spread = np.std(np.mean(found, 0), ddof=1) / 20
-    assert abs(np.mean(found) - wanted) < 4 * spread < 0.02
-    assert abs(wanted - 1 / 3) > 0.005
-
-
-def chain(k):
-    """Two unit vectors at random."""
-    u = np.random.default_rng(k).normal(size=(2, 3))
-    u /= np.linalg.norm(u, axis=1)[:, None]
-    return np.array([u[0], [0, 0, 0], u[1]])
-
-
 def test_what_nose_hoover_dynamics_conserves():
     model = Drops()
     state = settled(3, 8, 100, rng=2, model=model)
@@ -225,9 +174,8 @@ def test_a_failed_step_leaves_the_state(pair):
     state.momenta = state.momenta.clone()
     state.momenta[7] += 900 * state.masses[7]
     before = {name: value.clone() for name, value in vars(state).items() if torch.is_tensor(value)}
-    with pytest.raises(ConvergenceError, match=r"system 1|copy 1") as failed:
+    with pytest.raises(ConvergenceError, match=r"copy 1.* smaller time step"):
         pair.step(state, model, dt=4 * FS, kT=300 * K)
-    assert "smaller timestep" in " ".join(failed.value.__notes__)
     assert all(torch.equal(getattr(state, name), value) for name, value in before.items())
     pair.step(state, model, dt=0.0001 * FS, kT=300 * K)  # goes on
 
@@ -235,17 +183,11 @@ def test_a_failed_step_leaves_the_state(pair):
 @pytest.mark.parametrize("pair", [nve, langevin, nose_hoover], ids=["nve", "langevin", "nose_hoover"])
 def test_forces_that_are_not_finite_are_named(pair):
     state = pair.init(held_drops(3, 2), Drops(), kT=300 * K, dt=2 * FS)
-    state.forces = state.forces.clone()
-    state.forces[8, 1] = torch.nan
-    x = state.positions
-    with pytest.raises(NonFiniteError, match=r"force of atom 8 \(in system 1\)"):
-        pair.step(state, Drops(), dt=2 * FS, kT=300 * K)
-    assert state.positions is x
-    state = pair.init(held_drops(3, 2), Drops(), kT=300 * K, dt=2 * FS)
-    model = lambda state: {**Drops()(state), "forces": torch.full_like(state.forces, torch.inf)}  # noqa: E731
-    for call in (pair.step, pair.init):  # also those of a last step
+    bad = torch.where(torch.arange(18)[:, None] < 8, 0.0, torch.inf).expand(18, 3)
+    model = lambda state: {**Drops()(state), "forces": bad}  # noqa: E731
+    for call in (pair.step, pair.init):
         before = dict(vars(state))
-        with pytest.raises(NonFiniteError, match=r"force of atom 0 \(in system 0\)"):
+        with pytest.raises(NonFiniteError, match=r"force of atom 8 \(in system 1\)"):
             call(state, model, dt=2 * FS, kT=300 * K)
         assert vars(state) == before
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 import torch_sim as ts
-from torch_models import Butanes, Drops, WithStress, butane, drop, off
+from torch_models import Butanes, WithStress, butane, drop, off
 
 from kcons.constraints import Dihedral
 from kcons.errors import ConvergenceError, UnsupportedError
-from kcons.torchsim import hold, langevin
+from kcons.torchsim import hold
 
 CARBONS = [0, 1, 2, 3]
 MOST = 0.02
@@ -81,15 +81,6 @@ def test_systems_that_are_swapped_in_and_out():
     assert off(together).max() < 1e-10
     alone = ts.optimize(state[3], model, **settings)
     assert abs(float(together.energy[3] - alone.energy[0])) < 1e-3
-
-
-def test_dynamics_go_on_from_an_optimized_state():
-    model = Drops()
-    state = ts.concatenate_states([drop(3, k) for k in range(2)])
-    hold(state, "water")
-    end = ts.optimize(state, model, optimizer=ts.Optimizer.fire, max_steps=200)
-    made = ts.integrate(end, model, integrator=langevin, n_steps=5, temperature=300, timestep=0.002)
-    assert off(made).max() < 1e-12
 
 
 @pytest.mark.parametrize("optimizer", [ts.Optimizer.fire, ts.Optimizer.gradient_descent])

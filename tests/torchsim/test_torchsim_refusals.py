@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
 import torch_sim as ts
-from torch_models import Butanes, Drops, K, WithStress, butane, drop, state_of
+from torch_models import Drops, K, WithStress, drop, state_of
 
 from kcons.constraints import Distance, Plane, VelocityFormula
 from kcons.errors import InputError, UnsupportedError
@@ -26,14 +23,13 @@ def held(n=2):
     ("constraints", "options", "says"),
     [
         ("hbond", {}, "did you mean 'hbonds'"),
-        ("hbonds, allbonds", {}, "two names of bonds"),
+        ("hbonds, allbonds", {}, "'hbonds, allbonds'"),
         ("water", {"water_geometry": "tip9p"}, "no water model"),
-        ("allbonds", {"bonds": [[0, 99]]}, "99"),
         ([], {}, "nothing is to be held"),
         ([Distance(np.zeros((0, 2), int))], {}, "nothing is to be held"),
         ([Distance([0, 40])], {}, "40"),
         ([Distance([0, 1], [2.0])], {}, "project=True"),
-        ([3.0], {}, "constraints of kcons.constraints"),
+        ([3.0], {}, "is no kcons constraint"),
     ],
     ids=str,
 )
@@ -76,7 +72,7 @@ def test_constraints_of_torchsim_beside_are_refused():
     with pytest.raises(UnsupportedError, match="FixCom"):
         hold(state, "water")
     state = held()
-    with pytest.raises(InputError, match="in one call"):
+    with pytest.raises(UnsupportedError, match=r"Constraints on the state.* one call of hold"):
         hold(state, "water")
     state.constraints = [*state.constraints, ts.constraints.FixCom([0])]
     with pytest.raises(UnsupportedError, match="FixCom"):
@@ -94,29 +90,16 @@ def test_momentum_that_is_conserved_along_some_axes_is_refused():
     langevin.init(state, Drops(), kT=300 * K)
 
 
-@pytest.mark.parametrize("integrator", ["nve", "nvt_langevin", "nvt_nose_hoover", "nvt_vrescale"])
+@pytest.mark.filterwarnings("ignore")  # TorchSim's own about constraints
+@pytest.mark.parametrize("integrator", ts.Integrator)
 def test_integrators_of_torchsim_are_refused(integrator):
     """They cool the system: positions are corrected and momenta are not."""
-    with pytest.raises(UnsupportedError, match=r"kcons\.torchsim\.nve, langevin or nose_hoover"):
-        ts.integrate(held(), Drops(), integrator=ts.Integrator(integrator), n_steps=2, temperature=300, timestep=0.001)
-
-
-@pytest.mark.filterwarnings("ignore")  # TorchSim's own about constraints
-@pytest.mark.parametrize("integrator", [name for name in ts.Integrator if name.startswith("npt")])
-def test_constant_pressure_is_refused(integrator):
     x = drop(8).positions.numpy()
     state = state_of(x, [8, 1, 1] * 8, np.tile([15.999, 1.008, 1.008], 8), cell=9.3 * np.eye(3))
     hold(state, "water")
-    with pytest.raises(UnsupportedError, match="at constant pressure there is none"):
-        ts.integrate(
-            state,
-            WithStress(),
-            integrator=integrator,
-            n_steps=2,
-            temperature=300,
-            timestep=0.001,
-            external_pressure=0.0,
-        )
+    pressure = {"external_pressure": 0.0} if integrator.startswith("npt") else {}
+    with pytest.raises(UnsupportedError, match=r"kcons\.torchsim\.nve, langevin or nose_hoover"):
+        ts.integrate(state, WithStress(), integrator=integrator, n_steps=2, temperature=300, timestep=0.001, **pressure)
 
 
 @pytest.mark.parametrize(
@@ -157,16 +140,3 @@ def test_positions_that_are_edited_between_steps_are_refused():
             nve.step(state, model, **settings)
         state.positions = kept
     nve.step(state, model, **settings)
-
-
-def test_bonds_that_are_given_are_taken():
-    state, bonds = butane(), Butanes().first.T.tolist()
-    with pytest.raises(InputError, match="has no bonds of"):
-        hold(state, "allbonds", bonds=bonds[1:4], guess_bonds=False)
-    hold(state, "allbonds", bonds=bonds, guess_bonds=False)
-    assert state.constraints[0].motions[0].rank == 13
-
-
-def test_importing_kcons_imports_no_torch():
-    code = "import sys, kcons, kcons.ase; print({'torch', 'torch_sim'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"

@@ -12,24 +12,24 @@ MUTANTS = {
         ),
         "«batch.check()→pass»": "torchsim/torchsim_optimizers::steps_that_cannot_be_held_are_told",
         "self.system_idx + «system_offset→0»": "torchsim/torchsim_states::splitting_joining_popping_and_copies",
-        "if excess.max(initial=0.0) > «1→1e9»": "torchsim/torchsim_refusals::bad_input_is_named_and_leaves_the_state",
-        "[FixedAtoms(fixed)] if «len(fixed)→False»": "torchsim/torchsim_states::fixed_atoms_are_taken_over",
+        "if «not same→False»:": "torchsim/torchsim_refusals::a_state_that_has_become_another_is_refused[masses]",
+        "project=«project→True»)": "torchsim/torchsim_refusals::bad_input_is_named_and_leaves_the_state",
     },
     "torchsim/dynamics.py": {
         "away.max() > «FAR→1e9»": "torchsim/torchsim_refusals::a_state_that_has_become_another_is_refused[positions]",
         "«_each(state, dt, atoms=True)→0.5 * _each(state, dt, atoms=True)»)\n    state.momenta": (
             "torchsim/torchsim_dynamics::constant_energy_is_the_trajectory_of_the_engine"
         ),
-        "- 3 * «_free(self)→1»": "torchsim/torchsim_states::fixed_atoms_are_taken_over",
+        "- 3 * «_free(self)→1»": "torchsim/torchsim_states::fixed_atoms_stay",
         "held.batch(state)«.check()→»\n    state.positions = positions": (
             "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"
         ),
-        "is not held.left[0] «or state.positions._version != held.left[1]→»": (
+        "is not left[0] «or state.positions._version != left[1]→»": (
             "torchsim/torchsim_refusals::positions_that_are_edited_between_steps_are_refused"
         ),
-        'if «state.device.type == "cpu"→False»:': (
+        '«_check_forces(state, output["forces"])→»\n    held.left': (
             "torchsim/torchsim_dynamics::forces_that_are_not_finite_are_named[nve]"
         ),
-        "state.__dict__.update(«before→{}»)": "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state",
+        "step(«copy.copy(state)→state», model": "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state",
     },
 }
