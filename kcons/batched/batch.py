@@ -104,7 +104,7 @@ class Batch:
         self._calls = 0
         # Fixed atoms, in the order of their rows.
         self._fixed_rows = self._joined(lambda each: each.plan.pinned_rows, torch.int64, self.row_starts)
-        self._fixed = self._joined(lambda each: each.plan.pinned, torch.int64, self.atom_starts)
+        self._fixed = self._joined(lambda each: each.fixed_atoms, torch.int64, self.atom_starts)
         self._free = self.masses > 0
         self._free[self._fixed] = False
         self._inverse_masses = self._inverse(self.masses)
