@@ -28,7 +28,7 @@ for name, P in (("series", series), ("Jordan form", by_jordan), ("rotation", tur
     print(f"exp(At) by {name:12s} differs from flow.propagator by {abs(P - flow.propagator(t)).max():.1e}")
 
 times = np.linspace(0, 6, 300)
-X = flow.circle(times, [1.0, 0.0])
+X = np.array([flow.closed_form(s) @ [1.0, 0.0] for s in times])  # eq. 19
 fig, axes = plt.subplots(figsize=(6, 3.8), layout="constrained")
 axes.plot(omega * times, X[:, 0], color="royalblue", label=r"$x_1 = \Omega x$")
 axes.plot(omega * times, X[:, 1], color="crimson", linestyle="--", label=r"$x_2 = \dot x$")

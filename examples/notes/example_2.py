@@ -9,19 +9,19 @@ python examples/notes/example_2.py        writes example_2.png and example_2.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.models.flows import DampedOscillator, phase_volume
+from kcons.models.flows import DampedOscillator, classify, phase_volume
 
 t = np.linspace(0, 15, 400)
 fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
 for eta in (0.2, 1.0, 2.0, 5.0):
     flow = DampedOscillator(1.0, eta)
     X = np.array([flow.closed_form(s) @ [1.0, 0.0] for s in t])
-    left.plot(t, X[:, 0], label=rf"$\eta = {eta}\,\Omega$, {flow.regime}")
+    left.plot(t, X[:, 0], label=rf"$\eta = {eta}\,\Omega$")
     right.plot(*X.T)
     blocks = [b.sizes for b in flow.jordan_form().blocks]
     volume = phase_volume(flow, [1.0, 0.0], [0.0, 3.0]).log_volume[-1]
     print(
-        f"eta = {eta}: {flow.regime}, {flow.classification()}, Jordan blocks {blocks}, "
+        f"eta = {eta}: {classify(flow.matrix)}, Jordan blocks {blocks}, "
         f"ln of the phase volume after t = 3: {volume:.6f} = -3 eta"
     )
 left.set(xlabel=r"time $\Omega t$ (dimensionless)", ylabel=r"$x_1 = \Omega x$ (in parts of the start)")

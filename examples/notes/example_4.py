@@ -23,7 +23,7 @@ print(f"accelerations by (105) and (110) differ by {abs(by_projection - by_formu
 
 free, falling = ParticleOnSphere(R, m), ParticleOnSphere(R, m, lambda x: gravity)
 t = np.linspace(0, 4, 500)
-circle = free.great_circle(t, x0, v0)
+circle = free.solve((0, 4), np.concatenate([x0, v0]), t_eval=t, rtol=1e-12, atol=1e-13).y[:3].T
 swing = falling.solve((0, 4), np.concatenate([x0, v0]), t_eval=t).y[:3].T
 print(
     f"radius along the free path: {R} to {abs(np.linalg.norm(circle, axis=1) - R).max():.0e}; "

@@ -6,7 +6,7 @@ python examples/notes/figure_01.py        writes figure_01.png and figure_01.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.models.flows import HarmonicOscillator
+from kcons.models.flows import HarmonicOscillator, classify
 
 oscillator = HarmonicOscillator(omega=1.0)
 
@@ -27,4 +27,4 @@ for axes in (left, right):
     axes.set(xlabel=r"$x_1 = \Omega x$ (arbitrary units)", ylabel=r"$x_2 = \dot x$ (arbitrary units)", aspect="equal")
 for ending in ("png", "pdf"):
     fig.savefig(f"figure_01.{ending}", dpi=120)
-print(f"radius of the trajectory: 1 to within {abs(np.hypot(*X.T) - 1).max():.1e}; {oscillator.classification()}")
+print(f"radius of the trajectory: 1 to within {abs(np.hypot(*X.T) - 1).max():.1e}; {classify(oscillator.matrix)}")

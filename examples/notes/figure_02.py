@@ -6,7 +6,7 @@ python examples/notes/figure_02.py        writes figure_02.png and figure_02.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.models.flows import DampedOscillator
+from kcons.models.flows import DampedOscillator, classify
 
 oscillator = DampedOscillator(omega=1.0, eta=0.2)
 
@@ -26,4 +26,4 @@ for axes in (left, right):
     axes.set(xlabel=r"$x_1 = \Omega x$ (arbitrary units)", ylabel=r"$x_2 = \dot x$ (arbitrary units)", aspect="equal")
 for ending in ("png", "pdf"):
     fig.savefig(f"figure_02.{ending}", dpi=120)
-print(f"{oscillator.regime}: eigenvalues {oscillator.eigenvalues()}; {oscillator.classification()}")
+print(f"eigenvalues {oscillator.eigenvalues()}; {classify(oscillator.matrix)}")

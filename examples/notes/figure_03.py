@@ -17,7 +17,7 @@ def lagrangian(q, v, t):
 
 
 t = np.linspace(0.0, 1.5, 301)
-true = Pendulum().exact(t, [0.4, 0.9])[:, 0]
+true = Pendulum().solve((0, 1.5), [0.4, 0.9], t_eval=t).y[0]
 bump = np.sin(np.pi * t / t[-1])  # zero at both ends
 
 fig, (left, right) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")

@@ -22,7 +22,7 @@ for point in find_equilibria(pendulum, [[-7, 7], [-3, 3]]):
     print(f"x_1 = {point.position[0] / np.pi:+.0f} pi: {point.classification}")
 
 t = np.linspace(0, 20, 600)
-X = pendulum.exact(t, [10.0, 0.0])
+X = pendulum.solve((0, 20), [10.0, 0.0], t_eval=t).y.T
 right.plot(*X.T, color="0.2")
 right.plot(10, 0, "k>", markersize=9)
 right.plot(4 * np.pi, 0, "o", color="royalblue")

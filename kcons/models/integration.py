@@ -11,23 +11,19 @@ from scipy.integrate import BDF, DOP853, RK23, RK45, DenseOutput, OdeSolver, Rad
 
 from kcons.constraints.arguments import FloatArray, as_float_array, read_only_view
 from kcons.constraints.target import WRONG, first_derivative_4
-from kcons.errors import ContradictionError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
+from kcons.errors import ContradictionError, InputError, NonFiniteError, SingularGeometryError
 
 METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
 #: What SciPy takes where less is asked for.
 LEAST_RTOL = 100 * float(np.finfo(float).eps)
 #: h of `jacobian_by_differences`.
 STEP = 0.02
-#: Parts of the time left in which a motion that is known is looked at for events.
-PARTS = 100
-
-Motion = Callable[[float], FloatArray]
 
 
 class _Along(DenseOutput):
     """A solution between two times, by a function of time."""
 
-    def __init__(self, t_old: float, t: float, at: Motion) -> None:
+    def __init__(self, t_old: float, t: float, at: Callable[[float], FloatArray]) -> None:
         super().__init__(t_old, t)
         self._at = at
 
@@ -41,13 +37,9 @@ def integrate(
     start: FloatArray,
     method: type[OdeSolver],
     project: Callable[[float, FloatArray], FloatArray],
-    known: Callable[[float, FloatArray], Motion | None] = lambda t, y: None,
     **options: Any,
 ) -> Any:
-    """What SciPy's ``solve_ivp`` gives, with a projection of the end of each step, and of values between.
-
-    The next step starts from the projection. `known` is asked before each step: once nothing is left to integrate, it
-    gives a function of time, which is the solution from there on.
+    """What SciPy's ``solve_ivp`` gives, with a projection of values between steps and of ends, where the next begins.
 
     A trial step may go too far, to a singular place or to numbers that are not finite, and is then made shorter. What
     was wrong there is raised if the run ends there.
@@ -65,17 +57,8 @@ def integrate(
     class Projecting(method):  # type: ignore[misc, valid-type]
         t: float
         y: FloatArray
-        motion: Motion | None = None
-        pace = 0.0
 
         def _step_impl(self) -> tuple[bool, str | None]:
-            if self.motion is None:
-                self.motion, self.pace = known(self.t, self.y), (self.t_bound - self.t) / PARTS
-            if self.motion is not None:
-                ahead = self.t_bound - self.t
-                self.t = self.t + self.pace if abs(ahead) > 1.5 * abs(self.pace) else self.t_bound
-                self.y = self.motion(self.t)
-                return True, None
             success, message = super()._step_impl()
             if success:
                 y = project(self.t, self.y)
@@ -88,8 +71,6 @@ def integrate(
             return success, message
 
         def _dense_output_impl(self) -> DenseOutput:
-            if self.motion is not None:
-                return _Along(self.t_old, self.t, self.motion)
             between = super()._dense_output_impl()
             return _Along(self.t_old, self.t, lambda t: project(t, between(t)))
 
@@ -112,13 +93,10 @@ def check_run(
     Refused is also what SciPy goes on with for ever, or otherwise than was asked for: rtol below rounding, a negative
     atol, NaN.
     """
-    if method == "LSODA":
-        raise UnsupportedError(
-            "LSODA keeps its own copy of the state, which cannot be put back on the constraints; "
-            "use 'Radau' or 'BDF' for stiff systems"
-        )
     if not isinstance(method, str) or method not in METHODS:
-        raise InputError(f"there is no method {method!r}; choose from {', '.join(METHODS)}", item="method")
+        raise InputError(
+            f"{method!r} is not among the methods {', '.join(METHODS)}; for stiff systems take Radau", item="method"
+        )
     ends = as_float_array(t_span, "t_span")
     if ends.shape != (2,) or not np.all(np.isfinite(ends)):
         raise InputError(f"t_span is a pair of finite times, not {t_span!r:.80}", item="t_span")
@@ -187,8 +165,7 @@ def check_derivative(
 ) -> None:
     """Refuse a derivative that differences with a step and with half of it contradict.
 
-    Where none was given, differences alone are refused if half the step changes them by more than the part `smooth`, or
-    by more than their `rounding`.
+    Where none was given, refuse differences that half the step changes by more than the part `smooth` and `rounding`.
     """
     size = float(np.max(np.abs(fine), initial=0.0))
     apart = np.abs(fine - coarse)

@@ -2,11 +2,10 @@
 
 M(q) q'' = f(q, q', t) + G^T lambda,  g(q) = 0,  G = dg/dq
 
-as multibody problems and the test sets for differential-algebraic equations are published. Accelerations obey
-G q'' = b, b = -(q' d/dq)^2 g. With N an orthonormal basis of the null space of G and a_0 any solution of
-G a_0 = b, they are a_0 + N y, (N^T M N) y = N^T (f - M a_0). So M need not be regular, only positive along what the
-constraints leave free, and rows may depend on each other. Corrections of positions and velocities are the smallest
-in the metric of M by the same formula, with f = 0.
+as multibody problems are published. Accelerations obey G q'' = b, b = -(q' d/dq)^2 g. With N an orthonormal basis of
+the null space of G and G a_0 = b they are a_0 + N y, (N^T M N) y = N^T (f - M a_0). So M need not be regular, only
+positive along what the constraints leave free, and rows may depend on each other. Corrections of positions and
+velocities are the smallest in the metric of M by the same formula, with f = 0.
 
 References
 ----------
@@ -36,8 +35,6 @@ MASSLESS = 1e-13
 #: A start may be off the constraints by so much of its size; what is left after a projection, by so much.
 START, ACCEPTED = 1e-6, 1e-9
 ITERATIONS = 50
-#: Parts of a step of Newton's method that are tried far from the constraints.
-PARTS = tuple(0.5**k for k in range(8))
 _EPS = float(np.finfo(float).eps)
 
 
@@ -142,11 +139,6 @@ class Multibody:
         q, _ = self._state(q, q)
         return len(q) - len(self._place(q, 0.0, None).rows)
 
-    def residuals(self, q: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """g and its time derivative G v, shape (m,) each, in the units that g has."""
-        q, v = self._state(q, v)
-        return self._g(q), self._G(q) @ v
-
     def motion(self, q: ArrayLike, v: ArrayLike, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Accelerations, shape (n,), and multipliers, shape (m,), at a state on the constraints."""
         q, v = self._state(q, v)
@@ -190,14 +182,9 @@ class Multibody:
         t_span : pair of float
             Start and end; the end may be earlier.
         t_eval : array_like, optional
-            Times of the result, by the interpolant of the method, also on the constraints; by default the ends of the
-            steps.
-        method : str
-            'DOP853', 'RK45', 'RK23', or 'Radau' or 'BDF' for stiff forces, of SciPy.
-        rtol, atol : float
-            Allowed error of a step, of (q, v); `atol` may have shape (2n,).
-        options
-            max_step, first_step, and what else the method takes.
+            Times of the result, by default the ends of the steps; between them it is on the constraints as well.
+        method, rtol, atol, options
+            As in ``solve_ivp``, but LSODA, for (q, v); 'Radau' or 'BDF' serve stiff forces.
 
         Raises
         ------
@@ -294,13 +281,10 @@ class Multibody:
             if np.all(np.abs(g) <= 2 * _EPS * (np.abs(place.G) @ np.abs(place.q))):
                 break
             step = place.solve(np.zeros(len(q)), -g)
-            for part in PARTS if off > accepted else PARTS[:1]:
-                moved = place.q + part * step
-                there = self._g(moved)
-                left = _largest(there / place.size)
-                if left < (1.0 - 0.5 * part) * off:
-                    break
-            else:
+            moved = place.q + step
+            there = self._g(moved)
+            left = _largest(there / place.size)
+            if left >= 0.5 * off:
                 break
             place, g, off = self._place(moved, t, rank), there, left
         if not off <= accepted:

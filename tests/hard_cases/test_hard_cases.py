@@ -29,7 +29,7 @@ SAID = {
     "H22": "InputError: .*needs non-zero kinetic energy: draw velocities first",
     "H23": "OverdeterminedError: g - 1 = 0: isokinetic temperature undefined",
     "H29": r"InputError: Distance: row 1 names an atom twice: \(2, 2\)",
-    "H34": "BudgetError: .*more than the start can produce.*Leave the budget out",
+    "H34": "BudgetError: .*not what the start can produce.*Leave the budget out",
     "H36": "BudgetError: the start is already at equilibrium.*start elsewhere",
     "H39": "warned: total momentum is not zero.*Take it out",
     "H40": "InputError: the cutoff 1 must be above 0 and at most half the box",

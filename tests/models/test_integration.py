@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.errors import UnsupportedError
 from kcons.models.integration import METHODS, check_run, integrate
 
 
@@ -33,18 +32,6 @@ def test_the_next_step_starts_from_the_projection(method):
     np.testing.assert_allclose(counted.y[0], np.arange(len(counted.t)), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("end", [2.0, -2.0])
-def test_a_motion_that_is_known_is_taken_as_it_is(end):
-    known = lambda t, y: (lambda s: np.array([s, 7.0])) if abs(t) > 0.5 else None  # noqa: E731
-    passed = lambda t, y: t - 0.75 * end  # noqa: E731
-    options = {"max_step": 0.1, "dense_output": True, "events": passed}
-    found = integrate(turn, (0, end), [1.0, 0.0], METHODS["RK45"], lambda t, y: y, known, **options)
-    assert found.success and found.t[-1] == end
-    np.testing.assert_array_equal(found.sol(0.9 * end), [0.9 * end, 7.0])
-    np.testing.assert_allclose(found.t_events[0], [0.75 * end], rtol=1e-14)
-    np.testing.assert_allclose(found.sol(0.2 * end), [np.cos(0.2 * end), np.sin(0.2 * end)], atol=1e-5)
-
-
 def run(t_span=(0.0, 1.0), t_eval=None, method="RK45", **sizes):
     return check_run(t_span, t_eval, method, sizes, 2)
 
@@ -52,5 +39,3 @@ def run(t_span=(0.0, 1.0), t_eval=None, method="RK45", **sizes):
 def test_what_can_be_is_taken():
     assert run((1.0, 0.0), [0.7, 0.2])[1] == (1.0, 0.0)
     run(rtol=[1e-9, 1e-3], atol=0.0, max_step=np.inf, first_step=None, jac=len)
-    with pytest.raises(UnsupportedError, match="use 'Radau' or 'BDF'"):
-        run(method="LSODA")

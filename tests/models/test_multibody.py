@@ -62,13 +62,6 @@ def test_squeezer_ends_where_it_is_published_to():
     np.testing.assert_allclose(-found.multipliers[-1].reshape(2, 3).T.ravel(), MULTIPLIERS, rtol=2e-6, atol=0)
 
 
-@pytest.mark.parametrize("seed", [3, 4, 9])
-def test_far_starts_are_reached_by_parts_of_steps(seed):
-    body = squeezer()[0]["body"]
-    q, v = body.project(START + 0.3 * np.random.default_rng(seed).normal(size=7), np.zeros(7))
-    assert np.abs(body.residuals(q, v)).max() < 1e-14
-
-
 # -- closed forms ------------------------------------------------------------------------------------
 
 
@@ -77,6 +70,10 @@ def none(q, v, t):
 
 
 LENGTH, GRAVITY, SWING = 0.5, 9.8, 2.0
+
+
+def held(body, q, v):
+    return np.append(body._g(q), body._G(q) @ v)
 
 
 def pendulum(mass=(2.0, 2.0, 0.0)):
@@ -125,7 +122,7 @@ def test_at_steps_and_between_and_backwards(method, rtol, close):
     np.testing.assert_array_equal(back.t, times)
     np.testing.assert_allclose(back.q[:, 2], swinging(times)[0], rtol=0, atol=close)
     for found in (there, back):
-        assert max(np.abs(body.residuals(q, v)).max() for q, v in zip(found.q, found.v, strict=True)) < 1e-14
+        assert max(np.abs(held(body, q, v)).max() for q, v in zip(found.q, found.v, strict=True)) < 1e-14
 
 
 def test_no_time_and_no_times():
@@ -270,7 +267,7 @@ Q, V = np.array([0.4, 0.7]), np.array([-1.2, 0.8])
 )
 def test_derivatives_by_differences(given, digits):
     body = Multibody(np.eye(2), none, curve, **given)
-    body.residuals(Q, V)
+    body.degrees_of_freedom(Q)
     np.testing.assert_allclose(body._G(Q), gradient(Q), rtol=0, atol=1e-11 if not given else 0)
     np.testing.assert_allclose(-body._b(Q, V), bend(Q, V), rtol=0, atol=10.0**-digits)
     np.testing.assert_allclose(-body._b(Q, 1e3 * V), 1e6 * bend(Q, V), rtol=0, atol=10.0 ** (6 - digits))
@@ -280,7 +277,7 @@ def test_differences_go_with_the_length():
     """A curve a million times smaller."""
     small, q, v = 1e-6, np.array([0.3e-6]), np.array([2.5])
     body = Multibody([1.0], none, lambda q: np.sin(q / small), length=small)
-    body.residuals(q, v)
+    body.degrees_of_freedom(q)
     np.testing.assert_allclose(body._G(q)[0], np.cos(q / small) / small, rtol=1e-11)
     np.testing.assert_allclose(-body._b(q, v), -np.sin(q / small) * v**2 / small**2, rtol=1e-7)
 

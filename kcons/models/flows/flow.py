@@ -1,7 +1,7 @@
 """Flows: dX/dt = V(X, t) (notes eqs. 1-3), their Jacobians, divergence, trajectories and phase-space volume; mechanics.
 
 Functions take their arguments in SciPy's order, (t, X). Lagrangians are functions L(q, v, t) of arrays q, v of shape
-(f,) and a number t; Hamiltonians H(q, p) or H(q, p, t) (notes section 2).
+(f,) and a number t; Hamiltonians H(q, p, t) likewise (notes section 2).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from kcons.errors import ConvergenceError, InputError
 from kcons.models.integration import STEP, called, check_derivative, jacobian_by_differences
 
 __all__ = ["Flow", "HamiltonianFlow", "PhaseVolume", "action", "hamiltonian", "jacobian_by_differences"]
-__all__ += ["lagrange_residual", "momentum", "phase_volume", "velocity_of_momentum"]
+__all__ += ["lagrange_residual", "momentum", "phase_volume"]
 
 Field = Callable[[float, FloatArray], ArrayLike]
 Lagrangian = Callable[[FloatArray, FloatArray, float], float]
@@ -70,11 +70,6 @@ class Flow:
         """Jacobians with a step and with half of it."""
         return [jacobian_by_differences(self._velocity, t, self._state(X), step) for step in (STEP, STEP / 2)]
 
-    def check_jacobian(self, t: float, X: ArrayLike) -> None:
-        """Refuse a Jacobian that differences contradict, and differences that do not serve."""
-        given = None if self._jacobian is None else self.jacobian(t, X)
-        check_derivative("jacobian", "the velocity", given, *self._differences(t, X))
-
     def divergence(self, t: float, X: ArrayLike) -> float:
         """div V = tr A (notes eqs. 36, 37)."""
         return float(np.trace(self.jacobian(t, X)))
@@ -90,8 +85,6 @@ class Flow:
         **options: Any,
     ) -> Any:
         """A trajectory X(t) = f(X_0; t) (notes eq. 30): SciPy's ``solve_ivp``, with tighter tolerances."""
-        if method in ("Radau", "BDF", "LSODA"):
-            options.setdefault("jac", self.jacobian)
         return solve_ivp(self.velocity, tuple(t_span), self._state(X0), method, rtol=rtol, atol=atol, **options)
 
     def _state(self, X: ArrayLike) -> FloatArray:
@@ -144,7 +137,8 @@ def phase_volume(
         raise InputError("times are one-dimensional and increase", item="times")
     n = flow.n
     state, total = flow._state(X0), np.eye(n)
-    flow.check_jacobian(float(wanted[0]), state)
+    given = None if flow._jacobian is None else flow.jacobian(wanted[0], state)
+    check_derivative("jacobian", "the velocity", given, *flow._differences(wanted[0], state))
     log_volume = divergence = 0.0
     rows = [(state, total, 0.0, 0.0)]
 
@@ -173,71 +167,43 @@ def phase_volume(
 
 
 class HamiltonianFlow(Flow):
-    """The flow of H(q, p) or H(q, p, t) on X = (q, p): dq/dt = dH/dp, dp/dt = -dH/dq (notes eqs. 49-55).
+    """The flow of H(q, p, t) on X = (q, p): dq/dt = dH/dp, dp/dt = -dH/dq (notes eqs. 49-55).
+
+    The gradients are differences of H; where they are known, `Flow` takes (dH/dp, -dH/dq).
 
     Parameters
     ----------
-    hamiltonian : callable (q, p) -> float
-        H, arrays of shape (f,).
+    hamiltonian : callable (q, p, t) -> float
+        H, arrays of shape (f,). Where it depends on t, the energy changes with its derivative by t (notes eq. 51).
     f : int
         Degrees of freedom.
-    dH_dq, dH_dp : callable (q, p) -> (f,), optional
-        Gradients; by differences where they are not given.
-    time_dependent : bool
-        Whether H and its gradients take the time as a third argument, (q, p, t). The energy then changes, by
-        dH/dt = the derivative of H with respect to its third argument (notes eq. 51).
     """
 
-    def __init__(
-        self,
-        hamiltonian: Callable[..., float],
-        f: int,
-        dH_dq: Callable[..., ArrayLike] | None = None,
-        dH_dp: Callable[..., ArrayLike] | None = None,
-        *,
-        time_dependent: bool = False,
-    ) -> None:
+    def __init__(self, hamiltonian: Callable[..., float], f: int) -> None:
         self.f = whole_number(f, "f")
-        self._given = {"dH_dq": dH_dq, "dH_dp": dH_dp}
-        taken = ("q", "p", "t") if time_dependent else ("q", "p")
-        for name, function in (("hamiltonian", hamiltonian), *self._given.items()):
-            check_call(name, function, taken, "; time_dependent says whether it gets the time")
-        self.hamiltonian, self.time_dependent = hamiltonian, time_dependent
+        check_call("hamiltonian", hamiltonian, ("q", "p", "t"))
+        self.hamiltonian = hamiltonian
         super().__init__(self._field, 2 * self.f)
 
-    def _of(self, function: Callable[..., Any], X: FloatArray, t: float) -> Any:
-        """A function of the user at X."""
-        X = read_only_view(X)
-        return function(X[: self.f], X[self.f :], *((t,) if self.time_dependent else ()))
-
     def energy(self, X: ArrayLike, t: float = 0.0) -> float:
-        """H(q, p), or H(q, p, t)."""
-        return float(self._of(self.hamiltonian, self._state(X), t))
+        """H(q, p, t)."""
+        q, p = np.split(read_only_view(self._state(X)), 2)
+        return float(self.hamiltonian(q, p, t))
 
-    def _gradient(self, t: float, X: FloatArray) -> FloatArray:
+    def _gradient(self, t: float, X: FloatArray, step: float = STEP) -> FloatArray:
         """(dH/dq, dH/dp), shape (2f,)."""
-        slope = np.zeros(2 * self.f) if all(self._given.values()) else self._differences_of_energy(t, X, STEP)
-        for part, (name, function) in zip(np.split(slope, 2), self._given.items(), strict=True):
-            if function is not None:
-                part[:] = called(name, lambda X, g=function: self._of(g, X, t), (self.f,), X)
-        return slope
-
-    def _differences_of_energy(self, t: float, X: FloatArray, step: float) -> FloatArray:
-        return jacobian_by_differences(lambda s, Y: self._of(self.hamiltonian, Y, s), t, X, step)
+        return jacobian_by_differences(lambda s, Y: self.energy(Y, s), t, X, step)
 
     def _field(self, t: float, X: FloatArray) -> FloatArray:
         slope = self._gradient(t, X)
         return np.concatenate([slope[self.f :], -slope[: self.f]])
 
     def solve(self, t_span: Sequence[float], X0: ArrayLike, method: str = "DOP853", **options: Any) -> Any:
-        """As `Flow.solve`; gradients are compared with differences of H at the start."""
+        """As `Flow.solve`; refused where differences of H with half the step are others."""
         X, t = self._state(X0), float(t_span[0])
-        slope, rounding = self._gradient(t, X), 1e-10 * abs(self.energy(X, t))
-        differences = (self._differences_of_energy(t, X, step) for step in (STEP, STEP / 2))
-        for (name, function), own, *both in zip(
-            self._given.items(), *(np.split(part, 2) for part in (slope, *differences)), strict=True
-        ):
-            check_derivative(name, "H", None if function is None else own, *both, rounding=rounding)
+        both = (self._gradient(t, X, step) for step in (STEP, STEP / 2))
+        rounding = 1e-10 * abs(self.energy(X, t))
+        check_derivative("gradient to a Flow", "H", None, *both, rounding=rounding)
         return super().solve(t_span, X, method, **options)
 
 
@@ -278,27 +244,17 @@ def lagrange_residual(
     return first_derivative_4(along, 0.0, step) - jacobian_by_differences(lambda s, x: lagrangian(x, v, t), t, q)
 
 
-def velocity_of_momentum(
-    lagrangian: Lagrangian, q: ArrayLike, p: ArrayLike, t: float = 0.0, guess: ArrayLike | None = None
-) -> FloatArray:
-    """The v with dL/dv = p, shape (f,).
+def hamiltonian(lagrangian: Lagrangian, q: ArrayLike, p: ArrayLike, t: float = 0.0) -> float:
+    """H(q, p, t) = v . p - L, v the velocity with dL/dv = p (notes eqs. 47, 48).
 
     Raises
     ------
     ConvergenceError
-        If there is none near the guess.
+        If no such velocity is found.
     """
-    p = as_float_array(p, "p")
-    start = p if guess is None else as_float_array(guess, "guess")
-    found = root(lambda v: momentum(lagrangian, q, v, t) - p, start, options={"xtol": 1e-13})
+    q, p = as_float_array(q, "q"), as_float_array(p, "p")
+    found = root(lambda v: momentum(lagrangian, q, v, t) - p, p, options={"xtol": 1e-13})
     if not np.all(np.abs(found.fun) <= 1e-9 * np.maximum(1.0, np.abs(p))):
         left = float(np.max(np.abs(found.fun)))
-        raise ConvergenceError("no velocity has this momentum; give a guess near it", residual=left)
-    return np.asarray(found.x)
-
-
-def hamiltonian(lagrangian: Lagrangian, q: ArrayLike, p: ArrayLike, t: float = 0.0) -> float:
-    """H(q, p, t) = v . p - L with v the velocity of this momentum (notes eqs. 47, 48)."""
-    q = as_float_array(q, "q")
-    v = velocity_of_momentum(lagrangian, q, p, t)
-    return float(v @ as_float_array(p, "p") - lagrangian(q, v, t))
+        raise ConvergenceError("no velocity has this momentum; see whether dL/dv can take it", residual=left)
+    return float(found.x @ p - lagrangian(q, found.x, t))

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
-from scipy.special import ellipj, ellipkinc
 
 from kcons.constraints.arguments import FloatArray, NotNegative, Positive, as_float_array, check_call, checked, positive
 from kcons.errors import InputError
-from kcons.models.flows.flow import Flow, HamiltonianFlow, phase_volume
+from kcons.models.flows.flow import Flow, phase_volume
 from kcons.models.flows.linear import JordanBlocks, JordanForm, LinearFlow, jordan_block
 from kcons.models.integration import called
 
-__all__ = ["Compression", "DampedOscillator", "HarmonicOscillator", "ParticleOnSphere", "Pendulum", "Thermostat"]
-
-#: Part of the energy of the separatrix, within which elliptic functions of double precision lose their digits.
-NEAR_SEPARATRIX = 1e-9
+__all__ = ["DampedOscillator", "HarmonicOscillator", "ParticleOnSphere", "Pendulum", "Thermostat"]
 
 
 class DampedOscillator(LinearFlow):
@@ -30,15 +25,6 @@ class DampedOscillator(LinearFlow):
     def __init__(self, omega: Positive = 1.0, eta: NotNegative = 0.2) -> None:
         self.omega, self.eta = omega, eta
         super().__init__([[0.0, self.omega], [-self.omega, -self.eta]])
-
-    @property
-    def regime(self) -> str:
-        """'undamped', 'oscillating', 'critical' or 'overdamped', by the sign of a^2 = eta^2 - 4 Omega^2."""
-        if self.eta == 0:
-            return "undamped"
-        if self.eta == 2 * self.omega:
-            return "critical"
-        return "oscillating" if self.eta < 2 * self.omega else "overdamped"
 
     def eigenvalues(self) -> tuple[complex, complex]:
         """(-eta -+ a)/2, a = (eta^2 - 4 Omega^2)^1/2, in this order (notes eq. 23).
@@ -84,67 +70,23 @@ class HarmonicOscillator(DampedOscillator):
     def __init__(self, omega: float = 1.0) -> None:
         super().__init__(omega, 0.0)
 
-    def circle(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
-        """X(t) on its circle, shape (2,) or (k, 2) (notes eqs. 18, 19)."""
-        x1, x2 = self._state(X0)
-        angle = self.omega * as_float_array(t, "t")
-        c, s = np.cos(angle), np.sin(angle)
-        return np.stack([c * x1 + s * x2, c * x2 - s * x1], axis=-1)
 
-
-class Pendulum(HamiltonianFlow):
-    """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56, 57)."""
+class Pendulum(Flow):
+    """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56-61)."""
 
     @checked
     def __init__(self, omega: Positive = 1.0) -> None:
         self.omega = omega
         super().__init__(
-            lambda q, p: float(self.omega * (0.5 * p[0] ** 2 + 2.0 * np.sin(0.5 * q[0]) ** 2)),
-            1,
-            lambda q, p: self.omega * np.sin(q),
-            lambda q, p: self.omega * p,
+            lambda t, X: np.array([omega * X[1], -omega * np.sin(X[0])]),
+            2,
+            lambda t, X: np.array([[0.0, omega], [-omega * np.cos(X[0]), 0.0]]),
         )
-        self._jacobian = lambda t, X: np.array([[0.0, self.omega], [-self.omega * np.cos(X[0]), 0.0]])
 
-    def exact(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
-        """X(t) by Jacobi's elliptic functions, shape (2,) or (k, 2).
-
-        With k^2 = H/(2 Omega): sin(theta/2) = k sn(Omega t + u_0 | k^2) for k < 1, and theta/2 = am(k Omega t + u_0 |
-        1/k^2) for k > 1, where the pendulum turns over.
-
-        Raises
-        ------
-        InputError
-            A start on the separatrix, k = 1, or so near that elliptic functions lose their digits.
-        """
-        theta0, rate0 = self._state(X0)
-        times = as_float_array(t, "t")
-        m = self.energy(X0) / (2.0 * self.omega)
-        up, half = np.abs(np.cos(0.5 * theta0)), 0.5 * abs(rate0)
-        short = (up - half) * (up + half)  # 1 - m without its cancellation
-        if abs(short) < NEAR_SEPARATRIX:
-            raise InputError(
-                f"the start is so near the separatrix (by {short:.2g} of its energy) that elliptic functions lose "
-                "their digits: take flow.solve(...)",
-                item="X0",
-            )
-        # Measured from the nearest lowest position.
-        turns = np.round(theta0 / (2 * np.pi))
-        sine, half_rate = np.sin(0.5 * (theta0 - 2 * np.pi * turns)), 0.5 * rate0
-        k = np.sqrt(m)
-        if m < 1.0:
-            start = ellipkinc(np.arctan2(sine, half_rate), m)
-            sn, cn, dn, _ = ellipj(self.omega * times + start, m)
-            half = np.arctan2(k * sn, dn)
-            return np.stack([2.0 * half + 2 * np.pi * turns, 2.0 * k * cn], axis=-1)
-        direction = np.sign(rate0)
-        start = ellipkinc(0.5 * direction * (theta0 - 2 * np.pi * turns), 1.0 / m)
-        _, _, dn, am = ellipj(k * self.omega * times + start, 1.0 / m)
-        return np.stack([direction * 2.0 * am + 2 * np.pi * turns, direction * 2.0 * k * dn], axis=-1)
-
-    def stationary_point(self, k: int) -> FloatArray:
-        """(k pi, 0), stable for even k (notes eqs. 58-61)."""
-        return np.array([k * np.pi, 0.0])
+    def energy(self, X: ArrayLike) -> float:
+        """H, constant along every trajectory."""
+        x1, x2 = self._state(X)
+        return float(self.omega * (0.5 * x2**2 + 2.0 * np.sin(0.5 * x1) ** 2))
 
 
 class ParticleOnSphere(Flow):
@@ -175,28 +117,6 @@ class ParticleOnSphere(Flow):
             a = a + f - x * (x @ f) / self.radius**2
         return np.asarray(a)
 
-    def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
-        """The free motion x(t), shape (3,) or (k, 3)."""
-        x0, v0 = np.split(self._state(np.append(as_float_array(x0, "x0"), as_float_array(v0, "v0"))), 2)
-        speed = float(np.linalg.norm(v0))
-        if abs(np.linalg.norm(x0) - self.radius) > 1e-9 * self.radius:
-            raise InputError(f"x0 is {np.linalg.norm(x0):.9g} from the center, not {self.radius:.9g}", item="x0")
-        if abs(x0 @ v0) > 1e-9 * self.radius * speed:
-            raise InputError("v0 leaves the sphere: give its part along it, v - x (x.v)/R^2", item="v0")
-        angle = as_float_array(t, "t")[..., None] * speed / self.radius
-        return np.asarray(np.cos(angle) * x0 + self.radius * np.sin(angle) * (v0 / speed if speed else v0))
-
-
-class Compression(NamedTuple):
-    """Phase volume on the surface of constant K, along a trajectory, at k times."""
-
-    t: FloatArray
-    #: Measured: ln of the volume spanned by the tangent vectors, carried along by the variational equation.
-    log_volume: FloatArray
-    #: -(g - 1) times the integral of alpha.
-    predicted: FloatArray
-    g: int
-
 
 class Thermostat(Flow):
     """Particles at constant kinetic energy; X = (M^1/2 x, M^1/2 v), in which this is a sphere (notes example 5).
@@ -221,11 +141,6 @@ class Thermostat(Flow):
         self.masses, self.root, self.force = m, np.sqrt(m), force
         super().__init__(self._field, 2 * m.size)
 
-    @property
-    def degrees_of_freedom(self) -> int:
-        """g, before the thermostat takes its one."""
-        return self.masses.size
-
     def state(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
         """X of positions and velocities."""
         x, v = as_float_array(x, "x").ravel(), as_float_array(v, "v").ravel()
@@ -235,26 +150,28 @@ class Thermostat(Flow):
             raise InputError("an isokinetic thermostat needs non-zero kinetic energy", item="v")
         return self._state(np.concatenate([self.root * x, self.root * v]))
 
-    def positions(self, X: FloatArray) -> FloatArray:
-        """x, shape (n,)."""
-        return np.asarray(X[: self.masses.size] / self.root)
-
     def friction(self, X: ArrayLike) -> float:
         """alpha = v.f/(v^T M v) (notes eq. 113)."""
         X = as_float_array(X, "X")
         w = X[self.masses.size :]
-        return float(w @ (self._force(self.positions(X)) / self.root) / (w @ w))
+        return float(w @ self._push(X) / (w @ w))
 
-    def _force(self, x: FloatArray) -> FloatArray:
-        return called("force", self.force, x.shape, x, scalar=True)
+    def _push(self, X: FloatArray) -> FloatArray:
+        """M^-1/2 f, shape (n,)."""
+        x = X[: self.masses.size] / self.root
+        return called("force", self.force, x.shape, x, scalar=True) / self.root
 
     def _field(self, t: float, X: FloatArray) -> FloatArray:
         w = X[self.masses.size :]
-        return np.concatenate([w, self._force(self.positions(X)) / self.root - self.friction(X) * w])
+        return np.concatenate([w, self._push(X) - self.friction(X) * w])
 
-    def compression(self, X0: ArrayLike, times: ArrayLike) -> Compression:
-        """Measure the compression of phase space along a trajectory, and predict it from alpha."""
-        X0, n, g = self._state(X0), self.masses.size, self.degrees_of_freedom
+    def compression(self, X0: ArrayLike, times: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Measure the compression of phase space along a trajectory, and predict it from alpha, shape (k,) each.
+
+        The first is ln of the volume spanned by tangent vectors of the surface of constant K, carried along by the
+        variational equation; the second -(g - 1) times the integral of alpha.
+        """
+        X0, n = self._state(X0), self.masses.size
         extended = Flow(lambda t, Y: np.append(self.velocity(t, Y[:-1]), self.friction(Y[:-1])), self.n + 1)
         wanted = np.atleast_1d(as_float_array(times, "times"))
         Y, volume, rows = np.append(X0, 0.0), 0.0, [(0.0, 0.0)]
@@ -267,4 +184,4 @@ class Thermostat(Flow):
             Y = found.states[-1]
             rows.append((volume, float(Y[-1])))
         volumes, frictions = np.array(rows).T
-        return Compression(wanted, volumes, -(g - 1) * frictions, g)
+        return volumes, -(n - 1) * frictions

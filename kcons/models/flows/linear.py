@@ -4,10 +4,9 @@
 from the backward error of that, which is of the size of the rounding of the entries.
 
 **Jordan blocks** are not continuous in the matrix: next to any matrix lie others whose eigenvalues are all different.
-What numbers of finite precision can say is that a matrix lies within its rounding of one with the structure found.
-Eigenvalues that rounding may make equal are taken together, brought to the top of the Schur form, and what is left
-there after their mean is a nilpotent matrix up to rounding, whose null spaces, one after the other, give the sizes
-(Kublanovskaya's staircase) and chains of generalized eigenvectors.
+What can be said is that a matrix lies within its rounding of one with the structure found. Eigenvalues that rounding
+may make equal are brought to the top of the Schur form; what is left there after their mean is nilpotent up to
+rounding, and its null spaces give the sizes (Kublanovskaya's staircase) and chains of generalized eigenvectors.
 
 **Stability.** The notes' criterion Re lambda <= 0 (eq. 14) is completed: where Re lambda = 0, the Jordan blocks must be
 1 x 1, or the solution grows like a power of t. Whether a real part within its error is zero is decided in rational
@@ -51,13 +50,14 @@ CLOSER = 8.0
 LARGEST = 24
 #: Equilibria closer than this, in parts of the size of the box, are one.
 SAME = 1e-6
+#: |V| counts as zero below this part of its size in the box.
+ZERO = 1e-10
 
 
 class LinearFlow(Flow):
     """dX/dt = A X (notes eq. 7).
 
-    exp(At) is computed by scaling and squaring of a Pade approximant, not from eigenvectors: defective matrices, whose
-    eigenvectors do not span, need no special treatment, nor do those that are nearly so.
+    exp(At) is computed by scaling and squaring of a Pade approximant, which serves defective matrices as well.
 
     Parameters
     ----------
@@ -75,14 +75,6 @@ class LinearFlow(Flow):
     def exact(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
         """X(t) = exp(At) X(0), shape (n,) or (k, n) (notes eq. 8)."""
         return np.asarray(scipy.linalg.expm(self.matrix * as_float_array(t, "t")[..., None, None]) @ self._state(X0))
-
-    def jordan_form(self) -> JordanForm:
-        """T and J with A = T J T^-1, as far as double precision allows (notes eqs. 10-13)."""
-        return jordan_form(self.matrix)
-
-    def classification(self) -> Classification:
-        """Kind and stability (notes eq. 14, completed)."""
-        return classify(self.matrix)
 
 
 # -- eigenvalues --------------------------------------------------------------------------------------
@@ -209,9 +201,9 @@ def jordan_block_propagator(eigenvalue: complex, size: int, t: float) -> NDArray
     return np.asarray(np.exp(eigenvalue * t) * scipy.linalg.toeplitz(np.eye(size)[0], terms))
 
 
-def jordan_form(matrix: ArrayLike, error: ArrayLike = 0.0) -> JordanForm:
-    """T and J of a real matrix (notes eqs. 10-12), largest real parts first; arguments as of `classify`."""
-    found = spectrum(matrix, error)
+def jordan_form(matrix: ArrayLike) -> JordanForm:
+    """T and J of a real matrix (notes eqs. 10-12), largest real parts first."""
+    found = spectrum(matrix)
     pieces: list[tuple[JordanBlocks, ComplexArray]] = []
     for members in _clusters(found.values, found.errors):
         mean = _mean(found.values[members])
@@ -303,8 +295,7 @@ class Stability(Enum):
     ASYMPTOTIC = "asymptotically stable"
     STABLE = "stable"
     UNSTABLE = "unstable"
-    #: No eigenvalue is known to lie to the right of the axis, and not all are known to lie left of it or on it; SymPy,
-    #: which would tell those on it from others, may be missing.
+    #: No eigenvalue is known to lie right of the axis, nor all left of it or on it (which SymPy tells, if it is there).
     UNKNOWN = "cannot be told"
 
 
@@ -313,8 +304,6 @@ class Classification(NamedTuple):
 
     kind: Kind
     stability: Stability
-    #: 'star' or 'improper' for nodes with one eigenvalue only; 'saddle-focus'; otherwise empty.
-    detail: str
     #: Sorted by real part, largest first.
     eigenvalues: ComplexArray
     #: Whether all real parts are known not to vanish. Only then does the linear flow decide about the stability of an
@@ -324,10 +313,9 @@ class Classification(NamedTuple):
     errors: FloatArray
 
     def __str__(self) -> str:
-        name = self.detail if self.detail == "saddle-focus" else f"{self.detail} {self.kind.value}".strip()
         if self.stability is Stability.UNKNOWN:
-            return f"{name} whose stability {self.stability.value}"
-        return f"{self.stability.value} {name}"
+            return f"{self.kind.value} whose stability {self.stability.value}"
+        return f"{self.stability.value} {self.kind.value}"
 
 
 def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
@@ -351,24 +339,20 @@ def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
         real, mean, off = found.values[g].real, complex(np.mean(found.values[g])), found.errors[g]
         signs[g] = 1 if np.all(real > off) else -1 if np.all(real < -off) else 0
         zero, turning = zero or abs(mean) <= max(off), turning or abs(mean.imag) > max(off)
-    present, detail = set(signs.tolist()), ""
+    present = set(signs.tolist())
     if zero or (0 in present and len(present) == 2):
         kind = Kind.DEGENERATE
     elif len(present) > 1:
-        kind, detail = Kind.SADDLE, "saddle-focus" if turning and 0 not in present else ""
+        kind = Kind.SADDLE
     else:
         kind = Kind.CENTER if present == {0} else Kind.FOCUS if turning else Kind.NODE
-    if kind is Kind.NODE and len(groups) == 1 and len(A) > 1:
-        blocks = jordan_form(A, error).blocks
-        if len(blocks) == 1:
-            detail = "star" if blocks[0].sizes[0] == 1 else "improper"
     stability = Stability.UNSTABLE if 1 in present else Stability.ASYMPTOTIC if present == {-1} else Stability.UNKNOWN
     if stability is Stability.UNKNOWN and not np.any(error):
         axis = (2, True) if len(A) == 2 and not zero and np.trace(A) == 0.0 else on_axis(A)
         if axis is not None and axis[0] == np.sum(signs == 0):
             stability = Stability.STABLE if axis[1] else Stability.UNSTABLE
     order = np.lexsort((-found.values.imag, -found.values.real))
-    return Classification(kind, stability, detail, found.values[order], 0 not in present, found.errors[order])
+    return Classification(kind, stability, found.values[order], 0 not in present, found.errors[order])
 
 
 def on_axis(matrix: FloatArray) -> tuple[int, bool] | None:
@@ -413,7 +397,7 @@ class Equilibrium(NamedTuple):
 
 
 def find_equilibria(
-    flow: Flow, box: ArrayLike, *, starts: int = 100, time: float = 0.0, rng: Rng = 0, tolerance: float = 1e-10
+    flow: Flow, box: ArrayLike, *, starts: int = 100, time: float = 0.0, rng: Rng = 0
 ) -> list[Equilibrium]:
     """Search for equilibria within a box, by Powell's method from many starts.
 
@@ -429,8 +413,6 @@ def find_equilibria(
     time : float
         V is taken at this time.
     rng : int, numpy.random.Generator or None
-    tolerance : float
-        |V| counts as zero below this part of its size in the box.
     """
     edges, starts, n = as_float_array(box, "box"), whole_number(starts, "starts"), flow.n
     if edges.shape != (n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):
@@ -455,7 +437,7 @@ def find_equilibria(
                 place, left = (X - low) / width, float(np.linalg.norm(flow.velocity(time, X)))
             except InputError:  # the search has left all numbers
                 continue
-            inside = np.min(place) >= -SAME and np.max(place) <= 1 + SAME and left <= tolerance * size
+            inside = np.min(place) >= -SAME and np.max(place) <= 1 + SAME and left <= ZERO * size
             if inside and all(np.max(np.abs(X - other) / width) > SAME for other in found):
                 found.append(X)
     found.sort(key=lambda X: [round(float(value), 9) for value in X])

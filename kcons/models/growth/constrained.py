@@ -6,10 +6,9 @@
 d ln x/dt = phi + z.
 
 The rows are made orthogonal in the scalar product <a, a'> = sum_i x_i a_i a'_i, one after another (Gram-Schmidt, each
-row twice). This is a QR factorization of (A G^1/2)^T: it never forms A G A^T, whose condition number is the square.
-For the rows 1 and mu it amounts to the centered moment sum x (mu - M1)^2 = M2 - M1^2, computed without cancellation.
+row twice): a QR factorization of (A G^1/2)^T, which never forms A G A^T, whose condition number is the square.
 
-Trajectories are those of SciPy's ``solve_ivp``. The unknown is y = ln x: dy/dt = phi + z + Psi exp(-y). x = exp(y) is
+Trajectories are those of SciPy's ``solve_ivp``. The unknown is y = ln x, dy/dt = phi + z + Psi exp(-y), so that x is
 positive whatever the step; nothing is ever clipped. After each step the state is put back on the holonomic rows to
 round-off, by y + A^T mu with Newton's iteration, and the next step starts from there; so are values between.
 
@@ -17,13 +16,10 @@ The hypercycle of Eigen and Schuster, for any number of species:
 
     dx_i/dt = k_h x_i x_{i+1},  x_{n+1} = x_1   (eq. 142),     phi_i = k_h x_{i+1},  Psi = 0
 
-held to a fixed sum of the populations (eqs. 143, 144), and to a production of entropy that relaxes to equilibrium (149)
-or vanishes (150).
-
 Towards equilibrium all chemical potentials become equal, the entropy row fades into the row of the sum, and the
 direction of x - x_eq turns faster and faster towards the one in which the reactions push. Once it has got there,
-nothing is left to integrate: ln x - ln x_eq is proportional to phi - lambda, and the two rows say how far. That is what
-`settled` returns, so that the solution arrives at equilibrium instead of getting stuck before it.
+ln x - ln x_eq is proportional to phi - lambda, and the two rows say how far: the state is projected on this slow
+motion, so that the solution arrives at equilibrium instead of getting stuck before it.
 
 References
 ----------
@@ -34,8 +30,10 @@ Eigen & Schuster, The Hypercycle (Springer, 1979).
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, Self
+from functools import wraps
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,7 +52,7 @@ from kcons.errors import (
 from kcons.models.growth.model import EntropyRow, GrowthModel, Mixture, Populations, Row, TotalPopulation
 from kcons.models.integration import called, check_run, integrate
 
-__all__ = ["ConstrainedGrowth", "ConstrainedHypercycle", "GrowthSolution", "Hypercycle", "entropy_balance", "solve"]
+__all__ = ["ConstrainedGrowth", "ConstrainedHypercycle", "Hypercycle", "entropy_balance", "solve"]
 
 Event = Callable[[float, FloatArray], float]
 EPSILON = float(np.finfo(np.float64).eps)
@@ -75,8 +73,6 @@ LEAST_LOGARITHM = -1e300
 #: A motion may count as settled where ln(x/x_eq) is this small and the direction turns this slowly, in parts of the
 #: other times; it does within so many times the tolerance, since so far do integrators stray.
 NEARNESS, SLOWNESS, STRAYING = 0.1, 0.3, 20.0
-#: Where the excess is this part of kT sum x, its direction no longer matters.
-NEGLIGIBLE_EXCESS = 1e-22
 
 
 def constraint_rates(
@@ -119,14 +115,6 @@ class ConstrainedGrowth:
     ------
     ConstraintError
         If there are more rows than species.
-
-    Examples
-    --------
-    >>> from kcons.models.growth import ConstrainedGrowth, GrowthModel, TotalPopulation
-    >>> model = GrowthModel(lambda t, x: [1.0, 2.0], n=2)
-    >>> system = ConstrainedGrowth(model, [TotalPopulation(2)])
-    >>> system.velocity(0.0, [0.5, 0.5]).tolist()
-    [-0.25, 0.25]
     """
 
     def __init__(self, model: GrowthModel, rows: Sequence[Row] | Row = ()) -> None:
@@ -142,9 +130,8 @@ class ConstrainedGrowth:
                 rows=range(model.n, len(self.rows)),
             )
 
-    @property
-    def n(self) -> int:
-        return self.model.n
+    #: Least error of ln x that a run asks for.
+    tolerance = 1e-9
 
     @property
     def entropy_row(self) -> EntropyRow | None:
@@ -152,8 +139,8 @@ class ConstrainedGrowth:
 
     def bind(self, p: Populations) -> Self:
         """The same system with all targets set by the start `p`; refused if that is off a row, or rows contradict."""
-        if p.x.shape != (self.n,):
-            raise InputError(f"the start has populations of shape {p.x.shape}, the model {self.n}", item="x0")
+        if p.x.shape != (self.model.n,):
+            raise InputError(f"the start has populations of shape {p.x.shape}, the model {self.model.n}", item="x0")
         bound = copy.copy(self)
         bound.rows = tuple(row.bind(p) for row in self.rows)
         for number, row in enumerate(bound.rows):
@@ -184,22 +171,22 @@ class ConstrainedGrowth:
             )
         if np.all(np.isfinite(z)) and np.all(np.isfinite(drift)):
             return z
-        there = f"not finite at t = {p.time:.8g}; end the run before (an event), or mend the function"
-        for what, values in (("rate", self.model.rates(p)), ("source", self.model.sources(p))):
+        here = [("rate", "rates", self.model.rates(p)), ("source", "sources", self.model.sources(p))]
+        here += [
+            (f"row {k} ({r.name}) at the place", "rows", a + b)
+            for k, (r, a, b) in enumerate(zip(self.rows, rows, right, strict=True))
+        ]
+        for what, item, values in here:
             if values is not None and not np.all(np.isfinite(values)):
-                species = int(np.argmin(np.isfinite(values)))
-                raise NonFiniteError(f"the {what} of species {species} is {there}", item=f"{what}s")
-        for number, (row, b) in enumerate(zip(rows, right, strict=True)):
-            if not (np.all(np.isfinite(row)) and np.isfinite(b)):
-                raise NonFiniteError(
-                    f"row {number} ({self.rows[number].name}) has a coefficient or a rate that is {there}", item="rows"
-                )
+                species, t = int(np.argmin(np.isfinite(values))), f"t = {p.time:.8g}"
+                remedy = "end the run before (an event), or mend the function"
+                raise NonFiniteError(f"{what} of species {species} is not finite at {t}; {remedy}", item=item)
         return z
 
     def logarithmic_velocity(self, p: Populations) -> FloatArray:
         """d ln x/dt = phi + z + Psi/x, shape (n,); what `solve` integrates. NaN where x is beyond all numbers."""
         if not np.all(np.isfinite(p.x)):
-            return np.full(self.n, np.nan)
+            return np.full(self.model.n, np.nan)
         phi, psi = self.model.rates(p), self.model.sources(p)
         with np.errstate(all="ignore"):
             slope = phi + self.held(p, p.x * phi if psi is None else p.x * phi + psi)
@@ -229,7 +216,7 @@ class ConstrainedGrowth:
         """A, shape (m, n), and b, shape (m,) (notes eqs. 128-130); the row of an `EntropyRow` is mu."""
         p = self._at(t, x)
         rows = [r.mixture.potentials(p) if isinstance(r, EntropyRow) else r.gradient(p) for r in self.rows]
-        return np.array(rows).reshape(-1, self.n), np.array([row.rate(p) for row in self.rows])
+        return np.array(rows).reshape(-1, self.model.n), np.array([row.rate(p) for row in self.rows])
 
     def constrained_inverse(self, t: float, x: ArrayLike) -> FloatArray:
         """G_perp+ = A^T (A G A^T)^-1 A = (P_perp G P_perp)+, shape (n, n) (notes eqs. 140, 141)."""
@@ -249,8 +236,8 @@ class ConstrainedGrowth:
 
     def _at(self, t: float, x: ArrayLike) -> Populations:
         p = Populations.from_values(t, x)
-        if p.x.shape != (self.n,):
-            raise InputError(f"populations have shape ({self.n},), not {p.x.shape}", item="x")
+        if p.x.shape != (self.model.n,):
+            raise InputError(f"populations have shape ({self.model.n},), not {p.x.shape}", item="x")
         return p
 
     # -- the holonomic rows as conditions on the state ------------------------------------------------
@@ -288,51 +275,20 @@ class ConstrainedGrowth:
             iterations=MOST_ITERATIONS,
         )
 
-    def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[float], FloatArray] | None:
-        """How the motion goes on without integration, once nothing but the rows decides about it; None before.
-
-        Returns ln x, shape (n,), as a function of time.
-        """
-        return None
-
 
 # -- trajectories ------------------------------------------------------------------------------------
-
-
-class GrowthSolution(OptimizeResult):
-    """What `solve` returns: all that SciPy's ``solve_ivp`` returns, and more.
-
-    Attributes
-    ----------
-    y, log_y : ndarray, shape (n, k)
-        Populations x, 0 where they are below the smallest number of the machine, and ln x, always finite.
-    sol, log_sol : callable or None
-        x and ln x at any time, shape (n,), or at k, shape (n, k); on the constraints everywhere.
-    settled_time : float or None
-        When nothing but the rows was left to decide about the motion (equilibrium, for a hypercycle that produces
-        entropy); from there on the solution comes from the rows alone.
-    system : ConstrainedGrowth
-        The system with the targets that the start gave.
-    """
-
-    def residuals(self) -> FloatArray:
-        """sigma - sigma0 of the holonomic rows at all times, shape (m_h, k)."""
-        states = [Populations.from_logarithms(float(t), y) for t, y in zip(self.t, self.log_y.T, strict=True)]
-        return np.array([self.system.residuals(p) for p in states]).T
 
 
 def solve(
     system: ConstrainedGrowth,
     t_span: Sequence[float],
-    x0: ArrayLike | None = None,
+    x0: ArrayLike,
     method: str = "DOP853",
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
     events: Event | Sequence[Event] | None = None,
-    *,
-    log_x0: ArrayLike | None = None,
     **options: Any,
-) -> GrowthSolution:
+) -> OptimizeResult:
     """Integrate a constrained growth model; arguments as in SciPy's ``solve_ivp``.
 
     Parameters
@@ -341,15 +297,18 @@ def solve(
     t_span : pair of float
     x0 : array_like, shape (n,)
         Start, on the constraints.
-    method : str
-        'RK23', 'RK45', 'DOP853', 'Radau' or 'BDF'.
-    t_eval, dense_output, events
-        As in ``solve_ivp``; events are functions (t, x), with attributes `terminal` and `direction`.
-    log_x0 : array_like, shape (n,), optional
-        Start as logarithms, in place of x0.
+    method, t_eval, dense_output, events
+        As in ``solve_ivp``, but LSODA; events are functions (t, x), with attributes `terminal` and `direction`.
     options
         rtol (by default 1e-9) and atol (1e-11) of ln x, so that atol is a relative error of x; max_step, first_step,
         jac and what else the method takes.
+
+    Returns
+    -------
+    OptimizeResult
+        All that ``solve_ivp`` returns: y, shape (n, k), and sol are x, 0 below the smallest number of the machine. And
+        log_y and log_sol, ln x, always finite; system, with the targets that the start gave (a hypercycle knows its
+        `settled_time`). Values between steps are on the constraints as well.
 
     Raises
     ------
@@ -361,17 +320,11 @@ def solve(
         Rates, sources or rows that are not finite where the run has come to.
     """
     options = {"rtol": 1e-9, "atol": 1e-11} | {name: value for name, value in options.items() if value is not None}
-    solver, span, times = check_run(t_span, t_eval, method, options, system.n)
+    solver, span, times = check_run(t_span, t_eval, method, options, system.model.n)
     rtol, atol = (as_float_array(options[name], name) for name in ("rtol", "atol"))
-    tolerance = max(float(np.min(rtol + atol)), 1e-13)
-    if (x0 is None) == (log_x0 is None):
-        raise InputError("give the start either as x0 or as log_x0", item="x0")
-    log_x = np.array(as_float_array(() if log_x0 is None else log_x0, "log_x0"))
-    if not np.all(np.isfinite(log_x)):
-        raise InputError("log_x0 is not finite", item="log_x0")
-    p0 = Populations.from_logarithms(span[0], log_x) if x0 is None else Populations.from_values(span[0], x0)
-    bound = system.bind(p0)
-    end, settled_time = p0, None
+    p0 = Populations.from_values(span[0], x0)
+    bound, end = system.bind(p0), p0
+    bound.tolerance = max(float(np.min(rtol + atol)), 1e-13)
 
     def slope(t: float, y: FloatArray) -> FloatArray:
         return bound.logarithmic_velocity(Populations.from_logarithms(t, y))
@@ -383,64 +336,39 @@ def solve(
             end = Populations.from_logarithms(t, y)
         return y
 
-    def settled(t: float, y: FloatArray) -> Callable[[float], FloatArray] | None:
-        nonlocal settled_time
-        motion = bound.settled(t, y, tolerance)
-        settled_time = None if motion is None else t
-        return motion
-
-    given = events if events is None or isinstance(events, Iterable) else [events]
-    wrapped = None if given is None else [_of_logarithms(event) for event in given]
+    wrapped = None if events is None else [_of_logarithms(event) for event in np.atleast_1d(np.asarray(events, object))]
     options |= {"t_eval": times, "dense_output": dense_output, "events": wrapped}
     with np.errstate(all="ignore"):  # ln x may be -1e300, and trial steps go too far
-        found = integrate(slope, span, placed(span[0], p0.log_x), solver, placed, settled, **options)
+        found = integrate(slope, span, placed(span[0], p0.log_x), solver, placed, **options)
         for row in bound.rows:  # derivatives of what depends on time may be wrong later only
             row.check_derivatives(end)
         found.t, log_sol = np.asarray(found.t), found.sol
-        found.log_y = np.reshape(found.y, (system.n, -1))  # a list where the run ended before the first time wanted
+        found.log_y = np.reshape(
+            found.y, (system.model.n, -1)
+        )  # a list where the run ended before the first time wanted
         found.y = np.exp(found.log_y)
         found.y_events = None if found.y_events is None else [np.exp(y) for y in found.y_events]
     found.log_sol, found.sol = log_sol, None if log_sol is None else lambda t: np.exp(log_sol(t))
-    return GrowthSolution(found, settled_time=settled_time, system=bound)
+    return OptimizeResult(found, system=bound)
 
 
 def _of_logarithms(event: Event) -> Event:
     """An event as a function of ln x, with its attributes."""
     check_call("event", event, ("t", "x"))
-
-    def of_logarithms(t: float, y: FloatArray) -> float:
-        return float(called("event", event, (), t, np.exp(y)))
-
-    for name in ("terminal", "direction"):
-        setattr(of_logarithms, name, getattr(event, name, 0))
-    return of_logarithms
+    return wraps(event)(lambda t, y: float(called("event", event, (), t, np.exp(y))))
 
 
-class EntropyBalance(NamedTuple):
-    """Three ways to the entropy, times T, that a solution has produced, and where it went (notes eq. 145).
+def entropy_balance(solution: OptimizeResult) -> tuple[float, float]:
+    """The entropy, times T, produced during a run by what the model does by itself, and by the constraints (eq. 145).
 
-    `reactions` and `exchanged` are the parts of `integrated`: of what the model does by itself, Psi + G phi, and what
-    the constraints add to it, G z. In an open system (eq. 150) these are the entropy produced inside and the one
-    exchanged with the outside; in a closed one (eq. 149) nothing is exchanged, and their sum is produced inside.
-    """
-
-    #: g(x_0) - g(x(t)), from the two ends alone.
-    lost: float
-    #: The integral of -sum mu dx/dt along the solution.
-    integrated: float
-    #: What the law says.
-    prescribed: float
-    reactions: float
-    exchanged: float
-
-
-def entropy_balance(solution: GrowthSolution) -> EntropyBalance:
-    """Whether the entropy produced from the start to the end of a run is the integral of its prescribed rate.
+    These are the integrals of -sum mu (Psi + G phi) and of -sum mu G z along the solution. In an open system (eq. 150)
+    they are the entropy produced inside and the one exchanged with the outside; in a closed one (eq. 149) nothing is
+    exchanged, and their sum is produced inside: g(x_0) - g(x(t)).
 
     Parameters
     ----------
-    solution : GrowthSolution
-        Of a system with an `EntropyRow`, with dense_output=True.
+    solution : OptimizeResult
+        Of `solve`, for a system with an `EntropyRow`, with dense_output=True.
     """
     system = solution.system
     row = system.entropy_row
@@ -458,10 +386,8 @@ def entropy_balance(solution: GrowthSolution) -> EntropyBalance:
         return np.asarray(-changes @ row.mixture.potentials(p))
 
     t0, *between, t1 = solution.log_sol.ts.tolist()
-    integrated, reactions = quad_vec(production, t0, t1, epsabs=1e-10, epsrel=1e-9, points=between)[0].tolist()
-    ends = [Populations.from_logarithms(t, solution.log_sol(t)) for t in (t0, t1)]
-    lost = row.mixture.excess(ends[0], row.total) - row.mixture.excess(ends[1], row.total)
-    return EntropyBalance(lost, integrated, row.produced(t1), reactions, integrated - reactions)
+    whole, reactions = quad_vec(production, t0, t1, epsabs=1e-10, epsrel=1e-9, points=between)[0].tolist()
+    return reactions, whole - reactions
 
 
 # -- hypercycles -------------------------------------------------------------------------------------
@@ -484,8 +410,8 @@ class Hypercycle(GrowthModel):
         super().__init__(lambda t, x: self.k_h * np.roll(x, -1), n=whole_number(n, "n", 2))
         self.k_h = positive(k_h, "k_h")
         self.mixture = Mixture((0.1 + 0.05 * np.arange(1, n + 1)) * positive(kT, "kT") if mu0 is None else mu0, kT)
-        if self.mixture.n != n:
-            raise InputError(f"{self.mixture.n} standard potentials for {n} species", item="mu0")
+        if len(self.mixture.mu0) != n:
+            raise InputError(f"{len(self.mixture.mu0)} standard potentials for {n} species", item="mu0")
 
     # -- the three systems of figure 11 ----------------------------------------------------------------
 
@@ -531,52 +457,46 @@ class ConstrainedHypercycle(ConstrainedGrowth):
     """A hypercycle with a fixed sum of populations and, perhaps, a law of entropy production."""
 
     model: Hypercycle
+    #: From when on the motion is the slow one.
+    settled_time = math.inf
 
-    def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[float], FloatArray] | None:
-        """The slow motion from here on, once the state is on it to `tolerance`; None before.
+    def logarithmic_velocity(self, p: Populations) -> FloatArray:
+        row = self.entropy_row
+        if row is None or p.time < self.settled_time:
+            return super().logarithmic_velocity(p)
+        return (self.model.mixture.equilibrium(row.total) - p.log_x) * (0.5 / row.tau)
+
+    def project(self, time: float, log_x: FloatArray) -> FloatArray:
+        """The state on the rows; from `settled_time` on, which it sets, on the slow motion.
 
         d(ln x)/dt = phi + lambda_1 + lambda_2 mu. Close to x_eq, u = ln(x/x_eq) shrinks at the rate of the law,
         du/dt = -rho u, and mu is kT u but for a constant, so that u = s (phi(x) + lambda_1): its two unknowns come from
         the two rows, and x by iteration. The terms left out are of the order of rho r^3/|phi|, r the size of u.
-
-        Where nothing turns (two species, potentials that are all equal) the motion counts as settled when the excess is
-        negligible; its direction then stays.
         """
-        row = self.entropy_row
-        if row is None:
-            return None
-        rho = 0.5 / row.tau
-        log_eq, scale = self.model.mixture.equilibrium(row.total), self.model.mixture.kT * row.total
-
-        def size(t: float) -> float:
-            """The size of ln(x/x_eq) that belongs to the excess."""
-            return float(np.sqrt(2.0 * max(row.law_excess(t), 0.0) / scale))
+        row, settled = self.entropy_row, time >= self.settled_time
+        y = log_x if settled else super().project(time, log_x)
+        if row is None or math.isnan(row.total):
+            return y
+        log_eq, rho = self.model.mixture.equilibrium(row.total), 0.5 / row.tau
+        weights = np.exp(log_eq) / row.total
+        small = math.sqrt(2.0 * max(row.law_excess(time), 0.0) / (self.model.mixture.kT * row.total))
 
         def push(y: FloatArray) -> tuple[FloatArray, float]:
             """phi less its mean, and the size of it."""
             phi = self.model.rates(Populations.from_logarithms(time, y))
-            phi = phi - np.exp(log_eq) @ phi / row.total
-            return phi, float(np.sqrt(np.exp(log_eq) @ phi**2 / row.total))
+            phi = phi - weights @ phi
+            return phi, math.sqrt(weights @ phi**2)
 
-        def slow(t: float, accuracy: float = 0.0) -> FloatArray:
-            y, small = log_eq, size(t)
-            for _ in range(60 if small > 1e-15 else 0):
-                phi, length = push(y)
-                before, y = y, self.project(t, log_eq + small / length * phi)
-                if np.max(np.abs(y - before) - 4e-16 * np.abs(y)) <= accuracy:
-                    break
+        slow, length = log_eq, push(log_eq)[1]
+        near = small < NEARNESS and (self.model.k_h * row.total + rho) * small < SLOWNESS * length
+        if not settled and not (near and rho * small**3 < self.tolerance * length):
             return y
-
-        small, length = size(time), push(log_eq)[1]
-        others = self.model.k_h * row.total + rho
-        near = small < NEARNESS and others * small < SLOWNESS * length and rho * small**3 < tolerance * length
-        if self.n > 2 and near:
-            try:
-                if np.max(np.abs(slow(time, 0.1 * tolerance) - log_x)) < STRAYING * tolerance:
-                    return slow
-            except ConvergenceError:
-                return None
-        if row.law_excess(time) > NEGLIGIBLE_EXCESS * scale:
-            return None
-        left = size(time) or 1.0
-        return lambda t: log_eq + (log_x - log_eq) * min(size(t) / left, 1.0)
+        for _ in range(60 if small > 1e-15 else 0):
+            phi, length = push(slow)
+            before, slow = slow, super().project(time, log_eq + small / length * phi)
+            if np.max(np.abs(slow - before) - 4e-16 * np.abs(slow)) <= 0:
+                break
+        if not settled and np.max(np.abs(slow - y)) >= STRAYING * self.tolerance:
+            return y
+        self.settled_time = min(time, self.settled_time)
+        return slow

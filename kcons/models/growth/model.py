@@ -6,9 +6,8 @@ phi are the relative rates of growth and Psi the sources. Where Psi = 0 the equa
 it cannot make a population negative, and it goes on where x itself is below the smallest number of the machine.
 For this reason mixtures and rows are handed `Populations`, which hold both x and ln x.
 
-A row asks  sum_j A_j(x, t) dx_j/dt = b(x, t)  (notes eqs. 127, 128). Holonomic rows come from a function of the
-state that keeps its value, sigma(x, t) = sigma0 (eq. 126), so that A = d sigma/dx and b = -d sigma/dt (eqs. 129, 130);
-because they have a value, the state can be projected back on them to round-off.
+A row asks  sum_j A_j(x, t) dx_j/dt = b(x, t)  (notes eqs. 127, 128). A holonomic one has a value that it keeps, on
+which the state is projected, sigma(x, t) = sigma0 (eq. 126): A = d sigma/dx and b = -d sigma/dt (eqs. 129, 130).
 
 Entropy production is a row as well (eqs. 145-150). Closed system: T ds/dt = -sum mu dx/dt >= 0 (corrected: the notes
 drop the sign in the middle of (149)). With a fixed sum of x, what has been produced until t, T(s(t) - s_0), is what the
@@ -21,7 +20,8 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from functools import partial
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -82,7 +82,7 @@ class Populations(NamedTuple):
             value = array[tuple(bad[0])]
             raise InputError(
                 f"population {bad[0][0]} is {value:.6g}; populations are positive and finite: leave a species that is "
-                "zero out, start it at a small positive number, or give the start as log_x0",
+                "zero out, or start it at a small positive number",
                 item="x0",
             )
         return cls(time, array, np.log(array))
@@ -159,17 +159,11 @@ class Logistic(GrowthModel):
 
     def exact(self, t: ArrayLike, x0: float) -> FloatArray:
         """x(t) (notes eq. 66), written so that what overflows is in the denominator."""
-        times, x0 = as_float_array(t, "t"), finite_number(x0, "x0")
-        if x0 < 0:
-            raise InputError(f"x0 is {x0:g}; populations are not negative", item="x0")
-        if x0 in (0.0, self.plateau):
-            return np.full(times.shape, x0)
+        times, x0 = as_float_array(t, "t"), positive(x0, "x0")
         with np.errstate(over="ignore"):
-            share = self.plateau / x0 - 1.0
-            left = 1.0 + share * np.exp(-self.alpha * times)
-        if np.any(left <= 0):
-            since = np.log(-share) / self.alpha
-            raise InputError(f"x = {x0:g} at t = 0 came from infinity at t = {since:.6g}; give later times", item="t")
+            left = 1.0 + (self.plateau / x0 - 1.0) * np.exp(-self.alpha * times)
+        if not np.all(left > 0):
+            raise InputError("x came from infinity after the first of these times; give later ones", item="t")
         return np.asarray(self.plateau / left)
 
 
@@ -202,11 +196,6 @@ class LotkaVolterra(GrowthModel):
             [[self.alpha1 - self.beta1 * x2, -self.beta1 * x1], [self.alpha2 * x2, self.alpha2 * x1 - self.beta2]]
         )
 
-    def divergence(self, x: ArrayLike) -> FloatArray:
-        """div V = (alpha_1 - beta_1 x_2) - (beta_2 - alpha_2 x_1) (notes eq. 72)."""
-        x = as_float_array(x, "x")
-        return np.asarray((self.alpha1 - self.beta1 * x[1]) - (self.beta2 - self.alpha2 * x[0]))
-
 
 # -- ideal mixtures -----------------------------------------------------------------------------------
 
@@ -235,10 +224,6 @@ class Mixture:
         #: ln(x_eq/c), and the Gibbs energy at equilibrium over -c kT.
         self._log_fraction: FloatArray = log_softmax(-self.mu0 / self.kT)
         self._log_w = float(logsumexp(-self.mu0 / self.kT))
-
-    @property
-    def n(self) -> int:
-        return len(self.mu0)
 
     def potentials(self, p: Populations) -> FloatArray:
         """mu, shape of p.x (notes eq. 147); from ln x, hence finite where x underflows."""
@@ -270,16 +255,13 @@ class Mixture:
         """g_eq = -c kT ln sum exp(-mu0/kT)."""
         return -total * self.kT * self._log_w
 
-    def excess(self, p: Populations, total: float) -> Any:
-        """g - g_eq, a number a state, to the round-off of the potentials about their mean.
+    def excess(self, p: Populations, total: float) -> float:
+        """g - g_eq of one state, to the round-off of the potentials about their mean.
 
         g_eq is taken at the actual sum X of the populations, near `total`. The terms of
         kT [sum x_eq h(ln x/x_eq) - c h(ln X/c)], h(u) = u e^u - e^u + 1, are never negative, so that nothing cancels
         near equilibrium; x_eq and c are those of `total`.
         """
-        if p.x.ndim == 2:
-            states = zip(p.x.T, p.log_x.T, strict=True)
-            return np.array([self.excess(Populations(p.time, *state), total) for state in states])
         log_eq = self.equilibrium(total)
         # A trial step of an integrator may overflow; it is then rejected.
         with np.errstate(all="ignore"):
@@ -413,13 +395,9 @@ class HolonomicRow(Row):
                 continue
             near = [float(first_derivative_4(value, found.time, h)[0]) for h in (1e-6, 1e-9)]  # of what changes faster
             if not any(abs(v - found.given) <= WRONG * max(abs(v), abs(found.given)) for v in near):
-                said = (
-                    "depends on time, but has no time_derivative: give it"
-                    if self._time_derivative is None
-                    else "changes with time at another rate than differences of it: correct it"
-                )
                 raise InputError(
-                    f"{self.name} {said} ({found.given:.6g}; differences give {found.found:.6g})",
+                    f"{self.name} changes with time by {found.found:.6g}, its time_derivative is {found.given:.6g}: "
+                    "correct it, or give it where it was left out",
                     item="time_derivative",
                 )
 
@@ -449,16 +427,7 @@ class LinearRow(HolonomicRow):
             super().__init__(lambda t, x: c @ x, target=target, name=name)
             return
         check_call(f"{name}: target", target, ("t",))
-
-        def moved(t: float) -> FloatArray:
-            """Target and rate."""
-            pair = as_float_array(given := target(t), "target")
-            if pair.shape != (2,):
-                raise InputError(
-                    f"target of {name} gives {given!r:.80} at t = {t:g}; give (value, rate)", item="target"
-                )
-            return pair
-
+        moved = partial(called, "target", target, (2,))
         super().__init__(lambda t, x: c @ x - moved(t)[0], None, lambda t, x: -moved(t)[1], target=0.0, name=name)
 
     def gradient(self, p: Populations) -> FloatArray:
@@ -482,22 +451,14 @@ class VelocityRow(Row):
 
     Parameters
     ----------
-    coefficients : callable (t, x) -> (n,), or array_like, shape (n,)
-        A.
-    rate : callable (t, x) -> float, or float
-        b.
+    coefficients, rate : callable (t, x) -> (n,) and (t, x) -> float
+        A and b.
     """
 
-    def __init__(
-        self, coefficients: OfState | ArrayLike, rate: OfState | float = 0.0, *, name: str = "velocity row"
-    ) -> None:
-        row = np.zeros(0) if callable(coefficients) else as_float_array(coefficients, "coefficients").copy()
-        number = 0.0 if callable(rate) else finite_number(rate, "rate")
-        self._coefficients = coefficients if callable(coefficients) else lambda t, x: row
-        self._rate = rate if callable(rate) else lambda t, x: number
-        for what, given in (("coefficients", self._coefficients), ("rate", self._rate)):
-            check_call(f"{name}: {what}", given, ("t", "x"))
-        self.name = name
+    def __init__(self, coefficients: OfState, rate: OfState = lambda t, x: 0.0, *, name: str = "velocity row") -> None:
+        for what, given in (("coefficients", coefficients), ("rate", rate)):
+            check_call(what, given, ("t", "x"), needed=True)
+        self._coefficients, self._rate, self.name = coefficients, rate, name
 
     def gradient(self, p: Populations) -> FloatArray:
         return called(f"coefficients of {self.name}", self._coefficients, p.x.shape, p.time, p.x, scalar=True)
@@ -569,8 +530,8 @@ class EntropyRow(Row):
         return max(4.0 * abs(self.law_excess(p.time)), slope)
 
     def bind(self, p: Populations) -> EntropyRow:
-        if self.mixture.n != len(p.x):
-            raise InputError(f"the mixture has {self.mixture.n} species, the start {len(p.x)}", item="mixture")
+        if len(self.mixture.mu0) != len(p.x):
+            raise InputError(f"the mixture has {len(self.mixture.mu0)} species, the start {len(p.x)}", item="mixture")
         bound = copy.copy(self)
         bound.start, bound.total = p.time, math.fsum(p.x)
         bound.excess0 = self.mixture.excess(p, bound.total)
@@ -592,10 +553,9 @@ class EntropyRow(Row):
                 time=0.0,
             )
         if budget is not None and abs(budget / excess0 - 1.0) > BUDGET_TOLERANCE:
-            more = budget > excess0
-            time = -self.tau * math.log1p(-excess0 / budget) if more else math.inf
+            time = -self.tau * math.log1p(-excess0 / budget) if budget > excess0 else math.inf
             raise BudgetError(
-                f"T(s_eq - s_0) = {budget:.10g} is {'more' if more else 'less'} than the start can produce, "
+                f"T(s_eq - s_0) = {budget:.10g} is not what the start can produce, "
                 f"{excess0:.10g}; it would be used up at t = {time:.6g}. Leave the budget out; it is then computed",
                 budget=budget,
                 consistent=excess0,

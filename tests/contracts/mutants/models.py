@@ -5,8 +5,8 @@ MUTANTS = {
         "for _ in range(«2→1» if k else 0):": "constrained::nearly_parallel_rows_stay_orthogonal",
         "LOST = 1e-1«2→1»": "constrained::rows_count_as_dependent_below_a_part_in_a_million_million",
         "LOST = 1e-1«2→3»": "constrained::rows_count_as_dependent_below_a_part_in_a_million_million",
-        "= 1e-«9→8»": "constrained::dependent_rows_may_disagree_by_a_part_in_a_thousand_million",
-        "= 1e-«9→10»": "constrained::dependent_rows_may_disagree_by_a_part_in_a_thousand_million",
+        "Y_TOLERANCE = 1e-«9→8»": "constrained::dependent_rows_may_disagree_by_a_part_in_a_thousand_million",
+        "Y_TOLERANCE = 1e-«9→10»": "constrained::dependent_rows_may_disagree_by_a_part_in_a_thousand_million",
     },
     "steppers/compiled_operations.py": {
         "(«(r * n - d) + →»r": "schemes::great_circles_end_on_the_sphere_wherever_they_start",
@@ -39,7 +39,7 @@ MUTANTS = {
     "models/multibody.py": {
         "self.N.T @ «(f - self.M @ a)→f»": "multibody::one_place_against_the_theory",
         "left[rank - 1] > «DEPENDENT * left[0]→0.0»": "multibody::a_crossing_of_two_ways_is_passed_straight_on",
-        "range(«8→1»))": "multibody::far_starts_are_reached_by_parts_of_steps",
+        "if «not off <= accepted→False»:": "multibody::positions_that_cannot_be_met",
         "for _ in range(«ITERATIONS→1»):": "multibody::a_start_off_the_constraints_is_refused_and_can_be_mended",
     },
     "models/integration.py": {

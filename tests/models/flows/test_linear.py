@@ -86,8 +86,8 @@ def _halves(p: sympy.Poly) -> tuple[int, int]:
     return (n + below - above) // 2, (n - below + above) // 2
 
 
-def blocks_of(matrix, error=0.0):
-    return jordan_form(matrix, error).blocks
+def blocks_of(matrix):
+    return jordan_form(matrix).blocks
 
 
 # -- exp(At) ------------------------------------------------------------------------------------------
@@ -101,10 +101,10 @@ def test_reference(name):
     off = abs(flow.exact(given["times"], given["initial"]["x"]) - wanted)
     assert np.all(off < 1e-10 * np.abs(wanted).max(axis=1, keepdims=True))
     kinds = {"generic": Kind.SADDLE, "jordan3": Kind.NODE, "nilpotent": Kind.DEGENERATE, "stiff": Kind.NODE}
-    assert flow.classification().kind is kinds[name]
-    assert (flow.classification().stability is Stability.ASYMPTOTIC) == (kinds[name] is Kind.NODE)
+    assert classify(flow.matrix).kind is kinds[name]
+    assert (classify(flow.matrix).stability is Stability.ASYMPTOTIC) == (kinds[name] is Kind.NODE)
     if name in ("jordan3", "nilpotent"):
-        assert [b.sizes for b in flow.jordan_form().blocks] == [(3,)]
+        assert [b.sizes for b in jordan_form(flow.matrix).blocks] == [(3,)]
 
 
 def test_series_and_group_property():
@@ -233,7 +233,6 @@ def test_structures_that_rounding_allows():
         assert [b.sizes for b in blocks_of([[-1.0, 1.0], [corner, -1.0]])] == [(2,)]
     A = np.array([[1.0, 1.0], [0.0, 1.001]])
     assert [b.sizes for b in blocks_of(A)] == [(1,), (1,)]
-    assert [b.sizes for b in blocks_of(A, 1e-5)] == [(2,)]
 
 
 def test_neighbors_that_rounding_joins_are_told_as_uncertain():
@@ -260,8 +259,8 @@ def test_neighbors_that_rounding_joins_are_told_as_uncertain():
     [
         ([[-1.0, 0.0], [0.0, -2.0]], "asymptotically stable node"),
         ([[1.0, 0.3], [0.0, 2.0]], "unstable node"),
-        ([[-1.0, 0.0], [0.0, -1.0]], "asymptotically stable star node"),
-        (1e-8 * jordan_block(-1.0, 2), "asymptotically stable improper node"),
+        ([[-1.0, 0.0], [0.0, -1.0]], "asymptotically stable node"),
+        (1e-8 * jordan_block(-1.0, 2), "asymptotically stable node"),
         ([[-0.1, 1.0], [-1.0, -0.1]], "asymptotically stable focus"),
         ([[0.1, 1.0], [-1.0, 0.1]], "unstable focus"),
         ([[0.0, 1.0], [1.0, 0.0]], "unstable saddle"),
@@ -269,7 +268,7 @@ def test_neighbors_that_rounding_joins_are_told_as_uncertain():
         ([[0.0, 0.0], [0.0, -1.0]], "stable degenerate"),
         ([[0.0, 0.0], [0.0, 0.0]], "stable degenerate"),
         ([[0.0, 1.0], [0.0, 0.0]], "unstable degenerate"),
-        ([[-0.1, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, 1.0]], "unstable saddle-focus"),
+        ([[-0.1, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, 1.0]], "unstable saddle"),
         (scipy.linalg.block_diag(R, -1.0), "stable degenerate"),
         (np.diag([-1e6, -2.0, 1.0]), "unstable saddle"),
         (np.diag([-1e10, -1.0]), "asymptotically stable node"),
@@ -284,7 +283,7 @@ def test_neighbors_that_rounding_joins_are_told_as_uncertain():
 def test_names(matrix, name):
     found = classify(matrix)
     assert str(found) == name
-    assert found.hyperbolic == (name.split()[-1] in ("node", "focus", "saddle", "saddle-focus"))
+    assert found.hyperbolic == (name.split()[-1] in ("node", "focus", "saddle"))
 
 
 def test_purely_imaginary_blocks_that_are_defective_are_unstable():
@@ -349,7 +348,9 @@ def test_what_cannot_be_told():
 
 def test_jacobians_by_differences_are_known_as_well_as_differences_are():
     given = equilibrium_at(Pendulum(1.3), [0.0, 0.0]).classification
-    found = equilibrium_at(HamiltonianFlow(Pendulum(1.3).hamiltonian, 1), [0.0, 0.0]).classification
+    found = equilibrium_at(
+        HamiltonianFlow(lambda q, p, t: Pendulum(1.3).energy([*q, *p]), 1), [0.0, 0.0]
+    ).classification
     assert (str(given), str(found)) == ("stable center", "center whose stability cannot be told")
     assert np.all(found.errors > given.errors)
     assert min(abs(found.eigenvalues - 1.3j)) < found.errors[0] < 1e-6

@@ -52,10 +52,6 @@ def test_velocity_row():
     row = VelocityRow(lambda t, x: [t, x[0], 1.0], lambda t, x: x[1])
     assert row.gradient(P).tolist() == [0.3, 0.5, 1.0]
     assert row.rate(P) == 1.5
-    given = np.ones(3)
-    row = VelocityRow(given, 0.5)
-    given[:] = 7.0
-    assert (row.gradient(P).tolist(), row.rate(P)) == ([1.0, 1.0, 1.0], 0.5)
 
 
 def hill(power, *, given=False):
@@ -73,7 +69,7 @@ def test_differences_that_cannot_serve_are_refused():
         hill(400).bind(p)
     hill(400, given=True).bind(p)
     TotalPopulation(2, lambda t: (1.32 + 1e-3 * np.sin(1e5 * t), 1e2 * np.cos(1e5 * t))).bind(p)
-    with pytest.raises(InputError, match="changes with time at another rate"):
+    with pytest.raises(InputError, match="total population changes with time by"):
         TotalPopulation(2, lambda t: (1.32 + 1e-3 * np.sin(1e5 * t), 2e2 * np.cos(1e5 * t))).bind(p)
 
 
@@ -118,7 +114,7 @@ def test_rows_count_as_dependent_below_a_part_in_a_million_million(apart, depend
 
 @pytest.mark.parametrize(("off", "refused"), [(4e-10, False), (2.5e-9, True)])
 def test_dependent_rows_may_disagree_by_a_part_in_a_thousand_million(off, refused):
-    rows = [TotalPopulation(2, lambda t: (1.0, 1.0)), VelocityRow([1.0, 1.0], 1.0 + off)]
+    rows = [TotalPopulation(2, lambda t: (1.0, 1.0)), VelocityRow(lambda t, x: [1.0, 1.0], lambda t, x: 1.0 + off)]
     system = ConstrainedGrowth(GrowthModel(lambda t, x: 0.0 * x, n=2), rows)
     if refused:
         with pytest.raises(ContradictionError, match="row 1") as caught:
@@ -191,7 +187,11 @@ def test_dependent_rows_change_nothing_but_the_multipliers():
 def test_systems_that_cannot_be_held_are_refused():
     model = GrowthModel(rates, n=4)
     with pytest.raises(ContradictionError, match="row 1") as caught:
-        solve(ConstrainedGrowth(model, [TotalPopulation(4), VelocityRow(2 * np.ones(4), 0.1)]), (0.0, 1.0), X)
+        solve(
+            ConstrainedGrowth(model, [TotalPopulation(4), VelocityRow(lambda t, x: 2 * np.ones(4), lambda t, x: 0.1)]),
+            (0.0, 1.0),
+            X,
+        )
     assert caught.value.rows == (1,)
     with pytest.raises(ConstraintError, match="5 rows for 4"):
         ConstrainedGrowth(model, [LinearRow(np.eye(4)[k % 4]) for k in range(5)])
@@ -216,7 +216,8 @@ def test_projection_restores_the_rows():
 
 def test_time_dependent_rows_are_followed():
     found = solve(make(), (0.0, 2.0), X, rtol=1e-10, atol=1e-12, dense_output=True)
-    assert abs(found.residuals()).max() < 2e-15
+    states = [Populations.from_logarithms(t, y) for t, y in zip(found.t, found.log_y.T, strict=True)]
+    assert max(abs(found.system.residuals(p)).max() for p in states) < 2e-15
     assert found.y[0] * found.y[1] - 0.2 * found.t == pytest.approx(np.full(len(found.t), X[0] * X[1]), abs=3e-15)
     # The velocity row is kept along the path: its integral against the trajectory.
     t = np.linspace(0.0, 0.5, 501)
@@ -299,7 +300,7 @@ TWO = GrowthModel(lambda t, x: [1.0, 2.0], n=2)
 def test_tolerances_of_each_species_and_none() -> None:
     system = ConstrainedGrowth(TWO, [TotalPopulation(2)])
     usual = solve(system, (0.0, 1.0), [0.5, 0.5]).y[:, -1]
-    with pytest.raises(InputError, match=r"population 1 is 0; .* or give the start as log_x0"):
+    with pytest.raises(InputError, match="population 1 is 0; populations are positive"):
         solve(system, (0.0, 1.0), [0.5, 0.0])
     for options in ({"rtol": None}, {"rtol": [1e-9, 1e-9]}, {"atol": np.full(2, 1e-11)}):
         np.testing.assert_allclose(solve(system, (0.0, 1.0), [0.5, 0.5], **options).y[:, -1], usual, rtol=1e-12)
