@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.models.integration import METHODS, check_run, integrate
+from kcons.models.integration import METHODS, integrate
 
 
 def turn(t, y):
@@ -30,12 +30,3 @@ def test_the_next_step_starts_from_the_projection(method):
     # What projects to another place moves the rest of the run: here it counts the steps.
     counted = integrate(lambda t, y: 0 * y, (0, 2), [0.0], METHODS[method], lambda t, y: y + 1, max_step=0.1)
     np.testing.assert_allclose(counted.y[0], np.arange(len(counted.t)), rtol=0, atol=1e-12)
-
-
-def run(t_span=(0.0, 1.0), t_eval=None, method="RK45", **sizes):
-    return check_run(t_span, t_eval, method, sizes, 2)
-
-
-def test_what_can_be_is_taken():
-    assert run((1.0, 0.0), [0.7, 0.2])[1] == (1.0, 0.0)
-    run(rtol=[1e-9, 1e-3], atol=0.0, max_step=np.inf, first_step=None, jac=len)

@@ -125,14 +125,6 @@ def test_at_steps_and_between_and_backwards(method, rtol, close):
         assert max(np.abs(held(body, q, v)).max() for q, v in zip(found.q, found.v, strict=True)) < 1e-14
 
 
-def test_no_time_and_no_times():
-    body = pendulum()
-    still = body.solve(*hung(SWING), (1, 1))
-    np.testing.assert_array_equal(still.q[-1], hung(SWING)[0])
-    nothing = body.solve(*hung(SWING), (0, 0.1), [])
-    assert nothing.q.shape == (0, 3) and nothing.multipliers.shape == (0, 2) and nothing.evaluations > 0
-
-
 # -- the theory --------------------------------------------------------------------------------------
 
 
@@ -280,20 +272,3 @@ def test_differences_go_with_the_length():
     body.degrees_of_freedom(q)
     np.testing.assert_allclose(body._G(q)[0], np.cos(q / small) / small, rtol=1e-11)
     np.testing.assert_allclose(-body._b(q, v), -np.sin(q / small) * v**2 / small**2, rtol=1e-7)
-
-
-def test_what_functions_get_cannot_be_changed_and_what_they_return_may_be_used_again():
-    kept = np.empty((2, 2))
-
-    def reused(q):
-        kept[:] = gradient(q)
-        return kept
-
-    def greedy(q, v, t):
-        with pytest.raises(ValueError, match="read-only"):
-            q[0] = 1.0
-        return np.array([0.1, 0.2])
-
-    again = Multibody(np.eye(2), greedy, curve, reused).motion(Q, V)
-    fresh = Multibody(np.eye(2), greedy, curve, gradient).motion(Q, V)
-    np.testing.assert_array_equal(again[0], fresh[0])

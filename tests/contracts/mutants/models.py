@@ -31,7 +31,7 @@ MUTANTS = {
         "certain = «closer == 1.0 and →»bool(kept": "linear::neighbors_that_rounding_joins_are_told_as_uncertain",
     },
     "models/flows/flow.py": {
-        "concatenate([slope[self.f :], «-→»slope[: self": "flow::friction_by_a_hamiltonian_that_depends_on_time",
+        "concatenate([slope[self.f :], «-→»slope[: self": "flow::equations_by_differences",
     },
     "constraints/projection.py": {
         "vt[kept].«conj().→»T)": "constraints/projection::complex_matrices",

@@ -90,30 +90,15 @@ def test_settled_motion_continues_the_integrated_one():
 
 
 def test_start_at_equilibrium():
-    """H36: with nothing to produce it is refused; with no production asked for, or the total alone, it stays."""
+    """H36 with no production asked for: it stays."""
     model = Hypercycle()
     x_eq = np.exp(model.mixture.equilibrium(1.0))
-    for budget in (None, 0.0):
-        with pytest.raises(BudgetError, match="already at equilibrium"):
-            solve(model.with_entropy_production(30.0, budget=budget), (0.0, 50.0), x_eq)
     found = solve(model.without_entropy_production(), (0.0, 50.0), x_eq)
     assert found.success
     assert found.y == pytest.approx(np.repeat(x_eq[:, None], len(found.t), axis=1), rel=1e-12)
     # A run that has all but arrived can be gone on with.
     near = solve(model.with_entropy_production(30.0), (0.0, 900.0), X0, rtol=1e-6, atol=1e-7).y[:, -1]
     assert solve(model.with_entropy_production(30.0), (0.0, 50.0), near).success
-
-
-@pytest.mark.parametrize("n", [2, 3])
-def test_few_species(n):
-    # With n = 2 both rows together leave no freedom; the motion follows from them alone.
-    model = Hypercycle(n, 1.0, np.zeros(n))
-    x0 = [0.7, 0.3] if n == 2 else [0.5, 0.3, 0.2]
-    found = solve(model.with_entropy_production(2.0), (0.0, 200.0), x0, t_eval=[0.0, 10.0, 200.0])
-    assert found.success
-    excess = excesses(model, found)
-    assert excess[:2] == pytest.approx(excess[0] * np.exp(-found.t[:2] / 2.0), rel=1e-12)
-    assert found.y[:, -1] == pytest.approx(np.full(n, 1 / n), rel=1e-12)
 
 
 # -- extinction and return ----------------------------------------------------------------------------
@@ -141,7 +126,7 @@ def test_extinction_beyond_all_numbers_ends_at_the_least_logarithm():
 random_system = runpy.run_path(str(Path(__file__).parents[3] / "examples/notes/growth_results.py"))["random_system"]
 
 
-@pytest.mark.parametrize(("n", "kind"), [(2, "c"), (3, "b"), (3, "c"), (5, "b"), (5, "c"), (8, "b")])
+@pytest.mark.parametrize(("n", "kind"), [(2, "b"), (2, "c"), (3, "b"), (3, "c"), (5, "b"), (5, "c"), (8, "b")])
 def test_random_systems_run_to_their_end_and_hold_their_rows(n, kind):
     rng = np.random.default_rng([7, n, ord(kind)])
     for _ in range(2):
@@ -158,24 +143,6 @@ def test_random_systems_run_to_their_end_and_hold_their_rows(n, kind):
         assert abs(excess - left * excess0) < 1e-13 * max(size, excess0)
 
 
-def test_entropy_row_where_the_excess_is_much_larger_than_the_gibbs_energy():
-    # g_0 is -1.08, a sum of terms of 70, and lies 165 above equilibrium.
-    mu0, kT = [-56.5140392407906, 41.8127322553325, 13.366563603233304], 8.60383824140328
-    start = np.log(np.exp([0.06724395465832678, 0.6105286479569814, -3.357717120539264]))
-    model = Hypercycle(3, 1.383051805375621, mu0, kT)
-    times = np.linspace(0.1, 1.0, 10) * 10.0 / model.k_h
-    found = solve(
-        model.without_entropy_production(), (0.0, times[-1]), np.exp(start), t_eval=times, rtol=1e-6, atol=1e-8
-    )
-    total0, energy0, least = exact_energies(mu0, kT, start)
-    size = max(1.0, abs(float(energy0)))
-    for log_x in found.log_y.T:
-        total, energy, _ = exact_energies(mu0, kT, log_x)
-        assert abs(float(total - total0)) < 2e-15 * size
-        assert abs(float(energy - energy0)) < 1e-13 * size
-        assert abs(float(energy - total * least - energy0 + total0 * least)) < 1e-13 * size
-
-
 # -- laws of entropy production -----------------------------------------------------------------------
 
 
@@ -188,13 +155,10 @@ def test_production_law_of_the_notes():
     assert still.rate(START) == 0.0
 
 
-def test_budget_is_computed_from_the_start():
-    row = Hypercycle().with_entropy_production(30.0).bind(START).entropy_row
+def test_budget_that_agrees_with_the_start_is_taken_as_such():
+    row = Hypercycle().with_entropy_production(30.0, BUDGET * (1 + 1e-12)).bind(START).entropy_row
     assert row.excess0 == pytest.approx(BUDGET, rel=1e-14)
-    assert row.law_excess(60.0) == pytest.approx(BUDGET * np.exp(-2.0), rel=1e-14)
-    # One that agrees with the start is taken as such.
-    same = Hypercycle().with_entropy_production(30.0, BUDGET * (1 + 1e-12)).bind(START).entropy_row
-    assert same.law_excess(1e4) == pytest.approx(BUDGET * np.exp(-1e4 / 30), rel=1e-9)
+    assert row.law_excess(1e4) == pytest.approx(BUDGET * np.exp(-1e4 / 30), rel=1e-9)
 
 
 @pytest.mark.parametrize(("factor", "time"), [(1.1, 71.9369), (1.5, 32.9584), (0.5, np.inf)])
@@ -213,15 +177,6 @@ SYSTEMS = {
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_entropy_produced_is_the_integral_of_its_rate(name):
-    # Whatever times are shown.
-    found = solve(SYSTEMS[name], (0.0, 4.0), X0, t_eval=[2.0, 4.0], dense_output=True)
-    assert sum(entropy_balance(found)) == pytest.approx(PRODUCED[name], abs=1e-9)
-    assert found.system.entropy_row.produced(4.0) == pytest.approx(PRODUCED[name], abs=1e-14)
-    assert excesses(Hypercycle(), found)[-1] == pytest.approx(BUDGET - PRODUCED[name], abs=1e-13)
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
 def test_entropy_produced_inside_and_exchanged(name):
     system = SYSTEMS[name]
     found = solve(system, (0.0, 4.0), X0, dense_output=True)
@@ -234,5 +189,7 @@ def test_entropy_produced_inside_and_exchanged(name):
     assert reactions == pytest.approx(simpson(inside, x=t), abs=1e-7)
     assert exchanged == pytest.approx(simpson(-np.sum(mu * x * z, axis=0), x=t), abs=1e-7)
     assert abs(exchanged) > 0.1
-    # What an open system produces it gives away; what a closed one produces is the sum.
+    # What an open system produces it gives away; what a closed one produces is the sum: the integral of its rate.
     assert reactions + exchanged == pytest.approx(PRODUCED[name], abs=1e-9)
+    assert found.system.entropy_row.produced(4.0) == pytest.approx(PRODUCED[name], abs=1e-14)
+    assert excesses(Hypercycle(), found)[-1] == pytest.approx(BUDGET - PRODUCED[name], abs=1e-13)
