@@ -78,12 +78,7 @@ class _Bent:
         self.value = float(np.maximum(self.value, np.linalg.norm(np.cross(x[1] - x[0], d))))
 
 
-@case(
-    "H05",
-    "CO2 by 3 distances, collinear",
-    "free flight to 10 x the error of RATTLE; 5 dof; or refused",
-    "warn-or-raise",
-)
+@case("H05", "CO2 by 3 distances, collinear", "free flight to 10 x RATTLE; 5 dof; or refused", "warn-or-raise")
 def collinear(program: Program, quick: bool) -> Outcome:
     x = truths.rotated(CO2)
     axis = (x[2] - x[0]) / np.linalg.norm(x[2] - x[0])

@@ -57,9 +57,7 @@ def mass_ratio(program: Program, quick: bool, ratio: float) -> Outcome:
     )
 
 
-@case(
-    "H08", "Chain of 20, masses 1 and 1e12 in turn", "residual 1e-10; center of mass 1e-12 over 1e4 steps; |J a| 1e-14"
-)
+@case("H08", "Chain of 20, masses 1 and 1e12 in turn", "residual 1e-10; center 1e-12 over 1e4 steps; |J a| 1e-14")
 def mass_ratio_12(program: Program, quick: bool) -> Outcome:
     found = mass_ratio(program, quick, 1e12)
     if not isinstance(program, Core):
@@ -77,11 +75,7 @@ def mass_ratio_12(program: Program, quick: bool) -> Outcome:
     return outcome(*found.checks, ("|J a - b|", miss.max() / np.linalg.norm(a), 1e-14), remark=found.remark)
 
 
-@case(
-    "H16",
-    "Chains of 1e5 bonds, random and straight",
-    "residual 1e-12 (or what positions of 5e4 can store), 0.5 s a solve, < 1 GB",
-)
+@case("H16", "Chains of 1e5 bonds, random and straight", "residual 1e-12, or as stored; 0.5 s a solve; < 1 GB")
 def long_chain(program: Program, quick: bool) -> Outcome:
     n = (10_000 if quick else 100_000) + 1
     if program.name == "ASE":
@@ -122,11 +116,7 @@ def long_chain(program: Program, quick: bool) -> Outcome:
     return outcome(*found, remark=f"{n - 1} bonds")
 
 
-@case(
-    "X23",
-    "Near-straight chains (179 and 180 degrees) of 100 bonds",
-    "residual 1e-10; momentum and energy of free flight",
-)
+@case("X23", "Near-straight chains (179 and 180 degrees) of 100 bonds", "residual 1e-10; energy of free flight")
 def near_straight(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
     steps = program.length(quick, 20, 500)

@@ -80,12 +80,7 @@ def not_finite(program: Program, quick: bool) -> Outcome:
     )
 
 
-@case(
-    "H20",
-    "More rows than coordinates: four atoms, 12 independent rows, and they move",
-    "refused; at rest allowed",
-    "raise",
-)
+@case("H20", "Four atoms, 12 independent rows, and they move", "refused; at rest allowed", "raise")
 def no_freedom(program: Program, quick: bool) -> Outcome:
     x = np.array([[0.0, 0, 0], [1, 0, 0], [1.2, 1, 0], [0, 1.1, 0]])
     in_plane = [LinearCombination([a], [axis], None) for a in range(4) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
@@ -131,9 +126,7 @@ def single_precision(program: Program, quick: bool) -> Outcome:
     return outcome(("difference", apart, 1e-12), ("results in another precision", float(not double), 0))
 
 
-@case(
-    "H29", "Bond of an atom with itself, to no atom, to atom -1, of length 0 and -1", "refused, naming the row", "raise"
-)
+@case("H29", "Bond (i, i), to no atom, to atom -1, of length 0 and -1", "refused, naming the row", "raise")
 def bad_indices(program: Program, quick: bool) -> Outcome:
     def run(pairs: Any, *lengths: float) -> float:
         end = program.run(moving_chain(4, pairs=pairs, lengths=lengths), 0.01, 20)
@@ -150,12 +143,7 @@ def bad_indices(program: Program, quick: bool) -> Outcome:
     )
 
 
-@case(
-    "X62",
-    "A non-finite force far into a run",
-    "refused in the step where it appears; the last good state stays",
-    "raise",
-)
+@case("X62", "A non-finite force far into a run", "refused in that step; the last good state stays", "raise")
 def late_force(program: Program, quick: bool) -> Outcome:
     class Late(Problem):
         calls = 0

@@ -39,9 +39,7 @@ def fixed_and_bond(program: Program, quick: bool) -> Outcome:
 _HALF = "the velocities of VerletIntegrator belong to half steps: turning them round is not the reverse"
 
 
-@case(
-    "H30", "n steps, velocities turned round, n steps", "back at the start to 1e-10 after 2 x 1e4 steps", openmm=_HALF
-)
+@case("H30", "n steps, velocities turned round, n steps", "at the start to 1e-10 after 2 x 1e4 steps", openmm=_HALF)
 def reversal(program: Program, quick: bool) -> Outcome:
     """Springs to anchors: not chaotic."""
     x = truths.rotated([[0.0, 0, 0], [1.2, 0, 0]])

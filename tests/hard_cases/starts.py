@@ -38,11 +38,7 @@ def _tangent_checks(problem: Problem, first: Frame) -> list[tuple[str, float, fl
     ]
 
 
-@case(
-    "H10",
-    "Rigid water stretched by 20 %",
-    "residual 1e-12; center 1e-14; mass-weighted way 0.2771281292; unique velocities",
-)
+@case("H10", "Rigid water stretched by 20 %", "residual 1e-12; center 1e-14; way 0.2771281292; unique velocities")
 def stretched_water(program: Program, quick: bool) -> Outcome:
     masses, v = WIDE_MASSES, np.random.default_rng(4).standard_normal((3, 3))
     center = masses @ WIDE / masses.sum()
@@ -92,11 +88,7 @@ def unasked(program: Program, quick: bool) -> Outcome:
     )
 
 
-@case(
-    "H11",
-    "Velocities that violate the constraints, projected",
-    "|J v| 1e-12; energy lost as 1/2 (J v) (J M^-1 J)^-1 (J v)",
-)
+@case("H11", "Velocities that violate the constraints, projected", "|J v| 1e-12; energy lost as by the formula")
 def bad_velocities(program: Program, quick: bool) -> Outcome:
     problem = _violating()
     problem = problem.but(pairs=[*problem.pairs, (0, 2), (3, 5)])
@@ -145,11 +137,7 @@ def far_away(program: Program, quick: bool) -> Outcome:
 TRICLINIC = np.array([[6.0, 0.0, 0.0], [1.5, 5.5, 0.0], [-1.0, 1.2, 6.5]])
 
 
-@case(
-    "H13",
-    "Atoms wrapped into the cell at every step, orthorhombic and triclinic",
-    "as unwrapped to 1e-11 over 1e4 steps",
-)
+@case("H13", "Atoms wrapped at every step, orthorhombic and triclinic", "as unwrapped to 1e-11 over 1e4 steps")
 def wrapping(program: Program, quick: bool) -> Outcome:
     rng = np.random.default_rng(2)
     x = np.vstack([truths.rotated(WATER) + np.array([0.1, 0.2, 5.3]), truths.rotated(zigzag(5), 1) + 3.0])

@@ -57,12 +57,10 @@ def rotor_without_solution(program: Program, quick: bool) -> Outcome:
     return each_refused({f"{dt:g}": lambda dt=dt: length_off(dt) for dt in (1.01, 1.2, 1.5)})  # type: ignore[misc]
 
 
-_NO_DIRECTION = "it projects along the bonds as they are, not along those of a reference"
+_OWN = "it projects along the bonds as they are, not along those of a reference"
 
 
-@case(
-    "X41", "Bond turned by 90 degrees within a step", "refused", "raise", openmm=_NO_DIRECTION, in_openmm=_NO_DIRECTION
-)
+@case("X41", "Bond turned by 90 degrees within a step", "refused", "raise", openmm=_OWN, in_openmm=_OWN)
 def right_angle(program: Program, quick: bool) -> Outcome:
     """The correction is along the old bond, at right angles to the new one."""
     old = Problem([[0.0, 0, 0], [1, 0, 0]], [1.0, 1.0], [(0, 1)], [1.0])
@@ -92,9 +90,7 @@ def chain_in_springs() -> tuple[Problem, float]:
 SILENT = 1e-7
 
 
-@case(
-    "X42", "Step raised until failure", "the failure is an error; before it, residual 1e-7 (SETTLE of OpenMM has 3e-8)"
-)
+@case("X42", "Step raised until failure", "the failure is an error; before it, residual 1e-7 (OpenMM: 3e-8)")
 def raised_step(program: Program, quick: bool) -> Outcome:
     steps = program.length(quick, 50, 500)
     told: list[str] = []
@@ -149,11 +145,7 @@ def _stiff() -> tuple[Problem, float]:
     return problem.moving([[0, 0.4, 0.1], [0, -0.3, 0.2], [0, 0.5, -0.4]]), fastest
 
 
-@case(
-    "H41",
-    "Spring of 1e6 beside a rigid bond",
-    "energy bounded at half the limit of stability, 1e4 steps; residual 1e-10",
-)
+@case("H41", "Spring of 1e6 beside a rigid bond", "energy bounded at half the limit, 1e4 steps; residual 1e-10")
 def stiff_and_rigid(program: Program, quick: bool) -> Outcome:
     problem, omega = _stiff()
     steps = program.length(quick, 1000, 10_000)

@@ -75,13 +75,7 @@ def huge_forces(program: Program, quick: bool) -> Outcome:
     return outcome(*found)
 
 
-@case(
-    "H39",
-    "Isokinetic with total momentum that is conserved and not zero",
-    "warned, or refused",
-    "warn-or-raise",
-    peers=NONE,
-)
+@case("H39", "Isokinetic, total momentum kept and not zero", "warned, or refused", "warn-or-raise", peers=NONE)
 def conserved_momentum(program: Program, quick: bool) -> Outcome:
     rng = np.random.default_rng(3)
     x, masses = rng.standard_normal((6, 3)), rng.uniform(1, 2, 6)
