@@ -6,9 +6,7 @@ import numpy as np
 
 from hard_cases.case import Outcome, case, outcome
 from hard_cases.problem import Array, Problem
-from hard_cases.programs import Core, Program, Seen
-from kcons.comparison.projected_equation import ProjectedEquation
-from kcons.errors import KconsError
+from hard_cases.programs import Core, Program
 
 #: Steps of the pendulum for each program: quick and full.
 STEPS = {
@@ -58,12 +56,4 @@ def no_projection(program: Program, quick: bool) -> Outcome:
         (f"dt {dt:g}: residual", program.seen(problem, dt, round(horizon / dt), every=20).residual, 1e-12)
         for dt in (0.005, 0.04)
     ]
-    remark = f"t = {horizon:g}"
-    if isinstance(program, Core):
-        seen, failed = Seen(problem), ""
-        try:
-            type(program)(ProjectedEquation()).run(problem, 0.04, round(horizon / 0.04), seen)
-        except KconsError as error:
-            failed = f"{type(error).__name__} at "
-        remark += f"; on request, without projection: {failed}residual {seen.residual:.2g}"
-    return outcome(*found, remark=remark)
+    return outcome(*found, remark=f"t = {horizon:g}")
