@@ -22,10 +22,7 @@ def own_jacobian(t, X):
 def test_jacobian_by_differences():
     X = np.array([0.4, -1.2])
     np.testing.assert_allclose(flows.jacobian_by_differences(lambda t, X: X @ X, 0.0, 100 * X), 200 * X, rtol=1e-9)
-    assert flows.jacobian_by_differences(own, 0.5, X) == pytest.approx(own_jacobian(0.5, X), abs=1e-11)
-    assert flows.Flow(own, 2).jacobian(0.5, X) == pytest.approx(
-        flows.Flow(own, 2, own_jacobian).jacobian(0.5, X), abs=1e-11
-    )
+    assert flows.Flow(own, 2).jacobian(0.5, X) == pytest.approx(own_jacobian(0.5, X), abs=1e-11)
     assert flows.Flow(own, 2).divergence(0.5, X) == pytest.approx(np.sin(-1.2) + 0.05, abs=1e-11)
 
 
@@ -36,7 +33,6 @@ def test_jacobians_by_differences_know_their_error():
         error = flows.Flow(own, 2).jacobian_error(0.5, X)
         assert np.all(off <= error)
         assert np.all(error < 1e-9)
-    assert not flows.Flow(own, 2, own_jacobian).jacobian_error(0.5, X).any()
     # Waves shorter than the steps: nothing is known, and said so.
     rough = flows.Flow(lambda t, X: [np.sin(1e3 * X[0])], 1)
     assert abs(rough.jacobian(0.0, [0.1])[0, 0] - 1e3 * np.cos(100.0)) < rough.jacobian_error(0.0, [0.1])[0, 0]

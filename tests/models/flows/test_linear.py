@@ -237,7 +237,6 @@ def test_neighbors_that_rounding_joins_are_told_as_uncertain():
         ([[-1.0, 0.0], [0.0, -1.0]], "asymptotically stable node"),
         (1e-8 * jordan_block(-1.0, 2), "asymptotically stable node"),
         ([[-0.1, 1.0], [-1.0, -0.1]], "asymptotically stable focus"),
-        ([[0.1, 1.0], [-1.0, 0.1]], "unstable focus"),
         ([[0.0, 1.0], [1.0, 0.0]], "unstable saddle"),
         (1e8 * R, "stable center"),
         ([[0.0, 0.0], [0.0, -1.0]], "stable degenerate"),
@@ -245,8 +244,6 @@ def test_neighbors_that_rounding_joins_are_told_as_uncertain():
         ([[0.0, 1.0], [0.0, 0.0]], "unstable degenerate"),
         ([[-0.1, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, 1.0]], "unstable saddle"),
         (scipy.linalg.block_diag(R, -1.0), "stable degenerate"),
-        (np.diag([-1e6, -2.0, 1.0]), "unstable saddle"),
-        (np.diag([-1e10, -1.0]), "asymptotically stable node"),
         # Beside a rate of 1e10 rounding hides one of 1e-10.
         (np.diag([-1e10, -1e-10, 0.0]), "degenerate whose stability cannot be told"),
         # A part of 1e-13 is seen, one of 1e-17 is said neither to be there nor not.
