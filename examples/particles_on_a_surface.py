@@ -38,10 +38,10 @@ for name, surface in surfaces.items():
     motion = Motion(held, x)
 
     system = System(motion, repulsion)
-    path = run(system, system.initial_state(x, np.zeros_like(x)), 0.005, 400, record=400)
-    change = energy(path.positions[-1]) + 0.5 * np.sum(path.velocities[-1] ** 2) - energy(x)
-    off = np.abs(held.value(path.positions[-1])).max()
-    found = energy(minimize(motion, repulsion, path.positions[-1], tolerance=1e-9, longest=0.2).positions)
+    end = run(system, system.initial_state(x, np.zeros_like(x)), 0.005, 400)
+    change = energy(end.positions) + 0.5 * np.sum(end.velocities**2) - energy(x)
+    off = np.abs(held.value(end.positions)).max()
+    found = energy(minimize(motion, repulsion, end.positions, tolerance=1e-9, longest=0.2).positions)
     print(f"{name:10s} {change:16.1e} {off:17.0e} {found:22.8f}")
     assert off < 1e-12 and abs(change) < 1e-2 * energy(x)
     assert name != "sphere" or abs(found - 49.165253058) < 1e-8

@@ -20,8 +20,10 @@ motion = Motion(ConstraintSet([FixedAtoms([0]), Distance([[0, 1], [1, 2]])], x, 
 gravity = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -9.81], [0.0, 0.0, -9.81]])
 system = System(motion, lambda x, t: gravity, potential=lambda x, t: -float((gravity * x).sum()))
 start = State(x, np.zeros_like(x))
-path = run(system, start, 0.005, 10 * int(frames), stepper=BlanesMoan6(), record=10)
-energies = [system.total_energy(state) for state in path.frames]
+path = []
+run(system, start, 0.005, 10 * int(frames), stepper=BlanesMoan6(), observers=[path.append], every=10)
+energies = [system.total_energy(state) for state in path]
+at = np.array([state.positions for state in path])
 print(f"energy kept to {np.ptp(energies):.1e} of {9.81:.2f}")
 assert np.ptp(energies) < 1e-6
 
@@ -32,8 +34,8 @@ axes.set(xlim=(-2.1, 2.1), ylim=(-2.1, 2.1), aspect="equal", xlabel="x / m", yla
 
 
 def show(k: int) -> None:
-    rods.set_data(path.positions[k, :, 0], path.positions[k, :, 2])
-    trace.set_data(path.positions[max(0, k - 40) : k + 1, 2, 0], path.positions[max(0, k - 40) : k + 1, 2, 2])
+    rods.set_data(at[k, :, 0], at[k, :, 2])
+    trace.set_data(at[max(0, k - 40) : k + 1, 2, 0], at[max(0, k - 40) : k + 1, 2, 2])
 
 
-FuncAnimation(figure, show, len(path.frames)).save(f"{folder}/double_pendulum.gif", PillowWriter(fps=20), dpi=60)
+FuncAnimation(figure, show, len(path)).save(f"{folder}/double_pendulum.gif", PillowWriter(fps=20), dpi=60)

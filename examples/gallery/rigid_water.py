@@ -19,8 +19,9 @@ water = test_systems.build("water", 27, forces="ase")
 system, kT = System(water.motion, water.potential.forces), water.thermal_energy
 start = State(water.positions, water.velocities)
 stepper = Langevin(kT, 1e-3 / units.fs, 1)
-path = run(system, start, 2 * units.fs, 5 * int(frames), stepper=stepper, record=5)
-atoms = path.positions.reshape(len(path.frames), -1, 3, 3)
+path = []
+run(system, start, 2 * units.fs, 5 * int(frames), stepper=stepper, observers=[path.append], every=5)
+atoms = np.array([state.positions for state in path]).reshape(len(path), -1, 3, 3)
 lengths = np.linalg.norm(atoms[:, :, [1, 2, 2]] - atoms[:, :, [0, 0, 1]], axis=-1)
 print(f"lengths kept to {np.ptp(lengths, axis=0).max():.1e} angstrom")
 assert np.ptp(lengths, axis=0).max() < 1e-12
@@ -41,4 +42,4 @@ def show(k: int) -> None:
     hydrogens.set_offsets(now[:, 1:, :2].reshape(-1, 2))
 
 
-FuncAnimation(figure, show, len(path.frames)).save(f"{folder}/rigid_water.gif", PillowWriter(fps=20), dpi=60)
+FuncAnimation(figure, show, len(path)).save(f"{folder}/rigid_water.gif", PillowWriter(fps=20), dpi=60)

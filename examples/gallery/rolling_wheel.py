@@ -28,9 +28,10 @@ held = [
 ]
 motion = Motion(ConstraintSet(held, x, masses), x)
 weight = masses[:, None] * np.array([0.0, 0.0, -9.81])
-path = run(System(motion, lambda x, t: weight), State(x, np.zeros_like(x)), 0.005, 5 * int(frames), record=5)
-far = (path.positions[-1, 0] - x[0]) @ along
-exact = 9.81 * np.sin(slope) * masses.sum() / (masses.sum() + 3.0) * path.times[-1] ** 2 / 2
+path, start = [], State(x, np.zeros_like(x))
+end = run(System(motion, lambda x, t: weight), start, 0.005, 5 * int(frames), observers=[path.append], every=5)
+far = (end.positions[0] - x[0]) @ along
+exact = 9.81 * np.sin(slope) * masses.sum() / (masses.sum() + 3.0) * end.time**2 / 2
 print(f"rolled {far:.5f} m, by theory {exact:.5f} m")
 assert abs(far / exact - 1) < 1e-3
 
@@ -44,9 +45,9 @@ circle = np.linspace(0, 2 * np.pi, 80)
 
 
 def show(k: int) -> None:
-    at = path.positions[k]
+    at = path[k].positions
     rim.set_data(at[0, 0] + radius * np.cos(circle), at[0, 2] + radius * np.sin(circle))
     spokes.set_data(at[[1, 0, 2, 0, 3], 0], at[[1, 0, 2, 0, 3], 2])
 
 
-FuncAnimation(figure, show, len(path.frames)).save(f"{folder}/rolling_wheel.gif", PillowWriter(fps=20), dpi=60)
+FuncAnimation(figure, show, len(path)).save(f"{folder}/rolling_wheel.gif", PillowWriter(fps=20), dpi=60)

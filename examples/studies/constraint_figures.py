@@ -14,7 +14,6 @@ import numpy as np
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import Constraint, Custom, Distance, Formula, KnifeEdge, Plane, Rolling, VelocityFormula
-from kcons.steppers import Trajectory
 
 #: Of positions and time.
 Force = Callable[[np.ndarray, float], np.ndarray]
@@ -22,11 +21,12 @@ Force = Callable[[np.ndarray, float], np.ndarray]
 
 def moved(
     held: list[Constraint], x: np.ndarray, v: np.ndarray, force: Force | None, length: float, steps: int
-) -> tuple[Motion, Trajectory]:
-    motion = Motion(ConstraintSet(held, x, np.ones(len(x))), x)
-    return motion, run(
-        System(motion, force), State(x, motion.project_velocities(x, v)), length / steps, steps, record=5
-    )
+) -> tuple[Motion, np.ndarray, np.ndarray]:
+    """Times and positions."""
+    motion, path = Motion(ConstraintSet(held, x, np.ones(len(x))), x), list[State]()
+    start = State(x, motion.project_velocities(x, v))
+    run(System(motion, force), start, length / steps, steps, observers=[path.append], every=5)
+    return motion, np.array([state.time for state in path]), np.array([state.positions for state in path])
 
 
 def skate(steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -35,10 +35,10 @@ def skate(steps: int) -> tuple[np.ndarray, np.ndarray]:
     x = np.array([[-half, 0.0, 0.0], [half, 0.0, 0.0]])
     v = np.array([[pull / rate, -rate * half, 0.0], [pull / rate, rate * half, 0.0]])
     held = [Distance([[0, 1]]), Plane([0, 1], [0.0, 0.0, 1.0], 0.0), KnifeEdge([0], [1], [0.0, 0.0, 1.0], contact=0.5)]
-    _, path = moved(held, x, v, lambda x, t: np.tile([0.0, -pull, 0.0], (2, 1)), 6.0, steps)
-    turned = rate * path.times
+    _, t, path = moved(held, x, v, lambda x, t: np.tile([0.0, -pull, 0.0], (2, 1)), 6.0, steps)
+    turned = rate * t
     exact = np.stack([turned + np.sin(turned) * np.cos(turned), np.sin(turned) ** 2], axis=1) * pull / (2 * rate**2)
-    return path.positions.mean(axis=1)[:, :2], exact
+    return path.mean(axis=1)[:, :2], exact
 
 
 def wheel(steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -54,9 +54,8 @@ def wheel(steps: int) -> tuple[np.ndarray, np.ndarray]:
         Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]),
         Rolling([0], [1], 1.0, along, up),
     ]
-    _, path = moved(held, x, v, None, 12.0, steps)
-    t = path.times
-    return path.positions[:, 1, [0, 2]], np.stack([t + np.sin(t), 1 + np.cos(t)], axis=1)
+    _, t, path = moved(held, x, v, None, 12.0, steps)
+    return path[:, 1, [0, 2]], np.stack([t + np.sin(t), 1 + np.cos(t)], axis=1)
 
 
 def spiral(steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -64,28 +63,28 @@ def spiral(steps: int) -> tuple[np.ndarray, np.ndarray]:
     lean = np.radians(80)
     held = VelocityFormula("c*(x1*vy1 - y1*vx1) - s*(x1*vx1 + y1*vy1)", 0, {"c": np.cos(lean), "s": np.sin(lean)})
     x, v = np.array([[1.0, 0.0, 0.0]]), np.array([[np.cos(lean), np.sin(lean), 0.0]])
-    _, path = moved([Plane([0], [0.0, 0.0, 1.0], 0.0), held], x, v, None, 10.0, steps)
-    far = 1 + path.times * np.cos(lean)
+    _, t, path = moved([Plane([0], [0.0, 0.0, 1.0], 0.0), held], x, v, None, 10.0, steps)
+    far = 1 + t * np.cos(lean)
     around = np.log(far) * np.tan(lean)
-    return path.positions[:, 0, :2], far[:, None] * np.stack([np.cos(around), np.sin(around)], axis=1)
+    return path[:, 0, :2], far[:, None] * np.stack([np.cos(around), np.sin(around)], axis=1)
 
 
 def rounded_cube(steps: int) -> tuple[np.ndarray, float]:
     """Free motion on x^4 + y^4 + z^4 = 1; how far it leaves the surface."""
     x, v = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.7]])
     held = Custom([0], lambda r: float(np.sum(r**4)), lambda r: 4 * r**3)
-    motion, path = moved([held], x, v, None, 40.0, steps)
-    return path.positions[:, 0], max(float(np.abs(motion.constraint_set.value(r)).max()) for r in path.positions)
+    motion, _, path = moved([held], x, v, None, 40.0, steps)
+    return path[:, 0], max(float(np.abs(motion.constraint_set.value(r)).max()) for r in path)
 
 
-def wave(steps: int) -> tuple[Trajectory, float]:
+def wave(steps: int) -> tuple[np.ndarray, float]:
     """Three beads that a travelling wave lifts; how far they leave it."""
     x = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
     x[:, 2] = 0.3 * np.sin(x[:, 0])
     held = Formula("z1 - 0.3*sin(x1 - t)", [0, 1, 2])
-    motion, path = moved([held], x, np.zeros((3, 3)), lambda x, t: np.tile([0.0, 0.0, -1.0], (3, 1)), 6.0, steps)
-    pairs = zip(path.positions, path.times, strict=True)
-    return path, max(float(np.abs(motion.constraint_set.value(r, t)).max()) for r, t in pairs)
+    motion, t, path = moved([held], x, np.zeros((3, 3)), lambda x, t: np.tile([0.0, 0.0, -1.0], (3, 1)), 6.0, steps)
+    pairs = zip(path, t, strict=True)
+    return path, max(float(np.abs(motion.constraint_set.value(r, then)).max()) for r, then in pairs)
 
 
 def picture(folder: Path, steps: int = 800) -> None:

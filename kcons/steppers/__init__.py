@@ -14,10 +14,10 @@ A stepper never changes its input. Where it raises, nothing has happened.
 """
 
 from kcons.steppers import splitting
-from kcons.steppers.running import Observer, Trajectory, run
+from kcons.steppers.running import Observer, run
 from kcons.steppers.splitting import *
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import ReversibilityCheck, Stepper
 
-__all__ = ["Observer", "ReversibilityCheck", "State", "Stepper", "System", "Trajectory", "run"]
+__all__ = ["Observer", "ReversibilityCheck", "State", "Stepper", "System", "run"]
 __all__ += splitting.__all__

@@ -39,9 +39,10 @@ def test_states_of_a_barostat_are_measured_in_their_own_cell():
     system = CellSystem(motion)
     recorder = Recorder(system, HeldCoordinates(motion, held, x))
     stepper = ConstantPressure(Langevin(1.0, 1.0, rng=1), MonteCarloBarostat(0.01, every=1, width=0.2))
-    kept = run(system, system.initial_state(x), 0.01, 9, stepper=stepper, record=3)
-    assert len({frame.cell[0, 0] for frame in kept.frames}) > 1
-    for frame in kept.frames:
+    kept: list = []
+    run(system, system.initial_state(x), 0.01, 9, stepper=stepper, observers=[kept.append], every=3)
+    assert len({frame.cell[0, 0] for frame in kept}) > 1
+    for frame in kept:
         recorder(frame)
     np.testing.assert_allclose(recorder.series.value, 2.0, atol=1e-12)
 
