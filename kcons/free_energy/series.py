@@ -15,7 +15,7 @@ from kcons.constraints.target import FloatArray, nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.averages import weighted_mean
 from kcons.free_energy.held_coordinates import AT_ONCE, HeldCoordinates, Sample
-from kcons.steppers.files import in_one_piece, stored_arrays
+from kcons.steppers.files import in_one_piece, stored_arrays, write_arrays
 from kcons.steppers.state import State, System
 
 #: Atoms of all configurations that wait to be looked at, at most.
@@ -109,7 +109,7 @@ class Series(list[Sample]):
         for name in ("names", "periods", "isokinetic_degrees_of_freedom"):
             arrays[name] = np.array(getattr(self, name))
         with in_one_piece(file) as opened:
-            np.savez(opened, **arrays)  # type: ignore[arg-type]
+            write_arrays(opened, arrays)
 
     @classmethod
     def load(cls, file: str | PathLike[str]) -> Series:

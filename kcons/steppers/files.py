@@ -1,26 +1,23 @@
-"""Files that are either whole or not there, folders of one run, data as JSON, archives whose damage is noticed."""
+"""Files that are either whole or not there, folders of one run, data as JSON, arrays whose damage is noticed."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
-import platform
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from io import SEEK_END, BytesIO
+from hashlib import sha256
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from secrets import token_hex
-from struct import Struct
 from typing import Any, BinaryIO
-from zipfile import ZipFile
 
 import numpy as np
 
-from kcons.constraints.arguments import as_float_array, finite_array, finite_number, whole_number
+from kcons.constraints.arguments import finite_number, whole_number
 from kcons.errors import InputError, OccupiedError
 
 if sys.platform == "win32":
@@ -30,21 +27,12 @@ else:
 
 #: Ends the names of files that are still being written.
 UNFINISHED = ".unfinished"
-#: The file that a run locks while it writes into a folder.
+#: The file that a run locks while it writes into a folder, and that stays there.
 LOCK = ".kcons.lock"
-
-#: The record at the end of an archive without comment; the fifth number is how many files there are.
-_LAST_RECORD = Struct("<4s4H2LH")
 
 
 def as_path(value: str | PathLike[str], item: str) -> Path:
-    """The path that `value` names.
-
-    Raises
-    ------
-    InputError
-        It is neither text nor a path.
-    """
+    """The path that `value` names; `InputError` for what is neither text nor a path."""
     if not isinstance(value, str | PathLike):
         raise InputError(f"{item} is {value!r}; give a path", item=item)
     return Path(value)
@@ -112,10 +100,7 @@ class ResultFolder:
         remedy = "give another folder (--out)"
         if self.path.exists() and not self.path.is_dir():
             raise OccupiedError(f"{self.path}: there is a file where a folder has to be; {remedy}", item="folder")
-        there = list(self._there())
-        for path in there:
-            if path.is_symlink() or not path.is_file():
-                raise OccupiedError(f"{path} is a link, or no file; {remedy}", item="folder")
+        there = [path for name in dict.fromkeys((self.record, *self.names)) for path in sorted(self.path.glob(name))]
         if not there:
             return
         record = self.path / self.record
@@ -160,14 +145,6 @@ class ResultFolder:
             finally:
                 self._taken = False
 
-    def _there(self) -> Iterator[Path]:
-        """Files of the names of the results."""
-        for name in dict.fromkeys((self.record, *self.names)):
-            if "*" in name:
-                yield from sorted(self.path.glob(name))
-            elif (self.path / name).exists() or (self.path / name).is_symlink():
-                yield self.path / name
-
 
 def _said(record: Path) -> dict[str, Any]:
     """Entries of a record."""
@@ -179,39 +156,29 @@ def _said(record: Path) -> dict[str, Any]:
 
 
 def _other(mine: Mapping[str, Any], theirs: Mapping[str, Any], part: bool) -> list[tuple[str, str]]:
-    """Names of entries that differ, and the values of texts, which may be a `part` of all entries there."""
+    """Names of entries that differ, and the values of texts; those of a record that says more are a `part`."""
     found: list[tuple[str, str]] = []
     for key, value in mine.items():
         there = theirs.get(key)
         if part and isinstance(value, dict) and isinstance(there, dict):
             found += _other(value, there, part)
-        elif key not in theirs or there != value:
+        elif there != value:
             found.append((key, f" ({there})" if part and isinstance(there, str) else ""))
-    return found if part else found + [(key, "") for key in sorted(theirs.keys() - mine.keys())]
+    return found
 
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder, which the operating system takes away from a process that ends in whatever way."""
-    place = folder / LOCK
-    while True:
+    with (folder / LOCK).open("a+") as opened:
         try:
-            opened = os.open(place, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-        except OSError as error:
-            if place.is_symlink() or place.is_dir():
-                raise OccupiedError(f"{place} is a link, or no file; remove it", item="folder") from error
-            raise
-        try:
-            _lock(opened)
-            if os.fstat(opened).st_nlink:
-                break
-            os.close(opened)  # the run that had it has just removed it
+            if sys.platform == "win32":
+                msvcrt.locking(opened.fileno(), msvcrt.LK_NBLCK, 1)
+            else:
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, PermissionError) as error:
-            os.close(opened)
             raise OccupiedError(
-                f"another run writes into {folder} ({_holder(place)}); wait until it ends, or give another folder "
-                "(--out)",
-                item="folder",
+                f"another run writes into {folder}; wait until it ends, or give another folder (--out)", item="folder"
             ) from error
         except OSError as error:  # a file system without locks
             warnings.warn(
@@ -219,32 +186,7 @@ def _locked(folder: Path) -> Iterator[None]:
                 UserWarning,
                 stacklevel=5,
             )
-            break
-    try:
-        os.ftruncate(opened, 0)
-        os.write(opened, f"process {os.getpid()} on {platform.node()}".encode())
         yield
-    finally:
-        if sys.platform != "win32":
-            place.unlink(missing_ok=True)
-        os.close(opened)
-
-
-def _lock(opened: int) -> None:
-    if sys.platform == "win32":
-        os.lseek(opened, 1 << 30, os.SEEK_SET)  # others can read what lies before
-        msvcrt.locking(opened, msvcrt.LK_NBLCK, 1)
-        os.lseek(opened, 0, os.SEEK_SET)
-    else:
-        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _holder(place: Path) -> str:
-    """Who says that it has a lock."""
-    try:
-        return place.read_text(encoding="utf-8", errors="replace") or "it has just begun"
-    except FileNotFoundError:
-        return "it has just ended"
 
 
 def plain(value: Any) -> Any:
@@ -261,59 +203,27 @@ def text(data: Any, indent: int | None = 1) -> str:
     return json.dumps(plain(data), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
-def stored_arrays(file: BinaryIO) -> dict[str, Any]:
-    """The arrays of an archive, each with its checksum compared.
+def write_arrays(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
+    """Write arrays in NumPy's .npz format, with a checksum of all behind them."""
+    whole = BytesIO()
+    np.savez(whole, **arrays)
+    file.write(whole.getvalue() + sha256(whole.getvalue()).digest())
 
-    Nothing that kcons writes is compressed: an archive whose arrays, by its directory, are longer than itself is
-    refused before any of them is read.
-    """
-    found: dict[str, Any] = {}
-    with ZipFile(file) as archive:
-        # A damaged entry of the directory may hide the next one; its last record says how many there are.
-        length = file.seek(-_LAST_RECORD.size, SEEK_END) + _LAST_RECORD.size
-        count = _LAST_RECORD.unpack(file.read(_LAST_RECORD.size))[4]
-        if count != len(archive.namelist()):
-            raise ValueError(f"{len(archive.namelist())} arrays are listed of {count}")
-        unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > length:
-            raise ValueError(f"it has {length:,} bytes and would unpack to {unpacked:,}")
-        for name in archive.namelist():
-            # Read whole: what `numpy.load` does not look at, it does not check either.
-            content = BytesIO(archive.read(name))
-            array = np.lib.format.read_array(content, allow_pickle=False)
-            if content.read(1):
-                raise ValueError(f"{name} has more than its array")
-            found[name.removesuffix(".npy")] = array if array.ndim else array.item()
-    return found
+
+def stored_arrays(file: BinaryIO) -> dict[str, Any]:
+    """What `write_arrays` has written; `ValueError` unless all of it is as it was."""
+    content = file.read()
+    content, checksum = content[: -sha256().digest_size], content[-sha256().digest_size :]
+    if sha256(content).digest() != checksum:
+        raise ValueError("its checksum does not fit")
+    with np.load(BytesIO(content), allow_pickle=False) as archive:
+        return {name: array if array.ndim else array.item() for name, array in archive.items()}
 
 
 def refuse_clock(time: Any, step: Any, time_remainder: Any) -> None:
-    """Refuse times that are no finite numbers, and counts of steps that are none.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise `InputError` for times that are no finite numbers, and counts of steps that are none."""
     if type(step) is int and step >= 0 and type(time) is float and math.isfinite(time) and time_remainder == 0.0:
         return  # as in nearly all steps
     finite_number(time, "time")
     finite_number(time_remainder, "time_remainder")
     whole_number(step, "step", 0)
-
-
-def checked_state(values: dict[str, Any]) -> dict[str, Any]:
-    """What a state is made of, as a step needs it."""
-    shape = np.shape(values["positions"])
-    if len(shape) != 2 or shape[1] != 3:
-        raise ValueError(f"positions have shape {shape}")
-    for name in ("positions", "velocities", "forces", "remainder"):
-        if name in values:
-            values[name] = finite_array(values[name], shape[0], name)
-    for name in {"thermostat", "barostat"} & set(values):
-        values[name] = np.atleast_1d(as_float_array(values[name], name))
-        if not np.isfinite(values[name]).all():
-            raise ValueError(f"{name} is not finite")
-    if len(values.get("barostat", range(9))) < 9:
-        raise ValueError(f"barostat has {len(values['barostat'])} numbers, which are no cell")
-    refuse_clock(*(values.get(name, 0) for name in ("time", "step", "time_remainder")))
-    return values

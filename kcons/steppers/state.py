@@ -32,7 +32,7 @@ from kcons.motion.certificate import Schedule, off_row
 from kcons.motion.motion import Motion
 from kcons.solvers.addressable_solvers import pack_solver_tables
 from kcons.steppers.compiled_operations import beyond, check_finite
-from kcons.steppers.files import checked_state, in_one_piece, refuse_clock, stored_arrays
+from kcons.steppers.files import in_one_piece, refuse_clock, stored_arrays, write_arrays
 from kcons.steppers.packed_system import PackedSystem, packed_system, spheres_of
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
@@ -149,7 +149,7 @@ class State:
         """
         present = {name: value for name, value in self.__getstate__().items() if value is not None}
         with in_one_piece(file) if isinstance(file, str | PathLike) else nullcontext(file) as opened:
-            np.savez(opened, **present)
+            write_arrays(opened, present)
 
     @classmethod
     def load(cls, file: str | PathLike[str] | BinaryIO) -> State:
@@ -164,7 +164,7 @@ class State:
             with Path(file).open("rb") as opened:
                 return cls.load(opened)
         try:
-            return cls(**checked_state(stored_arrays(file)))
+            return cls(**stored_arrays(file))
         except Exception as error:  # a damaged archive raises whatever its bytes lead to
             name = getattr(file, "name", "the file")
             raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
@@ -198,8 +198,8 @@ class System:
     velocity_dependent : bool
         Whether `force` takes the velocities too (magnetic fields, drag that is not linear).
     far : float
-        From this many times the size of what is held away from the origin, states carry the remainder of their
-        positions. Infinite: never, so that positions and velocities alone are the whole state.
+        From this many (at least 1) times the size of what is held away from the origin, states carry the remainder of
+        their positions. Infinite: never, so that positions and velocities alone are the whole state.
 
     Raises
     ------
@@ -223,10 +223,7 @@ class System:
         taken = ("x", "v", "t") if velocity_dependent else ("x", "t")
         check_call("force", force, taken, "; velocity_dependent says whether it gets velocities v")
         check_call("potential", potential, ("x", "t"))
-        self.motion = motion
-        self.far = far if far == math.inf else finite_number(far, "far")
-        if not self.far >= 1:
-            raise InputError(f"far is {far}; give a number of 1 or more", item="far")
+        self.motion, self.far = motion, far
         self.force, self.potential = force, potential
         self.velocity_dependent = bool(velocity_dependent) and force is not None
         self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)

@@ -95,11 +95,11 @@ def test_a_run_that_is_stopped_says_how_it_goes_on(tmp_path):
         process.kill()
     assert process.returncode == 143
     assert "kcons: terminated; finished windows are kept: run again to resume" in said and "Traceback" not in said
-    assert [path.name for path in (tmp_path / "input").iterdir()] == ["settings.json"]
+    assert {path.name for path in (tmp_path / "input").iterdir()} == {"settings.json", ".kcons.lock"}
 
 
 def test_two_runs_into_one_folder(capsys):
     given = read_input("input.toml")
     with Windows(given.sampler, "input", given.settings, **given.options).taken():
         assert main(["freeenergy", "input.toml"]) == 2
-    assert "kcons: another run writes into input (process " in capsys.readouterr().err
+    assert "kcons: another run writes into input; wait" in capsys.readouterr().err

@@ -20,7 +20,6 @@ from itertools import product
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import ase.io
 import numpy as np
@@ -49,7 +48,7 @@ from kcons.free_energy.held_coordinates import HeldCoordinates, warn_of_gaps
 from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals, Relaxed
 from kcons.motion.minimization import minimize
 from kcons.motion.motion import Motion
-from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, write_files
+from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, write_arrays, write_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -421,7 +420,7 @@ class Attempt(Relaxed):
         head = {name: value for name, value in vars(self).items() if name not in ("number", *_ARRAYS)}
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         with in_one_piece(path) as file:
-            np.savez(file, head=np.array(json.dumps(head)), **arrays)
+            write_arrays(file, {"head": np.array(json.dumps(head)), **arrays})
 
     @classmethod
     def load(cls, path: Path, number: int) -> Attempt:
@@ -432,7 +431,7 @@ class Attempt(Relaxed):
             head = json.loads(str(data["head"])) | {name: data[name] for name in _ARRAYS}
             head |= {"point": tuple(head["point"]), "terms": [tuple(term) for term in head["terms"]]}
             return cls(number=number, **head)
-        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise UnreadableError(f"{path} cannot be read ({error}); remove it", item="folder") from error
 
 
