@@ -179,8 +179,6 @@ class SolverSequence:
         try:
             if len(plan.pinned):
                 x[plan.pinned] = plan.pinned_targets(targets)
-                if plan.between_fixed_atoms is not None:
-                    plan.check_rows_between_fixed_atoms(x, time)
             if images is not None and lattice is not None:
                 if self.unchecked is not None:
                     rows.refuse_other_images(ref, self.unchecked, self.numbers)
@@ -238,13 +236,6 @@ class SolverSequence:
         saved = y.copy() if self._several else None
         if len(plan.pinned):
             y[plan.pinned] = 0.0 if rates is None else rates[plan.pinned_rows].reshape(-1, 3)
-            if plan.between_fixed_atoms is not None:
-                try:
-                    plan.check_rates_between_fixed_atoms(x, y, rates, time, what)
-                except KconsError:
-                    if saved is not None:
-                        np.copyto(y, saved)
-                    raise
         found: list[FloatArray | None] = []
         moved: FloatArray | None = None
         if lattice is not None:

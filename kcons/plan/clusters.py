@@ -175,11 +175,8 @@ def _small_shapes(
     np.add.at(degree, ends.ravel(), 1)
     # Canonical orientation and order, so that equal clusters look equal: center first, then by mass.
     a, b = ends[:, 0], ends[:, 1]
-    swap = (
-        (degree[a] < degree[b])
-        | ((degree[a] == degree[b]) & (w[a] > w[b]))
-        | ((degree[a] == degree[b]) & (w[a] == w[b]) & (a > b))
-    )
+    place = np.argsort(np.lexsort((w, -degree)))
+    swap = place[a] > place[b]
     ends = np.where(swap[:, None], ends[:, ::-1], ends)
     a, b = ends[:, 0], ends[:, 1]
     order = np.lexsort((b, a, w[b], -degree[b], w[a], -degree[a], labels[rows]))

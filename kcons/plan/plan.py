@@ -9,14 +9,15 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
+from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError
 from kcons.plan.clusters import Shape, classify, cluster_labels, fixed_rows
+from kcons.plan.second_order import Blocks
 from kcons.solvers.chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.rank_revealing import independent, rank
+from kcons.solvers.rank_revealing import independent, independent_rows, rank
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.small_clusters import SmallClusters
@@ -66,10 +67,8 @@ class Plan:
     kinds : list of ClusterKind
     dependent : list of ndarray of int
         Rows of each cluster in which rows may depend on each other.
-    between_fixed_atoms : ndarray of int or None
-        Rows between fixed atoms that motion of these may break.
-    resting : tuple of ndarray of int and of positions, or None
-        Rows between fixed atoms at rest, which another cell may break, and positions of the set-up.
+    resting : tuple of ndarray of int, of positions and of time, or None
+        Rows between fixed atoms, and the set-up.
     eliminate_last : ndarray of bool, shape (n_rows,)
         Rows that depend on others of their cluster, eliminated after these.
     whole : list of bool
@@ -87,8 +86,7 @@ class Plan:
     driven: bool
     kinds: list[ClusterKind] = field(default_factory=list)
     dependent: list[IntArray] = field(default_factory=list)
-    between_fixed_atoms: IntArray | None = None
-    resting: tuple[IntArray, FloatArray] | None = None
+    resting: tuple[IntArray, FloatArray, float] | None = None
     whole: list[bool] = field(default_factory=list)
     eliminate_last: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     _places: FloatArray | None = None
@@ -105,68 +103,34 @@ class Plan:
             self._places = self.constraint_set.target(0.0)[self.pinned_rows].reshape(-1, 3)
         return self._places
 
-    def check_rows_between_fixed_atoms(self, x: FloatArray, time: float) -> None:
-        """Refuse rows between fixed atoms only that are not fulfilled; the others need no solver.
-
-        Raises
-        ------
-        ContradictionError
-            A position row is off at `x`, or a velocity row asks for another speed than that of the atoms.
-        """
-        if self.between_fixed_atoms is None:
-            return
-        self._require_fulfilled(self.between_fixed_atoms, x, time)
-        speed = self.constraint_set.velocity_target(x, time)
-        v = np.zeros_like(x)
-        v[self.pinned] = speed[self.pinned_rows].reshape(-1, 3)
-        self.check_rates_between_fixed_atoms(x, v, speed, time, "velocity")
-
     def check_cell(self) -> None:
-        """Refuse the present cell where it breaks rows between fixed atoms at rest, which no solver sees.
+        """Refuse rows between fixed atoms that these do not fulfil, in the present cell: no solver sees them.
 
         Raises
         ------
         ContradictionError
-            Such a row is off: the atoms stay, and an image of one of them does not.
+            Such a row is off, asks for a velocity, or moves, as its atoms may.
         """
-        if self.resting is not None:
-            self._require_fulfilled(*self.resting, 0.0, " in this cell")
-
-    def _require_fulfilled(self, rows: IntArray, x: FloatArray, time: float, where: str = "") -> None:
-        with np.errstate(invalid="ignore"):
-            found = self.constraint_set.residuals(x, None, time)
-        miss = np.abs(found.sigma)
-        bad = rows[~(miss[rows] <= found.allowed[rows])]
-        if len(bad):
-            raise self._broken(bad[0], f" and is off by {miss[bad[0]]:g}{where}; remove it or free one of its atoms")
-
-    def check_rates_between_fixed_atoms(
-        self, x: FloatArray, y: FloatArray, rates: FloatArray | None, time: float, what: str
-    ) -> None:
-        """Refuse rows between fixed atoms only whose A y, with the y of these atoms, is not `rates`.
-
-        Raises
-        ------
-        ContradictionError
-        """
-        if self.between_fixed_atoms is None:
+        if self.resting is None:
             return
-        jacobian = self.constraint_set.jacobian(x, time)[self.between_fixed_atoms]
-        fixed = np.zeros_like(y)
-        fixed[self.pinned] = y[self.pinned]
-        wanted = np.zeros(len(self.between_fixed_atoms)) if rates is None else rates[self.between_fixed_atoms]
-        miss = np.abs(jacobian @ fixed.ravel() - wanted)
-        bad = np.flatnonzero(~(miss <= 1e-10 * (np.abs(wanted) + abs(jacobian) @ np.abs(fixed.ravel()))))
+        rows, x, time = self.resting
+        held = self.constraint_set
+        moves = np.concatenate([np.full(item.n_rows, item.moving) for item in held.constraints])
+        carried = np.zeros(held.n_atoms)
+        carried[self.pinned] = moves[self.pinned_rows[::3]]
+        with np.errstate(invalid="ignore"):
+            found = held.residuals(x, None, time)
+        miss = np.maximum(np.abs(found.sigma), np.abs(held.velocity_target(x, time)))
+        moving = moves[rows] | (held.incidence[rows] @ carried > 0)
+        bad = np.flatnonzero(moving | ~(miss[rows] <= found.allowed[rows]))
         if len(bad):
-            raise self._broken(
-                self.between_fixed_atoms[bad[0]],
-                f", whose {what} does not follow it: off by {miss[bad[0]]:g}; remove it, free one of its atoms, or let "
-                "the fixed atoms move with it",
+            row = int(rows[bad[0]])
+            said = "moves" if moving[bad[0]] else f"is off by {miss[row]:g}"
+            raise ContradictionError(
+                f"row {self.named.row_name(row)} lies between fixed atoms and {said}; remove it or free one of these",
+                rows=[row],
+                atoms=self.named.row_atoms(row),
             )
-
-    def _broken(self, row: int, said: str) -> ContradictionError:
-        name, atoms = self.named.row_name(row), self.named.row_atoms(row)
-        return ContradictionError(f"row {name} lies between fixed atoms{said}", rows=[int(row)], atoms=atoms)
 
     def least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:
         """Multipliers of least norm with the same constraint force, where rows depend on each other."""
@@ -219,25 +183,17 @@ def make_plan(
     loose = labels < 0
     loose[pinned_rows] = False
     if loose.any():
-        plan.between_fixed_atoms = np.flatnonzero(loose)
         in_place = positions.copy()
         in_place[pinned] = plan.pinned_targets(constraint_set.target(time))
-        plan.check_rows_between_fixed_atoms(in_place, time)
-        if not constraint_set.moving:
-            plan.resting = (plan.between_fixed_atoms, in_place)
-            plan.between_fixed_atoms = None
+        plan.resting = np.flatnonzero(loose), in_place, time
+        plan.check_cell()
     whole_positions, placed = constraint_set.whole(positions), constraint_set.placed
     moved = None if placed is None else constraint_set.moved_places(positions[placed], whole_positions)
+    here = Request(np.zeros_like(positions), whole_positions, None, constraint_set.lattice, time, moved=moved)
     for shape, whole in _shapes(constraint_set, labels, inverse_masses):
         solver, rank = _solver(plan, shape, time), shape.rows.size
         if not shape.independent:
-            lattice = None if whole else constraint_set.lattice
-            if isinstance(solver, GeneralClusters):
-                rank = solver.rank(whole_positions, time, moved)
-            elif isinstance(solver, SparseDistances | SparseRows | SingleRows):
-                rank = solver.rank(whole_positions, lattice, time, moved)
-            else:
-                rank = _rank_of_small(shape, inverse_masses, whole_positions, lattice)
+            rank = _rank(plan, shape, solver, positions, here._replace(lattice=None) if whole else here)
         if shape.kind == "SingleRows" and rank < shape.rows.size:
             shape = replace(shape, kind="SparseRows")
         alone = shape.independent or shape.kind == "SingleRows"
@@ -246,13 +202,12 @@ def make_plan(
         clusters = _by_cluster(shape.rows.ravel(), labels) if asked else []
         sizes = [len(rows) for rows in clusters] or [0]
         if asked and max(sizes) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL:
-            marked = _mark_dependent_rows(plan, clusters, positions, time)
-            if sparse:
-                # The pivots of an order that knows nothing of dependence say less.
-                seen, rank = rank, marked
-                if seen < rank and shape.kind == "SparseRows":
-                    # Rows so nearly parallel that elimination, which sees squares, takes them for dependent.
-                    solver = GeneralClusters(constraint_set, shape.rows, labels[shape.rows], inverse_masses)
+            found = _mark_dependent_rows(plan, clusters, positions, time)
+            if rank < found and shape.kind == "SparseRows":
+                # Rows so nearly parallel that elimination, which sees squares, takes them for dependent.
+                solver = GeneralClusters(constraint_set, shape.rows, labels[shape.rows], inverse_masses)
+            # The pivots of an order that knows nothing of dependence say less.
+            rank = found if sparse else rank
         if rank < shape.rows.size:
             plan.dependent += clusters
             if shape.kind in ("RigidTriangles", "SmallClusters"):
@@ -265,8 +220,8 @@ def make_plan(
         plan.solvers.append(solver)
         plan.whole.append(whole and not (isinstance(solver, GeneralClusters) and solver.winds))
         plan.rank += rank
-        example = named.row_name(int(shape.rows.ravel()[0]))
-        plan.kinds.append(ClusterKind(solver.name, shape.clusters, shape.rows.size, rank, example))
+        numbers = shape.clusters, shape.rows.size, rank
+        plan.kinds.append(ClusterKind(solver.name, *numbers, named.row_name(int(shape.rows.ravel()[0]))))
     return plan
 
 
@@ -295,55 +250,31 @@ def _shapes(
     """The shapes of clusters, and whether these have whole rows: such clusters have solvers of their own."""
     marks = [np.zeros(c.n_rows, bool) if c.whole is None else c.whole for c in constraint_set.constraints]
     whole_rows = np.concatenate([*marks, np.zeros(0, bool)]) & (labels >= 0)
-    if not whole_rows.any():
-        for shape in classify(constraint_set, labels, inverse_masses):
-            yield shape, False
-        return
-    wholes = np.zeros(int(labels.max()) + 1, bool)
+    wholes = np.zeros(int(labels.max(initial=-1)) + 1, bool)
     wholes[labels[whole_rows]] = True
     for kind in (False, True):
         number = np.where(wholes == kind, np.cumsum(wholes == kind) - 1, -1)
-        chosen = np.where(labels >= 0, number[labels], -1)
+        chosen = np.append(number, -1)[labels]
         for shape in classify(constraint_set, chosen, inverse_masses):
             yield shape, kind
 
 
-def _mark_dependent_rows(plan: Plan, clusters: list[IntArray], positions: FloatArray, time: float) -> int:
-    """Independent rows of small clusters, by pivoted QR; marks those that the best conditioned rows leave over."""
-    from scipy.linalg import qr  # slow to import
+def _rank(plan: Plan, shape: Shape, solver: ClusterSolver, positions: FloatArray, here: Request) -> int:
+    """Independent rows at `positions`: of many small clusters at once, of others as their solver sees them `here`."""
+    if shape.rows.ndim == 1:
+        return solver.rank(here)
+    unit = Blocks(plan.constraint_set, here.time, shape.rows, shape.atoms, plan.pinned).dense(positions)[0]
+    return rank(np.nan_to_num(unit) * np.repeat(np.sqrt(plan.inverse_masses[shape.atoms[0]]), 3))
 
+
+def _mark_dependent_rows(plan: Plan, clusters: list[IntArray], positions: FloatArray, time: float) -> int:
+    """Independent rows of small clusters; marks those that the best conditioned rows leave over."""
     jacobian = plan.constraint_set.jacobian(positions, time)
-    root_w = np.repeat(np.sqrt(plan.inverse_masses), 3)
-    found = 0
+    jacobian.data *= np.repeat(np.sqrt(plan.inverse_masses), 3)[jacobian.indices]
     for rows in clusters:
         part = jacobian[rows]
-        columns, place = np.unique(part.indices, return_inverse=True)
-        b = np.zeros((len(rows), len(columns)))
-        b[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * root_w[part.indices]
-        size = np.linalg.norm(b, axis=1, keepdims=True)
-        triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
-        diagonal = np.zeros(len(rows))
-        diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
-        # The diagonal of the triangle stands for the singular values: it does not grow, and is their size.
-        left_over = ~independent(diagonal)
-        plan.eliminate_last[rows[order]] = left_over
-        found += int(np.sum(~left_over))
-    return found
-
-
-def _rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
-    """Rank of many small clusters of distances at once, from the singular values of their B."""
-    ends = shape.atoms[:, shape.pairs]  # (n_clusters, K, 2) global atoms
-    difference = positions[ends[..., 0]] - positions[ends[..., 1]]
-    if lattice is not None:
-        difference = minimum_image(difference, lattice)
-    n, k = ends.shape[:2]
-    b = np.zeros((n, k, shape.atoms.shape[1], 3))
-    row = np.arange(k)
-    root_w = np.sqrt(inverse_masses[shape.atoms[0]])
-    b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
-    b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
-    return rank(b.reshape(n, k, -1))
+        plan.eliminate_last[rows] = ~independent_rows(part[:, np.unique(part.indices)].toarray())
+    return sum(int(np.sum(~plan.eliminate_last[rows])) for rows in clusters)
 
 
 def _by_cluster(rows: IntArray, labels: IntArray) -> list[IntArray]:

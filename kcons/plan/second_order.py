@@ -61,8 +61,6 @@ UNSOLVABLE = 1e-4
 FLAT = 1e-6
 #: Relative misfit between the targets and a flat geometry above which the conversion is refused.
 MISFIT = 1e-6
-#: Bases are exchanged where the volume that they span grows by more than this part.
-LARGER = 1e-3
 #: Of rigid groups of one, two and three dimensions: where they lie, what they are, their degrees of freedom, and what
 #: holds them.
 _GROUPS = (
@@ -102,7 +100,7 @@ def without_second_order_rows(constraint_set: ConstraintSet, positions: FloatArr
 
 
 @dataclass
-class _Stack:
+class Blocks:
     """Blocks of one shape of a set, at a time.
 
     Attributes
@@ -119,7 +117,7 @@ class _Stack:
     atoms: IntArray
     pinned: IntArray
 
-    def chosen(self, which: IntArray | BoolArray) -> _Stack:
+    def chosen(self, which: IntArray | BoolArray) -> Blocks:
         return replace(self, rows=self.rows[which], atoms=self.atoms[which])
 
     def suspects(self, x: FloatArray) -> BoolArray:
@@ -208,7 +206,7 @@ class _Stack:
         return result
 
 
-def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> Iterator[_Stack]:
+def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> Iterator[Blocks]:
     """All blocks small enough for dense algebra, by shape; refuses larger ones whose rank is higher nearby."""
     rows: IntArray | None = None
     pinned = fixed_atoms(constraint_set)
@@ -231,7 +229,7 @@ def _stacks(constraint_set: ConstraintSet, positions: FloatArray, time: float) -
             for lo in range(0, len(same), chunk):
                 some = same[lo : lo + chunk, None]
                 of_some = members[starts[some] + np.arange(n_rows)], atoms[first_atom[some] + np.arange(n_atoms)]
-                yield _Stack(constraint_set, time, *of_some, pinned)
+                yield Blocks(constraint_set, time, *of_some, pinned)
         rows = np.sort(members[large[label]])
         if len(rows) == 0:
             return
@@ -296,7 +294,7 @@ class LocalRows:
         self.x = positions[self.atoms]
         self.pinned: BoolArray = np.isin(self.atoms, fixed_atoms(constraint_set)) if pinned is None else pinned
         every = np.arange(self.part.n_rows)[None], np.arange(len(self.atoms))[None]
-        self.alone = _Stack(self.part, time, *every, np.flatnonzero(self.pinned))
+        self.alone = Blocks(self.part, time, *every, np.flatnonzero(self.pinned))
 
     def inside(self, atoms: IntArray) -> IntArray:
         """Rows (block numbering) that a rigid group of `atoms` (block numbering) makes superfluous."""
@@ -318,20 +316,32 @@ class LocalRows:
         some = self.alone if rows is None else replace(self.alone, rows=rows[None])
         return some.rows.size > 1 and bool(some.suspects(x)[0])
 
-    def restored(self) -> LocalRows:
-        """The same block at positions that fulfil its targets, as nearly as Gauss-Newton gets there."""
-        x = self.x.copy()
-        held = self.part.holonomic
+    def fulfilled(
+        self, x: FloatArray, rows: IntArray, along: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Positions that fulfil the targets of rows, as nearly as Gauss-Newton gets, and what rows miss by their scale.
+
+        Positions change by combinations of the columns of `along`, or as free atoms can.
+        """
+        best, miss = x, np.full(len(rows), np.inf)
         for _ in range(60):
-            sigma = self.part.value(x, self.time)
-            # Towards a flat geometry the singular value is the square root of this, 1e-7: lost by any measure.
-            if np.max(np.abs(sigma) / self.part.scale) < 1e-14:
+            sigma = self.part.value(x, self.time)[rows]
+            off = np.abs(sigma) / self.part.scale[rows]
+            # Towards a flat geometry singular values are the square root of this, 1e-7: lost by any measure.
+            if not off.max() < miss.max() and not off.max() >= 1e-14:
                 break
+            if off.max() < miss.max():
+                best, miss = x, off
             unit, norms = self.linear(x)
-            step = np.linalg.lstsq(unit[held], -(sigma / norms)[held], rcond=STEP_CUT)[0]
-            x = x + step.reshape(x.shape)
+            a = unit[rows] if along is None else unit[rows] @ along
+            step = np.linalg.lstsq(a, -sigma / norms[rows], rcond=STEP_CUT)[0]
+            x = x + (step if along is None else along @ step).reshape(x.shape)
+        return best, miss
+
+    def restored(self) -> LocalRows:
+        """The same block where its targets are fulfilled."""
         other = copy.copy(self)
-        other.x = x
+        other.x = self.fulfilled(self.x, np.flatnonzero(self.part.holonomic))[0]
         return other
 
     def nearby(self, rng: np.random.Generator) -> FloatArray:
@@ -343,24 +353,17 @@ class LocalRows:
 
     def rigid_pairs(self) -> tuple[BoolArray, int]:
         """Pairs of atoms that keep their distance at positions nearby, and the rank there."""
-        rng = np.random.default_rng(20090131)
-        n = len(self.atoms)
-        best, rigid = -1, np.eye(n, dtype=bool)
-        for _ in range(3):
-            x = self.nearby(rng)
-            vt, rank = self.decomposed(x)
-            if rank <= best:
-                continue
-            best = rank
-            # A few random motions show every pair that can move.
-            motions = (rng.standard_normal((8, len(vt) - rank)) @ vt[rank:]).reshape(8, n, 3)
-            motions[:, self.pinned] = 0.0
-            apart = self.unwrapped(x)
-            apart = apart[:, None] - apart[None, :]
-            apart /= (np.linalg.norm(apart, axis=2) + np.eye(n))[:, :, None]
-            rates = np.abs(np.einsum("ijc,mijc->mij", apart, motions[:, :, None] - motions[:, None])).max(axis=0)
-            rigid = rates < 1e-7
-        return rigid, best
+        rng, n = np.random.default_rng(20090131), len(self.atoms)
+        x = self.nearby(rng)
+        vt, rank = self.decomposed(x)
+        # A few random motions show every pair that can move.
+        motions = (rng.standard_normal((8, len(vt) - rank)) @ vt[rank:]).reshape(8, n, 3)
+        motions[:, self.pinned] = 0.0
+        apart = self.unwrapped(x)
+        apart = apart[:, None] - apart[None, :]
+        apart /= (np.linalg.norm(apart, axis=2) + np.eye(n))[:, :, None]
+        rates = np.abs(np.einsum("ijc,mijc->mij", apart, motions[:, :, None] - motions[:, None])).max(axis=0)
+        return rates < 1e-7, rank
 
     def unwrapped(self, x: FloatArray) -> FloatArray:
         """Positions made whole across the boundary, following the rows."""
@@ -473,31 +476,20 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
 def _fitted(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray) -> FloatArray:
     """Coordinates along the line, in the plane or in space that fulfil the targets, shape (n, dimension).
 
-    Gauss-Newton along a line or within a plane, where the rows are regular; starts from the present positions.
+    Along a line or within a plane the rows are regular.
     """
-    center, flat = x[atoms].mean(axis=0), affine_dimension(x[atoms])
-    axes = np.linalg.svd(x[atoms] - center)[2][:flat]
-    plane = (x[atoms] - center) @ axes.T
-    columns = (3 * atoms[:, None] + np.arange(3)).ravel()
-    scale = block.part.scale[inside]
-    whole = x.copy()
-    best, miss, worst = plane, np.inf, 0
-    for _ in range(30):
-        whole[atoms] = center + plane @ axes
-        sigma = block.part.value(whole, block.time)[inside] / scale
-        if not np.abs(sigma).max() < miss:
-            break
-        best, worst, miss = plane, int(np.argmax(np.abs(sigma))), float(np.abs(sigma).max())
-        if miss < 1e-16:
-            break
-        a = block.part.jacobian(whole, block.time)[inside][:, columns].toarray()
-        a = np.einsum("rnc,fc->rnf", a.reshape(len(inside), len(atoms), 3), axes).reshape(len(inside), -1)
-        plane = plane + np.linalg.lstsq(a / scale[:, None], -sigma, rcond=STEP_CUT)[0].reshape(plane.shape)
-    if not miss <= MISFIT:
-        name = block.set.row_name(int(block.rows[inside[worst]]))
-        why = f"since the targets do not fit a {_GROUPS[flat - 1][1]} group: row {name} stays off by {miss:.2g}"
+    flat = affine_dimension(x[atoms])
+    x = x - x[atoms].mean(axis=0)
+    axes = np.linalg.svd(x[atoms])[2][:flat]
+    x[atoms] = x[atoms] @ axes.T @ axes
+    along = np.zeros((*x.shape, len(atoms), flat))
+    along[atoms, :, np.arange(len(atoms))] = axes.T
+    found, miss = block.fulfilled(x, inside, along.reshape(x.size, -1))
+    if not miss.max() <= MISFIT:
+        name = block.set.row_name(int(block.rows[inside[np.argmax(miss)]]))
+        why = f"since the targets do not fit a {_GROUPS[flat - 1][1]} group: row {name} stays off by {miss.max():.2g}"
         raise _refused(block, atoms, inside, x, f"{why} (relative)")
-    return best
+    return found[atoms] @ axes.T
 
 
 def _bases(block: LocalRows, atoms: IntArray, plane: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -506,14 +498,7 @@ def _bases(block: LocalRows, atoms: IntArray, plane: FloatArray) -> tuple[IntArr
 
     system = np.vstack([plane.T / np.abs(plane).max(), np.ones(len(plane))])
     preferred = system * np.where(block.pinned[atoms], 2.0, 1.0)
-    bases = qr(preferred, mode="r", pivoting=True)[1][: len(system)]
-    while True:  # an atom that weighs more than the base it would replace spans a larger volume
-        shares = np.abs(np.linalg.solve(preferred[:, bases], preferred))
-        base, atom = np.unravel_index(int(np.argmax(shares)), shares.shape)
-        if shares[base, atom] <= 1 + LARGER:
-            break
-        bases[base] = atom
-    bases = np.sort(bases)
+    bases = np.sort(qr(preferred, mode="r", pivoting=True)[1][: len(system)])
     weights = np.linalg.solve(system[:, bases], system).T
     # Round so that the weights sum to one: the relation then does not depend on the origin.
     weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)

@@ -144,12 +144,9 @@ class AddressableSolver:
                 np.multiply(self._multipliers(), -1.0 if kernel else 1.0, out=multipliers)
         return tuple.__new__(Outcome, found)  # as `Outcome(*found)`, in a third of its time
 
-    def rank(
-        self, x: FloatArray, lattice: FloatArray | None, time: float = 0.0, moved: FloatArray | None = None
-    ) -> int:
-        """Independent rows at `x`: those whose pivot does not vanish; `moved` as in `Request`."""
-        outcome = self.tangents(Request(np.zeros_like(x), x, None, lattice, time, moved=moved))
-        return int(np.count_nonzero(self.pivots)) if outcome.converged else len(self.rows)
+    def rank(self, here: Request) -> int:
+        """Independent rows at `here.reference`: those whose pivot does not vanish."""
+        return int(np.count_nonzero(self.pivots)) if self.tangents(here).converged else len(self.rows)
 
 
 def address_of(kernel: Any, signature: Any) -> int:

@@ -583,12 +583,7 @@ class Chains(AddressableSolver):
     kernels = Kernels(_positions, _tangents, resolved=_resolved)
 
     def __init__(
-        self,
-        rows: ArrayLike,
-        offsets: ArrayLike,
-        atoms: ArrayLike,
-        lengths: ArrayLike,
-        inv_mass: ArrayLike,
+        self, rows: ArrayLike, offsets: ArrayLike, atoms: ArrayLike, lengths: ArrayLike, inv_mass: ArrayLike
     ) -> None:
         self._made_of = rows, offsets, atoms, lengths, inv_mass
         self.rows = np.array(rows, dtype=np.int64)

@@ -69,9 +69,9 @@ class Outcome(NamedTuple):
 
 
 class ClusterSolver(Protocol):
-    """A solver of one kind for all clusters of one shape.
+    """A solver of one kind for all clusters of one shape; `rank` counts independent rows at the reference.
 
-    Both methods touch only the atoms of their rows, and leave everything as it was when the outcome is not
+    The first two methods touch only the atoms of their rows, and leave everything as it was when the outcome is not
     converged. `multipliers`, in the order of `rows`, receive those of unit steps in what a row measures.
     """
 
@@ -85,3 +85,5 @@ class ClusterSolver(Protocol):
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """y - M^-1 A^T mu with A y = rates; `multipliers` receive mu."""
         ...
+
+    def rank(self, here: Request) -> int: ...

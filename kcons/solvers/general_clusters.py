@@ -171,7 +171,7 @@ class GeneralClusters:
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
             rounding = self._rounding(batch, data, state)
-            settled = _each(relative <= rounding)
+            settled = np.all(relative <= rounding, axis=1)
             done |= settled & (polished | (error == 0.0))
             taken += ~done
             if done.all():
@@ -231,7 +231,7 @@ class GeneralClusters:
                 b = self._weighted(batch, data)
                 size = np.linalg.norm(b, axis=2)
                 speeds = flat[batch.columns]
-                bad = ~(np.isfinite(size) & (size > 0)) | ~_each(np.isfinite(speeds))[:, None]
+                bad = ~(np.isfinite(size) & (size > 0)) | ~np.isfinite(speeds).all(axis=1, keepdims=True)
                 if bad.any():
                     return _failed(batch, bad, 0)
                 unit = b / size[..., None]
@@ -267,10 +267,10 @@ class GeneralClusters:
             multipliers[:] = mu
         return worst
 
-    def rank(self, x: FloatArray, time: float, moved: FloatArray | None = None) -> int:
-        """Independent rows at `x`, by singular values; `moved` as in `Request`."""
-        self.subset.moved = None if moved is None else moved[self.atoms]
-        data = self.subset.jacobian(x[self.atoms], time).data
+    def rank(self, here: Request) -> int:
+        """Independent rows at `here.reference`, by singular values."""
+        self.subset.moved = None if here.moved is None else here.moved[self.atoms]
+        data = self.subset.jacobian(here.reference[self.atoms], here.time).data
         return sum(rank(self._weighted(batch, data)) for batch in self._batches)
 
 
@@ -285,11 +285,6 @@ def _failed(batch: Stack, bad: NDArray[np.bool_], iterations: int, residual: Flo
     size = np.where(bad, np.inf if residual is None else np.nan_to_num(residual, nan=np.inf), -1.0)
     where = np.unravel_index(int(np.argmax(size)), size.shape)
     return Outcome(False, float(size[where]), iterations, int(batch.rows[where]))
-
-
-def _each(test: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """For each cluster, whether all of its rows pass."""
-    return np.asarray(np.all(test, axis=1), dtype=np.bool_)
 
 
 def _rms(values: FloatArray) -> FloatArray:

@@ -30,14 +30,23 @@ def rank(rows: FloatArray) -> int:
     return int(np.sum(independent(np.linalg.svd(unit, compute_uv=False))))
 
 
+def independent_rows(rows: FloatArray) -> NDArray[np.bool_]:
+    """Which rows of one matrix, shape (K, C), are the best conditioned that all others depend on."""
+    from scipy.linalg import qr  # slow to import
+
+    size = np.linalg.norm(rows, axis=1, keepdims=True)
+    triangle, order = qr((rows / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
+    # The diagonal of the triangle stands for the singular values: it does not grow, and is their size.
+    diagonal, found = np.abs(np.diagonal(triangle)), np.zeros(len(rows), np.bool_)
+    found[order[: len(diagonal)]] = independent(diagonal)
+    return found
+
+
 def least_norm(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Least-norm, least-squares solutions of a stack of systems, singular directions cut."""
     u, s, vt = np.linalg.svd(matrix, full_matrices=False)
-    return np.asarray(np.einsum("nrk,nr->nk", vt, _inverse(s) * np.einsum("nkr,nk->nr", u, right)))
-
-
-def _inverse(singular: FloatArray) -> FloatArray:
-    return np.where(independent(singular), 1 / np.where(singular > 0, singular, 1.0), 0.0)
+    inverse = np.where(independent(s), 1 / np.where(s > 0, s, 1.0), 0.0)
+    return np.asarray(np.einsum("nrk,nr->nk", vt, inverse * np.einsum("nkr,nk->nr", u, right)))
 
 
 class Stack(NamedTuple):

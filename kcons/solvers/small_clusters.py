@@ -324,12 +324,7 @@ class SmallClusters(AddressableSolver):
     name = "SmallClusters"
 
     def __init__(
-        self,
-        rows: ArrayLike,
-        atoms: ArrayLike,
-        pairs: ArrayLike,
-        lengths: ArrayLike,
-        inv_mass: ArrayLike,
+        self, rows: ArrayLike, atoms: ArrayLike, pairs: ArrayLike, lengths: ArrayLike, inv_mass: ArrayLike
     ) -> None:
         local = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         members = np.array(atoms, dtype=np.int64)

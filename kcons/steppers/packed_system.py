@@ -113,7 +113,7 @@ def spheres_of(motion: Motion) -> FloatArray | None:
 def packed_system(motion: Motion, *more: NDArray[Any]) -> PackedSystem | None:
     """All rows, and `more`; None where there are rows that move, that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
-    if held.moving or plan.between_fixed_atoms is not None or any(plan.whole):
+    if held.moving or any(plan.whole):
         return None
     if plan.driven and held.target(0.0)[~held.holonomic].any():
         return None

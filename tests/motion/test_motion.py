@@ -92,34 +92,21 @@ def test_inputs_are_left_alone(sample) -> None:
 
 
 def test_out_gets_the_result_of_a_new_array(sample) -> None:
+    """It may be what is given, the reference, or another array."""
     motion, x = sample
     move, v = steps(len(x), 3)
-    new = x + move
-    calls = {
-        "positions": (lambda y, **kw: motion.project_positions(y, x, **kw), new),
-        "velocities": (lambda y, **kw: motion.project_velocities(x, y, **kw), v),
-        "restore": (lambda y, **kw: motion.restore_positions(y, **kw), new),
-        "forces": (lambda y, **kw: motion.project_forces(x, y, **kw), v),
-    }
-    for name, (call, given) in calls.items():
-        expected = call(given)
-        here = given.copy()
-        assert call(here, out=here) is here, name
-        np.testing.assert_array_equal(here, expected, err_msg=name)
-        other = np.full_like(given, 7.0)
-        kept = given.copy()
-        assert call(given, out=other) is other, name
-        np.testing.assert_array_equal(other, expected, err_msg=name)
-        np.testing.assert_array_equal(given, kept, err_msg=name)
-        # The array of the reference may take the result.
-        reference = x.copy()
-        second = {
-            "positions": lambda given=given, r=reference: motion.project_positions(given, r, out=r),
-            "velocities": lambda given=given, r=reference: motion.project_velocities(r, given, out=r),
-            "forces": lambda given=given, r=reference: motion.project_forces(r, given, out=r),
-        }
-        if name in second:
-            np.testing.assert_array_equal(second[name](), expected, err_msg=name)
+    for call, given in (
+        (lambda y, r, **kw: motion.project_positions(y, r, **kw), x + move),
+        (lambda y, r, **kw: motion.project_velocities(r, y, **kw), v),
+        (lambda y, r, **kw: motion.project_forces(r, y, **kw), v),
+        (lambda y, r, **kw: motion.restore_positions(y, **kw), x + move),
+    ):
+        expected, kept = call(given, x), given.copy()
+        here, reference, other = given.copy(), x.copy(), np.full_like(given, 7.0)
+        for out, arguments in ((here, (here, x)), (reference, (given, reference)), (other, (given, x))):
+            assert call(*arguments, out=out) is out
+            np.testing.assert_array_equal(out, expected)
+        np.testing.assert_array_equal(given, kept)
 
 
 def test_failure_changes_nothing(sample) -> None:
@@ -147,27 +134,6 @@ def test_failure_changes_nothing(sample) -> None:
             motion.project_forces(singular, u, out=target)
         np.testing.assert_array_equal(u, kept)
         assert (lam == 5).all() and (out == 3).all()
-
-
-def test_arrays_that_cannot_take_a_result_are_refused(sample) -> None:
-    motion, x = sample
-    n = motion.constraint_set.n_rows
-    read_only = x.copy()
-    frozen(read_only)
-    for out in (x.astype(np.float32), np.asfortranarray(x), x[:-1].copy(), read_only, x.tolist()):
-        for call in (
-            lambda out=out: motion.project_positions(x, x, out=out),
-            lambda out=out: motion.project_velocities(x, x, out=out),
-            lambda out=out: motion.project_forces(x, x, out=out),
-            lambda out=out: motion.restore_positions(x, out=out),
-            lambda out=out: motion.project_positions(x, x, velocities=out, dt=1.0),
-        ):
-            with pytest.raises(InputError, match="contiguous float64"):
-                call()
-    for lam in (np.zeros(n + 1), np.zeros(n, dtype=np.float32), [0.0] * n, np.zeros((n, 1))):
-        for project in (motion.project_positions, motion.project_velocities):
-            with pytest.raises(InputError, match="multipliers"):
-                project(x, x, multipliers=lam)
 
 
 # -- corrections and multipliers --------------------------------------------------------------------
@@ -301,7 +267,7 @@ def test_a_cell_that_moves_the_image_of_a_fixed_atom_is_refused(free, of_the_set
     whole = ConstraintSet(rows, x, np.ones(len(x)), cell=[10.0] * 3)
     motion = Motion(whole, x)
     for _ in range(2):
-        with pytest.raises(ContradictionError, match=r"#6 Distance\(0, 1\) lies between fixed atoms .* in this cell"):
+        with pytest.raises(ContradictionError, match=r"#6 Distance\(0, 1\) lies between fixed atoms and is off"):
             if of_the_set:
                 whole.with_cell([11.0, 10, 10])
                 motion.project_velocities(x, x)
@@ -546,40 +512,6 @@ def test_one_cluster(n: int) -> None:
     found = worst_condition(whole.jacobian(x), w, rows, np.zeros(n - 1, int), deficiency=0)
     assert found == pytest.approx(dense(whole, x, w, rows), rel=1e-6 if n - 1 <= reports.DENSE_ROWS else 1e-3)
     assert found > min(0.2 * n, 50)
-
-
-def test_worst_of_many_clusters_of_several_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    x = np.concatenate([WATER + 5 * k + 0.3 * rng.normal(size=(3, 3)) for k in range(20)])
-    pairs = [(3 * k + i, 3 * k + j) for k in range(20) for i, j in list(combinations(range(3), 2))[: 2 + k % 2]]
-    order = rng.permutation(len(pairs))
-    pairs = np.array(pairs)[order]
-    whole = ConstraintSet(held.Distance(pairs), x, rng.uniform(1, 20, 60))
-    labels = pairs[:, 0] // 3
-    w = 1 / whole.masses
-    w[6] = 0.0  # a fixed atom
-    expected = max(dense(whole, x, w, np.flatnonzero(labels == k)) for k in range(20))
-    found = worst_condition(whole.jacobian(x), w, np.arange(len(pairs)), labels, deficiency=0)
-    assert found == pytest.approx(expected, rel=1e-9)
-    # Portions of one cluster each give the same.
-    monkeypatch.setattr(reports, "PORTION", 1)
-    again = worst_condition(whole.jacobian(x), w, np.arange(len(pairs)), labels, deficiency=0)
-    assert again == found
-    some = np.flatnonzero(labels == 3)
-    one = worst_condition(whole.jacobian(x), w, some, labels, deficiency=0)
-    assert one == pytest.approx(dense(whole, x, w, some), rel=1e-9)
-
-
-def test_out_of_reach_is_not_a_number() -> None:
-    n = reports.DENSE_DEPENDENT_ROWS + 3
-    whole, x = straight_chain(n)
-    labels = np.zeros(n - 1, int)
-    assert np.isnan(worst_condition(whole.jacobian(x), 1 / whole.masses, np.arange(n - 1), labels, deficiency=1))
-    # A gradient of zero has no direction.
-    two = ConstraintSet(held.Distance([0, 1]), WATER[:2], np.ones(2))
-    jacobian = two.jacobian(WATER[:2])
-    jacobian.data[:] = 0.0
-    assert np.isnan(worst_condition(jacobian, np.ones(2), np.arange(1), np.zeros(1, int), deficiency=0))
 
 
 # -- minima of potentials on constraints ------------------------------------------------------------

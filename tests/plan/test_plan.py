@@ -115,12 +115,17 @@ def test_anchored_clusters(fixed, pairs, expected) -> None:
 def test_fulfilled_rows_between_fixed_atoms_are_dropped() -> None:
     plan = planned([held.FixedAtoms([0, 1]), held.Distance([[0, 1], [1, 2]])], WATER)
     assert plan.labels.tolist() == [-1] * 7 + [0]
-    assert plan.rank == 7 and plan.between_fixed_atoms is None
+    assert plan.rank == 7
 
 
 @pytest.mark.parametrize(
     "row",
-    [held.Distance([0, 1], 1.1), held.VelocityFormula("vx1 + vy2", [0, 1], None, 0.5), held.Plane(0, [1.0, 0, 0], 2)],
+    [
+        held.Distance([0, 1], 1.1),
+        held.VelocityFormula("vx1 + vy2", [0, 1], None, 0.5),
+        held.Plane(0, [1.0, 0, 0], 2),
+        held.Distance([0, 1], MovingTarget(lambda t: 0.9572 + max(0.0, t - 1) ** 2)),
+    ],
 )
 def test_rows_between_fixed_atoms_that_contradict_are_refused(row) -> None:
     far = np.vstack([np.full((20, 3), 9.0) + np.arange(20)[:, None], WATER])
@@ -131,30 +136,14 @@ def test_rows_between_fixed_atoms_that_contradict_are_refused(row) -> None:
     assert set(caught.value.atoms) <= {20, 21} and str(20) in str(caught.value)
 
 
-def test_atoms_fixed_on_a_path_that_breaks_a_row_between_them() -> None:
-    """Dropped rows are watched as long as something moves; nothing changes on failure."""
-    rows = [
-        held.FixedAtoms([0], lambda t: WATER[0]),
-        held.FixedAtoms([1], lambda t: WATER[1] + [0, 0, t]),
-        held.Distance([[0, 1], [1, 2]]),
-    ]
-    motion = Motion(ConstraintSet(rows, WATER, np.ones(3)), WATER)
-    assert motion.plan.between_fixed_atoms is not None
-    motion.project_positions(WATER, WATER, time=0.0)
-    x, v = WATER + 0.01, np.zeros((3, 3))
-    kept = x.copy()
-    with pytest.raises(ContradictionError, match=r"#6 Distance\(0, 1\)"):
-        motion.project_positions(x, WATER, time=0.3, out=x, velocities=v, dt=0.1)
-    np.testing.assert_array_equal(x, kept)
-    assert not v.any()
-
-
-def test_velocity_row_between_fixed_atoms_that_agrees() -> None:
-    moving = held.FixedAtoms([0], held.MovingTarget(lambda t: [t, 0.0, 0.0], lambda t: [1.0, 0, 0], lambda t: 0.0))
-    plan = planned([moving, held.VelocityFormula("vx1", 0, None, 1.0)], WATER)
-    assert plan.rank == 3
-    with pytest.raises(ContradictionError):
-        planned([moving, held.VelocityFormula("vx1", 0, None, 1.1)], WATER)
+def test_rows_between_fixed_atoms_that_move_are_refused() -> None:
+    """Also where these go together; a row that moves elsewhere is none of these."""
+    rows = [held.FixedAtoms([0, 1], lambda t: WATER[:2] + t), held.Distance([[0, 1], [1, 2]])]
+    with pytest.raises(ContradictionError, match=r"#6 Distance\(0, 1\) lies between fixed atoms and moves; remove"):
+        planned(rows, WATER)
+    x = np.vstack([WATER, WATER + 5.0])
+    moving = held.Distance([3, 4], MovingTarget(lambda t: 0.9572 + t))
+    assert planned([held.FixedAtoms([0, 1]), held.Distance([[0, 1], [1, 2]]), moving], x).rank == 8
 
 
 # -- rows that are named twice ----------------------------------------------------------------------
@@ -345,7 +334,6 @@ def counts(held):
 
 CONVERTED = {
     "CO2 by 3": (CO2, all_pairs(3), (1, 3), 5),
-    "OCS by 3": ([[0, 0, 0], [1.16, 0, 0], [2.72, 0, 0]], all_pairs(3), (1, 3), 5),
     "C3O2 by 10": ([[0, 0, 0], [1.16, 0, 0], [2.45, 0, 0], [3.74, 0, 0], [4.9, 0, 0]], all_pairs(5), (1, 9), 5),
     "two triples of a line": (
         [[0, 0, 0], [1, 0, 0], [2.1, 0, 0], [3.3, 0, 0]],
@@ -354,7 +342,6 @@ CONVERTED = {
         5,
     ),
     "square by 6": (ring(4), all_pairs(4), (3, 3), 6),
-    "formate by 6": (FORMATE, all_pairs(4), (3, 3), 6),
     "hexagon by 15": (ring(6), all_pairs(6), (3, 9), 6),
     "hexagon by 12": (ring(6), HEXAGON_12, (3, 9), 6),
     "benzene by 66": (BENZENE, all_pairs(12), (3, 27), 6),
@@ -417,11 +404,6 @@ def test_planar_groups_held_by_bonds_and_angles_are_converted(x, bonds, angles, 
 
 LEFT_ALONE = {
     "methane by 10 distances": (METHANE, [Distance(all_pairs(5))], 9),
-    "methane by bonds and angles": (
-        METHANE,
-        [Distance([(0, i) for i in range(1, 5)]), Angle([(i, 0, j) for i, j in combinations(range(1, 5), 2)])],
-        9,
-    ),
     "hexagon with an atom above all of it": (np.vstack([ring(6), [[0.2, 0.1, 1.3]]]), [Distance(all_pairs(7))], 15),
     "water by three distances": ([[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0]], [Distance(all_pairs(3))], 3),
     **{
@@ -432,7 +414,6 @@ LEFT_ALONE = {
         )
         for degrees in (179.0, 179.9, 179.99)
     },
-    "straight chain": ([[k, 0, 0] for k in range(6)], [Distance([(k, k + 1) for k in range(5)])], 5),
     "planar zigzag by bonds, angles and trans dihedrals": (
         [[0, 0, 0], [1, 0.5, 0], [2, 0, 0], [3, 0.5, 0], [4, 0, 0]],
         [
@@ -447,15 +428,6 @@ LEFT_ALONE = {
         [Distance([(0, 1), (0, 2), (0, 3)]), Dihedral([(1, 0, 2, 3)])],
         4,
     ),
-    "ethylene by bonds, angles and dihedrals": (
-        ETHYLENE,
-        [
-            Distance(ETHYLENE_BONDS),
-            Angle(ETHYLENE_ANGLES),
-            Dihedral([(2, 0, 1, 4), (2, 0, 1, 5), (3, 0, 1, 4), (3, 0, 1, 5)]),
-        ],
-        12,
-    ),
     "CO2 held on its line and by three distances": (
         CO2,
         [Distance(all_pairs(3)), LinearRelation(1, [0, 2], [0.5, 0.5])],
@@ -466,7 +438,6 @@ LEFT_ALONE = {
         [Distance(all_pairs(4)), Plane([0, 1, 2, 3], normal=[0, 0, 1], offset=0.0)],
         9,
     ),
-    "bond on a sphere": ([[1, 0, 0], [0, 1, 0]], [Distance([(0, 1)]), Sphere([0, 1], center=[0, 0, 0])], 3),
     "atom between two fixed ones": (
         [[0, 0, 0], [1, 0.5, 0], [2, 0, 0]],
         [Distance([(0, 1), (1, 2)]), FixedAtoms([0, 2])],
@@ -540,10 +511,6 @@ REFUSED = {
     "chain stretched between two fixed atoms": (
         [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]],
         [Distance([(0, 1), (1, 2), (2, 3)]), FixedAtoms([0, 3])],
-    ),
-    "hexagon by its bonds and long diagonals": (
-        ring(6),
-        [Distance([(i, (i + 1) % 6) for i in range(6)] + [(i, i + 3) for i in range(3)])],
     ),
     "sphere touching a plane": (
         [[0, 0, 1.0]],

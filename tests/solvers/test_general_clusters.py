@@ -68,7 +68,7 @@ def test_rows_that_are_nearly_parallel(exponent: int) -> None:
     w = rng.uniform(0.5, 2, (4, 3))
     rows = [weighted_square(w), weighted_square(w + 10.0**-exponent * rng.normal(size=(4, 3)))]
     solver, whole = solver_of(rows, x)
-    assert solver.rank(x, 0.0) == 2
+    assert solver.rank(Request(0 * x, x)) == 2
     # A step that two such rows can answer: along the surface, and off it to second order.
     v = Motion(whole, x).project_velocities(x, rng.normal(size=x.shape))
     new = x + 1e-2 * np.sqrt(10.0**-exponent) * v

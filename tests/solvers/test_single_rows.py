@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 
@@ -187,13 +186,3 @@ def test_where_one_fails_nothing_has_changed(bad) -> None:
     assert not packed_tangents(X, v, tables)
     np.testing.assert_array_equal(new, kept)
     np.testing.assert_array_equal(v, unlike)
-
-
-def test_kernels_are_compiled_for_their_own_solver_only() -> None:
-    """Those of the solver serve Python and other kernels."""
-    solver = solvers()[0]
-    x = X + 0.01
-    solver.positions(Request(x, X))
-    tables_of([solver])
-    for kernel in solver.kernels[:3]:
-        assert isinstance(kernel, numba.core.registry.CPUDispatcher) and len(kernel.signatures) == 1

@@ -263,10 +263,6 @@ class GivenRows:
                 runs[mine, 0], runs[mine, 1] = rows_at_once(item.row).address, apart[first[mine]]
         return runs
 
-    @property
-    def python(self) -> list[CalledRows]:
-        return [each for each in self.functions if isinstance(each, CalledRows)]
-
     def refuse(self) -> None:
         """Raise what a Python function has raised while a kernel ran."""
         for each in self.functions:
