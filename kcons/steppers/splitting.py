@@ -46,12 +46,7 @@ SRKN_14A = (
 
 
 def fractions_of(values: Sequence[float], item: str) -> tuple[float, ...]:
-    """Fractions of a step: a palindrome with the sum 1.
-
-    Raises
-    ------
-    InputError
-    """
+    """Fractions of a step; `InputError` for what is no palindrome with the sum 1."""
     g = tuple(float(x) for x in values)
     if not g or any(abs(a - b) > 1e-15 for a, b in zip(g, reversed(g), strict=True)):
         raise InputError(f"{item} {g} are no palindrome; give them so that steps can be taken back", item=item)
@@ -186,14 +181,9 @@ class Geodesic(Splitting):
     Verlet without constraints, it depends on how fast the forces vary, no longer on how fast the constrained directions
     turn.
 
-    Works with moving rows, which are met at the time of each substep, with velocity rows, and with forces that
-    depend on velocities.
-
     Not worth it where forces are cheap and vary as fast as the constrained directions turn: RATTLE with as many
-    smaller steps is then better.
-
-    A rigid rotor in free flight turns by exactly n asin(omega dt/n) a step of n substeps; without a solution for
-    omega dt >= n. An atom on a sphere turns by exactly omega dt.
+    smaller steps is then better. A rigid rotor in free flight turns by exactly n asin(omega dt/n) a step of n substeps;
+    without a solution for omega dt >= n. An atom on a sphere turns by exactly omega dt.
 
     Parameters
     ----------
@@ -221,12 +211,9 @@ class Composition(Splitting):
     and a palindrome of fractions, cancel them: sum g^3 = 0 gives order 4, three more conditions order 6. Some fractions
     must be negative: constraints, targets and forces are then asked for earlier times.
 
-    One force evaluation a fraction, more for forces that depend on velocities.
-
-    Works with all that `Rattle` works with: velocity rows, rows and targets that move.
-
-    Not for targets or forces with fewer derivatives in time than the order, which is then lost. Where the sums of
-    the fractions leave [0, 1], as those of `Yoshida4` do, not for targets or forces that begin with the run either.
+    One force evaluation a fraction, more for forces that depend on velocities. Not for targets or forces with fewer
+    derivatives in time than the order, which is then lost. Where the sums of the fractions leave [0, 1], as those of
+    `Yoshida4` do, not for targets or forces that begin with the run either.
 
     Parameters
     ----------
@@ -259,10 +246,7 @@ class Composition(Splitting):
 
 
 class Suzuki4(Composition):
-    """Order 4, five force evaluations: the robust choice of order 4 for all that is held.
-
-    All stages lie within the step. Not for targets or forces that are not smooth in time.
-    """
+    """Order 4, five force evaluations, all stages within the step: the robust choice of order 4."""
 
     def __init__(self) -> None:
         super().__init__(SUZUKI_4, 4, "Suzuki4()")
@@ -281,8 +265,7 @@ class Yoshida4(Composition):
 class KahanLi6(Composition):
     """Order 6, nine force evaluations: for high accuracy where forces depend on velocities.
 
-    All stages lie within the step. Not for targets or forces that are not smooth in time, nor where solves are
-    tight: some of its RATTLE steps are 0.79 of the whole step long.
+    All stages lie within the step. Not where solves are tight: some of its RATTLE steps are 0.79 of the whole long.
     """
 
     def __init__(self) -> None:
@@ -297,10 +280,9 @@ class RungeKuttaNystrom(Splitting):
     exact drifts; a drift whose own order is that of the splitting keeps it, here a composition of RATTLE drifts, which
     costs projections and no force. Along great circles where every row allows it.
 
-    Works with moving rows and with rows linear in the velocities; forces may depend on time.
-
-    Not with forces that depend on the velocities: the order would be lost without any sign, and `check` raises.
-    Not worth it where forces cost less than the projections of a drift, five or nine to a force evaluation.
+    All stages lie within the step. Not with forces that depend on the velocities: the order would be lost without any
+    sign, and `check` raises. Not worth it where forces cost less than the projections of a drift, five or nine to a
+    force evaluation.
 
     References
     ----------
@@ -316,10 +298,7 @@ class RungeKuttaNystrom(Splitting):
 
 
 class BlanesMoan4(RungeKuttaNystrom):
-    """Order 4, six force evaluations (SRKN_6^b), drifts by Suzuki's composition: 30 projections a step.
-
-    All stages lie within the step. Not for forces that depend on the velocities (raises; use Suzuki4 instead).
-    """
+    """Order 4, six force evaluations (SRKN_6^b), drifts by Suzuki's composition: 30 projections a step."""
 
     order = 4
 
@@ -328,10 +307,7 @@ class BlanesMoan4(RungeKuttaNystrom):
 
 
 class BlanesMoan6(RungeKuttaNystrom):
-    """Order 6, eleven force evaluations (SRKN_11^b), drifts by Kahan and Li's composition: 99 projections a step.
-
-    All stages lie within the step. Not for forces that depend on the velocities (raises; use KahanLi6 instead).
-    """
+    """Order 6, eleven force evaluations (SRKN_11^b), drifts by Kahan and Li's composition: 99 projections a step."""
 
     order = 6
 
@@ -342,8 +318,7 @@ class BlanesMoan6(RungeKuttaNystrom):
 class BlanesMoan6a(RungeKuttaNystrom):
     """Order 6, fourteen force evaluations (SRKN_14^a), beginning and ending with a drift: 135 projections a step.
 
-    All stages lie within the step. Not for forces that depend on the velocities (raises; use KahanLi6 instead), nor
-    where the forces at the end of a step are wanted: its states carry none.
+    Not where the forces at the end of a step are wanted: its states carry none.
     """
 
     order = 6

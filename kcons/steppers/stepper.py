@@ -55,12 +55,7 @@ class Stepper(Protocol):
 
 
 def require_stepper(stepper: Any, item: str = "stepper") -> None:
-    """Refuse a class, or a name.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise `InputError` for a class, or a name."""
     if isinstance(stepper, type) or not hasattr(stepper, "step"):
         raise InputError(f"{item} is {stepper!r}; give an object, such as kcons.Rattle()", item=item)
 
@@ -100,13 +95,7 @@ class Listed(DropsSystemCaches):
 
 
 def stays(state: State, dt: float) -> State | None:
-    """The state after a step of zero, None for any other step.
-
-    Raises
-    ------
-    InputError
-        `dt` is not finite.
-    """
+    """The state after a step of zero, None for any other step; `InputError` where `dt` is not finite."""
     if not math.isfinite(dt):
         raise InputError(f"the time step is {dt}", item="dt")
     return replace(state, step=state.step + 1) if dt == 0 else None
@@ -135,7 +124,7 @@ def retold(error: Error, message: str, kind: type[Error], step: int) -> Error:
     return told
 
 
-class ReversibilityCheck(Listed):
+class ReversibilityCheck:
     """A stepper that reverses every step and compares with its start, to find solves that fail silently.
 
     Projections have more than one solution when a step is large; a step that lands on another branch than the
@@ -174,15 +163,6 @@ class ReversibilityCheck(Listed):
 
     def __repr__(self) -> str:
         return f"ReversibilityCheck({self.stepper!r})"
-
-    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        """Those of the stepper, whose step is then taken back and compared."""
-        if not isinstance(self.stepper, Listed):
-            raise UnsupportedError(f"{self.stepper!r} does not say what its step consists of")
-        return self.stepper.operations(system)
-
-    def parts(self, system: System | None = None) -> tuple[Operation, ...]:
-        return self.stepper.parts(system) if isinstance(self.stepper, Listed) else self.operations(system)
 
     def check(self, system: System) -> None:
         self.stepper.check(system)

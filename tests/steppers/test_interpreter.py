@@ -352,25 +352,6 @@ def test_forces_that_know_the_time_and_reuse_their_array(stepper) -> None:
     assert found.forces is None or not np.shares_memory(found.forces, room)
 
 
-def test_forces_are_not_copied_and_those_of_other_kinds_are_taken_as_they_come() -> None:
-    system, state = molecules(*GROUPS)
-    state, force, made = system.with_forces(state), system.force, []
-    step = type(system).accepted
-    system.accepted = lambda raw, number, copy: made.append((number, copy)) or step(system, raw, number, copy)
-    after = Rattle().march(system, state, 0.02, 8)
-    assert not made
-    kinds = (np.ndarray.tolist, np.asfortranarray, lambda f: np.repeat(f, 2, axis=1)[:, ::2], np.float32, np.longdouble)
-    for kind in kinds:
-        made.clear()
-        system.force = lambda x, time, kind=kind: kind(force(x, time))
-        found = Rattle().march(system, state, 0.02, 8)
-        assert made == [(number, False) for number in range(1, 9)]
-        if kind is not np.float32:
-            assert_same(found, after)
-        else:
-            assert distance(found, after) < 1e-6
-
-
 @pytest.mark.parametrize("kind", [np.float32, np.asfortranarray, lambda a: a[::-1].copy()[::-1]])
 @pytest.mark.parametrize("stepper", [Rattle(), Suzuki4()], ids=repr)
 def test_starts_of_other_kinds_of_arrays(stepper, kind) -> None:
@@ -431,17 +412,6 @@ def test_a_temperature_that_is_changed_between_steps_counts_at_once(make) -> Non
     kept = state.copied()
     one.thermal_energy = other.thermal_energy = 0.3
     assert_same(one.step(system, state, 0.02), other.step(system, replace(kept, origin=None), 0.02))
-
-
-@pytest.mark.parametrize("make", [lambda: NoseHooverChain(0.1, 2.0), lambda: Isokinetic(0.1)])
-def test_bodies_that_feel_nothing_are_noticed_also_where_steps_go_on(make) -> None:
-    """After 20,000 steps, however many are made at once."""
-    system, state = molecules(*GROUPS, force=lambda x, t: -0.1 * x * [1.0, 1.7, 0.6])
-    thermostat = make()
-    state = thermostat.step(system, replace(state, step=19_990), 0.001)
-    with pytest.warns(UserWarning, match="feel"):
-        end = thermostat.march(system, state, 0.001, 40)
-    assert end.step == 20_031
 
 
 def test_copies_of_a_system_begin_anew() -> None:
@@ -546,13 +516,7 @@ def test_steps_without_solution_are_the_engines(name) -> None:
 
 @pytest.mark.parametrize(
     ("others", "ions", "bad"),
-    [
-        ([], 0, 50),
-        (["triangles"] * 11, 0, 50),
-        ([*["triangles"] * 11, *["methyl"] * 3], 0, 50),
-        (["methyl"] * 2, 300, 50),
-        (["long"], 0, 200),
-    ],
+    [([], 0, 50), ([*["triangles"] * 11, *["methyl"] * 3], 0, 50), (["methyl"] * 2, 300, 50), (["long"], 0, 200)],
 )
 def test_nothing_changes_where_a_chain_has_no_solution(others, ions, bad) -> None:
     """Also not what was solved before it: the kernel of chains writes at once."""

@@ -155,13 +155,6 @@ def test_state_off_the_constraints_is_named_as_the_cause():
         Rattle().step(system, crossed, 1.0)
 
 
-def test_huge_force_along_a_bond_cancels():
-    pull = np.array([[1e12, 0, 0], [-1e12, 0, 0]])
-    system, state = rotor(omega=0.0, force=lambda x, t: pull)
-    end = run(system, state, 1e-3, 10)
-    assert np.linalg.norm(end.positions[0] - end.positions[1]) == pytest.approx(1.2, rel=1e-10)
-
-
 def test_unsettled_friction_is_reported():
     system, state = rotor(force=lambda x, v, t: -1e3 * v, velocity_dependent=True)
     with pytest.raises(ConvergenceError, match="time step too large") as caught:
@@ -175,9 +168,6 @@ def test_forces_that_depend_on_velocities_are_taken_back(stepper):
     back = run(system, run(system, start, 0.05, 20, stepper=stepper), -0.05, 20, stepper=stepper)
     assert np.abs(back.positions - start.positions).max() <= 1e-12
     assert np.abs(back.velocities - start.velocities).max() <= 1e-12
-
-
-# -- compositions -----------------------------------------------------------------------------------
 
 
 # -- the geodesic splitting -------------------------------------------------------------------------

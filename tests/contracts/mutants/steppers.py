@@ -64,12 +64,12 @@ MUTANTS = {
         "            if «pairs→False»:": "interpreter::steps_in_kernels_are_those_of_the_engine",
     },
     "steppers/files.py": {
-        "if «count != len(archive.namelist())→False»:": "state::a_damaged_byte_is_noticed",
+        "if «sha256(content).digest() != checksum→False»:": "state::a_damaged_byte_is_noticed",
         "«unfinished.unlink(missing_ok=True)→pass»": "steppers/files::a_file_is_there_once_it_is_whole",
         '{target.name}«.{token_hex(8)}→»{UNFINISHED}"': "steppers/files::writers_of_one_path_do_not_meet",
         "«fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)→pass»": "steppers/files::a_folder_is_of_one_run_at_a_time",
         "        if «wrong→False»:": "steppers/files::a_folder_of_something_else_is_refused",
-        "if «unpacked > length→False»:": "steppers/files::an_archive_that_would_unpack_to_more_is_refused",
+        "«left.unlink(missing_ok=True)→pass»": "steppers/files::a_run_that_was_killed_leaves_a_folder_to_the_next",
     },
     "steppers/running.py": {
         "if steps and holds and «state is not system.last→False»:": "state::start_off_the_constraints",
@@ -120,8 +120,10 @@ MUTANTS = {
         "BOND_LIKE = «1→0».5": "images::a_polymer_that_closes_through_the_boundary",
     },
     "plan/plan.py": {
-        "«plan.eliminate_last[rows[order]] = left_over→pass»": "plan::dependent_rows_are_eliminated_last",
-        "plan.eliminate_last[rows«[order]→»] = left_over": "plan::rank_is_that_of_the_dense_matrix",
+        "plan.eliminate_last[rows] = «~→0 * »independent_rows": "plan::dependent_rows_are_eliminated_last",
+    },
+    "solvers/rank_revealing.py": {
+        "«independent→np.isfinite»(diagonal)": "plan::rank_is_that_of_the_dense_matrix",
     },
     "motion/certificate.py": {
         "SPEED = 1«0.→e1»0": "certificate::a_solver_that_is_wrong_without_knowing_is_found_in_the_first_step",
