@@ -104,13 +104,7 @@ class Plan:
         return self._places
 
     def check_cell(self) -> None:
-        """Refuse rows between fixed atoms that these do not fulfil, in the present cell: no solver sees them.
-
-        Raises
-        ------
-        ContradictionError
-            Such a row is off, asks for a velocity, or moves, as its atoms may.
-        """
+        """Raise `ContradictionError` for rows between fixed atoms that are off in this cell, or that move."""
         if self.resting is None:
             return
         rows, x, time = self.resting
@@ -125,12 +119,10 @@ class Plan:
         bad = np.flatnonzero(moving | ~(miss[rows] <= found.allowed[rows]))
         if len(bad):
             row = int(rows[bad[0]])
+            name, atoms = self.named.row_name(row), self.named.row_atoms(row)
             said = "moves" if moving[bad[0]] else f"is off by {miss[row]:g}"
-            raise ContradictionError(
-                f"row {self.named.row_name(row)} lies between fixed atoms and {said}; remove it or free one of these",
-                rows=[row],
-                atoms=self.named.row_atoms(row),
-            )
+            message = f"row {name} lies between fixed atoms and {said}; remove it or free one of its atoms"
+            raise ContradictionError(message, rows=[row], atoms=atoms)
 
     def least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:
         """Multipliers of least norm with the same constraint force, where rows depend on each other."""

@@ -61,6 +61,8 @@ UNSOLVABLE = 1e-4
 FLAT = 1e-6
 #: Relative misfit between the targets and a flat geometry above which the conversion is refused.
 MISFIT = 1e-6
+#: Bases are exchanged where the volume that they span grows by more than this part.
+LARGER = 1e-3
 #: Of rigid groups of one, two and three dimensions: where they lie, what they are, their degrees of freedom, and what
 #: holds them.
 _GROUPS = (
@@ -316,32 +318,20 @@ class LocalRows:
         some = self.alone if rows is None else replace(self.alone, rows=rows[None])
         return some.rows.size > 1 and bool(some.suspects(x)[0])
 
-    def fulfilled(
-        self, x: FloatArray, rows: IntArray, along: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Positions that fulfil the targets of rows, as nearly as Gauss-Newton gets, and what rows miss by their scale.
-
-        Positions change by combinations of the columns of `along`, or as free atoms can.
-        """
-        best, miss = x, np.full(len(rows), np.inf)
-        for _ in range(60):
-            sigma = self.part.value(x, self.time)[rows]
-            off = np.abs(sigma) / self.part.scale[rows]
-            # Towards a flat geometry singular values are the square root of this, 1e-7: lost by any measure.
-            if not off.max() < miss.max() and not off.max() >= 1e-14:
-                break
-            if off.max() < miss.max():
-                best, miss = x, off
-            unit, norms = self.linear(x)
-            a = unit[rows] if along is None else unit[rows] @ along
-            step = np.linalg.lstsq(a, -sigma / norms[rows], rcond=STEP_CUT)[0]
-            x = x + (step if along is None else along @ step).reshape(x.shape)
-        return best, miss
-
     def restored(self) -> LocalRows:
-        """The same block where its targets are fulfilled."""
+        """The same block at positions that fulfil its targets, as nearly as Gauss-Newton gets there."""
+        x = self.x.copy()
+        held = self.part.holonomic
+        for _ in range(60):
+            sigma = self.part.value(x, self.time)
+            # Towards a flat geometry the singular value is the square root of this, 1e-7: lost by any measure.
+            if np.max(np.abs(sigma) / self.part.scale) < 1e-14:
+                break
+            unit, norms = self.linear(x)
+            step = np.linalg.lstsq(unit[held], -(sigma / norms)[held], rcond=STEP_CUT)[0]
+            x = x + step.reshape(x.shape)
         other = copy.copy(self)
-        other.x = self.fulfilled(self.x, np.flatnonzero(self.part.holonomic))[0]
+        other.x = x
         return other
 
     def nearby(self, rng: np.random.Generator) -> FloatArray:
@@ -476,20 +466,31 @@ def _body(block: LocalRows, atoms: IntArray, x: FloatArray) -> FlatBody:
 def _fitted(block: LocalRows, atoms: IntArray, inside: IntArray, x: FloatArray) -> FloatArray:
     """Coordinates along the line, in the plane or in space that fulfil the targets, shape (n, dimension).
 
-    Along a line or within a plane the rows are regular.
+    Gauss-Newton along a line or within a plane, where the rows are regular; starts from the present positions.
     """
-    flat = affine_dimension(x[atoms])
-    x = x - x[atoms].mean(axis=0)
-    axes = np.linalg.svd(x[atoms])[2][:flat]
-    x[atoms] = x[atoms] @ axes.T @ axes
-    along = np.zeros((*x.shape, len(atoms), flat))
-    along[atoms, :, np.arange(len(atoms))] = axes.T
-    found, miss = block.fulfilled(x, inside, along.reshape(x.size, -1))
-    if not miss.max() <= MISFIT:
-        name = block.set.row_name(int(block.rows[inside[np.argmax(miss)]]))
-        why = f"since the targets do not fit a {_GROUPS[flat - 1][1]} group: row {name} stays off by {miss.max():.2g}"
+    center, flat = x[atoms].mean(axis=0), affine_dimension(x[atoms])
+    axes = np.linalg.svd(x[atoms] - center)[2][:flat]
+    plane = (x[atoms] - center) @ axes.T
+    columns = (3 * atoms[:, None] + np.arange(3)).ravel()
+    scale = block.part.scale[inside]
+    whole = x.copy()
+    best, miss, worst = plane, np.inf, 0
+    for _ in range(30):
+        whole[atoms] = center + plane @ axes
+        sigma = block.part.value(whole, block.time)[inside] / scale
+        if not np.abs(sigma).max() < miss:
+            break
+        best, worst, miss = plane, int(np.argmax(np.abs(sigma))), float(np.abs(sigma).max())
+        if miss < 1e-16:
+            break
+        a = block.part.jacobian(whole, block.time)[inside][:, columns].toarray()
+        a = np.einsum("rnc,fc->rnf", a.reshape(len(inside), len(atoms), 3), axes).reshape(len(inside), -1)
+        plane = plane + np.linalg.lstsq(a / scale[:, None], -sigma, rcond=STEP_CUT)[0].reshape(plane.shape)
+    if not miss <= MISFIT:
+        name = block.set.row_name(int(block.rows[inside[worst]]))
+        why = f"since the targets do not fit a {_GROUPS[flat - 1][1]} group: row {name} stays off by {miss:.2g}"
         raise _refused(block, atoms, inside, x, f"{why} (relative)")
-    return found[atoms] @ axes.T
+    return best
 
 
 def _bases(block: LocalRows, atoms: IntArray, plane: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -498,7 +499,14 @@ def _bases(block: LocalRows, atoms: IntArray, plane: FloatArray) -> tuple[IntArr
 
     system = np.vstack([plane.T / np.abs(plane).max(), np.ones(len(plane))])
     preferred = system * np.where(block.pinned[atoms], 2.0, 1.0)
-    bases = np.sort(qr(preferred, mode="r", pivoting=True)[1][: len(system)])
+    bases = qr(preferred, mode="r", pivoting=True)[1][: len(system)]
+    while True:  # an atom that weighs more than the base it would replace spans a larger volume
+        shares = np.abs(np.linalg.solve(preferred[:, bases], preferred))
+        base, atom = np.unravel_index(int(np.argmax(shares)), shares.shape)
+        if shares[base, atom] <= 1 + LARGER:
+            break
+        bases[base] = atom
+    bases = np.sort(bases)
     weights = np.linalg.solve(system[:, bases], system).T
     # Round so that the weights sum to one: the relation then does not depend on the origin.
     weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
