@@ -328,7 +328,6 @@ class Kind(NamedTuple):
 ANY = Kind("any unit", None)
 NUMBER = Kind("a plain number", ())
 LENGTH = Kind("nm", (("length", 1),))
-SPEED = Kind("nm/ps", (("length", 1), ("time", -1)))
 ANGLE = Kind("radian", (("angle", 1),))
 TIME = Kind("ps", (("time", 1),))
 #: A vector of which only the direction counts.

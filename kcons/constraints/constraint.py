@@ -94,7 +94,8 @@ class Constraint:
     #: Puts the value into ``out[0]`` and the gradient behind it, x, y, z by atom: of the positions ``r[0]``, ``r[1]``,
     #: ... of the atoms of one row in the same order, of its `parameters`, ``p[0]``, ... and of the time t. Written with
     #: + - * /, ``numpy.sqrt`` and the like, so that it can be compiled, and takes arrays of many rows and complex
-    #: numbers (``numpy.arctan2`` of real parts: only gradients are differentiated). See `VelocityRows` for those.
+    #: numbers (``numpy.arctan2`` of real parts: only gradients are differentiated). Of a velocity row a . v, of the
+    #: middle of a flight and, behind it, its way d: the value a . d, and its change by the end, a + (da/dr)^T d/2.
     row: Any = None
     #: Puts dq/dt into ``out[0]``, where `row` depends on t: of the same.
     rate: Any = None

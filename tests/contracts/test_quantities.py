@@ -13,7 +13,7 @@ from openmm import Vec3, unit
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, constrain, draw_velocities
 from kcons.constraints import FAMILIES, CustomVelocity, Distance, from_dict
-from kcons.constraints.arguments import ANGLE, ANY, DIRECTION, HELD, LENGTH, MD_UNITS, NUMBER, SPEED, TIME, rules_of
+from kcons.constraints.arguments import ANGLE, ANY, DIRECTION, HELD, LENGTH, MD_UNITS, NUMBER, TIME, rules_of
 from kcons.errors import InputError
 
 nm, angstrom, fs = unit.nanometer, unit.angstrom, unit.femtosecond
@@ -72,11 +72,6 @@ MADE = {
         **{"formula": "z1 - a*x1", "atoms": [0], "parameters": {"a": 2.0}, "target": 0.3, "period": 2.0},
     },
     "VelocityFormula": {"formula": "vz1 - a*x1*vx1", "atoms": [0], "parameters": {"a": 2.0}, "target": 0.3},
-    "KnifeEdge": {"back": [0], "front": [1], "normal": [0, 1.0, 1.0], "contact": [0.5], "target": 0.1},
-    "Rolling": {
-        **{"hub": [0], "rim": [1], "radius": 0.2, "heading": [1.0, 0, 0], "normal": [0, 0, 1.0]},
-        **{"target": 0.1},
-    },
     "CustomVelocity": {
         **{"atoms": [[0]], "coefficients": up, "target": 0.1, "time_dependent": False},
         **{"translation_invariant": False, "length": 0.5, "time_step": 0.1},
@@ -84,21 +79,20 @@ MADE = {
 }
 #: Arguments that are no measured numbers: atoms, functions, flags.
 OTHERS = {
-    *("self", "pairs", "triples", "quads", "atoms", "bases", "groups", "axes", "group_a", "group_b", "back", "front"),
-    *("hub", "rim", "function", "gradient", "formula", "parameters"),
+    *("self", "pairs", "triples", "quads", "atoms", "bases", "groups", "axes", "group_a", "group_b"),
+    *("function", "gradient", "formula", "parameters"),
     *("mass_weighted", "time_dependent", "translation_invariant"),
 }
 #: How a number of each kind is written with a unit: what it is multiplied with, and the unit.
 WRITTEN = {
     LENGTH: (10.0, angstrom),
     ANGLE: (180 / np.pi, unit.degree),
-    SPEED: (0.01, angstrom / fs),
     TIME: (1e3, fs),
     NUMBER: (1.0, unit.dimensionless),
     DIRECTION: (10.0, angstrom),
     ANY: (10.0, angstrom),
 }
-WRONG = {LENGTH: unit.kelvin, ANGLE: nm, SPEED: nm, TIME: nm, NUMBER: nm}
+WRONG = {LENGTH: unit.kelvin, ANGLE: nm, TIME: nm, NUMBER: nm}
 
 
 def kind_of(family, name):

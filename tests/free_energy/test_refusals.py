@@ -12,11 +12,12 @@ from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.lj import LennardJones
 from ase.md.verlet import VelocityVerlet
+from constraint_cases import blade
 from scan_systems import chain, threefold
 
 from kcons import ConstraintSet
 from kcons.ase import Constraints
-from kcons.constraints import Angle, CenterDistance, CustomVelocity, Dihedral, Distance, FixedAtoms, KnifeEdge, Plane
+from kcons.constraints import Angle, CenterDistance, CustomVelocity, Dihedral, Distance, FixedAtoms, Plane
 from kcons.errors import ConstraintError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.free_energy import (
     AseRecorder,
@@ -92,7 +93,7 @@ SAMPLERS = [
     (lambda: methanol({"turn": 90}), "turn", "'turn' is 90, and no kcons constraint"),
     *(
         (partial(methanol, {"q": row}), None, r"q is .*one row that holds positions", UnsupportedError)
-        for row in (Distance([[0, 1], [1, 3]]), KnifeEdge(0, 1, (0, 0, 1)))
+        for row in (Distance([[0, 1], [1, 3]]), blade([0, 1]))
     ),
     (lambda: straight(_ENDS), None, "collinear|undefined", SingularGeometryError),
     (lambda: two_particles({"r": Distance([[0, 1], [1, 0]])}), None, r"r is .*one row", UnsupportedError),
@@ -108,7 +109,7 @@ SAMPLERS = [
 
 RING = [[0, 0.1, 0.2], [1.1, 0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9], [3.1, 0.4, 1.9], [2.2, -0.5, 2.4]]
 X = np.array([*RING, [9, 9.1, 9.2], [10.1, 9, 8.9]])
-R, CENTER, EDGE = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5]), KnifeEdge(6, 7, (0, 0, 1))
+R, CENTER, EDGE = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5]), blade([6, 7])
 SET, STILL = ConstraintSet([R, CENTER, EDGE], X, np.ones(8)), np.zeros((8, 3))
 
 

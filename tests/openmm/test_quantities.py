@@ -7,7 +7,7 @@ from collective_cases import bond, with_variable
 from openmm import unit
 from openmm_systems import dumbbell, particles, started, state_of
 
-from kcons.constraints import Angle, CustomVelocity, Distance, FixedAtoms, ImplicitSurface, KnifeEdge, Sphere
+from kcons.constraints import Angle, CustomVelocity, Distance, FixedAtoms, ImplicitSurface, Sphere, VelocityFormula
 from kcons.errors import InputError
 from kcons.openmm import (
     CarriedConstraints,
@@ -53,7 +53,7 @@ def test_rows_are_held_at_what_was_written():
         Distance([[0, 1]], 1.0 * angstrom),
         Angle([[0, 1, 2]], [115.0] * unit.degrees),
         Sphere([3], [0, 0, 0] * angstrom, radius=3.8 * angstrom),
-        KnifeEdge([0], [1], [0, 0, 1], target=0.001 * angstrom / unit.femtosecond),
+        VelocityFormula("vx1", 0, target=0.001 * angstrom / unit.femtosecond),
     ]
     held = sigma(given)
     np.testing.assert_allclose(held.target(), [0.1, np.radians(115), 0.38, 0.1])

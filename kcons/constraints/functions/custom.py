@@ -31,7 +31,6 @@ from kcons.constraints.target import (
     nearest_image,
     second_derivative,
 )
-from kcons.constraints.velocity import VelocityRows
 from kcons.errors import InputError
 
 __all__ = ["Custom", "CustomVelocity", "ImplicitSurface"]
@@ -321,7 +320,7 @@ class ImplicitSurface(Custom):
         return np.asarray(self._checked(found, "function", (self.n_rows,)))
 
 
-class CustomVelocity(PythonRows, VelocityRows):
+class CustomVelocity(PythonRows):
     """A row whose coefficients are a function, called once a row.
 
     Parameters
@@ -342,6 +341,8 @@ class CustomVelocity(PythonRows, VelocityRows):
         Differences are taken at steps of at most 1e-3 `length`, and, with `time_dependent`, of `time_step`.
     """
 
+    holonomic = False
+    kind = RowKind.VELOCITY
     singular = "the coefficients are zero or not finite; move the atoms"
     functions: ClassVar[tuple[str, ...]] = ("coefficients",)
 

@@ -18,10 +18,7 @@ from kcons.constraints import (
     Distance,
     Formula,
     ImplicitSurface,
-    KnifeEdge,
-    Rolling,
     Sphere,
-    VelocityFormula,
     from_dict,
 )
 from kcons.constraints.functions import formula as formulas
@@ -217,29 +214,6 @@ def test_what_is_undefined_at_the_start_is_named(formula, x1, message):
     with pytest.raises((SingularGeometryError, InputError), match=message) as caught:
         ConstraintSet([Sphere(0, [1.0, 0, 0]), row], x, np.ones(2), time=TIME)
     assert caught.value.atoms in ((1,), ())
-
-
-# -- linear in the velocities ------------------------------------------------------------------------------
-
-BLADE = "((x2 - x1)*vy1 - (y2 - y1)*vx1)/sqrt((x2 - x1)**2 + (y2 - y1)**2)"
-WHEEL = "vx1 - R*((z2 - z1)*(vx2 - vx1) - (x2 - x1)*(vz2 - vz1))/((x2 - x1)**2 + (z2 - z1)**2)"
-UP = np.array([0.0, 0.0, 1.0])
-
-
-@pytest.mark.parametrize(
-    ("formula", "family"),
-    [
-        (VelocityFormula(BLADE, [0, 1]), KnifeEdge(0, 1, UP)),
-        (VelocityFormula(WHEEL, [0, 1], {"R": 0.7}), Rolling(0, 1, 0.7, [1.0, 0.0, 0.0])),
-    ],
-    ids=["blade", "wheel"],
-)
-def test_formulas_are_what_the_families_are(formula, family):
-    x, v = np.array([[0.3, -0.2, 0.0], [0.9, 0.4, 0.3]]), np.array([[0.5, 0.2, 0.0], [-0.4, 1.0, 0.3]])
-    one, other = (ConstraintSet(row, x, [1.0, 2.0]) for row in (formula, family))
-    np.testing.assert_allclose(one.jacobian(x).toarray(), other.jacobian(x).toarray(), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(one.acceleration_target(x, v), other.acceleration_target(x, v), rtol=1e-12)
-    assert formula.translation_invariant and not formula.holonomic and not formula.moving
 
 
 # -- Python functions: checks of what was given, accuracy of what was not --------------------------
