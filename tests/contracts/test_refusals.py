@@ -248,7 +248,6 @@ REFUSED: list[tuple[str, ...]] = [
         "[1.0, inf]",
     ),
     ("ORACLE.acceleration(?, [0.0])", "masses", "[[0.0] * 6], [1.0], [0.0] * 6", "[[0.0] * 6], [1.0] * 5, [0.0] * 6"),
-    ("ORACLE.bott_duffin([[1.0, 1.0]], ?, [0.0, 0.0], [0.0])", "masses", "[[1, 0.5], [0.4, 1]]", "[[nan, 0], [0, 1]]"),
     ("ORACLE.pseudo_inverse(?)", "matrix", "[1.0]", "[['a', 'b']]", "[[1.0], [1.0, 2.0]]", "X / 0"),
     ("ORACLE.pseudo_inverse(np.ma.masked_array(X, X == 1.0))", "matrix"),
     ("ORACLE.multipliers(X[:1], [1.0], [0.0] * 5, [0.0])", "f"),
