@@ -113,12 +113,13 @@ NEED_OPENMM = ("alanine", "device")
 
 
 def _warmup(chosen: argparse.Namespace) -> int:
-    from kcons.constraints.compilation import all_compiled, announcer
+    from kcons.constraints import compilation
 
     wanted = [name for given in chosen.what for name in names(given)] or USUAL
     for name in wanted:
         if name != "device":
             check_name(argparse.Namespace(system=name, size=None))
+    announcer, compilation.SMALL = compilation.announcer, 0
     announcer.announced = announcer.keeps  # it is said here
     for name in wanted:
         print(name, end=": ", flush=True)
@@ -126,8 +127,7 @@ def _warmup(chosen: argparse.Namespace) -> int:
             print("OpenMM is not installed")
             continue
         begun, before = time.perf_counter(), announcer.seconds
-        with all_compiled():
-            refused = _compiled_device() if name == "device" else _system(name)
+        refused = _compiled_device() if name == "device" else _system(name)
         compiled, whole = announcer.seconds - before, time.perf_counter() - begun
         print(refused or (f"compiled in {compiled:.1f} s" if compiled else f"is there ({whole:.1f} s)"))
     return 0

@@ -13,7 +13,7 @@ which `njit` and `cfunc` of this module make:
   its own file only, and what was kept would call others as they were.
 - Compiling that has taken a second is announced, once in a process, by the logger ``kcons`` (on standard error unless
   logging is set up otherwise).
-- Garbage is not collected while a kernel is compiled, which takes a fifth of the time.
+- Garbage is not collected while a kernel is compiled: that takes a fifth of the time.
 """
 
 from __future__ import annotations
@@ -34,27 +34,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from kcons.errors import UnsupportedError
+import llvmlite.binding as llvm
+import numba
+from numba.core import caching, codegen, compiler
+from numba.core.ccallback import CFunc
+from numba.core.sigutils import normalize_signature
 
-# Nothing that Numba imports is garbage. To look for it among all that it makes takes a tenth of the time.
-_collected = gc.isenabled()
-gc.disable()
-try:
-    import llvmlite.binding as llvm
-    import numba
-    from numba.core import caching, codegen, compiler
-    from numba.core.ccallback import CFunc
-    from numba.core.sigutils import normalize_signature
-finally:
-    if _collected:
-        gc.enable()
+from kcons.errors import UnsupportedError
 
 logger = logging.getLogger("kcons")
 
-#: Elements of work that Python does in less time than a compiled kernel takes to be loaded from disk.
+#: Elements of work that Python does in less time than a compiled kernel takes to be loaded from disk; 0 leaves none.
 SMALL = 3000
-#: Elements in all after which Python has spent a second or so.
-MUCH = 100_000
 #: Seconds of compiling, in all, before it is announced.
 PATIENCE = 1.0
 
@@ -67,31 +58,13 @@ if _config.DISABLE_JIT:
     )
 
 
-_in_python: dict[Any, int] = {}
-_all_compiled = False
-
-
-@contextmanager
-def all_compiled() -> Iterator[None]:
-    """Leave nothing to Python, however small: where kernels are compiled for larger systems."""
-    global _all_compiled
-    before, _all_compiled = _all_compiled, True
-    try:
-        yield
-    finally:
-        _all_compiled = before
-
-
 def plain_if_small(kernel: Any, size: int) -> Any:
     """A compiled function, or for little work the Python function that it was made of, unless it is loaded already.
 
-    For work on integers, about `size` elements: both return the same. Where little comes again and again, it is loaded
-    after all. What it calls must be `numba.extending.register_jitable`, which is compiled as a part of the caller only.
+    For work on integers, about `size` elements: both return the same. What it calls must be
+    `numba.extending.register_jitable`, which is compiled as a part of the caller only.
     """
-    if _all_compiled or size > SMALL or kernel.signatures or _in_python.get(kernel, 0) > MUCH:
-        return kernel
-    _in_python[kernel] = _in_python.get(kernel, 0) + size
-    return kernel.py_func
+    return kernel if size > SMALL or kernel.signatures else kernel.py_func
 
 
 _PACKAGE = Path(__file__).parents[1]
@@ -288,7 +261,14 @@ class Announcer:
         self._depth += 1
         try:
             if not self.announced and self.seconds + now - self._begun >= PATIENCE:
-                self._announce()
+                self.announced = True
+                said = (
+                    "This happens once on a machine and takes some seconds; `kcons warmup` does it beforehand"
+                    if self.keeps
+                    else "It can keep them nowhere: neither its own folder nor your home can be written to. "
+                    "Set NUMBA_CACHE_DIR to a folder of yours, and it happens only once"
+                )
+                logger.warning(f"kcons compiles the kernels that this system needs. {said}")
             yield
         finally:
             self._depth -= 1
@@ -296,16 +276,6 @@ class Announcer:
                 gc.enable()
             if not self._depth:
                 self.seconds += time.perf_counter() - self._begun
-
-    def _announce(self) -> None:
-        self.announced = True
-        said = (
-            "This happens once on a machine and takes some seconds; `kcons warmup` does it beforehand"
-            if self.keeps
-            else "It can keep them nowhere: neither its own folder nor your home can be written to. "
-            "Set NUMBA_CACHE_DIR to a folder of yours, and it happens only once"
-        )
-        logger.warning(f"kcons compiles the kernels that this system needs. {said}")
 
 
 def clock() -> float:

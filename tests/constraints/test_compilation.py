@@ -21,7 +21,7 @@ import pytest
 
 import kcons
 from kcons.constraints import compilation
-from kcons.constraints.compilation import MUCH, SMALL, Announcer, all_compiled, njit, plain_if_small
+from kcons.constraints.compilation import SMALL, Announcer, njit, plain_if_small
 from kcons.errors import MissingPackageError
 
 #: Compiles one small kernel; says how many kernels came from the folder, and how many were compiled.
@@ -247,12 +247,6 @@ def test_little_work_is_left_to_python():
     assert twice(1) == 2
     assert plain_if_small(twice, 1) is twice  # it is there
 
-    thrice = numba.njit(lambda n: 3 * n)
-    with all_compiled():
-        assert plain_if_small(thrice, 1) is thrice
-    given = [plain_if_small(thrice, SMALL) for _ in range(MUCH // SMALL + 3)]
-    assert given[0] is thrice.py_func and given[-1] is thrice  # that was much in all
-
 
 def test_a_small_molecule_needs_its_numerics_only():
     """What orders its rows is left to Python; kernels are made for one kind of arguments."""
@@ -273,12 +267,6 @@ for module in [module for name, module in sys.modules.items() if name.startswith
     assert {counts[f"kcons.solvers.sparse.elimination.{name}"] for name in ("_minimum_degree", "_finish")} == {"0"}
     assert {counts[f"kcons.plan.clusters.{name}"] for name in ("_edge_blocks",)} == {"0"}
     assert set(counts.values()) <= {"0", "1"}
-
-
-@pytest.mark.parametrize("before", ["", "gc.disable(); "], ids=["on", "off"])
-def test_the_import_leaves_the_collector_of_garbage_as_it_was(before):
-    code = f"import gc; {before}import kcons; print(gc.isenabled())"
-    assert ended(started(code))[0] == str(not before)
 
 
 # -- the announcement -------------------------------------------------------------------------------
