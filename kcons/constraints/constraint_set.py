@@ -111,13 +111,6 @@ class ConstraintSet:
         time: float = 0.0,
     ) -> None:
         given = constraints_in(constraints, "constraints")
-        for item in given:
-            if item.units is not None:
-                raise InputError(
-                    f"{item!r} was given Quantities and is in {item.units}, and nobody knows what the positions are "
-                    "in; hold it in OpenMM (kcons.openmm), or give plain numbers in the units of the positions",
-                    item="units",
-                )
         time = finite_number(time, "time")
         x = as_float_array(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import (
     Directions,
     FloatArray,
-    Lengths,
     PositiveLengths,
     as_float_array,
     atom_array,
@@ -204,7 +203,7 @@ class Sphere(Surface):
     singular = "atom {atom} lies at the center of the sphere: gradient undefined; move the atom"
     center: FloatArray
 
-    def __init__(self, atoms: ArrayLike, center: Lengths, radius: Target = None) -> None:
+    def __init__(self, atoms: ArrayLike, center: ArrayLike, radius: Target = None) -> None:
         super().__init__(atoms, radius, center=center)
 
     @staticmethod
@@ -233,7 +232,7 @@ class Cylinder(Surface):
     length_powers = {"point": 1}
     singular = "atom {atom} lies on the axis of the cylinder: gradient undefined; move the atom"
 
-    def __init__(self, atoms: ArrayLike, point: Lengths, axis: Directions, radius: Target = None) -> None:
+    def __init__(self, atoms: ArrayLike, point: ArrayLike, axis: Directions, radius: Target = None) -> None:
         super().__init__(atoms, radius, point=point, axis=axis)
 
     @staticmethod
@@ -270,7 +269,7 @@ class Torus(Surface):
     def __init__(
         self,
         atoms: ArrayLike,
-        center: Lengths,
+        center: ArrayLike,
         axis: Directions,
         major_radius: PositiveLengths,
         minor_radius: Target = None,
@@ -321,7 +320,7 @@ class Ellipsoid(Surface):
     def __init__(
         self,
         atoms: ArrayLike,
-        center: Lengths,
+        center: ArrayLike,
         semi_axes: PositiveLengths,
         rotation: ArrayLike | None = None,
         target: Target = 0.0,
@@ -399,7 +398,7 @@ class Plane(LinearRows):
     row_width = 1
 
     def __init__(
-        self, atoms: ArrayLike, normal: Directions, offset: Target = None, *, point: Lengths | None = None
+        self, atoms: ArrayLike, normal: Directions, offset: Target = None, *, point: ArrayLike | None = None
     ) -> None:
         if offset is not None and point is not None:
             raise InputError("Plane: give either offset or point, not both", item="point")
@@ -428,7 +427,7 @@ class Line(LinearRows):
 
     row_width = 1
 
-    def __init__(self, atoms: ArrayLike, point: Lengths | None, direction: Directions) -> None:
+    def __init__(self, atoms: ArrayLike, point: ArrayLike | None, direction: Directions) -> None:
         column = atom_table(atoms, self.family, 1)
         along = _for_each(direction, len(column), "direction")
         # Normal to the line and to the coordinate axis it is farthest from.

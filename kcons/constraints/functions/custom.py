@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Annotated, Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import (
-    ANY,
-    LENGTH,
     TAKES_TIME,
-    Duration,
     FloatArray,
+    Positive,
     as_float_array,
     check_call,
-    positive,
     read_only_view,
 )
 from kcons.constraints.constraint import Constraint, Fault, RowKind
@@ -40,14 +37,11 @@ _FLOAT = np.dtype(np.float64)
 _PLACES = (1, -1, 2, -2)
 _DIFFERENCE = np.array([FIRST_4[0], -FIRST_4[0], FIRST_4[1], -FIRST_4[1]])
 
-_Length: TypeAlias = Annotated[float, LENGTH, positive] | None
-_Period: TypeAlias = Annotated[float, ANY, positive] | None
-
 
 class PythonRows(Constraint, base=True):
     """Rows of functions, called once a row; what is not given is taken by differences."""
 
-    held = ANY
+    held = ""
     time_dependent: bool
     time_step: float
     length: Any
@@ -143,9 +137,9 @@ class Custom(PythonRows):
         *,
         time_dependent: bool = False,
         translation_invariant: bool = False,
-        period: _Period = None,
-        length: _Length = None,
-        time_step: Duration = 0.02,
+        period: Positive | None = None,
+        length: Positive | None = None,
+        time_step: Positive = 0.02,
     ) -> None:
         super().__init__(atoms, target)
         self._take(time_dependent, length, time_step, function=function, gradient=gradient)
@@ -288,8 +282,8 @@ class ImplicitSurface(Custom):
         target: Target = 0.0,
         *,
         time_dependent: bool = False,
-        length: _Length = None,
-        time_step: Duration = 0.02,
+        length: Positive | None = None,
+        time_step: Positive = 0.02,
     ) -> None:
         given: dict[str, Any] = {"time_dependent": time_dependent, "length": length, "time_step": time_step}
         super().__init__(atoms, function, gradient, target, **given)
@@ -354,8 +348,8 @@ class CustomVelocity(PythonRows):
         *,
         time_dependent: bool = False,
         translation_invariant: bool = False,
-        length: Annotated[float, LENGTH, positive] = 1.0,
-        time_step: Duration = 1e-3,
+        length: Positive = 1.0,
+        time_step: Positive = 1e-3,
     ) -> None:
         super().__init__(atoms, target)
         self._take(time_dependent, length, time_step, coefficients=coefficients)
