@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from difflib import get_close_matches
-from importlib.util import find_spec
 from typing import Any
 
 __all__ = [
@@ -164,18 +163,13 @@ EXTRAS = {
 
 def with_extra(error: ModuleNotFoundError, what: str) -> ModuleNotFoundError:
     """The same error; where a package of `EXTRAS` is missing, or too old, one that says how `what` gets it."""
-    package, _, inside = (error.name or "").partition(".")
+    package = (error.name or "").partition(".")[0]
     if package not in EXTRAS or isinstance(error, MissingPackageError):
         return error
-    if inside and find_spec(package) is not None:
-        return MissingPackageError(
-            f"{what} needs {error.name}, which the {package} that is installed does not have: "
-            f"python -m pip install --upgrade 'kcons[{EXTRAS[package]}]'",
-            name=error.name,
-        )
     return MissingPackageError(
-        f"{what} needs {package}, which is not installed: python -m pip install 'kcons[{EXTRAS[package]}]'",
-        name=package,
+        f"{what} needs {error.name}, which is not installed, or not in this version: "
+        f"python -m pip install --upgrade 'kcons[{EXTRAS[package]}]'",
+        name=error.name,
     )
 
 

@@ -123,7 +123,7 @@ def atom_array(atoms: Any, name: str, item: str = "atoms") -> NDArray[Any]:
         return np.atleast_1d(np.asarray(atoms))
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
-            f"{name}: rows name different numbers of atoms, {_value_text(atoms)}; give rows of one width", item=item
+            f"{name}: rows name different numbers of atoms, {atoms!r:.80}; give rows of one width", item=item
         ) from None
 
 
@@ -132,29 +132,30 @@ def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") ->
 
     Of rows of one atom a list of atoms is taken, too.
     """
+
+    def wrong(words: str, row: Any = ()) -> InputError:
+        return InputError(f"{name}: {words}", item=item, atoms=row)
+
     table = atom_array(atoms, name, item)
     if table.size == 0:
         return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
     if not np.issubdtype(table.dtype, np.integer):
         remedy = "; of a mask give np.flatnonzero(mask)" if table.dtype == bool else ""
-        raise InputError(f"{name}: atom indices must be integers, not {table.dtype}{remedy}", item=item)
+        raise wrong(f"atom indices must be integers, not {table.dtype}{remedy}")
     table = table.astype(np.int64)
     table = table.reshape(-1, 1) if width == 1 and table.ndim < 2 else np.atleast_2d(table)
     if table.ndim != 2:
-        raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item=item)
+        raise wrong(f"atoms must have shape (n_rows, width), not {table.shape}")
     if width is not None and table.shape[1] != width:
-        wanted = f"a row has {width} atom{'s' if width > 1 else ''}"
-        raise InputError(f"{name}: {wanted}, but atoms has shape {np.shape(atoms)}", item=item)
+        raise wrong(f"a row has {width} atom{'s' if width > 1 else ''}, but atoms has shape {np.shape(atoms)}")
     if table.min() < 0:
         row, slot = np.argwhere(table < 0)[0]
-        words = f"row {row} has the negative atom index {table[row, slot]}; count atoms from 0"
-        raise InputError(f"{name}: {words}", item=item, atoms=table[row])
+        raise wrong(f"row {row} has the negative atom index {table[row, slot]}; count atoms from 0", table[row])
     ordered = np.sort(table, axis=1)
     repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
     if repeated.any():
         row = int(np.argmax(repeated))
-        words = f"row {row} names an atom twice: {tuple(table[row].tolist())}"
-        raise InputError(f"{name}: {words}", item=item, atoms=table[row])
+        raise wrong(f"row {row} names an atom twice: {tuple(table[row].tolist())}", table[row])
     return table
 
 
@@ -201,7 +202,7 @@ def finite_number(value: Any, item: str) -> float:
     refuse_units(value, item)
     found = _float(value)
     if not math.isfinite(found):
-        raise InputError(f"{item} is {_value_text(value)}; give a finite number", item=item)
+        raise InputError(f"{item} is {value!r:.80}; give a finite number", item=item)
     return found
 
 
@@ -211,14 +212,6 @@ def _float(value: Any) -> float:
         return math.nan if np.ndim(value) or isinstance(value, str | bytes) else float(value)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # of objects that say they are arrays, the last
         return math.nan
-
-
-def _value_text(value: Any) -> str:
-    """A value in a message: of whole numbers of thousands of digits, which Python does not print, the kind."""
-    try:
-        return f"{value!r:.80}"
-    except ValueError:
-        return f"of the type {type(value).__name__}"
 
 
 def all_positive(values: ArrayLike, item: str) -> FloatArray:
@@ -249,7 +242,7 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
         good = False
     if not good or isinstance(value, bool):
         bounds = f", {least} or more" if most is None else f" from {least} to {most}"
-        raise InputError(f"{item} is {_value_text(value)}; give a whole number{bounds}", item=item)
+        raise InputError(f"{item} is {value!r:.80}; give a whole number{bounds}", item=item)
     return found
 
 
@@ -257,7 +250,7 @@ def _number_rule(good: Callable[[float], bool], words: str) -> Callable[[Any, st
     def rule(value: Any, item: str) -> float:
         number = math.nan if isinstance(value, bool) else _float(value)
         if not (math.isfinite(number) and good(number)):
-            raise InputError(f"{item} is {_value_text(value)}; give a {words}", item=item)
+            raise InputError(f"{item} is {value!r:.80}; give a {words}", item=item)
         return number
 
     return rule
@@ -273,7 +266,7 @@ def one_of(value: Any, item: str, words: tuple[Any, ...]) -> Any:
     """`value`, which has to be one of `words`."""
     if not isinstance(value, str | int | np.integer) or value not in words:
         *others, last = map(repr, words)
-        raise InputError(f"{item} is {_value_text(value)}; choose {', '.join(others)} or {last}", item=item)
+        raise InputError(f"{item} is {value!r:.80}; choose {', '.join(others)} or {last}", item=item)
     return value
 
 
@@ -291,7 +284,7 @@ Rng: TypeAlias = int | np.random.Generator | None
 def seed_from(rng: Rng, bits: int = 64) -> int:
     """A seed: a whole number of so many bits itself, or one drawn from a generator."""
     if isinstance(rng, int | np.integer) and not 0 <= rng < 2**bits:
-        raise InputError(f"rng is {_value_text(rng)}; give a whole number from 0 to {2**bits - 1}", item="rng")
+        raise InputError(f"rng is {rng!r:.80}; give a whole number from 0 to {2**bits - 1}", item="rng")
     drawn = generator_of(rng)
     return int(rng if isinstance(rng, int | np.integer) else drawn.integers(2 ** (bits - 1)))
 
@@ -302,7 +295,7 @@ def generator_of(rng: Rng) -> np.random.Generator:
         return np.random.default_rng(rng)
     except (TypeError, ValueError):
         raise InputError(
-            f"rng is {_value_text(rng)}; give a whole number from 0 on, a numpy.random.Generator, or None", item="rng"
+            f"rng is {rng!r:.80}; give a whole number from 0 on, a numpy.random.Generator, or None", item="rng"
         ) from None
 
 
