@@ -31,7 +31,7 @@ def examine() -> tuple[dict[str, dict[str, str]], list[str]]:
     import numba
 
     from kcons.comparison.machine import kernels_cached, processor, simd_width
-    from kcons.constraints.compilation import announcer, has_a_file, njit
+    from kcons.constraints.compilation import has_a_file, njit
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     found = {
@@ -52,8 +52,6 @@ def examine() -> tuple[dict[str, dict[str, str]], list[str]]:
         },
     }
     wrong = []
-    if not announcer.keeps:
-        wrong.append("every process compiles its kernels anew; set NUMBA_CACHE_DIR to a folder that can keep them")
     if find_spec("openmm"):
         found |= {"OpenMM platforms": _platforms(), "steps on the device": _device()}
         if "runs" not in found["OpenMM platforms"].values():
@@ -120,7 +118,7 @@ def _warmup(chosen: argparse.Namespace) -> int:
         if name != "device":
             check_name(argparse.Namespace(system=name, size=None))
     announcer, compilation.SMALL = compilation.announcer, 0
-    announcer.announced = announcer.keeps  # it is said here
+    announcer.announced = True  # it is said here
     for name in wanted:
         print(name, end=": ", flush=True)
         if name in NEED_OPENMM and find_spec("openmm") is None:

@@ -5,7 +5,7 @@ processor has results of its own in the same folder, and several processes may u
 which `njit` and `cfunc` of this module make:
 
 - Where the folder of kcons cannot be written to, Numba keeps results below the user's home; where that cannot be
-  written to either, in ``$NUMBA_CACHE_DIR``. Without any of these they are kept for one process only.
+  written to either, in ``$NUMBA_CACHE_DIR``, which has to be set then.
 - The machine code of a kernel is the same in the process that compiles it and in those that load it (`_Library`), so
   results are the same to the last bit.
 - A damaged file counts as missing.
@@ -18,7 +18,6 @@ which `njit` and `cfunc` of this module make:
 
 from __future__ import annotations
 
-import atexit
 import functools
 import gc
 import hashlib
@@ -26,8 +25,6 @@ import inspect
 import logging
 import os
 import re
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -225,25 +222,14 @@ def has_a_file(function: Any) -> bool:
     return Path(function.__code__.co_filename).is_file()
 
 
-def keep_somewhere() -> bool:
-    """See that kernels can be kept; whether other processes find them."""
-    try:
-        njit(cache=True)(has_a_file)  # which is not compiled
-    except RuntimeError:  # no locator: neither folder can be written to
-        _config.CACHE_DIR = tempfile.mkdtemp(prefix="kcons-")
-        atexit.register(shutil.rmtree, _config.CACHE_DIR, ignore_errors=True)
-        return False
-    return True
-
-
 class Announcer:
     """Says that kernels of kcons are compiled, the first that begins after `PATIENCE`; keeps garbage meanwhile.
 
-    `seconds` is what compiling has taken in this process, and `keeps` whether other processes find what is compiled.
+    `seconds` is what compiling has taken in this process.
     """
 
-    def __init__(self, keeps: bool = True) -> None:
-        self.seconds, self.announced, self.keeps = 0.0, False, keeps
+    def __init__(self) -> None:
+        self.seconds, self.announced = 0.0, False
         self._depth, self._begun = 0, 0.0  # Numba compiles in one thread at a time
 
     @property
@@ -262,13 +248,10 @@ class Announcer:
         try:
             if not self.announced and self.seconds + now - self._begun >= PATIENCE:
                 self.announced = True
-                said = (
-                    "This happens once on a machine and takes some seconds; `kcons warmup` does it beforehand"
-                    if self.keeps
-                    else "It can keep them nowhere: neither its own folder nor your home can be written to. "
-                    "Set NUMBA_CACHE_DIR to a folder of yours, and it happens only once"
+                logger.warning(
+                    "kcons compiles the kernels that this system needs. This happens once on a machine and takes some "
+                    "seconds; `kcons warmup` does it beforehand"
                 )
-                logger.warning(f"kcons compiles the kernels that this system needs. {said}")
             yield
         finally:
             self._depth -= 1
@@ -283,4 +266,11 @@ def clock() -> float:
     return time.perf_counter() - announcer.seconds
 
 
-announcer = Announcer(keep_somewhere())
+announcer = Announcer()
+try:
+    njit(cache=True)(has_a_file)  # which is not compiled
+except RuntimeError:  # no locator
+    raise UnsupportedError(
+        "compiled kernels can be kept nowhere: neither the folder of kcons nor your home can be written to; set "
+        "NUMBA_CACHE_DIR to a folder of yours"
+    ) from None

@@ -66,15 +66,6 @@ def small_as_before():
     compilation.SMALL = before
 
 
-@pytest.mark.parametrize("keeps", [True, False])
-def test_kernels_that_nobody_keeps_are_announced(keeps, monkeypatch, capsys):
-    monkeypatch.setattr(announcer, "announced", False)
-    monkeypatch.setattr(announcer, "keeps", keeps)
-    monkeypatch.setattr(machine, "USUAL", ())
-    assert main.main(["warmup"]) == 0
-    assert announcer.announced == keeps
-
-
 def test_it_says_what_was_compiled(monkeypatch, capsys):
     """Only what is not there: a kind that takes a second, which it does once."""
     left = [1.0, 0.0]
