@@ -24,5 +24,5 @@ kj_mol = (found.energies - found.energies.min()) * units.mol / units.kJ
 for angle, energy in zip(degrees, kj_mol, strict=True):
     print(f"{angle:5d} degrees {energy:6.1f} kJ/mol  {'#' * round(2 * energy)}")
 
-structure = found.structure((degrees.tolist().index(120),))  # Atoms; hold=True keeps the constraint on them
+structure = found.structure((degrees.tolist().index(120),))
 assert abs(structure.get_dihedral(2, 0, 1, 3) - 120) < 1e-9 and not found.failed

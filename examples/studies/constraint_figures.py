@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Constraint, Custom, CustomVelocity, Distance, Formula, Plane, VelocityFormula
+from kcons.constraints import Constraint, Custom, Distance, Formula, Plane, VelocityFormula
 from kcons.steppers import Trajectory
 
 #: Of positions and time.
@@ -65,13 +65,9 @@ def wheel(steps: int) -> tuple[np.ndarray, np.ndarray]:
 def spiral(steps: int) -> tuple[np.ndarray, np.ndarray]:
     """A velocity at 80 degrees from the radius everywhere: a logarithmic spiral, at constant speed."""
     lean = np.radians(80)
-
-    def coefficients(r: np.ndarray) -> np.ndarray:
-        x, y = r[0, :2] / np.hypot(*r[0, :2])
-        return np.array([[-y * np.cos(lean) - x * np.sin(lean), x * np.cos(lean) - y * np.sin(lean), 0.0]])
-
+    held = VelocityFormula("c*(x1*vy1 - y1*vx1) - s*(x1*vx1 + y1*vy1)", 0, {"c": np.cos(lean), "s": np.sin(lean)})
     x, v = np.array([[1.0, 0.0, 0.0]]), np.array([[np.cos(lean), np.sin(lean), 0.0]])
-    _, path = moved([Plane([0], [0.0, 0.0, 1.0], 0.0), CustomVelocity(0, coefficients)], x, v, None, 10.0, steps)
+    _, path = moved([Plane([0], [0.0, 0.0, 1.0], 0.0), held], x, v, None, 10.0, steps)
     far = 1 + path.times * np.cos(lean)
     around = np.log(far) * np.tan(lean)
     return path.positions[:, 0, :2], far[:, None] * np.stack([np.cos(around), np.sin(around)], axis=1)
@@ -103,7 +99,7 @@ def picture(folder: Path, steps: int = 800) -> None:
     beside = {
         "VelocityFormula: a skate on a slope": (grid[0, :], "y", skate(steps)),
         "VelocityFormula: a point on the rim of a wheel": (grid[1, :], "z", wheel(steps)),
-        "CustomVelocity:\n80° from the radius": (grid[2, 0], "y", spiral(steps)),
+        "VelocityFormula:\n80° from the radius": (grid[2, 0], "y", spiral(steps)),
     }
     for title, (place, up, (found, exact)) in beside.items():
         axes = figure.add_subplot(place, title=title, aspect="equal", xlabel="x", ylabel=up)
@@ -132,7 +128,7 @@ def picture(folder: Path, steps: int = 800) -> None:
 
 
 def main(arguments: list[str], steps: int = 100) -> None:
-    for name, motion in (("Skate", skate), ("Wheel", wheel), ("CustomVelocity", spiral)):
+    for name, motion in (("Skate", skate), ("Wheel", wheel), ("Spiral", spiral)):
         found, exact = motion(steps)
         print(f"{name:<15} {np.abs(found - exact).max():.1e} from the closed form")
     for name, held in (("Custom", rounded_cube), ("Formula", wave)):

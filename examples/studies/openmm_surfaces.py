@@ -24,7 +24,7 @@ import openmm
 import pandas as pd
 from openmm import unit
 
-from kcons.constraints import Cylinder, Ellipsoid, Formula, Plane, Sphere, Torus
+from kcons.constraints import Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.openmm import SCHEMES, SurfaceIntegrator
 
 CUTOFFS = (0.85, 1.0, 1.2)  # nm; 2.5 sigma, OpenMM's default, 3.5 sigma
@@ -45,6 +45,10 @@ def argon(n: int, cutoff: float) -> tuple[openmm.System, np.ndarray]:
     return system, (np.array(list(np.ndindex(side, side, side)))[:n] + 0.5) * edge / side
 
 
+#: The last column along [1, 1, 1].
+TILTED = np.linalg.qr([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0], [1.0, 0.0, 0.0]])[0][:, ::-1]
+
+
 def surface(kind: str, x: np.ndarray) -> Any:
     """One surface for each particle, through where it is."""
     rng = np.random.default_rng(1)
@@ -53,8 +57,8 @@ def surface(kind: str, x: np.ndarray) -> Any:
     center = x - 0.5 * u
     return {
         "spheres": lambda: Sphere(atoms, center),
-        "cylinders along z": lambda: Cylinder(atoms, center, [0, 0, 1]),
-        "tilted cylinders": lambda: Cylinder(atoms, center, [1, 1, 1]),
+        "cylinders along z": lambda: Ellipsoid(atoms, center, [0.5, 0.5, np.inf], target=None),
+        "tilted cylinders": lambda: Ellipsoid(atoms, center, [0.5, 0.5, np.inf], TILTED, None),
         "planes": lambda: Plane(atoms, u),
         "ellipsoids": lambda: Ellipsoid(atoms, center, [0.4, 0.5, 0.6], target=None),
         "rotated ellipsoids": lambda: Ellipsoid(

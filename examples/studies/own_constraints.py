@@ -26,8 +26,6 @@ from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import (
     Constraint,
     Custom,
-    CustomVelocity,
-    Cylinder,
     Distance,
     Ellipsoid,
     Formula,
@@ -55,7 +53,7 @@ def quartic_gradient(r):
 #: Name -> what holds these atoms, each on a surface of its own through where it is.
 HELD: dict[str, Callable[[np.ndarray], Constraint]] = {
     "Sphere": lambda atoms: Sphere(atoms, [0, 0, 0]),
-    "Cylinder": lambda atoms: Cylinder(atoms, [0, 0, 0], [0, 0, 1.0]),
+    "Cylinder": lambda atoms: Ellipsoid(atoms, [0, 0, 0], [1.0, 1.0, np.inf], target=None),
     "Plane": lambda atoms: Plane(atoms, [0, 0, 1.0]),
     "Ellipsoid": lambda atoms: Ellipsoid(atoms, [0, 0, 0], AXES, target=None),
     "Torus": lambda atoms: Torus(atoms, [0, 0, 0], [0, 0, 1.0], 0.5),
@@ -66,11 +64,6 @@ HELD: dict[str, Callable[[np.ndarray], Constraint]] = {
     "Custom, Python": lambda atoms: Custom(atoms[:, None], quartic.py_func, quartic_gradient.py_func),
     "Custom, no gradient": lambda atoms: Custom(atoms[:, None], quartic.py_func),
 }
-
-
-@numba.njit
-def around(r):
-    return np.array([[-r[0, 1] - 0.2 * r[0, 0], r[0, 0] - 0.2 * r[0, 1], 0.0]])
 
 
 UP, ALONG = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
@@ -91,8 +84,6 @@ BODIES: dict[str, tuple[np.ndarray, list[Constraint]]] = {
         ],
     ),
     "VelocityFormula": (ALONG[None], [Plane([0], UP), VelocityFormula(SPIRAL, 0)]),
-    "CustomVelocity, Numba": (ALONG[None], [Plane([0], UP), CustomVelocity(0, around)]),
-    "CustomVelocity, Python": (ALONG[None], [Plane([0], UP), CustomVelocity(0, around.py_func)]),
 }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcons.constraints import Constraint, CustomVelocity, ImplicitSurface
+from kcons.constraints import Constraint, Custom
 from kcons.constraints.functions.straight_line import Tape, differentiated, function_of
 from kcons.errors import UnsupportedError
 
@@ -44,7 +44,7 @@ class RowFunction(NamedTuple):
     """What rows are computed by, equal for rows that are computed alike.
 
     The `tape` has value and gradient. What is not `holonomic` is a function of the middle of a flight and of the way;
-    its gradient is by where the flight ends, or, of functions of users, by both. `timed` is what depends on the time.
+    its gradient is by where the flight ends. `timed` is what depends on the time.
     """
 
     tape: Tape
@@ -61,9 +61,6 @@ class RowFunction(NamedTuple):
         `r` are coordinates x, y, z by atom, and the way behind them for velocity rows; `p` are parameters.
         """
         value, *slope = run(self.tape, r, p, t)
-        n = 3 * self.width
-        if len(slope) > n:
-            slope = [0.5 * middle + way for middle, way in zip(slope[:n], slope[n:], strict=True)]
         return value, slope
 
 
@@ -72,12 +69,11 @@ def row_function(item: Constraint) -> RowFunction:
     found = function_of(item)
     if found is not None:
         return RowFunction(found.tape(), item.width, item.holonomic)
-    n, function = 3 * item.width * (1 if item.holonomic else 2), _of_user(item)
+    assert isinstance(item, Custom)
+    function, n = item.function, 3 * item.width
 
     def row(r: Any, p: Any, t: Any) -> Any:
-        places = np.array([r[k] for k in range(n)], dtype=object).reshape(-1, 3)
-        value = function(places[: item.width], *((t,) if item.time_dependent else ()))  # type: ignore[attr-defined]
-        value = value if item.holonomic else (value * places[item.width :]).sum()
+        value = function(np.array([r[k] for k in range(n)], dtype=object).reshape(-1, 3))
         return value.item() if isinstance(value, np.ndarray) else value
 
     try:
@@ -88,9 +84,3 @@ def row_function(item: Constraint) -> RowFunction:
             "branches, or as a Formula"
         ) from error
     return RowFunction(tape._replace(results=tape.results[:-1]), item.width, item.holonomic)
-
-
-def _of_user(item: Any) -> Callable[..., Any]:
-    if isinstance(item, ImplicitSurface):
-        return lambda r, *t: item.function(r, *t)[0]
-    return item.coefficients if isinstance(item, CustomVelocity) else item.function  # type: ignore[no-any-return]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +42,6 @@ def _scan(chosen: argparse.Namespace) -> int:
     if chosen.constrain is not None:
         held += constraints_of(atoms, chosen.constrain, guess_bonds=True)
     atoms.calc = _calculator(chosen.calculator, chosen.settings)
-    held += getattr(atoms.calc, "held", [])
     how: dict[str, Any] = {"held": held, "fmax": chosen.fmax, "both_ways": not chosen.one_way}
     folder: Path = chosen.out or Path(f"scan-{chosen.structure.stem}")
     begun: list[None] = []
@@ -56,7 +54,7 @@ def _scan(chosen: argparse.Namespace) -> int:
 
         found = scan(atoms, coordinates, values, folder=folder, progress=progress, **how)
     written = found.write(folder)
-    show(found.table(), found.summary())
+    show(found.table().drop(columns="error").to_string(index=False, float_format="{:.4f}".format), found.summary())
     say_written(written)
     return INCOMPLETE if found.failed else 0
 
@@ -99,19 +97,9 @@ def _calculator(name: str, given: str) -> Any:
         settings = None
     if not isinstance(settings, dict):
         raise InputError(f"--settings are {given}; give names and values as JSON: '{{\"charge\": 1}}'", item="settings")
-    if not name.endswith(".xml"):
-        from kcons.ase.named_calculators import named_calculator
+    from kcons.ase.named_calculators import named_calculator
 
-        return named_calculator(name, settings)
-    import openmm
-
-    from kcons.free_energy.scans.system_calculator import SystemCalculator, read_system
-
-    system = read_system(Path(name), "calculator")
-    try:
-        return SystemCalculator(system, **settings)
-    except (TypeError, openmm.OpenMMException) as error:
-        raise InputError(f'--settings of a System are {{"platform": NAME}}: {error}', item="settings") from error
+    return named_calculator(name, settings)
 
 
 #: The table: options of each family are alike.
@@ -131,29 +119,18 @@ OF_FAMILIES = [
 def _free_energy(chosen: argparse.Namespace) -> int:
     from kcons.comparison.progress import Watcher
     from kcons.free_energy import Windows, read_input
-    from kcons.steppers.files import text, write_files
 
     given = read_input(chosen.input, allow_modules=chosen.allow_module or ())
     folder: Path = chosen.out or Path(chosen.input.stem)
-    how = {**given.options, "workers": chosen.workers}
-    windows, pulls, ways = Windows(given.sampler, folder, given.settings, **how), None, given.pulls
-    if ways:  # a folder belongs to settings, and pulls are slower than the way to a window
-        slow = replace(given.settings, pull=ways.pop("steps"))
-        pulls = Windows(given.sampler, folder / "pulls", slow, **how)
+    windows = Windows(given.sampler, folder, given.settings, workers=chosen.workers, **given.options)
     watcher = Watcher(shown=True)
     with windows.taken(), watcher, watcher.piece(f"{len(given.targets)} windows in {folder}", 1.0):
-        for each in filter(None, (windows, pulls)):
-            each.progress = lambda done, total: watcher.advance(done / total)
+        windows.progress = lambda done, total: watcher.advance(done / total)
         found = windows.run(given.targets)
         if given.improve and not found.failed:
             found = windows.improve(**given.improve)
-        # Before pulls, which may fail.
-        written, said = found.write(folder), [found.summary()]
-        if ways and pulls:
-            numbers, beside = found.beside(pulls.pull(**ways), ways["start"], ways["end"])
-            written += write_files(folder, {"pulls.json": text(numbers).encode()})
-            said.append(beside)
-    show(found.table(), "\n".join(said))
+        written = found.write(folder)
+    show(found.table(), found.summary())
     say_written(written)
     return INCOMPLETE if found.failed else 0
 
@@ -174,7 +151,7 @@ COMMANDS = (
             Option("--count-from", "number of the first atom (default 0)", type=int, choices=(0, 1), default=0),
             Option("--fix", "atoms that stay where they are", nargs="+", default=(), **ATOMS),
             Option("--constrain", "bonds (guessed from distances) and angles that are held as they are", choices=HELD),
-            Option("--calculator", "gfn2 (default), another of ASE, MODULE:NAME, FILE.xml of OpenMM", default="gfn2"),
+            Option("--calculator", "gfn2 (default), another of ASE, MODULE:NAME", default="gfn2"),
             Option("--settings", "of the calculator, such as '{\"charge\": 1}'", default="{}", metavar="JSON"),
             Option("--fmax", "largest force left, eV/angstrom (default 0.01)", type=float, default=0.01),
             Option("--one-way", "relax each point from the first neighbor only", action="store_true"),

@@ -173,10 +173,6 @@ def refuse_other(value: Any, kind: type | tuple[type, ...], item: str, remedy: s
         raise InputError(f"{item} is {value!r:.120}; give {remedy}", item=item)
 
 
-#: What to say of functions of constraints that were given other arguments.
-TAKES_TIME = "; say time_dependent=True for functions that take the time t as well"
-
-
 def check_call(item: str, function: Any, arguments: tuple[str, ...], hint: str = "", needed: bool = False) -> None:
     """Refuse what is no function, or cannot be called with `arguments`; None, where none is needed, passes.
 

@@ -12,9 +12,19 @@ import numpy as np
 from numpy import arctan2, sqrt
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANGLE, as_float_array, atom_array, read_only, refuse_other, whole_number
+from kcons.constraints.arguments import (
+    ANGLE,
+    as_float_array,
+    atom_array,
+    atom_table,
+    check_pairs,
+    read_only,
+    refuse_other,
+    whole_number,
+)
 from kcons.constraints.constraint import Constraint, Fault, IntArray, RowKind
-from kcons.constraints.surface import LinearRows
+from kcons.constraints.periodic.one_piece import spanning_tree
+from kcons.constraints.surface import LinearCombination
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, norm
 from kcons.errors import InputError
@@ -57,13 +67,6 @@ class Distance(Internal):
         The two atoms of each row.
     target : float, array_like, callable of time, MovingTarget or None
         Length held, in the unit of the positions.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> bond = Distance([[0, 1]])
-    >>> bond.measure(np.array([[[0.0, 0.0, 0.0], [0.0, 3.0, 4.0]]]), 0.0)
-    array([5.])
     """
 
     positive = "target"
@@ -91,12 +94,12 @@ class DistanceDifference(Internal):
 
     Parameters
     ----------
-    pairs : array_like of int, shape (n_pairs, 2) or (n_rows, n_pairs, 2)
-        The pairs of atoms of each row. Rows that share atoms in different ways need objects of their own.
-    target : float, array_like, callable of time, MovingTarget or None
-        What each row is held at, in the unit of the positions; may be negative.
+    pairs : array_like of int, shape (n_pairs, 2)
+        The pairs of atoms of the one row.
+    target : float, callable of time, MovingTarget or None
+        What it is held at, in the unit of the positions; may be negative.
     weights : array_like, shape (n_pairs,)
-        Weight of each distance, for all rows; 1 and -1 unless given.
+        Weight of each distance; 1 and -1 unless given.
 
     Examples
     --------
@@ -113,26 +116,11 @@ class DistanceDifference(Internal):
     weights: tuple[float, ...]
 
     def __init__(self, pairs: ArrayLike, target: Target = None, *, weights: ArrayLike = (1.0, -1.0)) -> None:
-        table = atom_array(pairs, self.family, "pairs")
-        table = table[None] if table.ndim == 2 else table
-        if table.ndim != 3 or table.shape[2] != 2 or not table.size or not np.issubdtype(table.dtype, np.integer):
-            raise InputError(
-                "DistanceDifference: pairs are pairs of atoms, [[0, 1], [1, 2]] for one row; for more rows of as many "
-                "pairs each, a list of such",
-                item="pairs",
-            )
-        atoms = [_walk(row)[0] for row in table.tolist()]
-        slots = [
-            tuple((named.index(i), named.index(j)) for i, j in row)
-            for named, row in zip(atoms, table.tolist(), strict=True)
-        ]
-        if other := [k for k, found in enumerate(slots) if found != slots[0]]:
-            raise InputError(
-                f"DistanceDifference: rows 0 and {other[0]} share atoms in different ways; use one object for each",
-                item="pairs",
-            )
-        self.slots, self.weights = slots[0], tuple(np.ravel(as_float_array(weights, "weights")).tolist())
-        super().__init__(atoms, target)
+        table = check_pairs(pairs, item="pairs").tolist()
+        atoms = _walk(table)[0]
+        self.slots = tuple((atoms.index(i), atoms.index(j)) for i, j in table)
+        self.weights = tuple(np.ravel(as_float_array(weights, "weights")).tolist())
+        super().__init__([atoms], target)
 
     def _settle(self) -> None:
         try:
@@ -142,19 +130,11 @@ class DistanceDifference(Internal):
             raise InputError("DistanceDifference: slots are pairs and weights are numbers", item="slots") from None
         n = len(self.slots)
         if len(self.weights) != n or not np.all(np.isfinite(self.weights)) or not all(self.weights):
-            raise InputError(
-                f"DistanceDifference: weights are {self.weights}; give {n} finite {'number' if n == 1 else 'numbers'} "
-                "other than 0, one for each pair",
-                item="weights",
-            )
+            words = f"weights are {self.weights}; give one for each of {n} pairs, finite and not 0"
+            raise InputError(f"DistanceDifference: {words}", item="weights")
         if self.n_rows and {slot for pair in self.slots for slot in pair} != set(range(self.width)):
             raise InputError("DistanceDifference: slots and atoms do not belong together", item="slots")
-        if twice := [i for i, j in self.slots if i == j]:
-            named = self.atoms[0, twice[0]] if self.n_rows else twice[0]
-            raise InputError(f"DistanceDifference: a pair names atom {named} twice", item="pairs")
-        if len({frozenset(pair) for pair in self.slots}) < n:
-            raise InputError("DistanceDifference: a pair comes twice; name it once and add the weights", item="pairs")
-        self.links = read_only(np.array(_walk(self.slots)[1], dtype=np.int64))
+        self.links = read_only(_walk(self.slots)[1])
         self.alike = 2 + 3 * n
         self.positive = "target" if min(self.weights) > 0 else ""
 
@@ -185,10 +165,8 @@ class DistanceDifference(Internal):
         out[0] = q
 
     def parameters(self) -> FloatArray:
-        row = [float(self.width), float(len(self.slots))]
-        for (i, j), w in zip(self.slots, self.weights, strict=True):
-            row += [i, j, w]
-        return np.tile(row, (self.n_rows, 1))
+        pairs = np.column_stack([self.slots, self.weights])
+        return np.tile([self.width, len(pairs), *pairs.ravel()], (self.n_rows, 1))
 
     def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
         yield from super().faults(r, time)
@@ -196,28 +174,15 @@ class DistanceDifference(Internal):
         yield size < COLLINEAR * np.abs(self.weights).max(), lambda k: self.singular
 
 
-def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], list[tuple[int, int]]]:
-    """Atoms that pairs name, and pairs that lead to each atom from one before it, by their places in this list.
-
-    Along a path, pairs lead from each atom to the next; see `Constraint.links`.
-    """
-    neighbors: dict[int, list[int]] = {}
-    for i, j in pairs:
-        neighbors.setdefault(i, []).append(j)
-        neighbors.setdefault(j, []).append(i)
-    place: dict[int, int] = {}
-    links = []
-    for root in sorted(neighbors, key=lambda atom: len(neighbors[atom])):  # an end of a path first
-        ways = [(root, root)]
-        while ways:
-            before, atom = ways.pop()
-            if atom in place:
-                continue
-            place[atom] = len(place)
-            if atom != before:
-                links.append((place[before], place[atom]))
-            ways += [(atom, other) for other in reversed(neighbors[atom])]
-    return list(place), links
+def _walk(pairs: Sequence[Sequence[int]]) -> tuple[list[int], IntArray]:
+    """Atoms that pairs name, along a path one after the other, and `Constraint.links` by their places in this list."""
+    named = list(dict.fromkeys(atom for pair in pairs for atom in pair))
+    ends = np.array([[named.index(atom) for atom in pair] for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    ends_first = np.argsort(np.bincount(ends.ravel()), kind="stable")
+    atoms, parents = spanning_tree(ends, len(named), ends_first)
+    place = np.argsort(atoms)
+    links = np.stack([place[parents], place[atoms]], axis=1)
+    return [named[k] for k in atoms.tolist()], links[parents != atoms]
 
 
 def angle_between(ux: Any, uy: Any, uz: Any, wx: Any, wy: Any, wz: Any) -> tuple[Any, ...]:
@@ -371,7 +336,7 @@ class MassWeighted(Constraint, base=True):
         yield from super().faults(r, time)
 
 
-class CenterOfMass(MassWeighted, LinearRows):
+class CenterOfMass(MassWeighted, LinearCombination):
     """Cartesian components of the center of mass of a group, q = n . sum_i m_i r_i/M.
 
     Positions are taken as they are (unwrapped), in periodic cells too.
@@ -428,16 +393,11 @@ class CenterDistance(MassWeighted):
     split: int
 
     def __init__(self, group_a: ArrayLike, group_b: ArrayLike, target: Target = None) -> None:
-        try:
-            a, b = (np.atleast_2d(atom_array(group, self.family)) for group in (group_a, group_b))
-            table = np.hstack([a, b])
-        except ValueError:
-            raise InputError(
-                "CenterDistance: group_a and group_b must have the same number of rows, each of equal sizes",
-                item="groups",
-            ) from None
+        a, b = (atom_table(group, self.family, None, "groups") for group in (group_a, group_b))
+        if len(a) != len(b):
+            raise InputError("CenterDistance: group_a and group_b have different numbers of rows", item="groups")
         self.split = a.shape[1]
-        super().__init__(table, target)
+        super().__init__(np.hstack([a, b]), target)
 
     def _settle(self) -> None:
         whole_number(self.split, "CenterDistance: split", 0)

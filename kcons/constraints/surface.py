@@ -7,7 +7,7 @@ taken from the positions as they are: surfaces are not repeated in periodic cell
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,38 +22,39 @@ from kcons.constraints.arguments import (
     atom_array,
     atom_table,
     check_range,
-    read_only,
     unit,
 )
-from kcons.constraints.constraint import Constraint, Fault, RowKind
-from kcons.constraints.target import MovingTarget, Target
+from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.target import Target
 from kcons.errors import InputError
 
-__all__ = [
-    "Cylinder",
-    "Ellipsoid",
-    "FixedAtoms",
-    "Line",
-    "LinearCombination",
-    "LinearRelation",
-    "Plane",
-    "Sphere",
-    "Torus",
-]
+__all__ = ["Ellipsoid", "FixedAtoms", "Line", "LinearCombination", "LinearRelation", "Plane", "Sphere", "Torus"]
 
 _VECTOR = (3,)
 
 
-class LinearRows(Constraint, base=True):
-    """Rows q = sum_a c_a . r_a with constant coefficients, shape (n_rows, width, 3), which are their parameters.
+class LinearCombination(Constraint):
+    """A combination of Cartesian coordinates, q = sum_a c_a . r_a, one row; it has no curvature.
 
-    They have no curvature. Minimum images apply if a common shift of all atoms leaves every row of the
-    object unchanged (coefficients that sum to zero); otherwise the positions are taken as they are.
+    Minimum images apply if a common shift of all atoms leaves every row of the object unchanged (coefficients that sum
+    to zero); otherwise the positions are taken as they are.
+
+    Parameters
+    ----------
+    atoms : array_like of int, shape (n_rows, width) or (width,)
+        Atoms of each row.
+    coefficients : array_like, shape (width, 3) or (n_rows, width, 3)
+        What each coordinate is multiplied with.
+    target : float, array_like, callable of time, MovingTarget or None
+        Value held.
     """
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
     kind = RowKind.LINEAR
     coefficients: FloatArray
+
+    def __init__(self, atoms: ArrayLike, coefficients: ArrayLike, target: Target = None) -> None:
+        super().__init__(atoms, target, coefficients=coefficients)
 
     def _settle(self) -> None:
         c = self.coefficients
@@ -73,32 +74,7 @@ class LinearRows(Constraint, base=True):
         return self.coefficients.reshape(self.n_rows, 3 * self.width)
 
 
-class LinearCombination(LinearRows):
-    """A combination of Cartesian coordinates, q = sum_a c_a . r_a, one row.
-
-    Parameters
-    ----------
-    atoms : array_like of int, shape (n_rows, width) or (width,)
-        Atoms of each row.
-    coefficients : array_like, shape (width, 3) or (n_rows, width, 3)
-        What each coordinate is multiplied with.
-    target : float, array_like, callable of time, MovingTarget or None
-        Value held.
-
-    Examples
-    --------
-    Two atoms kept at the same height:
-
-    >>> level = LinearCombination([0, 1], [[0, 0, 1], [0, 0, -1]], target=0.0)
-    >>> level.n_rows
-    1
-    """
-
-    def __init__(self, atoms: ArrayLike, coefficients: ArrayLike, target: Target = None) -> None:
-        super().__init__(atoms, target, coefficients=coefficients)
-
-
-class LinearRelation(LinearRows):
+class LinearRelation(LinearCombination):
     """An atom at a fixed combination of others, r_a = sum_i w_i r_i: three rows (x, y, z) an atom.
 
     What holds a linear rigid group (two bases) or a planar one (three bases) where distances alone would
@@ -114,14 +90,6 @@ class LinearRelation(LinearRows):
         w_i. With weights that sum to 1 the relation is independent of the origin, and minimum images apply.
     target : array_like of shape (n, 3), callable of time, MovingTarget, or None
         What r_a - sum_i w_i r_i is held at; zero by default, None takes the initial value.
-
-    Examples
-    --------
-    The carbon of CO2 in the middle of its oxygens:
-
-    >>> relation = LinearRelation(0, [1, 2], [0.5, 0.5])
-    >>> relation.n_rows, relation.translation_invariant
-    (3, True)
     """
 
     def __init__(self, atoms: ArrayLike, bases: ArrayLike, weights: ArrayLike, target: Target = 0.0) -> None:
@@ -137,14 +105,11 @@ class LinearRelation(LinearRows):
                 item="weights",
             ) from None
         factors = np.hstack([np.ones((len(w), 1)), -w])
-        super().__init__(
-            np.repeat(np.hstack([dependent, base]), 3, axis=0),
-            target,
-            coefficients=np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, factors.shape[1], 3),
-        )
+        coefficients = np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, factors.shape[1], 3)
+        super().__init__(np.repeat(np.hstack([dependent, base]), 3, axis=0), coefficients, target)
 
 
-class FixedAtoms(LinearRows):
+class FixedAtoms(LinearCombination):
     """Atoms held at given points: three rows (x, y, z) an atom, in the order of `atoms`.
 
     The engine gives them infinite mass; their multipliers are the reaction forces. Each may be named once.
@@ -162,12 +127,7 @@ class FixedAtoms(LinearRows):
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
         column = atom_table(atoms, self.family, 1)
-        if not callable(target) and not isinstance(target, MovingTarget | None):
-            place = as_float_array(target, "target")
-            target = np.tile(place, len(column)) if place.shape == (3,) else place
-        super().__init__(
-            np.repeat(column, 3, axis=0), target, coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :]
-        )
+        super().__init__(np.repeat(column, 3, axis=0), np.tile(np.eye(3), (len(column), 1))[:, None, :], target)
         values, counts = np.unique(column, return_counts=True)
         if len(values) < len(column):
             atom = int(values[np.argmax(counts > 1)])
@@ -213,37 +173,6 @@ class Sphere(Surface):
         out[0], out[1], out[2], out[3] = q, x / q, y / q, z / q
 
 
-class Cylinder(Surface):
-    """Distance from an axis, q = |d - (d.n) n|, d = r - p.
-
-    Parameters
-    ----------
-    atoms : int or array_like of int, shape (n_rows,)
-        The atoms; each is one row.
-    point : array_like, shape (3,) or (n_rows, 3)
-        A point p of the axis.
-    axis : array_like, shape (3,) or (n_rows, 3)
-        Direction n of the axis, of any length.
-    radius : float, array_like, callable of time, MovingTarget or None
-        Distance held; None takes the initial one.
-    """
-
-    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"point": _VECTOR, "axis": _VECTOR}
-    length_powers = {"point": 1}
-    singular = "atom {atom} lies on the axis of the cylinder: gradient undefined; move the atom"
-
-    def __init__(self, atoms: ArrayLike, point: ArrayLike, axis: Directions, radius: Target = None) -> None:
-        super().__init__(atoms, radius, point=point, axis=axis)
-
-    @staticmethod
-    def row(r: Any, p: Any, t: Any, out: Any) -> None:
-        x, y, z = r[0] - p[0], r[1] - p[1], r[2] - p[2]
-        along = x * p[3] + y * p[4] + z * p[5]
-        x, y, z = x - along * p[3], y - along * p[4], z - along * p[5]
-        q = sqrt(x * x + y * y + z * z)
-        out[0], out[1], out[2], out[3] = q, x / q, y / q, z / q
-
-
 class Torus(Surface):
     """Distance from a circle, q = sqrt((rho - R)^2 + z^2), rho and z taken about the axis through `center`.
 
@@ -264,7 +193,6 @@ class Torus(Surface):
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR, "axis": _VECTOR, "major_radius": ()}
     length_powers = {"center": 1, "major_radius": 1}
     singular = "atom {atom} lies on the axis or on the core circle of the torus: gradient undefined; move the atom"
-    major_radius: FloatArray
 
     def __init__(
         self,
@@ -292,8 +220,8 @@ class Torus(Surface):
 class Ellipsoid(Surface):
     """Level of an ellipsoid, q = s (|y| - 1), y_i = (e_i . (r - c))/a_i; the surface is q = 0.
 
-    s is the geometric mean of the semi-axes, so that q is a length and its gradient of order one: s/a_i at
-    the ends of the axes.
+    n/s^2 is the sum of 1/a_i^2 over the n finite semi-axes, so that q is a length and its gradient of order one: s/a_i
+    at the ends of the axes. A cylinder of radius R is one of semi-axes R, R and infinity, with q its distance from it.
 
     Parameters
     ----------
@@ -302,7 +230,7 @@ class Ellipsoid(Surface):
     center : array_like, shape (3,) or (n_rows, 3)
         Center c.
     semi_axes : array_like, shape (3,) or (n_rows, 3)
-        Semi-axes a_i. An infinite one makes it an elliptic cylinder along that axis.
+        Semi-axes a_i. An infinite one makes it a cylinder along that axis.
     rotation : array_like, shape (3, 3) or (n_rows, 3, 3), optional
         Orthonormal directions e_i of the axes, as columns; x, y, z by default.
     target : float, array_like, callable of time, MovingTarget or None
@@ -313,9 +241,7 @@ class Ellipsoid(Surface):
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"size": (), "center": _VECTOR, "matrix": (3, 3)}
     length_powers = {"size": 1, "center": 1, "matrix": -1}
     singular = "atom {atom} lies at the center of the ellipsoid: gradient undefined; move the atom"
-    #: s, and B with y = B (r - c), whose rows are e_i/a_i.
-    size: FloatArray
-    matrix: FloatArray
+    size: FloatArray  # s; the rows of the matrix are e_i/a_i
 
     def __init__(
         self,
@@ -333,26 +259,10 @@ class Ellipsoid(Surface):
                 "Ellipsoid: the columns of rotation are not orthonormal; give unit vectors at right angles",
                 item="rotation",
             )
-        finite = inverse > 0
-        if not np.all(finite.any(axis=1)):
-            raise InputError("Ellipsoid: a row has no finite positive semi-axis", item="semi_axes")
-        logs = np.log(np.where(finite, inverse, 1.0)).sum(axis=1)
-        size = np.exp(-logs / finite.sum(axis=1))
+        if not np.all(inverse.any(axis=1)):
+            raise InputError("Ellipsoid: a row has no finite semi-axis", item="semi_axes")
+        size = np.sqrt(np.count_nonzero(inverse, axis=1) / np.square(inverse).sum(axis=1))
         self._keep(size=size, center=center, matrix=axes * inverse[:, :, None])
-
-    def _settle(self) -> None:
-        if not hasattr(self, "size"):  # not yet, `__init__` keeps it later
-            return
-        square = self.matrix @ self.matrix.transpose(0, 2, 1)
-        inverse = np.sqrt(np.diagonal(square, axis1=1, axis2=2))
-        across = np.abs(square) > 1e-9 * inverse[:, :, None] * inverse[:, None]
-        means = [np.exp(-np.log(each[each > 0]).mean()) if each.any() else np.nan for each in inverse]
-        if (across & ~np.eye(3, dtype=bool)).any() or not np.allclose(self.size, means, rtol=1e-9, atol=0.0):
-            raise InputError(
-                "Ellipsoid: the rows of matrix are directions at right angles over the semi-axes, and size is the "
-                "geometric mean of these",
-                item="matrix",
-            )
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
@@ -372,14 +282,8 @@ class Ellipsoid(Surface):
     def scale(self, time: float = 0.0) -> FloatArray:
         return self.size
 
-    def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
-        yield from super().faults(r, time)
-        if self.target is not None:
-            target, words = self.target_at(time), "lies beyond the center of the ellipsoid; use 0 for its surface"
-            yield ~(target > -self.size), lambda k: f"target {target[k]:g} {words}", "target"
 
-
-class Plane(LinearRows):
+class Plane(LinearCombination):
     """Distance along a normal, q = n . r.
 
     Parameters
@@ -389,30 +293,22 @@ class Plane(LinearRows):
     normal : array_like, shape (3,) or (n_rows, 3)
         Normal of the plane, of any length; n is its unit vector.
     offset : float, array_like, callable of time, MovingTarget or None
-        n . r of the plane.
-    point : array_like, shape (3,) or (n_rows, 3), optional
-        A point of the plane, instead of `offset`. Without either, each atom keeps its initial plane.
+        n . r of the plane; None lets each atom keep its initial plane.
     """
 
     kind = RowKind.FUNCTION  # which is as fast as others of one atom, and faster than linear rows of any width
     row_width = 1
 
-    def __init__(
-        self, atoms: ArrayLike, normal: Directions, offset: Target = None, *, point: ArrayLike | None = None
-    ) -> None:
-        if offset is not None and point is not None:
-            raise InputError("Plane: give either offset or point, not both", item="point")
+    def __init__(self, atoms: ArrayLike, normal: Directions, offset: Target = None) -> None:
         n = np.asarray(normal)
-        super().__init__(atoms, offset, coefficients=n if n.ndim == 1 else n[:, None])
-        if point is not None:
-            self.target = _held(self, point)
+        super().__init__(atoms, n if n.ndim == 1 else n[:, None], offset)
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
         out[0], out[1], out[2], out[3] = p[0] * r[0] + p[1] * r[1] + p[2] * r[2], p[0], p[1], p[2]
 
 
-class Line(LinearRows):
+class Line(LinearCombination):
     """Atoms on a straight line: two rows an atom, q = e_1 . r and e_2 . r, e_1 and e_2 normal to it.
 
     Parameters
@@ -433,19 +329,14 @@ class Line(LinearRows):
         # Normal to the line and to the coordinate axis it is farthest from.
         first = unit(np.cross(along, np.eye(3)[np.argmin(np.abs(along), axis=1)]), "direction")
         both = np.stack([first, np.cross(along, first)], axis=1).reshape(-1, 1, 3)
-        super().__init__(np.repeat(column, 2, axis=0), None, coefficients=both)
-        if point is not None:
-            self.target = _held(self, np.repeat(_for_each(point, len(column), "point"), 2, axis=0))
+        places = None if point is None else np.repeat(_for_each(point, len(column), "point"), 2, axis=0)
+        target = None if places is None else np.einsum("ki,ki->k", both[:, 0], places)
+        super().__init__(np.repeat(column, 2, axis=0), both, target)
 
 
 def _for_each(vectors: ArrayLike, count: int, name: str) -> FloatArray:
     array = as_float_array(vectors, name)
     if array.shape not in ((3,), (count, 3)):
         raise InputError(f"{name} has shape {array.shape}; give (3,) or ({count}, 3)", item=name)
+    check_range(array, f"{name} of row {{row}}", name)
     return np.broadcast_to(array, (count, 3))
-
-
-def _held(item: LinearRows, point: ArrayLike) -> FloatArray:
-    points = _for_each(point, item.n_rows, "point")
-    check_range(points, f"{item.family}: point of row {{row}}", "point")
-    return read_only(np.asarray(np.einsum("ki,ki->k", item.coefficients[:, 0], points)))

@@ -25,7 +25,6 @@ _NAMES = {
     "profiles.profile": ("Profile", "Surface", "fit_surface", "integrate", "plot_profile"),
     "profiles.pulls": ("Pulled", "pull_free_energy"),
     "scans.relaxed_scan": ("Scan", "scan"),
-    "scans.system_calculator": ("SystemCalculator",),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)

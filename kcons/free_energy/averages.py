@@ -136,12 +136,12 @@ def agreement(one: FloatArray, other: FloatArray, covariance: FloatArray) -> flo
     """Probability, by chi square, of a difference of two means (d,) as large as theirs, if both are of the same.
 
     `covariance` (d, d) is that of both together; where it is singular, only what has an error counts, and a difference
-    in what has none has the probability 0. Differences of rounding, 1e-9 of the largest mean, are none.
+    in what has none has the probability 0. Differences of rounding, 1e-9 of the largest mean or of 1, are none.
     """
     sizes, directions = np.linalg.eigh(covariance)
     known = sizes > 1e-12 * max(float(sizes[-1]), 0.0)
     parts = directions.T @ (one - other)
-    parts[np.abs(parts) <= 1e-9 * max(np.abs(one).max(), np.abs(other).max())] = 0.0
+    parts[np.abs(parts) <= 1e-9 * max(np.abs(one).max(), np.abs(other).max(), 1.0)] = 0.0
     if parts[~known].any():
         return 0.0
     count = int(known.sum())

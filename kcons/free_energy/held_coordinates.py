@@ -77,8 +77,8 @@ def named(coordinates: Mapping[str, Constraint]) -> dict[str, Constraint]:
         remedy = 'give a mapping of names to constraints, such as {"torsion": Dihedral([[0, 1, 2, 3]])}'
         raise InputError(f"no coordinates are named; {remedy}", item="coordinates")
     for name, coordinate in coordinates.items():
-        if not isinstance(coordinate, Constraint):
-            raise InputError(f"{name!r} is {coordinate!r}, and no kcons constraint", item=name)
+        if not isinstance(coordinate, Constraint) or coordinate.n_rows != 1:
+            raise InputError(f"{name!r} is {coordinate!r}; give a kcons constraint of one row", item=name)
     return dict(coordinates)
 
 
@@ -92,8 +92,7 @@ class HeldCoordinates:
     motion : Motion or ConstraintSet
         What is held. For a dynamics class of ASE, ``dynamics.motion``.
     coordinates : mapping of str to Constraint
-        Each a constraint of the set, named by an object of the same kind on the same atoms. One with n > 1 rows gives
-        n coordinates, ``name[0]`` to ``name[n - 1]``.
+        Each a row of the set, named by a constraint of the same kind on the same atoms.
     positions : array_like, shape (n_atoms, 3)
         Where it is found out whether the coordinates depend on the other constraints.
     time : float
@@ -137,28 +136,23 @@ class HeldCoordinates:
     ) -> None:
         held = motion if isinstance(motion, ConstraintSet) else motion.sources[0]
         x = as_array(positions, (held.n_atoms, 3), "positions")
-        names: list[str] = []
-        rows: list[int] = []
+        names: dict[int, str] = {}
         for name, coordinate in named(coordinates).items():
-            found = rows_like(held, coordinate, name)
-            for k, row in enumerate(found):
-                label = name if len(found) == 1 else f"{name}[{k}]"
-                if row in rows:
-                    same = names[rows.index(row)]
-                    raise InputError(f"{same} and {label} are the same row {row} of the set", item=same)
-                if label in names:
-                    raise InputError(f"two coordinates have the name {label!r}; give each its own", item=label)
-                names.append(label)
-                rows.append(row)
-        self.names = tuple(names)
-        self.rows: IntArray = np.array(rows, dtype=np.int64)
+            (row,) = rows_like(held, coordinate, name)
+            if row in names:
+                raise InputError(f"{names[row]} and {name} are the same row {row} of the set", item=names[row])
+            names[row] = name
+        self.names = tuple(names.values())
+        self.rows: IntArray = np.array([*names], dtype=np.int64)
         self._source = held
         label = connected_components(held.incidence @ held.incidence.T, directed=False)[1]
         everything = np.flatnonzero(np.isin(label, label[self.rows]))  # of the clusters of the coordinates
         others = np.setdiff1d(everything, self.rows)
         if not held.holonomic[others].all():
             said = "share atoms with velocity constraints, under which configurations have no known distribution"
-            raise UnsupportedError(f"{' and '.join(names)} {said}; multipliers alone are those of Motion.multipliers")
+            raise UnsupportedError(
+                f"{' and '.join(self.names)} {said}; multipliers alone are those of Motion.multipliers"
+            )
         # All rows of the clusters; in results those of the coordinates, as they are named, come after the others.
         self._rows, self.atoms = held.subset(everything)
         self._order = np.searchsorted(everything, np.concatenate([others, self.rows]))
@@ -460,4 +454,4 @@ def leaves_the_rest(
         root = np.sqrt(np.repeat(part.masses, 3))
         slopes = (part.jacobian(place[atoms]).toarray() / root for place in (x, there))
         before, after = (float(np.linalg.slogdet(a @ a.T)[1]) for a in slopes)  # minus infinity of dependent rows
-    return bool(np.isfinite(before) and abs(after - before) < _SAME)
+    return abs(after - before) < _SAME

@@ -35,7 +35,7 @@ def _column(field: str) -> property:
 
 
 class Series(list[Sample]):
-    """Samples of held coordinates; see `Sample` for what they are. A slice is a series of some, a sum one of all.
+    """Samples of held coordinates; see `Sample` for what they are. A slice is a series of some.
 
     Parameters
     ----------
@@ -74,16 +74,6 @@ class Series(list[Sample]):
         part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom)
         part += found
         return part
-
-    def __add__(self, others: Any) -> Series:  # type: ignore[override]
-        refuse_other(others, Series, "others", "a kcons.free_energy.Series")
-        for name in ("names", "periods", "isokinetic_degrees_of_freedom"):
-            mine, theirs = getattr(self, name), getattr(others, name)
-            if not np.array_equal(mine, theirs):
-                raise InputError(f"{name} are {mine} and {theirs}; add series of the same coordinates", item=name)
-        whole: Series = self[:]
-        whole += others
-        return whole
 
     time, value, multiplier, kinetic, log_det_z, gradient, off, turned, mean_kinetic = map(_column, Sample._fields)
 

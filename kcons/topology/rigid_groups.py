@@ -65,8 +65,8 @@ _AS_GOOD = 1 - 1e-6
 class VirtualSites:
     """Sites at r_0 + a (r_1 - r_0) + b (r_2 - r_0) + c (r_1 - r_0) x (r_2 - r_0).
 
-    They have no mass and no degrees of freedom, so that nothing holds them: they are placed after every move of
-    their parents, and their forces act on the parents.
+    They have no mass and no degrees of freedom, so that nothing holds them: they are placed after every move of their
+    parents.
 
     Attributes
     ----------
@@ -84,37 +84,14 @@ class VirtualSites:
     def __len__(self) -> int:
         return len(self.sites)
 
-    def _arms(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        origin = x[self.parents[:, 0]]
-        return origin, x[self.parents[:, 1]] - origin, x[self.parents[:, 2]] - origin
-
     def place(self, positions: ArrayLike) -> FloatArray:
         """Positions with the sites where they belong, shape (n_atoms, 3); molecules must be whole."""
         x = np.array(as_float_array(positions, "positions"))
-        origin, u, w = self._arms(x)
+        origin = x[self.parents[:, 0]]
+        u, w = (x[self.parents[:, k]] - origin for k in (1, 2))
         a, b, c = self.coefficients.T[:, :, None]
         x[self.sites] = origin + a * u + b * w + c * np.cross(u, w)
         return x
-
-    def spread_forces(self, positions: ArrayLike, forces: ArrayLike) -> FloatArray:
-        """Forces with those on the sites handed to the parents, shape (n_atoms, 3).
-
-        The work along any motion of the parents, total force and torque stay the same.
-        """
-        x = as_float_array(positions, "positions")
-        f = np.array(as_float_array(forces, "forces"))
-        if f.shape != x.shape:
-            raise InputError(f"forces have shape {f.shape}, positions {x.shape}", item="forces")
-        _, u, w = self._arms(x)
-        a, b, c = self.coefficients.T[:, :, None]
-        acting = f[self.sites].copy()
-        first = a * acting + c * np.cross(w, acting)
-        second = b * acting + c * np.cross(acting, u)
-        f[self.sites] = 0.0
-        np.add.at(f, self.parents[:, 0], acting - first - second)
-        np.add.at(f, self.parents[:, 1], first)
-        np.add.at(f, self.parents[:, 2], second)
-        return f
 
     def in_unit(self, factor: float) -> VirtualSites:
         """The same where lengths are given by numbers larger by `factor`."""

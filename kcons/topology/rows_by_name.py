@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, LinearRelation
 from kcons.constraints.arguments import checked
-from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import lined_up
 from kcons.errors import InputError, did_you_mean
@@ -320,17 +320,7 @@ def rows_of(snapshot: Snapshot, holding: Holding, numbers: Callable[[Any], IntAr
     Returns
     -------
     HeldRows
-        Targets are those of the positions, where none are given.
-
-    Raises
-    ------
-    InputError
-        Unknown names, nothing to hold, missing bonds, masses or elements, odd waters; each says what to do.
-
-    Warns
-    -----
-    UserWarning
-        If bonds were guessed without being asked for (guess_bonds='missing'), or not for all hydrogens.
+        Targets are those of the positions, where none are given. Errors and warnings are those of `with_options`.
     """
     kind, topology = holding.kind, snapshot.topology
     geometry, _ = holding.geometry()
@@ -358,12 +348,8 @@ def rows_of(snapshot: Snapshot, holding: Holding, numbers: Callable[[Any], IntAr
     if len(waters.triples):
         rows.append(water_rows(waters.triples, geometry, snapshot.angstrom))
     rows += body_rows(snapshot, groups)
-    for key, make in holding.own_rows:
-        made = make(numbers(key))
-        if not isinstance(made, Constraint):
-            raise InputError(f"{make!r} gave {made!r}, which is no kcons constraint", item="on")
-        rows.append(made)
-    rows = [item for item in rows if item.n_rows]
+    own = [row for key, make in holding.own_rows for row in constraints_in(make(numbers(key)), "on")]
+    rows = [item for item in (*rows, *own) if item.n_rows]
     if not rows:
         raise InputError(_nothing(snapshot.topology, kind, selected), item="constrain")
     _check_masses(snapshot.topology, rows)
@@ -503,12 +489,8 @@ def _internal(
 
 def _closing(bonds: IntArray, hydrogen: BoolArray) -> BoolArray:
     """Bonds between two hydrogens that have other bonds."""
-    both: BoolArray = np.all(hydrogen[bonds], axis=1)
-    if not both.any():
-        return both
     degree = np.bincount(bonds.ravel(), minlength=len(hydrogen))
-    closing: BoolArray = both & np.all(degree[bonds] > 1, axis=1)
-    return closing
+    return np.asarray(np.all(hydrogen[bonds] & (degree[bonds] > 1), axis=1))
 
 
 # -- checks ---------------------------------------------------------------------------------------

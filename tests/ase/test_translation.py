@@ -39,10 +39,10 @@ from kcons.ase import (
 from kcons.constraints import (
     Angle,
     CenterOfMass,
+    Custom,
     Dihedral,
     Distance,
     FixedAtoms,
-    ImplicitSurface,
     LinearCombination,
     Plane,
     Sphere,
@@ -229,9 +229,9 @@ def test_attach_keeps_objects_that_add_forces_and_refuses_unknown_ones():
 
 def test_function_rows_are_left_out_of_files_with_a_warning(tmp_path):
     atoms = Atoms("H2", positions=[[1, 0, 0], [3, 0, 0]])
-    surface = ImplicitSurface([0], lambda r: (r**2).sum(axis=1) - 1, lambda r: 2 * r)
+    surface = Custom([0], lambda r: (r**2).sum() - 1, lambda r: 2 * r, 0.0)
     constrain(atoms, [surface, Distance([0, 1])])
-    with pytest.warns(UserWarning, match="left out of the file: ImplicitSurface"):
+    with pytest.warns(UserWarning, match="left out of the file: Custom"):
         write(tmp_path / "a.traj", atoms)
     assert np.array_equal(read(tmp_path / "a.traj").positions, atoms.positions)
     with pytest.warns(UserWarning, match="left out"):

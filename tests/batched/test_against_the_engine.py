@@ -14,7 +14,7 @@ from tests.systems.rows_in_cells import MASSES as CHAIN_MASSES
 
 STEP = 0.01
 #: Functions of Python, of which the engine takes differences of eleven digits.
-DIFFERENCED = {name for name in CASES if name.startswith(("Custom", "ImplicitSurface"))}
+DIFFERENCED = {name for name in CASES if name.startswith("Custom")}
 
 
 @pytest.fixture(params=["lanes", "levels"])

@@ -10,7 +10,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from ase.build import molecule
 from ase.io import write
@@ -60,27 +59,6 @@ def test_an_input_runs_and_goes_on(tmp_path, capsys):
     assert "No such file or directory: 'nothing.toml'" in capsys.readouterr().err
 
 
-PULLS = """
-[pulls]
-to = 200
-count = 5
-steps = 40
-"""
-
-
-def test_pulls_beside_windows(tmp_path, capsys):
-    (tmp_path / "input.toml").write_text(INPUT + PULLS)
-    assert main(["freeenergy", "input.toml", "--workers", "1"]) == 0
-    shown = capsys.readouterr().out
-    assert "pulls give " in shown and "(BAR)" in shown and " standard errors" in shown and "input/pulls.json" in shown
-    assert len(list((tmp_path / "input" / "pulls").glob("pull-*.npz"))) == 10
-    known = json.loads((tmp_path / "input" / "pulls.json").read_text())
-    assert np.degrees([known["from"][0], known["to"][0]]) == pytest.approx([60, 200])
-    assert set(known) >= {"bar", "jarzynski", "windows"}
-    difference = (known["bar"][0] - known["windows"][0]) / np.hypot(known["bar"][1], known["windows"][1])
-    assert f"{difference:+.1f} standard errors" in shown
-
-
 def test_modules_of_an_input_are_allowed_by_name(tmp_path, capsys):
     mine = 'calculator = "lj"\nsettings = {sigma = 1.0, epsilon = 0.02, rc = 6.0}'
     other = 'calculator = "os:system"\nsettings = {command = "touch ran"}'
@@ -120,15 +98,8 @@ def test_a_run_that_is_stopped_says_how_it_goes_on(tmp_path):
     assert [path.name for path in (tmp_path / "input").iterdir()] == ["settings.json"]
 
 
-def test_two_runs_into_one_folder_and_results_of_others(tmp_path, capsys):
+def test_two_runs_into_one_folder(capsys):
     given = read_input("input.toml")
     with Windows(given.sampler, "input", given.settings, **given.options).taken():
         assert main(["freeenergy", "input.toml"]) == 2
     assert "kcons: another run writes into input (process " in capsys.readouterr().err
-    # Before any window is sampled.
-    (tmp_path / "input.toml").write_text(INPUT + PULLS)
-    (tmp_path / "new" / "pulls").mkdir(parents=True)
-    (tmp_path / "new" / "pulls" / "settings.json").write_text("precious")
-    assert main(["freeenergy", "input.toml", "--out", "new"]) == 2
-    assert "new/pulls has other files called settings.json" in capsys.readouterr().err
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["pulls"]

@@ -9,11 +9,10 @@ import pytest
 
 from kcons.constraints import (
     Custom,
-    CustomVelocity,
     Distance,
     Ellipsoid,
     FixedAtoms,
-    ImplicitSurface,
+    Line,
     LinearCombination,
     LinearRelation,
     Plane,
@@ -102,14 +101,12 @@ WAYS = {
     "targets of fixed atoms": lambda m, bad: FixedAtoms([0, 1, 2], bad),
     "a moving target": lambda m, bad: FixedAtoms([0, 1, 2], lambda t: bad).target_at(0.0),
     "normals": lambda m, bad: Plane([0, 1, 2], bad),
-    "points": lambda m, bad: Plane([0, 1, 2], [0, 0, 1], point=bad),
+    "points": lambda m, bad: Line([0, 1, 2], bad, [0, 0, 1]),
     "centers": lambda m, bad: Sphere([0, 1, 2], bad),
     "semi-axes": lambda m, bad: Ellipsoid([0, 1, 2], np.zeros(3), bad),
     "coefficients": lambda m, bad: LinearCombination([0, 1, 2], bad),
     "weights": lambda m, bad: LinearRelation([3], [0, 1, 2], bad if isinstance(bad, list) else bad[0]),
     "a gradient": lambda m, bad: held([Custom([0, 1, 2], lambda r: 1.0, lambda r: bad)]),
-    "gradients of a surface": lambda m, bad: held([ImplicitSurface([0, 1, 2], lambda r: r[:, 0], lambda r: bad)]),
-    "coefficients by a function": lambda m, bad: held([CustomVelocity([0, 1, 2], lambda r: bad)]),
 }
 
 
@@ -163,11 +160,8 @@ def of_velocities(motion, force, stepper) -> None:
 CALLS = {
     "potential": lambda m, f: System(m, lambda x, t: PULL, potential=f).total_energy(State(X, 0 * X)),
     **{f"force of v, {each!r}": partial(of_velocities, stepper=each) for each in (Rattle(), Suzuki4(), Geodesic(3))},
-    "CustomVelocity": lambda m, f: held([CustomVelocity([0], f)]),
     "Custom": lambda m, f: held([Custom([0], f)]),
     "Custom, gradient": lambda m, f: held([Custom([0], lambda r: r[0, 0], f)]),
-    "ImplicitSurface": lambda m, f: held([ImplicitSurface([0], f, target=None)]),
-    "ImplicitSurface, gradient": lambda m, f: held([ImplicitSurface([0], lambda r: r[:, 0], f, target=None)]),
 }
 
 

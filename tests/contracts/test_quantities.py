@@ -24,7 +24,7 @@ WITH_UNITS = {
     "semi-axes": lambda: Ellipsoid(0, [0, 0, 0], [1, 2, 3] * nm),
     "normal": lambda: Plane(0, [0, 0, 1] * nm),
     "parameter": lambda: Formula("x1 - a", 0, {"a": 1 * nm}),
-    "time_step": lambda: Custom([0], lambda r: r[0, 2], time_step=1 * fs),
+    "length": lambda: Custom([0], lambda r: r[0, 2], length=1 * nm),
     "another target": lambda: Distance([[0, 1]]).with_target(1 * angstrom),
     "what a function returns": lambda: Distance([[0, 1]], lambda t: (3 + t) * angstrom).target_at(0.0),
 }

@@ -31,9 +31,7 @@ def test_reference_time_is_that_of_the_gradients() -> None:
     def normal(t: float) -> np.ndarray:
         return np.array([-np.sin(t), np.cos(t), 0.0])
 
-    plane = held.ImplicitSurface(
-        [0], lambda r, t: r @ normal(t), lambda r, t: np.tile(normal(t), (len(r), 1)), time_dependent=True
-    )
+    plane = held.Formula("y1*cos(t) - x1*sin(t)", [0])
     x = np.array([[1.0, 0.0, 0.0]])
     motion = Motion(ConstraintSet(plane, x, [2.0]), x)
     for reference in (0.0, 0.2, None):

@@ -17,16 +17,6 @@ def ar1(rng, n, memory, d=1):
     return lfilter([1.0], [1.0, -memory], noise, axis=0)
 
 
-def test_samples_are_worth_fewer_independent_ones():
-    """That intervals cover as often as they say is asked in tests/thermostats/test_correlated_series.py."""
-    rng = np.random.default_rng(1)
-    for memory in (0.0, 0.7, 0.9):
-        exact = (1 + memory) / (1 - memory)
-        found = [weighted_mean(5.0 + ar1(rng, round(1000 * exact), memory)) for _ in range(300)]
-        assert np.median([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.1)
-        assert np.median([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
-
-
 @pytest.mark.filterwarnings("ignore:.*independent ones")  # in one of 300, a single block has most of the spread
 def test_weights_that_belong_to_the_values():
     """x normal with weight exp(b x) has the mean b. The weights have the memory of x."""
@@ -43,21 +33,11 @@ def test_several_quantities_at_once_have_a_covariance():
     rng = np.random.default_rng(3)
     mixing = np.array([[1.0, 0.0], [0.8, 0.3]])
     found = [weighted_mean(ar1(rng, 1000, 0.5, d=2) @ mixing.T) for _ in range(300)]
+    assert np.median([m.n_effective for m in found]) == pytest.approx(1000 / 3, rel=0.15)
     seen = np.cov(np.array([m.value for m in found]).T)
     said = np.mean([m.covariance for m in found], axis=0)
     assert said == pytest.approx(3 * mixing @ mixing.T / 1000, rel=0.08)
     assert seen == pytest.approx(said, rel=0.25)  # of 300 samples, a variance is known to 8 percent
-
-
-def test_weights_mean_what_repetition_means():
-    rng = np.random.default_rng(4)
-    x = rng.standard_normal(200)
-    often = rng.integers(1, 4, 200)
-    assert weighted_mean(x, often).value == pytest.approx([np.repeat(x, often).mean()], rel=1e-13)
-    one, *others = (weighted_mean(x, factor * often) for factor in (1.0, 1e-300, 5e307))  # which does not matter
-    for other in others:
-        assert one.value == pytest.approx(other.value) and one.error == pytest.approx(other.error, rel=1e-9)
-    assert one.n == 200 and one.n_effective <= often.sum() ** 2 / (often**2).sum()
 
 
 def test_one_sample_with_all_the_weight_is_warned_of():
@@ -97,6 +77,7 @@ def test_windows_that_agree_do_so_with_the_right_probability():
         # Known exactly, as the multiplier of two atoms alone, where each side has another rounding.
         ([-7.75], [-7.75 * (1 + 1e-13)], [2e-28], 1.0),
         ([-7.75], [-7.75 * (1 + 1e-6)], [2e-28], 0.0),
+        ([2e-15], [-1e-15], [2e-32], 1.0),  # 0 by symmetry
     ],
 )
 def test_agreement_of_single_numbers_and_of_exact_ones(one, other, variances, chance):

@@ -114,13 +114,13 @@ def test_many_samples_at_once_are_those_taken_alone(case):
 def test_names_follow_the_mapping_and_not_the_set():
     bond, turn, bend = Distance([[0, 1]]), Dihedral([[0, 1, 2, 3]]), Angle([[1, 2, 3], [2, 3, 4]])
     constraint_set = ConstraintSet([bend, bond, turn], CHAIN, MASSES)
-    mine = HeldCoordinates(constraint_set, {"turn": turn, "bend": bend, "bond": Distance([[1, 0]])}, CHAIN)
-    assert mine.names == ("turn", "bend[0]", "bend[1]", "bond")
-    assert mine.rows.tolist() == [3, 0, 1, 2]
+    mine = HeldCoordinates(constraint_set, {"turn": turn, "bend": bend.select([1]), "bond": Distance([[1, 0]])}, CHAIN)
+    assert mine.names == ("turn", "bend", "bond")
+    assert mine.rows.tolist() == [3, 1, 2]
     sample = mine.sample(CHAIN, np.zeros((N, 3)), np.zeros((N, 3)))
     np.testing.assert_allclose(sample.value, constraint_set.measure(CHAIN)[mine.rows], rtol=1e-15)
-    assert mine.periods == pytest.approx([2 * np.pi, 0, 0, 0])
-    assert repr(mine) == "<HeldCoordinates: turn, bend[0], bend[1], bond, beside 0 rows of their clusters>"
+    assert mine.periods == pytest.approx([2 * np.pi, 0, 0])
+    assert repr(mine) == "<HeldCoordinates: turn, bend, bond, beside 1 rows of their clusters>"
 
 
 R, BEND, BONDS = Distance([[0, 3]]), Angle([[0, 3, 4]]), Distance([[0, 1], [1, 2]])

@@ -78,7 +78,8 @@ def test_weights_take_the_metric_away():
     """<cos^2> of three equal masses with two bonds held: raw 0.321021053874, weighted 1/3."""
     x = trimer(20000)
     cosine = np.einsum("ni,ni->n", x[:, 0], x[:, 2])
-    series = series_of({"bonds": Distance([[0, 1], [1, 2]])}, [], np.ones(3), x[:200], np.zeros_like)
+    bonds = {"first": Distance([[0, 1]]), "second": Distance([[1, 2]])}
+    series = series_of(bonds, [], np.ones(3), x[:200], np.zeros_like)
     np.testing.assert_allclose(np.exp(series.log_det_z), (4 - cosine**2)[:200], rtol=1e-12)
     log_weights = -0.5 * np.log(4 - cosine**2)
     np.testing.assert_allclose(series.weights, np.exp(log_weights[:200] + 0.5 * series.log_det_z.min()), rtol=1e-12)

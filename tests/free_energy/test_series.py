@@ -78,11 +78,6 @@ def test_files_have_all_of_it(tmp_path):
     for field in Sample._fields:
         np.testing.assert_array_equal(getattr(read, field), getattr(series, field))
     np.testing.assert_array_equal(read[3:6].multiplier, series.multiplier[3:6])
-    whole = read[:3] + series[3:]
-    assert whole.isokinetic_degrees_of_freedom == 7 and np.array_equal(whole.work, series.work)
-    for other, said in ((Series(["turn", "bond"]), "periods are"), (Series(["a"]), "names are"), ([], "give a kcons")):
-        with pytest.raises(InputError, match=said):
-            series + other
     empty = Series(["a", "b"])
     empty.save(tmp_path / "empty.npz")
     assert len(Series.load(tmp_path / "empty.npz")) == 0 and empty.work.shape == empty.weights.shape == (0,)

@@ -85,7 +85,6 @@ def test_table_for_distances(shape, pairs, times, expected) -> None:
         ([held.Distance([0, 1]), held.CenterOfMass([[0, 1, 2, 3, 4]])], ("SparseRows", 1, 4, 4)),
         ([held.RadiusOfGyration([[0, 1, 2], [2, 1, 0]])], ("SparseRows", 1, 2, 1)),
         ([blade([0, 1])], ("SparseRows", 1, 1, 1)),
-        ([held.ImplicitSurface([0, 1], lambda r: r[:, 0] - 3.0, target=None)], ("GeneralClusters", 2, 2, 2)),
     ],
 )
 def test_table_for_other_rows(rows, expected) -> None:

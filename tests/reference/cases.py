@@ -171,8 +171,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def _ellipse_xz(spec: Spec) -> list[held.Constraint]:
-    weights = np.array([1 / spec["a"] ** 2, 0.0, 1 / spec["b"] ** 2])
-    return [held.ImplicitSurface(spec["atom"], lambda x: x**2 @ weights - 1, lambda x: 2 * weights * x)]
+    return [held.Formula("(x1/a)**2 + (z1/b)**2 - 1", spec["atom"], {"a": spec["a"], "b": spec["b"]})]
 
 
 def _rotating_plane(spec: Spec) -> list[held.Constraint]:

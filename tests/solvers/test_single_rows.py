@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import Angle, Custom, Cylinder, Dihedral, Distance, Ellipsoid, Formula, Plane, Sphere, Torus
+from kcons.constraints import Angle, Custom, Dihedral, Distance, Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.errors import ConvergenceError
 from kcons.solvers.addressable_solvers import pack_solver_tables, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.cluster_solver import Request
@@ -63,7 +63,7 @@ def around(n: int) -> np.ndarray:
 ITEMS = {
     "Sphere": lambda atoms, own: Sphere(atoms, OFF + own),
     "Plane": lambda atoms, own: Plane(atoms, AXIS + own),
-    "Cylinder": lambda atoms, own: Cylinder(atoms, OFF + own, AXIS),
+    "Cylinder": lambda atoms, own: Ellipsoid(atoms, OFF + own, [1.0, np.inf, 1.0], target=None),
     "Ellipsoid": lambda atoms, own: Ellipsoid(atoms, OFF + own, [1.0, 2.0, 3.0], target=None),
     "Torus": lambda atoms, own: Torus(atoms, OFF + own, AXIS, 0.5),
     "Formula": lambda atoms, own: Formula("z1 - a*sin(x1 + t)*y1**2", atoms, {"a": 0.5 + np.ravel(own[..., 0])}, None),

@@ -22,10 +22,9 @@ from stepper_systems import (
 )
 
 from kcons.constraints import (
-    CustomVelocity,
     Distance,
     FixedAtoms,
-    ImplicitSurface,
+    Formula,
     MovingTarget,
     Plane,
     Sphere,
@@ -362,22 +361,14 @@ def test_great_circles_end_on_the_sphere_wherever_they_start() -> None:
 # -- times ------------------------------------------------------------------------------------------
 
 
-def turning(rate: float = 1.3) -> ImplicitSurface:
+def turning(rate: float = 1.3) -> Formula:
     """Atom 0 in a plane through the z axis that turns: the gradient depends on the time, not only the value."""
-    return ImplicitSurface(
-        0,
-        lambda r, t: r[:, 0] * np.sin(rate * t) - r[:, 1] * np.cos(rate * t),
-        lambda r, t: np.tile([np.sin(rate * t), -np.cos(rate * t), 0.0], (len(r), 1)),
-        time_dependent=True,
-        length=1.0,
-    )
+    return Formula("x1*sin(w*t) - y1*cos(w*t)", 0, {"w": rate})
 
 
-def pushed(speed) -> CustomVelocity:
+def pushed(speed) -> VelocityFormula:
     """Atom 2 moves at a given speed in a direction that turns with the time and depends on the place."""
-    return CustomVelocity(
-        [2], lambda r, t: np.array([[np.cos(2 * t), np.sin(2 * t), r[0, 0]]]), target=speed, time_dependent=True
-    )
+    return VelocityFormula("vx1*cos(2*t) + vy1*sin(2*t) + vz1*x1", 2, target=speed)
 
 
 def swept(*more) -> tuple:

@@ -38,55 +38,18 @@ def _rotation() -> np.ndarray:
     return q
 
 
-def hoop(atoms: object, omega: float = 0.8) -> kc.ImplicitSurface:
-    """A plane through the z axis that turns with omega: -x sin(wt) + y cos(wt) = 0."""
+def spread(atoms: object, *, given: bool = True) -> kc.Custom:
+    """exp(-|r_0 - r_1|^2/8) + |r_1 - r_2|^2/5, its gradient given or not."""
 
-    def function(r, t):
-        return -r[:, 0] * np.sin(omega * t) + r[:, 1] * np.cos(omega * t)
+    def function(r):
+        return np.exp(-np.sum((r[0] - r[1]) ** 2) / 8) + np.sum((r[1] - r[2]) ** 2) / 5
 
-    def normal(r, t):
-        return np.tile([-np.sin(omega * t), np.cos(omega * t), 0.0], (len(r), 1))
-
-    return kc.ImplicitSurface(atoms, function, normal, time_dependent=True)
-
-
-def saddle(atoms: object) -> kc.ImplicitSurface:
-    """z = (x^2 - y^2)/4 + x^3/9."""
-    return kc.ImplicitSurface(
-        atoms,
-        lambda r: r[:, 2] - (r[:, 0] ** 2 - r[:, 1] ** 2) / 4 - r[:, 0] ** 3 / 9,
-        lambda r: np.stack([-r[:, 0] / 2 - r[:, 0] ** 2 / 3, r[:, 1] / 2, np.ones(len(r))], axis=1),
-        target=None,
-    )
-
-
-def spread(atoms: object) -> kc.Custom:
-    """exp(-|r_0 - r_1|^2/8) + |r_1 - r_2|^2/5 cos(t)."""
-
-    def function(r, t):
-        return np.exp(-np.sum((r[0] - r[1]) ** 2) / 8) + np.sum((r[1] - r[2]) ** 2) / 5 * np.cos(t)
-
-    def gradient(r, t):
+    def gradient(r):
         a, b = r[0] - r[1], r[1] - r[2]
-        first = -a / 4 * np.exp(-a @ a / 8)
-        second = 2 * b / 5 * np.cos(t)
+        first, second = -a / 4 * np.exp(-a @ a / 8), 2 * b / 5
         return np.array([first, second - first, -second])
 
-    return kc.Custom(atoms, function, gradient, time_dependent=True, translation_invariant=True)
-
-
-def bare(atoms: object) -> kc.Custom:
-    whole = spread(atoms)
-    return kc.Custom(atoms, whole.function, time_dependent=True, translation_invariant=True)
-
-
-def swirl(atoms: object) -> kc.CustomVelocity:
-    """(r_1 + (t, 0, 0)) x r_0 . v_0 + |r_0|^2 e_z . v_1."""
-
-    def coefficients(r, t):
-        return np.array([np.cross(r[1] + [t, 0, 0], r[0]), [0.0, 0.0, r[0] @ r[0]]])
-
-    return kc.CustomVelocity(atoms, coefficients, time_dependent=True)
+    return kc.Custom(atoms, function, gradient if given else None, translation_invariant=True)
 
 
 #: Across the blade and in the plane that it glides on, of any length; (a, b, c) is normal to this.
@@ -103,7 +66,7 @@ def blade(ends: object, normal: object = (0.0, 0.0, 1.0), contact: object = 0.0)
 CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Distance": lambda: kc.Distance([[0, 1], [2, 3], [7, 1]]),
     "Distance moving": lambda: kc.Distance([[4, 6], [5, 0]], lambda t: [1 + 0.1 * np.sin(t), 2.0]),
-    "DistanceDifference": lambda: kc.DistanceDifference([[[0, 1], [1, 2]], [[3, 5], [5, 6]]]),
+    "DistanceDifference": lambda: kc.DistanceDifference([[3, 5], [5, 6]]),
     "DistanceDifference of a star and a pair": lambda: kc.DistanceDifference(
         [[1, 0], [1, 2], [7, 1], [4, 6]], weights=[1.0, -0.5, 2.0, -1.0]
     ),
@@ -113,20 +76,17 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Angle": lambda: kc.Angle([[0, 1, 2], [3, 4, 5], [7, 1, 6]]),
     "Dihedral": lambda: kc.Dihedral([[0, 1, 2, 3], [7, 6, 2, 4]]),
     "Sphere": lambda: kc.Sphere([0, 3], [[0.1, 0.2, -0.3], [1.0, 0.0, 3.0]]),
-    "Cylinder": lambda: kc.Cylinder([1, 2], [3.0, 0.2, -0.3], [[1.0, 2.0, 0.5], [0.0, 0.0, -2.0]]),
     "Torus": lambda: kc.Torus([1, 2, 5], [0.1, 0.0, 0.2], [0.1, 0.2, 1.0], [1.5, 0.9, 3.0]),
     "Ellipsoid": lambda: kc.Ellipsoid([4, 5], [0.1, 0.2, 0.3], [1.0, 2.0, 3.0], _rotation(), target=None),
     "Elliptic cylinder": lambda: kc.Ellipsoid([4, 5], [0.0, 0.0, 0.0], [1.0, np.inf, 3.0], target=None),
     "Plane": lambda: kc.Plane([0, 1], [[1.0, 2.0, 3.0], [0.0, 0.0, 1.0]], offset=[0.2, -0.4]),
     "Line": lambda: kc.Line([3, 4], [0.1, 0.2, 0.3], [1.0, 1.0, -0.5]),
-    "ImplicitSurface": lambda: saddle([0, 3, 5]),
-    "ImplicitSurface moving": lambda: hoop([0, 1]),
     "CenterOfMass": lambda: kc.CenterOfMass([[0, 1, 2], [3, 4, 5]], axes=(0, 2)),
     "CenterDistance": lambda: kc.CenterDistance([[0, 1, 2], [3, 4, 5]], [[3, 4], [6, 7]]),
     "RadiusOfGyration": lambda: kc.RadiusOfGyration([[0, 1, 2, 3], [4, 5, 6, 7]]),
     "RadiusOfGyration equal weights": lambda: kc.RadiusOfGyration([0, 1, 2, 3, 5], mass_weighted=False),
     "Custom": lambda: spread([[0, 1, 2], [5, 3, 4]]),
-    "Custom without a gradient": lambda: bare([[0, 1, 2], [5, 3, 4]]),
+    "Custom without a gradient": lambda: spread([[0, 1, 2], [5, 3, 4]], given=False),
     "Formula": lambda: kc.Formula("z1*exp(x1/4) - a*sin(b*y1)", [0, 3], {"a": 0.4, "b": [1.0, 2.0]}, target=None),
     "Formula of differences": lambda: kc.Formula(
         "atan2(x1 - x2, y2 - y3) + abs(z1 - z3 + 9)**1.5 - sqrt((x1 - x3)**2 + (z2 - z1)**2)/3",
@@ -148,7 +108,6 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
         "cos(w*t)*vx1 + sin(w*t - z1)*vy2", [0, 1], {"w": 0.8}, np.sin
     ),
     "blade": lambda: blade([[0, 1], [3, 4]], [[0.0, 0.2], [0.0, 0.1], [1.0, 1.0]], contact=[0.0, 0.3]),
-    "CustomVelocity": lambda: swirl([[0, 1], [6, 4]]),
 }
 
 ORIGIN, UP = [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]
@@ -183,11 +142,11 @@ VALUES = {
     **{f"angle {a}": (kc.Angle([0, 1, 2]), bent(a, 1.3, 0.7), [np.radians(a)]) for a in (0.001, 20, 109.5, 179.9999)},
     **{f"dihedral {a}": (kc.Dihedral([0, 1, 2, 3]), twisted(a), [np.radians(a)]) for a in TURNS},
     "sphere": (kc.Sphere(0, [1.0, 0.0, 0.0]), [[1.0, 3.0, 4.0]], [5.0]),
-    "cylinder": (kc.Cylinder(0, [0.0, 0.0, 7.0], [0.0, 0.0, 5.0]), [[3.0, 4.0, -100.0]], [5.0]),
+    "cylinder": (kc.Ellipsoid(0, [0.0, 0.0, 7.0], [2.0, 2.0, np.inf]), [[3.0, 4.0, -100.0]], [3.0]),
     "torus": (kc.Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 5.0, 2.5]], [2.5]),
     "torus, inside": (kc.Torus(0, UP, [0.0, 0.0, 2.0], 3.0), [[0.0, 2.5, 1.0]], [0.5]),
     "ellipsoid": (kc.Ellipsoid(0, [0.5, 0.1, 0.2], [1, 2, 4], ROTATION), on_ellipsoid([1, 2, 4], ROTATION), [0.0]),
-    "ellipsoid, outside": (kc.Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [[0.0, 0.0, 8.0]], [2.0]),
+    "ellipsoid, outside": (kc.Ellipsoid(0, ORIGIN, [1.0, 2.0, 4.0]), [[0.0, 0.0, 8.0]], [4 / math.sqrt(7)]),
     "elliptic cylinder": (
         kc.Ellipsoid(0, ORIGIN, [2.0, np.inf, 0.5]), [[2.0 * np.cos(0.3), 17.0, 0.5 * np.sin(0.3)]], [0.0]
     ),

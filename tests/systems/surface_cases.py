@@ -8,7 +8,7 @@ import openmm_systems
 from openmm import unit
 from openmm_systems import field, pairs_force, particles, state_of
 
-from kcons.constraints import Cylinder, Ellipsoid, Formula, Plane, Sphere, Torus
+from kcons.constraints import Ellipsoid, Formula, Plane, Sphere, Torus
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.openmm import SurfaceIntegrator
@@ -23,8 +23,8 @@ FORMULA = "b*x1**2 + y1**2 + 2*z1**2 + 0.3*x1*y1*z1"
 
 KINDS = {
     "sphere": lambda atoms, x: Sphere(atoms, CENTER),
-    "cylinder": lambda atoms, x: Cylinder(atoms, CENTER, [0, 0, 1]),
-    "tilted cylinder": lambda atoms, x: Cylinder(atoms, CENTER, [1, -2, 2]),
+    "cylinder": lambda atoms, x: Ellipsoid(atoms, CENTER, [1, 1, np.inf], target=None),
+    "tilted cylinder": lambda atoms, x: Ellipsoid(atoms, CENTER, [1, np.inf, 1], TURN, None),
     "plane": lambda atoms, x: Plane(atoms, [2, 1, -1]),
     "ellipsoid": lambda atoms, x: Ellipsoid(atoms, CENTER, [0.9, 1.2, 1.6], target=None),
     "rotated ellipsoid": lambda atoms, x: Ellipsoid(atoms, CENTER, [0.9, 1.2, 1.6], TURN, target=None),

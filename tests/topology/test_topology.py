@@ -15,7 +15,6 @@ from kcons.topology.topology import (
     require_standard_form,
     split_residues,
     whole_groups,
-    whole_molecules,
     whole_numbers,
 )
 
@@ -109,12 +108,6 @@ def test_cells_that_would_have_to_be_turned():
 
 
 # -- molecules across the faces of a cell --------------------------------------------------------------
-
-
-def test_what_is_whole_or_has_no_cell_stays():
-    for length, cell in ((1.5, np.diag([7.0, 8.0, 9.0])), (6.5, None)):
-        made = snapshot(["C", "C"], [[0.0, 0, 0], [length, 0, 0]], [(0, 1)], cell=cell)
-        assert whole_molecules(made) is made
 
 
 def test_groups_lie_where_the_bonds_of_their_molecule_say():

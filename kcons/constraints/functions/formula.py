@@ -18,7 +18,7 @@ import re
 import sys
 import tempfile
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from keyword import iskeyword
@@ -51,11 +51,10 @@ _SAME = 1e-9
 _COORDINATE = re.compile(r"(v?)[xyz]([1-9][0-9]{0,5})")
 _OPERATIONS: dict[type, Callable[[Any, Any], Any]]
 _OPERATIONS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power}
-_PI = {"pi": np.float64(np.pi)}
 
 
-def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tuple[ast.expr, set[int]]:
-    """The tree of a formula, which may have velocities or not, and the atoms in it."""
+def parsed(formula: str) -> ast.expr:
+    """The tree of a formula that is neither too long nor too deep."""
     if len(formula) > MAX_LENGTH:
         raise _too_large(formula, f"has {len(formula)} characters, and at most {MAX_LENGTH} are read")
     try:
@@ -71,47 +70,7 @@ def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tup
         level = [child for node in level for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
     if level:
         raise _too_large(formula, f"is nested in more than {MAX_DEPTH} levels")
-
-    def wrong(part: str, what: str, item: str) -> InputError:
-        return InputError(f"Formula: {part} in {formula!r} {what}", item=item)
-
-    found, called = set(), set()
-    for node in ast.walk(tree):  # what contains something comes before it
-        match node:
-            case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
-                called.add(node.func)
-                if name not in FUNCTIONS or len(args) != 1 + (name == "atan2"):
-                    known = f"{', '.join(sorted(FUNCTIONS))}, of one number each, atan2 of two"
-                    raise wrong(ast.unparse(node), f"is no function of formulas; these are {known}", name)
-            case ast.Name(id=name):
-                known_as = _COORDINATE.fullmatch(name)
-                if known_as and (speeds or not known_as[1]):
-                    found.add(int(known_as[2]))
-                elif known_as:
-                    held = "what is linear in velocities is held by VelocityFormula"
-                    raise wrong(repr(name), f"is a velocity; {held}", name)
-                elif name in FUNCTIONS and node not in called:
-                    raise wrong(name, f"is a function; write what it is of, as in {name}(x1)", name)
-                elif name not in (*FUNCTIONS, *parameters, "t", "pi"):
-                    places = "x1, y1, z1, x2, ..." + (", vx1, vy1, ..." if speeds else "")
-                    known = ", ".join([places, "t", "pi", *parameters])
-                    remedy = f"Give it as a parameter: parameters={{{name!r}: ...}}"
-                    raise wrong(repr(name), f"is not known; known are {known}. {remedy}", name)
-            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
-                if not value <= sys.float_info.max:
-                    raise _too_large(formula, "has a number that is too large", "write it in other units")
-            case ast.BinOp(op=operation) if type(operation) in _OPERATIONS:
-                pass
-            case ast.UnaryOp(op=ast.USub() | ast.UAdd()) | ast.operator() | ast.unaryop() | ast.expr_context():
-                pass
-            case _:
-                hint = "; a power is written **" if isinstance(node, ast.BinOp) else ""
-                allowed = f"use + - * / **, numbers, names and functions{hint}"
-                raise wrong(repr(ast.unparse(node)), f"is not allowed; {allowed}", "formula")
-    undefined = undefined_part(tree, _PI)
-    if undefined is not None:
-        raise InputError(f"Formula: {undefined} in {formula!r:.200}; give numbers with a finite value", item="formula")
-    return tree, found
+    return tree
 
 
 def _too_large(
@@ -122,40 +81,45 @@ def _too_large(
     return InputError(f"Formula: {formula!r:.60} {what}; {remedy}", item="formula")
 
 
-def _value(tree: ast.expr, numbers: Mapping[str, Any], constant: Callable[[Any], Any] = np.float64) -> Any:
-    """The value of a tree, with numbers for names."""
+def _value(tree: ast.expr, numbers: Mapping[str, Any], formula: str) -> Any:
+    """The value of a part of a formula, with numbers for names."""
+
+    def value(part: ast.expr) -> Any:
+        return _value(part, numbers, formula)
+
     match tree:
-        case ast.Constant(value=value):
-            return constant(value)
-        case ast.Name(id=name):
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            if not number <= sys.float_info.max:
+                raise _too_large(formula, "has a number that is too large", "write it in other units")
+            return float(number)
+        case ast.Name(id=name) if name in numbers:
             return numbers[name]
-        case ast.Call(func=ast.Name(id=name), args=args):
-            return FUNCTIONS[name](*(_value(each, numbers, constant) for each in args))
-        case ast.BinOp(left=left, op=operation, right=right):
-            return _OPERATIONS[type(operation)](_value(left, numbers, constant), _value(right, numbers, constant))
-        case ast.UnaryOp(op=sign, operand=operand):
-            value = _value(operand, numbers, constant)
-            return -value if isinstance(sign, ast.USub) else value
-    raise AssertionError(ast.dump(tree))
-
-
-def undefined_part(tree: ast.expr, numbers: Mapping[str, float]) -> str | None:
-    """The smallest part of a tree, among those that have names of `numbers` only, without a finite value, in words."""
-    known: dict[ast.AST, bool] = {}
-    for node in reversed(list(ast.walk(tree))):  # parts before what they are parts of
-        function = isinstance(node, ast.Name) and node.id in FUNCTIONS
-        known[node] = function or all(known[part] for part in ast.iter_child_nodes(node))
-        if isinstance(node, ast.Name) and not function:
-            known[node] = node.id in numbers
-        if not isinstance(node, ast.expr) or function or not known[node]:
-            continue
-        with np.errstate(all="ignore"):
-            value = _value(node, numbers)
-            if not np.isfinite(value):
-                inside = node.args[:1] if isinstance(node, ast.Call) else []
-                of = "".join(f" where {ast.unparse(each)} = {_value(each, numbers):g}" for each in inside)
-                return f"{ast.unparse(node)} is {value}{of}"
-    return None
+        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in FUNCTIONS and len(args) == 1 + (
+            name == "atan2"
+        ):
+            return FUNCTIONS[name](*map(value, args))
+        case ast.BinOp(left=left, op=operation, right=right) if type(operation) in _OPERATIONS:
+            return _OPERATIONS[type(operation)](value(left), value(right))
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -value(operand)
+        case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+            return value(operand)
+    item = "formula"
+    match tree:
+        case ast.Call(func=ast.Name(id=item)):
+            known = f"{', '.join(sorted(FUNCTIONS))}, of one number each, atan2 of two"
+            what = f"is no function of formulas; these are {known}"
+        case ast.Name(id=item) if item in FUNCTIONS:
+            what = f"is a function; write what it is of, as in {item}(x1)"
+        case ast.Name(id=item) if _COORDINATE.fullmatch(item):
+            what = "is a velocity; what is linear in velocities is held by VelocityFormula"
+        case ast.Name(id=item):
+            known = ", ".join(["x1, y1, z1, x2, ...", *(name for name in numbers if not _COORDINATE.fullmatch(name))])
+            what = f"is not known; known are {known}. Give it as a parameter: parameters={{{item!r}: ...}}"
+        case _:
+            hint = "; a power is written **" if isinstance(tree, ast.BinOp) else ""
+            what = f"is not allowed; use + - * / **, numbers, names and functions{hint}"
+    raise InputError(f"Formula: {ast.unparse(tree)!r} in {formula!r:.200} {what}", item=item)
 
 
 class Code:
@@ -166,23 +130,28 @@ class Code:
     """
 
     def __init__(self, formula: str, parameters: tuple[str, ...], speeds: bool = False) -> None:
-        tree, atoms = parsed(formula, parameters, speeds)
-        width = max(atoms, default=0)
-        if len(atoms) < max(width, 1):
-            least = min({*range(1, width + 1)} - atoms, default=0)
+        tree = parsed(formula)
+        places = [_COORDINATE.fullmatch(node.id) for node in ast.walk(tree) if isinstance(node, ast.Name)]
+        atoms = {int(place[2]) for place in places if place and (speeds or not place[1])}
+        self.width = width = max(atoms, default=0)
+        if len(atoms) < width:
+            least = min({*range(1, width + 1)} - atoms)
             what = f"atom {width} of a row and not atom {least}; number them from 1 on"
-            if not atoms:
-                what = "no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of the second"
             raise InputError(f"Formula: {formula!r} names {what}", item="formula")
-        self.tree, self.width, n = tree, width, 3 * width
-        names = [f"{kind}{axis}{atom}" for kind in ["", "v"] for atom in range(1, width + 1) for axis in "xyz"]
+        n = 3 * width
+        names = [
+            f"{kind}{axis}{atom}" for kind in ("", "v")[: 1 + speeds] for atom in range(1, width + 1) for axis in "xyz"
+        ]
 
         def value(r: Any, p: Any, t: Any) -> Any:
             known = {name: r[k] for k, name in enumerate(names)} | {name: p[k] for k, name in enumerate(parameters)}
-            return _value(tree, {**known, "t": t, "pi": math.pi}, float)
+            return _value(tree, {**known, "t": t, "pi": math.pi}, formula)
 
         with np.errstate(all="ignore"):  # of constants
             tape = differentiated(value, n + n * speeds)
+        if not atoms:
+            what = "no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of the second"
+            raise InputError(f"Formula: {formula!r} names {what}", item="formula")
         found, *slopes, moves = (_text(each) for each in tape.results)
         steep, slope = slopes[:n], slopes[n:] or slopes
         self.invariant = _look(formula, tape, n, speeds, len(parameters)) and width > 1
@@ -247,8 +216,11 @@ def _look(formula: str, tape: Tape, n: int, speeds: bool, parameters: int) -> bo
     with np.errstate(all="ignore"):
         value, *slopes = looked(r)
         steep, slope = np.array(slopes[:n]), np.array(slopes[n:] or slopes)
-        seen = np.isfinite(slopes).all(axis=0)
-        if seen.all() and not slope.any():
+        if not np.isfinite([value, *slopes]).all(axis=0).any():
+            raise InputError(
+                f"Formula: {formula!r:.200} is finite nowhere; give numbers with a finite value", item="formula"
+            )
+        if np.isfinite(slopes).all() and not slope.any():
             what = "velocities: it has none of them" if speeds else "positions: its gradient is zero"
             raise InputError(
                 f"Formula: {formula!r} does not change with the {what}; write one that does", item="formula"
@@ -350,6 +322,7 @@ class Formula(Constraint):
     """
 
     held = ""
+    singular = "value and gradient must be finite, and the gradient not zero; move the atoms, or write another formula"
     shared: ClassVar[tuple[str, ...]] = ("formula", "names", "period")
     per_row: Mapping[str, tuple[int, ...]] = {"values": ()}  # type: ignore[misc]
     values: FloatArray
@@ -395,16 +368,6 @@ class Formula(Constraint):
     def rate(self) -> Any:  # type: ignore[override]
         return self.code().rate
 
-    def undefined(self, k: int, r: FloatArray, time: float) -> str:
-        axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
-        numbers = dict(zip([*axes, "t", *self.names], [*r.ravel(), time, *self.values[k]], strict=True))
-        numbers |= {f"v{axis}": 1.0 for axis in axes} | {"pi": np.pi}
-        what = undefined_part(self.code().tree, {name: np.float64(value) for name, value in numbers.items()})
-        if what is None:
-            flat = not self.select([k]).gradient(r[None], time).any()
-            what = f"its gradient is {'zero' if flat else 'not finite'}"
-        return f"{self.formula!r}: {what} at the start; move the atoms, or write another formula"
-
     @classmethod
     def _rebuilt(cls, data: Mapping[str, Any]) -> Self:
         names, table = data["names"], as_float_array(data["values"], f"{cls.family}: values")
@@ -436,9 +399,7 @@ class VelocityFormula(Formula):
     Raises
     ------
     InputError
-        As `Formula`; a formula that is not linear in the velocities.
-    SingularGeometryError
-        When put into a set: coefficients that are all zero, or not finite.
+        A formula that is not linear in the velocities; else as `Formula`.
 
     Examples
     --------

@@ -188,7 +188,7 @@ class Function(NamedTuple):
 
 @cache
 def _linear(size: int) -> Callable[..., None]:
-    """The row of `LinearRows`, whose coefficients are their parameters."""
+    """The row of `LinearCombination`, whose coefficients are their parameters."""
 
     def row(r: Any, p: Any, t: Any, out: Any) -> None:
         out[0] = sum((p[k] * r[k] for k in range(size)), 0.0)

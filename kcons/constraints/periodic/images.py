@@ -130,8 +130,6 @@ def find_images(
         reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([table.lengths[:, 0] for table in bonds]))
         for table in bonds:
             table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
-    if all(t.held and not (t.whole.any() or t.unsure.any()) for t in tables):
-        return given, None
     ties = [item for item in ties if item.holds_length and not item.moving and item.n_rows]
     others = [_Links(item.changed(whole=None, cell_offsets=None), 0, *place) for item in ties]
     held = [*bonds, *others]

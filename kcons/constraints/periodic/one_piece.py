@@ -7,14 +7,13 @@ The one place in which atoms are moved by whole cells: for rows (`images`), for 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from kcons.constraints.arguments import FloatArray, IntArray
-from kcons.constraints.compilation import njit
+from kcons.constraints.compilation import njit, plain_if_small
 from kcons.errors import InputError
 
 BoolArray = NDArray[np.bool_]
@@ -25,27 +24,21 @@ def lattice_of(cell: FloatArray | None, pbc: bool | Sequence[bool] | BoolArray) 
 
     Directions without periodicity get a unit vector normal to the others. None without a periodic direction.
     """
-    # Barostats come here at each trial, with True; the rest takes many times as long.
-    periodic = None if pbc is True else np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
-    if cell is None or (periodic is not None and not periodic.any()):
+    periodic = np.zeros(3, dtype=bool) | np.asarray(pbc, dtype=bool)
+    if cell is None or not periodic.any():
         return None
-    if periodic is None or periodic.all():
-        with suppress(np.linalg.LinAlgError):
-            found = np.empty((2, 3, 3))
-            found[0], found[1] = cell, np.linalg.inv(cell)
-            if np.vdot(found[0], found[0]) * np.vdot(found[1], found[1]) < 1e16:
-                return found
-    if periodic is None:
-        periodic = np.ones(3, dtype=bool)
-    full = cell.copy()
-    basis = cell[periodic]
-    _, singular, vh = np.linalg.svd(basis)
-    if singular.min() < 1e-10 * max(singular.max(), np.finfo(float).tiny):
-        raise InputError("the periodic cell vectors are zero or not independent", item="cell")
-    full[~periodic] = vh[len(basis) :]
-    inverse = np.linalg.inv(full)
+    full, basis = cell.copy(), cell[periodic]
+    if len(basis) < 3:
+        full[~periodic] = np.linalg.svd(basis)[2][len(basis) :]
+    singular = InputError("the periodic cell vectors are zero or not independent", item="cell")
+    try:
+        inverse = np.linalg.inv(full)
+    except np.linalg.LinAlgError:
+        raise singular from None
     inverse[:, ~periodic] = 0.0
-    return np.ascontiguousarray(np.stack([full, inverse]))
+    if not np.vdot(basis, basis) * np.vdot(inverse, inverse) < 1e20:
+        raise singular
+    return np.array([full, inverse])
 
 
 def minimum_image(d: FloatArray, lattice: FloatArray | None) -> FloatArray:
@@ -105,24 +98,19 @@ def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) 
 
 
 def make_whole(x: FloatArray, atoms: IntArray, parents: IntArray, lattice: FloatArray | None) -> FloatArray:
-    """Copy of `x`, shape (n_atoms, 3), with `atoms` moved by whole cells next to their parents, which are among them.
+    """Copy of `x`, shape (n_atoms, 3), with `atoms` moved by whole cells next to their parents, which come before them.
 
-    Each atom is rounded once, wherever it is stored. Nothing is compiled for what is done once; see `follow_parents`.
+    Each atom is rounded once, wherever it is stored.
     """
-    if lattice is None:
-        return x.copy()
-    parent = np.arange(len(x))
-    parent[atoms] = parents
-    cells = -np.round((x - x[parent]) @ lattice[1])
-    while np.any(parent != parent[parent]):
-        cells += cells[parent]
-        parent = parent[parent]
-    return x + cells @ lattice[0]
+    y = x.copy()
+    if lattice is not None:
+        plain_if_small(follow_parents, 30 * len(atoms))(y, atoms, parents, lattice)
+    return y
 
 
 @njit(cache=True)
 def follow_parents(y, atoms, parents, lattice):  # type: ignore[no-untyped-def]
-    """`make_whole` for what is done again and again: moves atoms in place, parents before their children."""
+    """Move atoms in place; see `make_whole`."""
     cell, inverse = lattice[0], lattice[1]
     for k in range(len(atoms)):
         a, b = atoms[k], parents[k]

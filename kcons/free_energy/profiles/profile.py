@@ -12,15 +12,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from kcons.constraints.arguments import Finite, FloatArray, Positive, as_float_array, checked, positive, whole_number
-from kcons.constraints.target import nearest_image
 from kcons.errors import InputError
 from kcons.free_energy.averages import finite
 from kcons.free_energy.profiles.gaussian_process import Axis, Learned, inside, learn
@@ -45,8 +43,6 @@ _SAME = 1e-9
 _ROTATIONS = np.geomspace(0.01, 3.0, 12)
 #: Probability below which that field is warned of.
 _CHANCE = 1e-3
-#: Distance, in parts of the range, below which two minima are one.
-_ONE = 1e-3
 #: Places whose errors are computed at once, with the covariances among them.
 _TOGETHER = 200
 
@@ -153,7 +149,7 @@ def integrate(
     x : array_like, shape (n,)
         Places of the windows, in any order; radian for angles if f is per radian.
     f : array_like, shape (n,)
-        dF/dx there: the slope of the free energy, not the force against it. Windows at one place are put together.
+        dF/dx there: the slope of the free energy, not the force against it.
     e : array_like, shape (n,)
         Standard errors of f; 0 where it is exact.
     period : float, optional
@@ -188,28 +184,13 @@ def integrate(
             )
         place = place.min() + (place - place.min()) % period
         place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
-    # Places that differ by rounding are one, with the weights that the errors give them.
     order = np.argsort(place, kind="stable")
-    new = np.diff(place[order], prepend=-np.inf) > _SAME * (np.ptp(place) if place.size else 0.0)
-    places, which = place[order][new], np.empty(len(place), dtype=np.int64)
-    which[order] = np.cumsum(new) - 1
-    if len(places) < 3:
-        raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
-    for k in np.flatnonzero(np.bincount(which[error == 0]) > 1):
-        exact = force[(which == k) & (error == 0)]
-        if np.ptp(exact) > 1e-9 * np.abs(exact).max():
-            raise InputError(
-                f"windows at {places[k]:g} have mean forces from {exact.min():g} to {exact.max():g}, all with an error "
-                "of 0; give their errors",
-                item="e",
-            )
-    # Errors of 0 among others: exact values count alone.
-    weights = 1.0 / np.maximum(error, 1e-12 * float(error.max()) or 1.0) ** 2
-    total = np.bincount(which, weights)
-    forces, errors = np.bincount(which, weights * force) / total, np.sqrt(np.bincount(which, (weights * error) ** 2))
-    errors /= total
+    places, forces, errors = place[order], force[order], error[order]
+    different = int((np.diff(places, prepend=-np.inf) > _SAME * (np.ptp(places) if places.size else 0.0)).sum())
+    if different < 3:
+        raise InputError(f"{different} different windows are too few for a profile; give 3 or more", item="x")
     low, high = float(places[0]), float(places[-1] if period is None else places[0] + period)
-    axis = Axis(low, high - low, period is not None, _COEFFICIENTS if len(places) >= _MANY else 1)
+    axis = Axis(low, high - low, period is not None, _COEFFICIENTS if different >= _MANY else 1)
     process, closure = learn(places[:, None], forces[:, None], errors[:, None, None] ** 2, [axis], [True]), None
     if period is not None:
         closure = process.difference(np.array([low]), np.array([high]))
@@ -258,14 +239,6 @@ def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "ener
 # -- several coordinates -----------------------------------------------------------------------------
 
 
-class Minimum(NamedTuple):
-    """A minimum of a surface: where, F and the standard error of F, both against the zero of the surface."""
-
-    x: FloatArray
-    F: float
-    error: float
-
-
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A free energy in d coordinates.
@@ -304,29 +277,6 @@ class Surface:
         if any(end.shape != self.low.shape for end in ends):
             raise InputError(f"a and b must be places of {len(self.low)} coordinates", item="a")
         return self._process.difference(*self._places(np.stack(ends)))
-
-    def minima(self) -> list[Minimum]:
-        """Minima inside of the range, lowest first; each is what a search from some window comes to."""
-        size, periods = self.high - self.low, np.array([period or 0.0 for period in self.periods])
-        bounds = [(0.0, 1.0) if period is None else (None, None) for period in self.periods]
-        how: dict[str, Any] = {"jac": True, "method": "L-BFGS-B", "bounds": bounds, "options": {"ftol": 1e-13}}
-
-        def value(part: FloatArray) -> tuple[float, FloatArray]:
-            there = self._process.mean((self.low + part * size)[None], range(-1, len(size)))[:, 0]
-            return float(there[0]), there[1:] * size
-
-        found: list[FloatArray] = []
-        for start in self.windows:
-            (place,) = self._places((self.low + minimize(value, (start - self.low) / size, **how).x * size)[None])
-            at_an_end = (periods == 0) & ((place <= self.low) | (place >= self.high))
-            known = (np.abs(nearest_image(place - other, periods) / size).max() <= _ONE for other in found)
-            if not at_an_end.any() and not any(known):
-                found.append(place)
-        if not found:
-            return []
-        F, errors = self.free_energy(found)
-        minima = [Minimum(x, float(value), float(error)) for x, value, error in zip(found, F, errors, strict=True)]
-        return sorted(minima, key=lambda minimum: minimum.F)
 
     def _places(self, x: ArrayLike) -> FloatArray:
         return inside(x, self.low, self.high, self.periods, "x")

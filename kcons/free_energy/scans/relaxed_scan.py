@@ -26,11 +26,7 @@ import ase.io
 import numpy as np
 from ase import Atoms, units
 from numpy.typing import ArrayLike
-from rich import box
-from rich.console import Console
-from rich.table import Column, Table
 
-from kcons import __version__
 from kcons.ase.binding import FORCES_ONLY, applied_forces
 from kcons.ase.constraints_object import Constraints
 from kcons.ase.named_calculators import described
@@ -53,10 +49,11 @@ from kcons.free_energy.held_coordinates import HeldCoordinates, warn_of_gaps
 from kcons.free_energy.scans.relaxation import FIRST, Descent, Internals, Relaxed
 from kcons.motion.minimization import minimize
 from kcons.motion.motion import Motion
-from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, text, write_files
+from kcons.steppers.files import ResultFolder, in_one_piece, stored_arrays, write_files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 #: Energy by which a structure has to be lower to be handed on to the neighbors, in eV (10^-5 hartree).
 LOWER = 2.7e-4
@@ -65,7 +62,7 @@ MOST_ATOMS = 150
 #: Relaxations to a point that failed after which it is given up.
 MOST_TRIES = 4
 #: What is in a folder besides what the scan is of: its relaxations, and what `Scan.write` makes of them.
-PLACE, WRITTEN = "relaxations", ("scan.json", "scan.csv", "scan.png", "scan.extxyz")
+PLACE, WRITTEN = "relaxations", ("scan.csv", "scan.png", "scan.extxyz")
 
 #: One eV in kJ/mol, and the difference of energies that is told of, in kJ/mol.
 KJ, TOLD = units.mol / units.kJ, 0.1
@@ -129,7 +126,8 @@ def scan(
         The first failure, where no point at all could be relaxed.
     """
     items = constraints_in(coordinates, "coordinates")
-    lists = [values] if isinstance(coordinates, Constraint) else list(values)  # type: ignore[arg-type]
+    one = isinstance(coordinates, Constraint) or not isinstance(values, Iterable)
+    lists = [values] if one else list(values)  # type: ignore[arg-type]
     grid = Grid(items, lists)  # type: ignore[arg-type]
     settings: dict[str, Any] = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
     wavefront = _Wavefront(atoms, grid, constraints_in(held, "held"), settings)
@@ -438,15 +436,6 @@ class Attempt(Relaxed):
             raise UnreadableError(f"{path} cannot be read ({error}); remove it", item="folder") from error
 
 
-class _Shown(Table):
-    """A table that `print` shows as a terminal does."""
-
-    def __str__(self) -> str:
-        page = io.StringIO()
-        Console(file=page, width=200, color_system=None).print(self)
-        return page.getvalue().rstrip()
-
-
 @dataclass
 class Scan:
     """What a scan found.
@@ -505,15 +494,13 @@ class Scan:
         """Calls of energy and forces in all."""
         return sum(attempt.evaluations for attempt in self.attempts)
 
-    def structure(self, point: Point, *, hold: bool = False) -> Atoms:
+    def structure(self, point: Point) -> Atoms:
         """The minimum at a point, its values and energy in `info`.
 
         Parameters
         ----------
         point : tuple of int
             Numbers of its values in the lists of the scan.
-        hold : bool
-            Whether the atoms get the constraints they had there: what was held besides, and the coordinates.
         """
         if point not in self.best:
             raise InputError(
@@ -522,8 +509,6 @@ class Scan:
         found = self.atoms.copy()
         found.positions[:] = self.best[point].positions
         found.info |= {"energy": self.best[point].energy, **self._values(point)}
-        if hold:
-            found.set_constraint(Constraints([*self.held, *self.grid.held_at(point)]))
         return found
 
     def _values(self, point: Point) -> dict[str, float]:
@@ -531,22 +516,24 @@ class Scan:
 
     # -- shown ----------------------------------------------------------------------------------
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Of each point the values, energies, hysteresis, calls, the force left, and why it failed."""
-        energy, spread = self.energies, self.hysteresis
-        lowest = np.nanmin(energy)
-        return [
+    def table(self) -> DataFrame:
+        """A row a point: its values, energies, hysteresis, calls, the force left, and why it failed."""
+        import pandas
+
+        energy, spread, units = self.energies, self.hysteresis, [unit.replace(" ", "_") for unit in self.grid.units]
+        lowest, names = np.nanmin(energy), [f"{key}_{unit}" for key, unit in zip(self.grid.keys, units, strict=True)]
+        return pandas.DataFrame(
             {
-                **self._values(point),
-                "energy_eV": float(energy[point]) if point in self.best else None,
+                **dict(zip(names, self.grid.shown(point), strict=True)),
+                "energy_eV": float(energy[point]),
                 "energy_kJ_mol": float(energy[point] - lowest) * KJ,
                 "hysteresis_kJ_mol": float(spread[point]) * KJ,
                 "calls": sum(attempt.evaluations for attempt in self.attempts if attempt.point == point),
-                "force_left_eV_A": self.best[point].largest if point in self.best else float("nan"),
+                "force_left_eV_A": self.best[point].largest if point in self.best else np.nan,
                 "error": self.failed.get(point),
             }
             for point in self.grid.points
-        ]
+        )
 
     def summary(self) -> str:
         """What was done, and what failed."""
@@ -562,21 +549,6 @@ class Scan:
                 f"{self.grid.said(worst)}; the lower one is kept"
             )
         return "\n".join([*lines, *(f"failed: {why}" for why in self.failed.values())])
-
-    def table(self) -> Table:
-        """A row a point; energies above the lowest one. Print it."""
-        titles = [f"{name}\n{unit}" for name, unit in zip(self.grid.names, self.grid.units, strict=True)]
-        titles += ["energy\nkJ/mol", "hysteresis\nkJ/mol", "calls\n", "force left\neV/angstrom"]
-        shown = _Shown(*(Column(title, justify="right") for title in titles), box=box.SIMPLE_HEAD, padding=(0, 1))
-        for row in self.rows():
-            *values, _, energy, spread, calls, left, error = row.values()
-            numbers = (
-                ("failed", "", f"{calls}", "")
-                if error
-                else (f"{energy:.3f}", f"{spread:.3f}", f"{calls}", f"{left:.4f}")
-            )
-            shown.add_row(*(f"{value:.6g}" for value in values), *numbers)
-        return shown
 
     def plot(self) -> Figure:
         """Energy along one coordinate, or over two; points that failed are crosses."""
@@ -605,20 +577,11 @@ class Scan:
         return figure
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Put scan.json, .csv, .png and .extxyz (the minima, as in the grid) into a folder; the paths written."""
-        import pandas
-
-        data: dict[str, Any] = {
-            "kcons": __version__,
-            "coordinates": dict(zip(self.grid.keys, self.grid.units, strict=True)),
-            "points": self.rows(),
-            "relaxations": len(self.attempts),
-            "calls": self.evaluations,
-        }
+        """Put scan.csv, .png and .extxyz (the minima, as in the grid) into a folder; the paths written."""
         frames, picture = io.StringIO(), io.BytesIO()
         for point in sorted(self.best):
             ase.io.write(frames, self.structure(point), format="extxyz")
         self.plot().savefig(picture, dpi=150, format="png")
-        table = pandas.DataFrame(self.rows()).to_csv(index=False, lineterminator="\r\n", na_rep="")
-        contents = (text(data).encode(), table.encode(), picture.getvalue(), frames.getvalue().encode())
+        table = self.table().to_csv(index=False, lineterminator="\r\n", na_rep="")
+        contents = (table.encode(), picture.getvalue(), frames.getvalue().encode())
         return write_files(folder, dict(zip(WRITTEN, contents, strict=True)))

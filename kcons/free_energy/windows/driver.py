@@ -43,7 +43,7 @@ from kcons.constraints.arguments import (
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, nearest_image
-from kcons.errors import InfeasibleError, InputError, KconsError, OccupiedError, UnsupportedError
+from kcons.errors import InfeasibleError, InputError, KconsError
 from kcons.free_energy.averages import agreement
 from kcons.free_energy.held_coordinates import HeldCoordinates, named, warn_of_gaps
 from kcons.free_energy.profiles.profile import Profile, Surface, fit_surface, integrate, plot_profile
@@ -51,7 +51,6 @@ from kcons.free_energy.profiles.pulls import MIN_PULLS, Pulled, pull_free_energy
 from kcons.free_energy.series import Collector, MeanForce, Series, mean_force, thermal_multipliers
 from kcons.motion.motion import Motion
 from kcons.steppers.files import ResultFolder, text, write_files
-from kcons.thermostats import Estimate
 from kcons.thermostats.correlated_series import FEW_INDEPENDENT
 
 if TYPE_CHECKING:
@@ -67,21 +66,24 @@ _WALK, _STRETCHED = 20, 0.1
 class Window:
     """Coordinates held at `target`, pulled there from `start`; both in the units of the MD engine.
 
-    `side` is 'up' or 'down' for windows, 'forward' or 'backward' for pulls, which begin in equilibrium at `start`.
+    `side` is 'up' or 'down' for windows, 'forward' or 'backward' for pulls, which begin in equilibrium at `start` and
+    are counted by `number`.
     """
 
-    number: int
     side: str
     start: tuple[float, ...]
     target: tuple[float, ...]
-    seed: int
+    rng: int
+    number: int = 0
 
     @property
     def name(self) -> str:
-        if self.side in SIDES:
-            return f"window-{self.number:04d}-{self.side}"
-        begin, end = ("_".join(f"{q:.6g}" for q in place) for place in (self.start, self.target))
-        return f"pull-{begin}-to-{end}-{self.number:04d}"
+        begin, end = ("_".join(f"{q:.9g}" for q in place) for place in (self.start, self.target))
+        return f"window-{end}-{self.side}" if self.side in SIDES else f"pull-{begin}-to-{end}-{self.number:04d}"
+
+    @property
+    def seed(self) -> int:
+        return int(np.random.SeedSequence([self.rng, *self.name.encode()]).generate_state(1)[0])
 
 
 @dataclass(frozen=True)
@@ -158,10 +160,7 @@ class Sampler(ABC):
         turning: IntArray | None,
         angstrom: float = 1.0,
     ) -> None:
-        for name, item in named(coordinates).items():
-            if item.n_rows != 1 or not item.holonomic:
-                raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row that holds positions")
-        self.coordinates = {name: item.with_target(None) for name, item in coordinates.items()}
+        self.coordinates = {name: item.with_target(None) for name, item in named(coordinates).items()}
         self.names = tuple(self.coordinates)
         kinds = [item.held for item in self.coordinates.values()]
         self.scales = np.array([angstrom if kind is LENGTH else 1.0 for kind in kinds])
@@ -227,8 +226,8 @@ class Sampler(ABC):
 
     def at(self, values: ArrayLike) -> list[Constraint]:
         """The coordinates held at `values`."""
-        pairs = zip(self.coordinates.values(), np.asarray(values).tolist(), strict=True)
-        return [item.with_target(value) for item, value in pairs]
+        (place,) = places_of([np.atleast_1d(values)], self.names).tolist()
+        return [item.with_target(value) for item, value in zip(self.coordinates.values(), place, strict=True)]
 
     def towards(self, begin: Sequence[float], end: Sequence[float], duration: float) -> list[Constraint]:
         """The coordinates moved at a constant rate from time 0 on; at rest where both ends are the same."""
@@ -281,7 +280,9 @@ def places_of(targets: ArrayLike | Iterable[Sequence[float]], names: Sequence[st
     places = np.array(as_float_array(listed, "targets"))
     places = places[:, None] if places.ndim == len(names) == 1 else places
     if places.ndim != 2 or places.shape[1] != len(names) or not len(places) or not np.all(np.isfinite(places)):
-        raise InputError("targets must be finite numbers, one row for each window", item="targets")
+        raise InputError(
+            f"targets must be finite numbers, one of {' and '.join(names)} for each window", item="targets"
+        )
     return places
 
 
@@ -290,11 +291,11 @@ BOLTZMANN = 0.00831446261815324
 #: How often a window is begun again whose process was killed.
 RETRIES = 3
 #: Files of a folder of windows, those of `FreeEnergy` and of the command line included.
-FILES = ("window-*.npz", "pull-*.npz", "free_energy.json", "profile.csv", "profile.png", "pulls.json")
+FILES = ("window-*.npz", "pull-*.npz", "free_energy.json", "profile.csv", "profile.png")
 #: Differences of the two sides that are less probable than this are marked, and widen errors.
 UNLIKELY = 0.01
 #: What a window is in free_energy.json, by attributes of `WindowResult`.
-_KEYS = {"number": "number", "value": "value", "mean force": "force", "covariance": "covariance"}
+_KEYS = {"value": "value", "mean force": "force", "covariance": "covariance"}
 _KEYS |= {"raw multiplier": "raw", "p_value": "p_value", "samples": "n", "independent samples": "n_effective"}
 #: Windows of a torsion do not go around a gap that is wider than any other by more than this.
 _HOLE = 2.001
@@ -312,14 +313,12 @@ class WindowResult(MeanForce):
 
     Attributes
     ----------
-    number : int
     sides : dict of str to MeanForce
         From below and from above, in the units of the MD engine.
     p_value : float
         Probability of a larger difference between the sides if both were equilibrated; NaN with one side.
     """
 
-    number: int
     sides: dict[str, MeanForce]
     p_value: float
 
@@ -338,6 +337,8 @@ class FreeEnergy:
         Windows that failed, and why.
     angles : tuple of bool or None
         Which coordinates are angles; None where the unit is that of a formula or a function.
+    kept : int
+        Runs of these windows that were finished before.
     """
 
     names: tuple[str, ...]
@@ -345,6 +346,7 @@ class FreeEnergy:
     windows: list[WindowResult]
     failed: dict[str, str] = field(default_factory=dict)
     angles: tuple[bool | None, ...] = ()
+    kept: int = 0
 
     @cached_property
     def profile(self) -> Profile:
@@ -364,16 +366,6 @@ class FreeEnergy:
         x, periods = self._places()
         f = np.array([w.force for w in self.windows])
         return fit_surface(x, f, np.array([w.covariance for w in self.windows]), periods=periods)
-
-    def between(self, a: float, b: float) -> Estimate | None:
-        """F(b) - F(a) of the profile, in whichever turn the places are given; None where it does not reach both."""
-        profile, period, ends = self.profile, float(self.periods[0]), np.array([a, b])
-        if period:
-            ends += period * np.ceil((profile.x[0] - ends) / period - 1e-9)
-        try:
-            return profile.difference(*ends.tolist())
-        except InputError:
-            return None
 
     def _places(self) -> tuple[FloatArray, list[float | None]]:
         """Where the windows are, shape (n, d), and the period of each coordinate that they go all around."""
@@ -418,52 +410,43 @@ class FreeEnergy:
         made = Table(*(Column(title, justify="right") for title in titles))
         made.title = f"mean force (kJ/mol per {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})"
         for window in self.windows:
-            shown = [np.degrees(q) if angle else q for q, angle in zip(window.value, self.angles, strict=True)]
             mark = "!" if window.p_value < UNLIKELY else ""
             made.add_row(
-                *(f"{q:.4g}" for q in shown),
-                *(f"{f:.2f} ± {e:.2f}" for f, e in zip(window.force, window.error, strict=True)),
+                *self._shown(window),
+                *map(with_error, window.force, window.error),
                 ", ".join(f"{raw:.2f}" for raw in window.raw),
                 f"{window.n_effective:.0f}",
                 "" if np.isnan(window.p_value) else f"{window.p_value:.2g}{mark}",
             )
         return made
 
+    def _shown(self, window: WindowResult) -> list[str]:
+        return [f"{np.degrees(q) if angle else q:.4g}" for q, angle in zip(window.value, self.angles, strict=True)]
+
+    def _places_where(self, what: Callable[[WindowResult], bool]) -> str:
+        return "; ".join(", ".join(self._shown(window)) for window in self.windows if what(window))
+
     def summary(self) -> str:
         """A sentence or two."""
-        lines = [f"{len(self.windows)} windows"]
-        if doubtful := ", ".join(str(w.number) for w in self.windows if w.p_value < UNLIKELY):
+        lines = [f"{len(self.windows)} windows" + f", {self.kept} of their runs kept from before" * bool(self.kept)]
+        if doubtful := self._places_where(lambda window: window.p_value < UNLIKELY):
             lines.append(
-                f"runs from below and from above differ by more than chance in window {doubtful} (marked !): something "
-                "slow is not equilibrated there; sample longer, or look for the other coordinate"
+                f"runs from below and from above differ by more than chance at {doubtful} (marked !): something slow "
+                "is not equilibrated there; sample longer, or look for the other coordinate"
             )
-        if poor := ", ".join(str(w.number) for w in self.windows if w.n_effective < FEW_INDEPENDENT):
+        if poor := self._places_where(lambda window: window.n_effective < FEW_INDEPENDENT):
             lines.append(
-                f"fewer than {FEW_INDEPENDENT} independent samples in window {poor}: errors there are not to be relied "
-                "on; sample longer"
+                f"fewer than {FEW_INDEPENDENT} independent samples at {poor}: errors there are not to be relied on; "
+                "sample longer"
             )
         profile = self._profile()
         if isinstance(profile, Profile):
             gap = profile.difference(*(float(profile.x[pick(profile.F)]) for pick in (np.argmin, np.argmax)))
-            lines.append(f"from the lowest to the highest point {gap.value:.2f} ± {gap.error:.2f} kJ/mol")
+            lines.append(f"from the lowest to the highest point {with_error(*gap)} kJ/mol")
         elif profile:
             lines.append(profile)
         lines += [f"{name} failed: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
-
-    def beside(self, pulled: Pulled, start: FloatArray, end: FloatArray) -> tuple[dict[str, Any], str]:
-        """What pulls gave, as plain data and in a sentence; of one coordinate with the windows between the ends."""
-        best = pulled.best
-        numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist(), "overlap": pulled.overlap}
-        numbers |= {"bar": [*best], "jarzynski": [*pulled.jarzynski]}
-        said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol (BAR)"
-        if isinstance(self._profile(), Profile):
-            windows = self.between(float(start[0]), float(end[0]))
-            if windows is None:
-                return numbers, f"{said}; the windows do not reach both ends"
-            numbers["windows"] = [*windows]
-            said += f", windows {windows.value:.2f} ± {windows.error:.2f}: {best.off(*windows):+.1f} standard errors"
-        return numbers, said
 
     def numbers(self) -> dict[str, Any]:
         """All of it as plain data."""
@@ -487,7 +470,13 @@ class FreeEnergy:
         return write_files(folder, contents)
 
 
-def combine_sides(number: int, target: FloatArray, sides: dict[str, MeanForce], sampler: Sampler) -> WindowResult:
+def with_error(value: float, error: float) -> str:
+    """A number and its standard error to two significant digits, as text; of the number at most six decimals."""
+    digits = min(max(1 - math.floor(math.log10(error)), 0), 6) if error else 2
+    return f"{round(value, digits) + 0.0:.{digits}f} ± {f'{error:.1e}' if digits == 6 else f'{error:.{digits}f}'}"
+
+
+def combine_sides(target: FloatArray, sides: dict[str, MeanForce], sampler: Sampler) -> WindowResult:
     """The mean of both sides, and how probable their difference is."""
     per = sampler.kJ / sampler.scales
     forces, raws, covariances, n, effective = (
@@ -503,7 +492,7 @@ def combine_sides(number: int, target: FloatArray, sides: dict[str, MeanForce], 
             covariance = covariance + np.outer(half, half)
     means = (forces.mean(axis=0), covariance, per * raws.mean(axis=0), int(n.sum()), float(effective.sum()))
     names = next(iter(sides.values())).names
-    return WindowResult(names, target, *means, number=number, sides=sides, p_value=chance)
+    return WindowResult(names, target, *means, sides=sides, p_value=chance)
 
 
 class Windows:
@@ -537,8 +526,8 @@ class Windows:
     KconsError
         A coordinate that is undefined at the structure or depends on other constraints.
     OccupiedError
-        The folder has windows of other settings, or other files of their names; in `run`, `improve` and `pull`, of
-        other values, or another run writes there.
+        The folder has windows of other settings, or other files of their names; in `run`, `improve` and `pull`,
+        another run writes there.
     """
 
     def __init__(
@@ -558,8 +547,9 @@ class Windows:
         self.workers = os.cpu_count() or 1 if workers is None else whole_number(workers, "workers")
         self.settings = settings or Settings()
         self.both_sides, self.seed = both_sides, seed_from(rng)
-        self._targets: list[tuple[float, ...]] = []
+        self._targets: dict[tuple[float, ...], None] = {}
         self._failed: dict[str, str] = {}
+        self._made: set[str] = set()  # not kept from before
         given = as_float_array(approach, "approach")
         if given.shape not in ((), (len(sampler.names),)) or not np.isfinite(given).all():
             remedy = f"give a finite number, or one for each of {', '.join(sampler.names)}"
@@ -589,35 +579,17 @@ class Windows:
         Returns
         -------
         FreeEnergy
-            One failed window does not stop the others; `failed` says why.
+            Of all windows that were asked for. One failed window does not stop the others; `failed` says why.
         """
-        numbers: list[int] = []
         with self.taken():
-            for place in map(tuple, places_of(targets, self.sampler.names).tolist()):
-                asked = [n for n, target in enumerate(self._targets) if target == place and n not in numbers]
-                numbers += asked[:1] or self._added([place])
-            return self._run(numbers)
+            return self._run(map(tuple, places_of(targets, self.sampler.names).tolist()))
 
-    def _added(self, places: Iterable[Sequence[float]]) -> list[int]:
-        """Numbers of new windows."""
-        first = len(self._targets)
-        self._targets += map(tuple, places)
-        return list(range(first, len(self._targets)))
-
-    def _run(self, numbers: Sequence[int]) -> FreeEnergy:
-        jobs, missing = [job for number in numbers for job in self._jobs(number)], []
-        for job in jobs:
-            if not (file := self.file(job)).exists():
-                missing.append(job)
-                continue
-            away = nearest_image(Series.load(file).value[:1] - np.array(job.target), self.sampler.periods)
-            if np.abs(away).max(initial=0.0) > 1e-4:
-                wanted = ", ".join(f"{q:g}" for q in self._targets[job.number])
-                raise OccupiedError(
-                    f"{file} was sampled elsewhere than at {wanted}, where window {job.number} is to be: the folder is "
-                    "one of other values; choose another folder",
-                    item="targets",
-                )
+    def _run(self, places: Iterable[tuple[float, ...]]) -> FreeEnergy:
+        asked = dict.fromkeys(places)
+        self._targets |= asked
+        jobs = [job for place in asked for job in self._jobs(place)]
+        missing = [job for job in jobs if not self.file(job).exists()]
+        self._made.update(job.name for job in missing)
         failed = self._sample(missing, len(jobs))
         for job in jobs:
             self._failed.pop(job.name, None)
@@ -647,26 +619,25 @@ class Windows:
                     break
                 places = profile.next_windows(min(at_once, most - len(self._targets)), below=below)
                 known = len(self._failed)
-                result = self._run(self._added([place] for place in places))
+                result = self._run((place,) for place in places)
                 if len(self._failed) > known:
                     break
         return result
 
-    def _jobs(self, number: int) -> list[Window]:
+    def _jobs(self, place: tuple[float, ...]) -> list[Window]:
         """The runs of a window; without a pull they begin where they end."""
-        target = np.array(self._targets[number])
+        target = np.array(place)
         approach = self.approach if self.settings.pull else 0.0
         ways = zip(SIDES[: 1 + self.both_sides], (-1, 1), strict=False)
-        return [self._job(number, side, target + sign * approach, target) for side, sign in ways]
+        return [self._job(side, target + sign * approach, target) for side, sign in ways]
 
-    def _job(self, number: int, side: str, *ends: FloatArray) -> Window:
+    def _job(self, side: str, *ends: FloatArray, number: int = 0) -> Window:
         """A run from one place to another; the same one whenever it is asked for."""
-        seed = np.random.SeedSequence([self.seed, number, (*SIDES, *DIRECTIONS).index(side)]).generate_state(1)[0]
         start, target = (tuple((end / self.sampler.scales).tolist()) for end in ends)
-        return Window(number, side, start, target, int(seed))
+        return Window(side, start, target, self.seed, number)
 
     def pull(self, start: ArrayLike, end: ArrayLike, count: int = 20) -> Pulled:
-        """F(end) - F(start) from the works of pulls both ways, kJ/mol, by BAR; and by Jarzynski.
+        """F(end) - F(start) from the works of pulls both ways, kJ/mol, by BAR.
 
         Each pull begins in equilibrium (`Settings.equilibration`), takes `Settings.pull` steps at a constant rate, and
         is recorded at every step. Finished ones are kept.
@@ -690,7 +661,7 @@ class Windows:
         if np.array_equal(*ends):
             raise InputError("start and end of the pulls are the same; give two places", item="end")
         ways = zip(DIRECTIONS, (ends, ends[::-1]), strict=True)
-        jobs = [[self._job(number, way, *places) for number in range(count)] for way, places in ways]
+        jobs = [[self._job(way, *places, number=number) for number in range(count)] for way, places in ways]
         missing = [job for each in jobs for job in each if not self.file(job).exists()]
         with self.taken():
             failed = self._sample(missing, 2 * count)
@@ -723,7 +694,7 @@ class Windows:
                     running = {pool.submit(_sampled, *how, job, self.file(job)): job for job in left}
                     for future in as_completed(running):
                         error = future.exception()
-                        if isinstance(error, BrokenExecutor) or type(error).__name__ in _LOST:
+                        if isinstance(error, BrokenExecutor):
                             continue
                         left.remove(running[future])
                         if error is not None:
@@ -742,10 +713,11 @@ class Windows:
     def result(self) -> FreeEnergy:
         """Mean forces of the windows that are finished."""
         kT = BOLTZMANN * self.settings.temperature / self.sampler.kJ
-        found, problems = [], dict(self._failed)
-        for number, target in enumerate(self._targets):
+        found, problems, kept = [], dict(self._failed), 0
+        for target in self._targets:
             sides: dict[str, MeanForce] = {}
-            for job in filter(lambda job: self.file(job).exists(), self._jobs(number)):
+            for job in filter(lambda job: self.file(job).exists(), self._jobs(target)):
+                kept += job.name not in self._made
                 try:
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore", UserWarning)  # few independent samples: said of the window
@@ -753,14 +725,13 @@ class Windows:
                 except KconsError as error:
                     problems[job.name] = f"{type(error).__name__}: {error}"
             if sides:
-                found.append(combine_sides(number, np.array(target), sides, self.sampler))
+                found.append(combine_sides(np.array(target), sides, self.sampler))
         found.sort(key=lambda w: w.value.tolist())
-        return FreeEnergy(self.sampler.names, self.sampler.periods, found, problems, tuple(self.sampler.angles))
+        return FreeEnergy(self.sampler.names, self.sampler.periods, found, problems, tuple(self.sampler.angles), kept)
 
 
-#: What is said of a window whose process was killed, and errors of Dask that say so.
+#: What is said of a window whose process was killed.
 _KILLED = "its process was killed each time (a script that starts processes does so below if __name__ == '__main__':)"
-_LOST = ("KilledWorker", "CancelledError")
 
 
 def _sampled(sampler: Sampler, settings: Settings, window: Window, file: Path) -> None:

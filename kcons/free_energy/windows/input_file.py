@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, FixedAtoms
-from kcons.constraints.arguments import ANGLE, Count, Positive, rules_of, whole_number
+from kcons.constraints.arguments import Count, Positive, rules_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, did_you_mean
-from kcons.free_energy.profiles.pulls import MIN_PULLS
 from kcons.free_energy.windows.driver import Sampler, Settings
 from kcons.steppers.files import as_path
 
@@ -37,7 +36,7 @@ MOST_WINDOWS = 100_000
 #: How many atoms each kind of coordinate has, and what it becomes.
 FAMILIES: dict[str, tuple[int, Callable[[ArrayLike], Constraint]]] = {
     "distance": (2, Distance),
-    "difference": (4, lambda rows: DistanceDifference(np.reshape(rows, (-1, 2, 2)))),
+    "difference": (4, lambda rows: DistanceDifference(np.reshape(rows, (-1, 2)))),
     "angle": (3, Angle),
     "dihedral": (4, Dihedral),
 }
@@ -80,7 +79,6 @@ class Forces:
     calculator: str | None = None
     settings: dict | None = None
     system: str | None = None
-    platform: str | None = None
 
 
 @dataclass(kw_only=True)
@@ -154,16 +152,8 @@ class Improve:
     at_once: Count = 1
 
 
-@dataclass(kw_only=True)
-class Pulls:
-    begin: float | list[float] | None = field(default=None, metadata={"key": "from"})
-    to: float | list[float] | None = None
-    count: Annotated[int, partial(whole_number, least=MIN_PULLS)] = 20
-    steps: Count = 20_000
-
-
 #: Keys of [sampling] that are arguments of `Windows`; the others are those of `Settings`.
-_OF_WINDOWS = {"both_sides": bool, "approach": float | list[float], "rng": int}
+_OF_WINDOWS = {"both_sides": bool, "rng": int}
 _SAMPLING = get_type_hints(Settings, include_extras=True) | _OF_WINDOWS
 #: Tables of a file.
 _TABLES: dict[str, Any] = {
@@ -173,7 +163,6 @@ _TABLES: dict[str, Any] = {
     "held": HeldRows,
     "sampling": make_dataclass("Sampling", [(key, kind | None, None) for key, kind in _SAMPLING.items()]),
     "improve": Improve,
-    "pulls": Pulls,
 }
 
 
@@ -188,11 +177,9 @@ class InputFile:
     targets : ndarray, shape (n, d)
         In angstrom and radian.
     options : dict
-        Of `Windows`: both_sides, approach, rng.
+        Of `Windows`: both_sides, rng.
     improve : dict or None
         Of `Windows.improve`.
-    pulls : dict or None
-        Of `Windows.pull`: start and end in angstrom and radian, count; and steps, of `Settings.pull`.
     """
 
     sampler: Sampler
@@ -200,7 +187,6 @@ class InputFile:
     targets: FloatArray
     options: dict[str, Any]
     improve: dict[str, Any] | None
-    pulls: dict[str, Any] | None
 
 
 def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -> InputFile:
@@ -246,17 +232,6 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
     targets = np.array(list(product(*(entry.places() for entry in entries))))
     sampling = {key: value for key, value in vars(tables["sampling"]).items() if value is not None}
     options = {key: sampling.pop(key) for key in _OF_WINDOWS if key in sampling}
-    if "approach" in options:
-        options["approach"] = _in_radian("approach", options["approach"], coordinates)
-    pulls, ways = tables.get("pulls"), None
-    if pulls is not None:
-        start, end = (
-            place if given is None else _in_radian(f"{key} of [pulls]", np.atleast_1d(given), coordinates)
-            for key, given, place in (("from", pulls.begin, targets[0]), ("to", pulls.to, targets[-1]))
-        )
-        if np.array_equal(start, end):
-            raise InputError("[pulls] begin where they end; give from and to", item="pulls")
-        ways = {"start": start, "end": end, "count": pulls.count, "steps": pulls.steps}
     if "improve" in data and (len(coordinates) > 1 or count < 3):
         raise InputError(
             f"[improve] adds windows to a profile along one coordinate; the input file has {len(coordinates)}, with "
@@ -264,7 +239,7 @@ def read_input(file: str | PathLike[str], allow_modules: Collection[str] = ()) -
             item="improve",
         )
     sampler = _sampler(path.parent, tables, coordinates, allow_modules)
-    return InputFile(sampler, Settings(**sampling), targets, options, data.get("improve"), ways)
+    return InputFile(sampler, Settings(**sampling), targets, options, data.get("improve"))
 
 
 def _read(kind: Any, name: str, entry: Any) -> Any:
@@ -325,16 +300,6 @@ def _opened(program: str, read: Callable[[str], Any], path: Path) -> Any:
         raise InputError(f"{program} cannot read {path}: {type(error).__name__}: {error}", item="structure") from error
 
 
-def _in_radian(key: str, given: ArrayLike, coordinates: Mapping[str, Constraint]) -> FloatArray:
-    """Values of the coordinates, or one for all of them, angles of degrees in radian."""
-    values = np.array(given, dtype=np.float64)
-    if values.shape not in ((), (len(coordinates),)):
-        raise InputError(
-            f"{key} has {values.size} values; give one for each of {', '.join(coordinates)}", item=key.split()[0]
-        )
-    return np.where([item.held is ANGLE for item in coordinates.values()], np.radians(values), values)
-
-
 def _sampler(
     folder: Path, tables: Mapping[str, Any], coordinates: Mapping[str, Constraint], allow_modules: Collection[str]
 ) -> Sampler:
@@ -345,20 +310,17 @@ def _sampler(
             "give calculator or system in [forces]: a calculator of ASE, or the XML file of a System of OpenMM",
             item="forces",
         )
-    for key, other in (("settings", "system"), ("platform", "calculator")):
-        if getattr(forces, key) is not None and getattr(forces, other) is not None:
-            raise InputError(f"{key} of [forces] says nothing to a {other}; leave it out", item=key)
     if forces.system is not None:
-        if "held" in tables:
-            raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
+        for given, key in ((forces.settings, "settings of [forces]"), (tables.get("held"), "[held]")):
+            if given is not None:
+                raise InputError(f"{key} is for a calculator of ASE, and no System; leave it out", item=key)
         from openmm import app
 
-        from kcons.free_energy.scans.system_calculator import read_system
-        from kcons.free_energy.windows.openmm_windows import OpenMMWindows
+        from kcons.free_energy.windows.openmm_windows import OpenMMWindows, read_system
 
         system = read_system(folder / forces.system, "system")
         pdb = _opened("OpenMM", app.PDBxFile if place.suffix == ".cif" else app.PDBFile, place)
-        return OpenMMWindows(pdb.topology, system, pdb.positions, coordinates, platform=forces.platform)
+        return OpenMMWindows(pdb.topology, system, pdb.positions, coordinates)
     from kcons.ase.named_calculators import LISTED, named_calculator, refuse_unlisted
     from kcons.free_energy.windows.ase_windows import AseWindows
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from os import PathLike
+from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
@@ -242,6 +243,26 @@ class OpenMMWindows(Sampler):
 
     def simulation(self, window: Window, settings: Settings) -> _Simulation:
         return _Simulation(self, window, settings)
+
+
+def read_system(path: Path, item: str) -> openmm.System:
+    """The System of an XML file; refuses one with a `PythonForce`, whose code would run while it is read."""
+    if not path.is_file():
+        raise InputError(f"there is no file {path}", item=item)
+    text = path.read_text(encoding="utf-8", errors="replace")
+    if "PythonForce" in text:
+        raise InputError(
+            f"{path} has a PythonForce in it, whose code would run while the file is read; make the System in Python "
+            "where you trust it (OpenMMWindows)",
+            item=item,
+        )
+    try:
+        system = openmm.XmlSerializer.deserialize(text)
+    except (ValueError, openmm.OpenMMException) as error:
+        raise InputError(f"{path} is no System of OpenMM: {error}", item=item) from error
+    if not isinstance(system, openmm.System):
+        raise InputError(f"{path} has a {type(system).__name__} in it, no System", item=item)
+    return system
 
 
 class _Simulation:

@@ -1,8 +1,7 @@
 """The plugin, compiled where it is used and kept in the caches of the user.
 
-OpenMM comes with all of its headers and its libraries with all symbols, so that a C++ compiler is all that is needed.
-There is one library for the integrator with the platforms Reference and CPU, and one for each of OpenCL, CUDA and HIP,
-since OpenMM loads those of each platform apart.
+OpenMM comes with all headers and symbols: a C++ compiler is all that is needed. There is one library for the integrator
+with the platforms Reference and CPU, and one for each of OpenCL, CUDA and HIP, which OpenMM loads apart.
 """
 
 from __future__ import annotations
@@ -29,31 +28,26 @@ from kcons.errors import UnsupportedError
 logger = logging.getLogger("kcons.openmm")
 
 SOURCES = Path(__file__).parent / "plugin"
+#: OpenMM's libraries, and beside them its headers, as pip and conda have them.
+LIBRARIES = Path(openmm.version.openmm_library_path)
+HEADERS = LIBRARIES.parent / "include"
 #: Platforms that have a library of their own.
 ACCELERATED = ("OpenCL", "CUDA", "HIP")
 #: Name of the package that `python -m kcons.openmm.device.wheel` makes.
 PACKAGE = "kcons_device"
-_CORE = ("program_integrator.cpp", "plain_platforms.cpp")
-_FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared", "-w")
+_FLAGS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-w")
 
 
 def compiler() -> list[str]:
     """The C++ compiler: $CXX, or the first of g++, c++ and clang++ that is there; empty if none is."""
-    given = shlex.split(os.environ.get("CXX", ""))
-    found = [path for name in (*given[:1], "g++", "c++", "clang++") if (path := shutil.which(name))]
-    return [found[0], *(given[1:] if given and found[0] == shutil.which(given[0]) else [])] if found else []
+    known = shlex.split(os.environ.get("CXX", "")), ["g++"], ["c++"], ["clang++"]
+    return next(([path, *words[1:]] for words in known if words and (path := shutil.which(words[0]))), [])
 
 
 def folder() -> Path:
     """Where libraries are kept: with Numba's files if $NUMBA_CACHE_DIR is set, else where caches of the user are."""
     given = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(given) / "kcons-device"
-
-
-def headers() -> Path | None:
-    """OpenMM's headers: beside its libraries, as pip and conda have them."""
-    path = Path(openmm.version.openmm_library_path).parent / "include"
-    return path if (path / "OpenMM.h").exists() else None
 
 
 def digest() -> str:
@@ -72,9 +66,7 @@ def refusal() -> str:
         return ""
     if not compiler():
         return "there is no C++ compiler; install g++, or a wheel made by python -m kcons.openmm.device.wheel"
-    if headers() is None:
-        return f"OpenMM's headers are not at {Path(openmm.version.openmm_library_path).parent / 'include'}"
-    return ""
+    return "" if (HEADERS / "OpenMM.h").exists() else f"OpenMM's headers are not at {HEADERS}"
 
 
 def reluctance() -> str:
@@ -94,8 +86,8 @@ def is_built() -> bool:
 def places() -> list[Path]:
     """Folders that may have libraries of these sources: an installed wheel, and the cache."""
     found = importlib.util.find_spec(PACKAGE)
-    wheel = [Path(path) / digest() for path in (found.submodule_search_locations or ())] if found else []
-    return [*wheel, folder() / digest()]
+    wheels = (found and found.submodule_search_locations) or ()
+    return [Path(path) / digest() for path in (*wheels, folder())]
 
 
 def accelerated() -> list[str]:
@@ -110,26 +102,25 @@ def build(target: Path, platforms: Sequence[str], stubs: bool = False) -> None:
     With `stubs`, link with empty libraries of the names of OpenMM's, so that none of the platforms need be here.
     """
     target.mkdir(parents=True, exist_ok=True)
-    libraries = Path(openmm.version.openmm_library_path)
     with tempfile.TemporaryDirectory(dir=target) as made:
-        where = [f"-L{libraries}", f"-L{libraries / 'plugins'}", f"-Wl,-rpath,{libraries}:{libraries / 'plugins'}"]
+        where = [f"-L{LIBRARIES}", f"-L{LIBRARIES / 'plugins'}", f"-Wl,-rpath,{LIBRARIES}:{LIBRARIES / 'plugins'}"]
         if stubs:
             where = [f"-L{made}"]
             for name in ("OpenMM", *(f"OpenMM{platform}" for platform in platforms)):
-                stub = ["-shared", "-xc++", os.devnull, f"-Wl,-soname,lib{name}.so", "-o", f"{made}/lib{name}.so"]
-                _compile(stub)
-        shared = [*_FLAGS, f"-I{headers()}", *where, f"-L{made}", "-Wl,-rpath,$ORIGIN"]
-        core = [str(SOURCES / name) for name in _CORE]
+                _compile(["-shared", "-xc++", os.devnull, f"-Wl,-soname,lib{name}.so", "-o", f"{made}/lib{name}.so"])
+        shared = [*_FLAGS, f"-I{HEADERS}", *where, f"-L{made}", "-Wl,-rpath,$ORIGIN"]
+        core = [str(SOURCES / name) for name in ("program_integrator.cpp", "plain_platforms.cpp")]
         _compile([*core, *shared, "-lOpenMM", "-Wl,-soname,libKcons.so", "-o", f"{made}/libKcons.so"])
         for platform in platforms:
-            name, source = f"libKcons{platform}.so", str(SOURCES / "common_platform.cpp")
-            linked = [*shared, "-lKcons", f"-lOpenMM{platform}", "-lOpenMM"]
-            _compile([source, f'-DPLATFORM="{platform}"', *linked, "-o", f"{made}/{name}"])
+            linked = [*shared, "-lKcons", f"-lOpenMM{platform}", "-lOpenMM", "-o", f"{made}/libKcons{platform}.so"]
+            _compile([str(SOURCES / "common_platform.cpp"), f'-DPLATFORM="{platform}"', *linked])
         for path in Path(made).glob("libKcons*.so"):
             os.replace(path, target / path.name)
 
 
 def _compile(arguments: Sequence[str]) -> None:
+    if not compiler():
+        raise UnsupportedError("there is no C++ compiler, which steps on Reference and CPU and a wheel need")
     done = subprocess.run([*compiler(), *arguments], capture_output=True, text=True)
     if done.returncode:
         raise UnsupportedError(f"the C++ compiler refused the plugin: {done.stderr.strip()[:2000]}")
@@ -140,24 +131,19 @@ def library() -> ctypes.CDLL:
     """The library of the integrator, with those of all platforms loaded into OpenMM; UnsupportedError without one."""
     if why := refusal():
         raise UnsupportedError(f"no steps on the device: {why}")
-    wanted = accelerated()
-    names = ["libKcons.so", *(f"libKcons{name}.so" for name in wanted)]
+    names = ["libKcons.so", *(f"libKcons{name}.so" for name in accelerated())]
     there = next((path for path in places() if all((path / name).exists() for name in names)), None)
     if there is None:
         there = folder() / digest()
-        logger.info("compiling the plugin of OpenMM for %s", ", ".join(["Reference", "CPU", *wanted]))
-        build(there, wanted)
-    loaded = ctypes.CDLL(str(there / "libKcons.so"))
-    loaded.kcons_error.restype = ctypes.c_char_p
-    for name in wanted:
-        openmm.Platform.loadPluginLibrary(str(there / f"libKcons{name}.so"))
-    return loaded
+        logger.info("compiling the plugin of OpenMM for %s", ", ".join(["Reference", "CPU", *accelerated()]))
+        build(there, accelerated())
+    loaded = [ctypes.CDLL(str(there / name)) for name in names]
+    loaded[0].kcons_error.restype = ctypes.c_char_p
+    return loaded[0]
 
 
 def kernels_library(source: str) -> Path:
     """Kernels for Reference and CPU, compiled to a library; UnsupportedError where there is no compiler."""
-    if not compiler():
-        raise UnsupportedError("steps on the platforms Reference and CPU need a C++ compiler, and there is none")
     path = folder() / f"kernels_{hashlib.sha256(f'{_FLAGS} {source}'.encode()).hexdigest()[:24]}.so"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -3,9 +3,8 @@
 //
 // rows_cluster  first row, first atom, first level of each cluster
 // rows_row      of each row: function, first slot, first parameter, how its atoms are gathered (0 as stored, 1 relative
-//               to the first, 2 by shortest images along the list, 3 with cells that are given), first entry, first
-//               earlier entry, flags (1 of velocities, 2 may depend on others, 4 is summed), number of its
-//               moving target or -1, its first cell
+//               to the first, 2 with cells that are given, too), first entry, first earlier entry, flags (1 of
+//               velocities, 2 is summed), number of its moving target or -1, its first cell
 // rows_number   of each row: target, scale, period
 // rows_slot     of each slot (an atom of a row): the atom in its cluster, its row
 // rows_entry    of each entry of the matrix: its two rows in the order of elimination, first product, first update
@@ -16,30 +15,19 @@
 #define PLACE(p) (3*rows_slot[2*(p)])
 
 // Values and gradients at x + d (moved) or at x, of rows first to last; those of velocities `half_way` before `time`.
-// Shortest images are found at x, and kept.
 DEVICE void rows_evaluate(ROWS int cluster, mixed time, mixed half_way, int moved, GLOBAL const mixed* x, GLOBAL const mixed* d, GLOBAL mixed* result) {
     for (int k = rows_cluster[3*cluster]+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) {
         int begin = ROW(k, 1), end = ROW(k+1, 1), how = ROW(k, 3), rolls = ROW(k, 6) & 1, size = 3*(end-begin), s = PLACE(begin);
-        GLOBAL mixed *r = rows_place+9*begin, *base = r+2*size;
+        GLOBAL mixed* r = rows_place+6*begin;
         mixed share = rolls ? (mixed) 0.5 : (mixed) 1;
         for (int p = begin; p < end; p++) {
             int a = PLACE(p), at = 3*(p-begin);
-            mixed ux = x[a], uy = x[a+1], uz = x[a+2];
-            if (how == 2) {
-                if (!moved && p == begin) base[0] = base[1] = base[2] = 0;
-                else if (!moved) ROWS_STEP(base, at, x, a, PLACE(p-1))
-                ux = base[at]; uy = base[at+1]; uz = base[at+2];
+            XYZ {
+                r[at+c] = how ? x[a+c]-x[s+c] : x[a+c];
+                if (moved) r[at+c] += share*(how ? d[a+c]-d[s+c] : d[a+c]);
+                if (rolls) r[size+at+c] = moved ? d[a+c] : (mixed) 0;
             }
-            else if (how) {ux -= x[s]; uy -= x[s+1]; uz -= x[s+2];}
-            if (how == 3) {
-                GLOBAL const mixed* n = rows_cells+ROW(k, 8)+at;
-                ux += n[0]*box0.x+n[1]*box1.x+n[2]*box2.x; uy += n[1]*box1.y+n[2]*box2.y; uz += n[2]*box2.z;
-            }
-            if (rolls) for (int c = 0; c < 3; c++) r[size+at+c] = moved ? d[a+c] : (mixed) 0;
-            if (moved) {
-                ux += share*(how ? d[a]-d[s] : d[a]); uy += share*(how ? d[a+1]-d[s+1] : d[a+1]); uz += share*(how ? d[a+2]-d[s+2] : d[a+2]);
-            }
-            r[at] = ux; r[at+1] = uy; r[at+2] = uz;
+            if (how == 2) ROWS_SHIFT((r+at), (rows_cells+ROW(k, 8)+at))
         }
         rows_function(ROW(k, 0), r, rows_parameter+ROW(k, 2), rows_knots[0]+(rolls ? time-half_way : time), result+3*begin+k);
     }
@@ -58,8 +46,8 @@ DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, G
                 for (int u = ENTRY(e, 2); u < ENTRY(e+1, 2); u++) {
                     int p = rows_product[2*u], q = rows_product[2*u+1], a = 3*p+i+1, b = 3*q+j+1;
                     mixed m = w[rows_slot[2*p]];
-                    up += m*(now[a]*there[b]+now[a+1]*there[b+1]+now[a+2]*there[b+2]);
-                    low += m*(now[b]*there[a]+now[b+1]*there[a+1]+now[b+2]*there[a+2]);
+                    up += m*ROWS_DOT((now+a), (there+b));
+                    low += m*ROWS_DOT((now+b), (there+a));
                 }
                 mixed whole = fabs(up);
                 for (int u = ENTRY(e, 3); u < ENTRY(e+1, 3); u++) {
@@ -68,7 +56,7 @@ DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, G
                     up -= rows_lower[p]*inverse*rows_upper[q];
                     low -= rows_lower[q]*inverse*rows_upper[p];
                 }
-                if (i == j) rows_pivot[i] = (ROW(i, 6) & 2) && fabs(up) <= ROWS_PIVOT*whole ? (mixed) 0 : 1/up;
+                if (i == j) rows_pivot[i] = fabs(up) <= ROWS_PIVOT*whole ? (mixed) 0 : 1/up;
                 else {rows_upper[e] = up; rows_lower[e] = low;}
             }
         for (int k = first+LOCAL_ID; k < rows_level[level+1]; k += LOCAL_SIZE) {
@@ -96,15 +84,12 @@ DEVICE void rows_solve(ROWS int cluster, int factors, GLOBAL const mixed* now, G
 DEVICE void rows_push(ROWS int cluster, GLOBAL const mixed* there, GLOBAL mixed* d, GLOBAL const mixed* w) {
     int base = rows_cluster[3*cluster+1];
     for (int a = base+LOCAL_ID; a < rows_cluster[3*cluster+4]; a += LOCAL_SIZE) {
-        mixed sx = 0, sy = 0, sz = 0;
+        mixed s[3] = {0, 0, 0};
         for (int u = rows_atom[a]; u < rows_atom[a+1]; u++) {
-            int p = rows_touch[u], k = rows_slot[2*p+1], g = 3*p+k+1;
-            mixed y = rows_answer[k];
-            sx += y*there[g]; sy += y*there[g+1]; sz += y*there[g+2];
+            int p = rows_touch[u], k = rows_slot[2*p+1];
+            XYZ s[c] += rows_answer[k]*there[3*p+k+1+c];
         }
-        int at = 3*(a-base);
-        mixed m = w[a-base];
-        d[at] -= m*sx; d[at+1] -= m*sy; d[at+2] -= m*sz;
+        XYZ d[3*(a-base)+c] -= w[a-base]*s[c];
     }
 }
 
@@ -123,7 +108,7 @@ DEVICE int rows_measure(ROWS int cluster, mixed h, mixed time, GLOBAL const mixe
         if (period > 0) off -= period*rint(off/period);
         rows_off[k] = off;
         for (int q = 3*begin+k+1; q < 3*ROW(k+1, 1)+k+1; q++) along += rows_now[q]*rows_there[q];
-        if (!ROW(k, 3)) for (int p = begin; p < ROW(k+1, 1); p++) for (int c = 0; c < 3; c++) reach += fabs(rows_there[3*p+k+1+c]*x[PLACE(p)+c]);
+        if (!ROW(k, 3)) for (int p = begin; p < ROW(k+1, 1); p++) XYZ reach += fabs(rows_there[3*p+k+1+c]*x[PLACE(p)+c]);
         mixed allowed = tolerance*rows_number[3*k+1]*(rolls ? (mixed) 0.0625 : (mixed) 1)+ROWS_ROUNDING*reach;
         if (!(fabs(off) <= allowed && along > 0)) scratch[0] = k+1;
         if (!(fabs(off) < ROWS_FAR)) scratch[1] = k+1;
@@ -153,7 +138,7 @@ DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const 
         int k = (missed > 0 ? missed : -missed)-1;
         FAIL(ROWS_FIRST_LARGE+k, rows_off[k])
     }
-    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) ROWS_ADD(ROWS_FIRST_LARGE+k, rows_sum[k]/h)
+    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 2) ROWS_ADD(ROWS_FIRST_LARGE+k, rows_sum[k]/h)
     SYNC_THREADS;
 }
 
@@ -167,17 +152,14 @@ DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL co
             mixed off = 0;
             if (ROW(k, 7) >= 0) off = -rate*rows_moving(rows_knots, ROW(k, 7), time, rolls ? 0 : 1);
             else if (rolls) off = -rate*rows_number[3*k];
-            if (rate != 0) off += rate*rows_drift(ROW(k, 0), rows_place+9*begin, rows_parameter+ROW(k, 2), rows_knots[0]+time);
-            for (int p = begin; p < ROW(k+1, 1); p++) {
-                int g = 3*p+k+1, a = PLACE(p);
-                off += rows_there[g]*v[a]+rows_there[g+1]*v[a+1]+rows_there[g+2]*v[a+2];
-            }
+            if (rate != 0) off += rate*rows_drift(ROW(k, 0), rows_place+6*begin, rows_parameter+ROW(k, 2), rows_knots[0]+time);
+            for (int p = begin; p < ROW(k+1, 1); p++) off += ROWS_DOT((rows_there+3*p+k+1), (v+PLACE(p)));
             rows_off[k] = off;
         }
         SYNC_THREADS;
         rows_solve(ROWS_PASS cluster, pass == 0, rows_there, rows_there, w);
         rows_push(ROWS_PASS cluster, rows_there, v, w);
-        if (rate != 0) for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 4) ROWS_ADD(ROWS_FIRST_LARGE+k, rows_answer[k])
+        if (rate != 0) for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 2) ROWS_ADD(ROWS_FIRST_LARGE+k, rows_answer[k])
         SYNC_THREADS;
     } while (++pass < 2);
 }

@@ -8,8 +8,6 @@ order of elimination by levels (see `clusters.c`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +23,7 @@ ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4
 #: Rows from which a matrix has the precision of forces: registers are then scarce, and residuals are exact still.
 FEW = 4
 #: How rows take their atoms, see `clusters.c`.
-STORED, RELATIVE, NEAREST, IN_CELLS = range(4)
+STORED, RELATIVE, IN_CELLS = range(3)
 #: Where a function has no tape.
 REMEDY = ", and is not written in C; leave it to the host (device=False)"
 #: Operations that are operators in C, and functions that have another name there.
@@ -174,67 +172,43 @@ class ItemWriter:
         a = row.atoms
         return [{a[0]: "-", a[1]: "+"}] if self._plain(row) else [{each: "+"} for each in a]
 
-    def _each(self, write: Callable[[int, Row], str]) -> str:
-        return "".join(write(k, row) for k, row in enumerate(self.rows))
-
-    def _begin(self, what: str, first: str) -> str:
-        def room(k: int, row: Row) -> str:
-            size = 3 * len(row.atoms)
-            kept = f", b{k}[{size}]" if row.how == NEAREST else ""
-            return f" mixed r{k}[{size * (1 + row.rolls)}], o{k}[{1 + size}], g{k}[{size}]{kept};\n"
-
-        return (
-            f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
-            f"mixed* d, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
-            f"{self.table.shape[1]};\n{self._each(room)} mixed off[{self.count}], sum[{self.count}];\n "
-            f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n mixed z;\n"
-        )
+    def _unit(self, k: int) -> str:
+        """What residuals are multiplied by, and multipliers are to be."""
+        return f"{self.targets[k]}*" if self._plain(self.rows[k]) else ""
 
     # -- rows ------------------------------------------------------------------------------------
 
-    def _gathered(self, k: int, row: Row, moved: bool) -> str:
-        """Positions of a row's atoms into r, at x or at x + d; of rows of velocities the way stands behind them."""
-        lines, first, size = [], 3 * row.atoms[0], 3 * len(row.atoms)
-        for i, atom in enumerate(row.atoms):
-            for c in range(3):
-                a, s, own = 3 * atom + c, first + c, f"r{k}[{3 * i + c}]"
-                place, way = f"x[{a}]", f"d[{a}]"
-                if row.how != STORED:
-                    place, way = (f"x[{a}]-x[{s}]", f"(d[{a}]-d[{s}])") if i else ("0", "0")
-                    if row.how == NEAREST:
-                        place = f"b{k}[{3 * i + c}]"
-                if row.how == IN_CELLS and i:
-                    cells = f"rows_cells[(int) {self.cells[k]}+{3 * i}"
-                    shift = [f"{cells}+{m}]*box{m}.{'xyz'[c]}" for m in range(c, 3)]
-                    place = "+".join([place, *shift])
-                half_way = "(mixed) 0.5*" if row.rolls else ""
-                lines.append(f" {own} = {place}{f'+{half_way}{way}' if moved else ''};")
-                if row.rolls:
-                    lines.append(f" r{k}[{size + 3 * i + c}] = {f'd[{a}]' if moved else '0'};")
-        return "".join(lines) + "\n"
-
-    def _images(self, k: int, row: Row) -> str:
-        """Shortest images along the list, once: atoms move by less than half the cell."""
-        if row.how != NEAREST:
-            return ""
-        steps = (f" ROWS_STEP(b{k}, {3 * i}, x, {3 * b}, {3 * a})" for i, (a, b) in enumerate(pairwise(row.atoms), 1))
-        return f" b{k}[0] = b{k}[1] = b{k}[2] = 0;{''.join(steps)}\n"
-
     def _value(self, k: int, row: Row, time: str, moved: bool) -> str:
-        """Value less target, or value alone, and gradient of a row."""
-        text = self._gathered(k, row, moved)
+        """Value, less the target of a plain row, and gradient at x or x + d; of rows of velocities half-way."""
+        text, size = "", 3 * len(row.atoms)
+        for i, atom in enumerate(row.atoms):
+            place, way = (f"{{0}}[{3 * atom}+c]".format(of) for of in "xd")
+            if row.how != STORED:
+                place, way = (f"{each}-{each[0]}[{3 * row.atoms[0]}+c]" for each in (place, way))
+            half = "(mixed) 0.5*" * row.rolls
+            text += f" XYZ r{k}[{3 * i}+c] = {place}{f'+{half}({way})' * moved};\n"
+            if row.rolls:
+                text += f" XYZ r{k}[{size + 3 * i}+c] = {f'd[{3 * atom}+c]' if moved else '0'};\n"
+            if row.how == IN_CELLS:
+                text += f" ROWS_SHIFT((r{k}+{3 * i}), (rows_cells+(int) {self.cells[k]}+{3 * i}))\n"
         if not self._plain(row):
             return f"{text} rows_f{row.function}(r{k}, {self.parameters[k]}, rows_knots[0]+{time}, o{k});\n"
-        u, t = [f"r{k}[{3 + c}]" for c in range(3)], self.targets[k]
-        square = "+".join(f"{each}*{each}" for each in u)
-        lines = [f" o{k}[{1 + c}] = {u[c]};" for c in range(3)]
-        return f"{text} o{k}[0] = (mixed) 0.5*({square}-{t}*{t});{''.join(lines)}\n"
+        u, t = f"(r{k}+3)", self.targets[k]
+        return f"{text} o{k}[0] = (mixed) 0.5*(ROWS_DOT({u}, {u})-{t}*{t}); XYZ o{k}[1+c] = {u}[c];\n"
 
-    def _reference(self, time: str) -> str:
-        text = ""
+    def _begin(self, what: str, first: str, time: str) -> str:
+        """What a function begins with: its numbers, and gradients at x."""
+        text = (
+            f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
+            f"mixed* d, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
+            f"{self.table.shape[1]};\n mixed off[{self.count}], sum[{self.count}], whole;\n "
+            f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n"
+        )
         for k, row in enumerate(self.rows):
-            kept = "".join(f" g{k}[{c}] = o{k}[{1 + c}];" for c in range(3 * len(self._legs(row))))
-            text += f"{self._images(k, row)}{self._value(k, row, time, False)}{kept} sum[{k}] = 0;\n"
+            size, kept = 3 * len(row.atoms), 3 * len(self._legs(row))
+            text += f" mixed r{k}[{size * (1 + row.rolls)}], o{k}[{1 + size}], g{k}[{size}];\n"
+            text += f"{self._value(k, row, time, False)} for (int c = 0; c < {kept}; c++) g{k}[c] = o{k}[1+c];\n"
+            text += f" sum[{k}] = 0;\n"
         return text
 
     def _wanted(self, k: int, row: Row, time: str, rate: int) -> str:
@@ -251,25 +225,24 @@ class ItemWriter:
         for p, one in enumerate(self._legs(self.rows[k])):
             for q, other in enumerate(self._legs(self.rows[j])):
                 weight = "".join(f"{'+' if one[a] == other[a] else '-'}w[{a}]" for a in one if a in other)
-                along = "+".join(f"{left.format(k, 3 * p + c)}*g{j}[{3 * q + c}]" for c in range(3))
-                terms += [f"({weight})*({along})"] if weight else []
+                terms += [
+                    f"({weight})*ROWS_DOT(({left}{k}+{{}}), (g{j}+{3 * q}))".format(3 * p + (left == "o"))
+                ] * bool(weight)
         return "+".join(terms)
 
-    def _factored(self, symmetric: bool) -> str:
+    def _factored(self, left: str) -> str:
         """J, and its L and U in place, without pivoting: it is nearly symmetric and positive."""
-        n, left = self.count, "g{}[{}]" if symmetric else "o{}[1+{}]"
-        lines = [" mixed whole;\n"] if any(row.depends for row in self.rows) else []
+        n, lines = self.count, []
         filled = self.filled = [set[int]() for _ in self.rows]
         for k in range(n):
             for j in range(n):
                 text = self._product(k, j, left)
                 if text:
                     filled[k].add(j)
-                    lines.append(f" J[{k * n + j}] = {f'J[{j * n + k}]' if symmetric and j < k else text};\n")
+                    lines.append(f" J[{k * n + j}] = {f'J[{j * n + k}]' if left == 'g' and j < k else text};\n")
         for k, row in enumerate(self.rows):
             pivot = f"J[{k * n + k}]"
-            if row.depends:
-                lines.append(f" whole = fabs((mixed) {pivot});\n")
+            lines.append(f" whole = fabs((mixed) {pivot});\n" * row.depends)
             for m in range(k):
                 if m not in filled[k]:  # which grows
                     continue
@@ -278,95 +251,75 @@ class ItemWriter:
                     old = f"J[{k * n + j}]" if j in filled[k] else "0"
                     filled[k].add(j)
                     lines.append(f" J[{k * n + j}] = {old}-J[{k * n + m}]*J[{m * n + j}];\n")
-            none = f"fabs((mixed) {pivot}) <= ROWS_PIVOT*whole ? 0 : " if row.depends else ""
+            none = f"fabs((mixed) {pivot}) <= ROWS_PIVOT*whole ? 0 : " * row.depends
             lines.append(f" {pivot} = {none}1/{pivot};\n")
         return "".join(lines)
 
     def _solved(self) -> str:
         """J y = off, y, and what it takes from d or v, which is called `d`."""
-        n, lines = self.count, []
+        n, text = self.count, ""
         for k in range(n):
             taken = "".join(f"-J[{k * n + m}]*y[{m}]" for m in sorted(self.filled[k]) if m < k)
-            lines.append(f" y[{k}] = off[{k}]{taken};\n")
+            text += f" y[{k}] = off[{k}]{taken};\n"
         for k in range(n - 1, -1, -1):
             taken = "".join(f"-J[{k * n + j}]*y[{j}]" for j in sorted(self.filled[k]) if j > k)
-            lines.append(f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}]; sum[{k}] += y[{k}];\n")
+            text += f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}]; sum[{k}] += y[{k}];\n"
         for k, row in enumerate(self.rows):
             for p, leg in enumerate(self._legs(row)):
-                for c in range(3):
-                    lines.append(f" z = g{k}[{3 * p + c}]*y[{k}];")
-                    lines += [f" d[{3 * a + c}] {'-' if sign == '+' else '+'}= w[{a}]*z;" for a, sign in leg.items()]
-            lines.append("\n")
-        return "".join(lines)
+                pushed = " ".join(f"d[{3 * a}+c] {'-' if sign == '+' else '+'}= w[{a}]*z;" for a, sign in leg.items())
+                text += f" XYZ {{mixed z = g{k}[{3 * p}+c]*y[{k}]; {pushed}}}\n"
+        return text
 
     def _sums(self, by: str) -> str:
-        return self._each(
-            lambda k, r: f" ROWS_ADD({self.row_number}+{k}, {self._unit(k, r)}sum[{k}]{by})\n" if r.summed else ""
-        )
-
-    def _unit(self, k: int, row: Row) -> str:
-        """What residuals are multiplied by, and multipliers are to be."""
-        return f"{self.targets[k]}*" if self._plain(row) else ""
+        summed = [k for k, row in enumerate(self.rows) if row.summed]
+        return "".join(f" ROWS_ADD({self.row_number}+{k}, {self._unit(k)}sum[{k}]{by})\n" for k in summed)
 
     # -- functions -------------------------------------------------------------------------------
 
     def positions(self) -> str:
         """x + d on the rows."""
-
-        def start(k: int, row: Row) -> str:
-            goal = self._wanted(k, row, "time-h/2" if row.rolls else "time", 0)
-            rounded = ""
+        starts = turns = missed = turned = ""
+        for k, row in enumerate(self.rows):
+            time, unit = "time-h/2" if row.rolls else "time", self._unit(k)
+            allowed = f"tolerance*{unit}{self.scales[k]}{'*(mixed) 0.0625' * row.rolls}"
+            starts += f" mixed t{k} = {'h*' * row.rolls}{self._wanted(k, row, time, 0)}, a{k} = {allowed};\n"
             if row.how == STORED:
-                size = "+".join(f"fabs(o{k}[{1 + c}]*r{k}[{c}])" for c in range(3 * len(row.atoms)))
-                rounded = f" a{k} += ROWS_ROUNDING*({size});"
-            allowed = f"tolerance*{self._unit(k, row)}{self.scales[k]}{'*(mixed) 0.0625' if row.rolls else ''}"
-            return f" mixed t{k} = {'h*' if row.rolls else ''}{goal}, a{k} = {allowed};{rounded}\n"
-
-        def turn(k: int, row: Row) -> str:
-            text = self._value(k, row, "time-h/2" if row.rolls else "time", True)
-            text += f" off[{k}] = o{k}[0]{'' if self._plain(row) else f'-t{k}'};"
+                size = f"a{k} += ROWS_ROUNDING*fabs(o{k}[1+c]*r{k}[c]);"
+                starts += f" for (int c = 0; c < {3 * len(row.atoms)}; c++) {size}\n"
+            turns += f"{self._value(k, row, time, True)} off[{k}] = o{k}[0]{'' if unit else f'-t{k}'};"
             if row.period:
-                text += f" off[{k}] -= {literal(row.period)}*rint(off[{k}]/{literal(row.period)});"
-            return f"{text} there = there && fabs(off[{k}]) <= a{k};\n"  # so that NaN fails
-
-        def turned(k: int, row: Row) -> str:
-            along = "+".join(f"o{k}[{1 + c}]*g{k}[{c}]" for c in range(3 * len(self._legs(row))))
-            return f" if (!({along} > 0)) bad = {k};\n"
-
+                turns += f" off[{k}] -= {literal(row.period)}*rint(off[{k}]/{literal(row.period)});"
+            turns += f" there = there && fabs(off[{k}]) <= a{k};\n"  # so that NaN fails
+            missed += f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};"
+            along = "+".join(f"ROWS_DOT((o{k}+{1 + 3 * p}), (g{k}+{3 * p}))" for p in range(len(self._legs(row))))
+            turned += f" if (!({along} > 0)) bad = {k};\n"
         # A row of one particle is met to rounding, by one more iteration.
         first, stop, then = (", last = 0", "there && last", " last = there;") if self.single else ("", "there", "")
-        missed = self._each(lambda k, row: f" if (!(fabs(off[{k}]) <= a{k})) bad = {k};")
-        units = ", ".join(self.targets[k] if self._plain(row) else "1" for k, row in enumerate(self.rows))
+        units = ", ".join(self._unit(k)[:-1] or "1" for k in range(self.count))
         fail = f"{{const mixed unit[] = {{{units}}}; FAIL({self.row_number}+bad, off[bad]/unit[bad]); return;}}\n"
         return (
-            f"{self._begin('positions', 'h')}{self._reference('time-h')}{self._each(start)}"
-            f" int bad = -1{first};\n"
-            f" for (int turn = 0;; turn++) {{\n int there = 1;\n{self._each(turn)} if ({stop}) break;{then}\n"
-            f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored(False)}{self._solved()} }}\n"
-            f"{self._each(turned)} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
+            f"{self._begin('positions', 'h', 'time-h')}{starts} int bad = -1{first};\n"
+            f" for (int turn = 0;; turn++) {{\n int there = 1;\n{turns} if ({stop}) break;{then}\n"
+            f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored('o')}{self._solved()} }}\n"
+            f"{turned} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
         )
 
     def velocities(self) -> str:
         """v, which is called d, along the rows."""
-
-        def demanded(k: int, row: Row) -> str:
+        demanded = speeds = ""
+        for k, row in enumerate(self.rows):
             rate = self._wanted(k, row, "time", 0 if row.rolls else 1)
             if self.held.functions[row.function].rate is not None:
                 rate += f"-rows_f{row.function}_rate(r{k}, {self.parameters[k]}, rows_knots[0]+time)"
-            return f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
-
-        def speed(k: int, row: Row) -> str:
-            parts = [
-                f"g{k}[{3 * p + c}]*({''.join(f'{sign}d[{3 * a + c}]' for a, sign in leg.items())})"
-                for p, leg in enumerate(self._legs(row))
-                for c in range(3)
-            ]
-            return f" off[{k}] = {'+'.join(parts)}-c{k};\n"
-
+            demanded += f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
+            speeds += f" off[{k}] = -c{k};\n"
+            for p, leg in enumerate(self._legs(row)):
+                speed = "".join(f"{sign}d[{3 * a}+c]" for a, sign in leg.items())
+                speeds += f" XYZ off[{k}] += g{k}[{3 * p}+c]*({speed});\n"
         return (
-            f"{self._begin('velocities', 'rate')}{self._reference('time')}{self._each(demanded)}"
-            f"{self._factored(True)} for (int pass = 0; pass < {1 + self.coarse}; pass++) {{\n"
-            f"{self._each(speed)}{self._solved()} }}\n if (rate != 0) {{{self._sums('')} }}\n}}\n"
+            f"{self._begin('velocities', 'rate', 'time')}{demanded}{self._factored('g')}"
+            f" for (int pass = 0; pass < {1 + self.coarse}; pass++) {{\n{speeds}{self._solved()} }}\n"
+            f" if (rate != 0) {{{self._sums('')} }}\n}}\n"
         )
 
 
@@ -385,13 +338,10 @@ def large_clusters(shapes: list[Shape], held: Any, first_row: int) -> tuple[list
     #: Of each row the atoms and the later rows that it is coupled to, among those of all clusters.
     atoms: list[IntArray] = []
     later: list[IntArray] = []
-    doubtful: list[bool] = []
     clusters = [(0, 0, 0)]
     for shape in shapes:
         numbered.append(shape._replace(name="large", first=len(clusters) - 1))
         order = elimination([row.atoms for row in shape.rows], {k for k, r in enumerate(shape.rows) if r.depends})
-        # Where rows may depend on others any pivot may vanish: not all of them are marked in large clusters.
-        doubtful += [bool(held.doubtful[shape.clusters].any())] * shape.clusters.size
         for cluster in shape.clusters:
             first, first_atom, _ = clusters[-1]
             kinds += [shape.rows[k] for k in order.rows]
@@ -416,7 +366,6 @@ def large_clusters(shapes: list[Shape], held: Any, first_row: int) -> tuple[list
     earlier = np.flatnonzero(entry_row < entry_column)
     earlier = earlier[np.argsort(entry_column[earlier], kind="stable")]
     sizes = [len(held.parameters[row]) for row in rows]
-    flags = [row.rolls + 2 * doubt + 4 * row.summed for row, doubt in zip(kinds, doubtful, strict=True)]
     moves = np.array([row.moves for row in kinds])
     columns: list[Any] = [
         [*(row.function for row in kinds), 0],
@@ -425,7 +374,7 @@ def large_clusters(shapes: list[Shape], held: Any, first_row: int) -> tuple[list
         [*(row.how for row in kinds), 0],
         diagonal,
         np.searchsorted(entry_column[earlier], np.arange(count + 1)),
-        [*flags, 0],
+        [*(row.rolls + 2 * row.summed for row in kinds), 0],
         [*np.where(moves, held.mover[rows], -1), 0],
         [*held.cell[rows], 0],
     ]
@@ -457,7 +406,7 @@ def large_clusters(shapes: list[Shape], held: Any, first_row: int) -> tuple[list
     parameters = np.concatenate([*(held.parameters[row] for row in rows), np.zeros(1)])
     arrays += [Array("rows_number", "mixed", numbers.ravel()), Array("rows_parameter", "mixed", parameters)]
     slots, entries = len(slot_row), len(entry_row)
-    rooms = {"place": 9 * slots, "now": 3 * slots + count, "there": 3 * slots + count}
+    rooms = {"place": 6 * slots, "now": 3 * slots + count, "there": 3 * slots + count}
     rooms |= {"upper": entries, "lower": entries} | dict.fromkeys(("pivot", "off", "answer", "sum"), count)
     arrays += [Array(f"rows_{name}", "mixed", np.zeros(size)) for name, size in rooms.items()]
     source = _source(sorted({row.function for row in kinds}), held, first_row)

@@ -7,7 +7,7 @@ import ctypes
 import json
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial, partialmethod
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,9 @@ from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, KconsError, UnsupportedError
+from kcons.errors import ConvergenceError, UnsupportedError
 from kcons.openmm.device import build
-from kcons.openmm.device.kernels import PLAIN, VERBS, Op, plan, room_for
+from kcons.openmm.device.kernels import PLAIN, Op, plan, room_for
 from kcons.openmm.device.rows import KernelRows, constraints_of, function_on_device
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
@@ -38,9 +38,9 @@ from kcons.thermostats.nose_hoover import FRACTIONS
 
 #: Ensembles whose operations kernels have.
 ENSEMBLES = (ConstantEnergy, Langevin, Isokinetic, NoseHoover, NoseHooverMiddle, LangevinRespa, IsokineticSpheres)
-_EMPTY = b'<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
+_EMPTY = '<Integrator type="KconsProgram" version="1" stepSize="0.001" constraintTolerance="1e-10" description=""/>'
 _DOUBLES, _WHOLES = ctypes.POINTER(ctypes.c_double), ctypes.POINTER(ctypes.c_int)
-#: Integrators by their address, for parts, which no text describes; and why the last plan could not be made.
+#: Integrators by their address; and why the last plan could not be made.
 _ALIVE: weakref.WeakValueDictionary[int, DeviceIntegrator] = weakref.WeakValueDictionary()
 _REFUSALS: list[Exception] = []
 #: Places in what the kernel `look` tells: sum of v^2; whether a row failed, in which step, its number, its residual.
@@ -71,27 +71,23 @@ def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
             function_on_device(item)
     except UnsupportedError as error:
         return str(error)
-    for operation in ensemble.operations(scheme):
-        if operation.verb not in VERBS or (isinstance(operation, Fly) and operation.exact):
-            return f"the operation {operation.verb!r} has no kernel"
-    return ""
+    exact = any(isinstance(operation, Fly) and operation.exact for operation in ensemble.operations(scheme))
+    return "flights along great circles have no kernel" if exact else ""
 
 
 def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> list[Op]:
     """Operations as plain data, with the time of each; what acts in the middle of a drift is written out."""
     done: list[Op] = []
-    now = 0.0
+    flights: tuple[float, ...]
+    ends: tuple[float, ...] = (0.0,)
     if isinstance(ensemble, NoseHooverMiddle):
         middle = (Project(), Chain(0.5), Chain(0.5))
         operations = [o for given in operations for o in (middle if isinstance(given, Exchange) else (given,))]
     for operation in operations:
-        flights: tuple[float, ...] = ()
-        ends: tuple[float, ...] = (now,)
+        flights, ends = (), ends[-1:]
         if isinstance(operation, Fly):
             flights, ends = operation.flights, operation.ends
-            now = ends[-1]
         elif isinstance(operation, Chain):
-            assert isinstance(ensemble, NoseHoover)
             flights = tuple(operation.fraction * f for f in FRACTIONS)
         done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
         if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
@@ -104,9 +100,8 @@ class DeviceProgram(Program):
 
     on_device = True
     integrator: DeviceIntegrator
-    #: Variables that belong to a state, in the order of the array `memory`; `conditions` when they were asked for last.
+    #: Variables that belong to a state, in the order of the array `memory`.
     kept: list[str]
-    made_under: tuple[Any, ...] = ()
 
     def hand_over(self) -> None:
         """Describe the step to the plugin."""
@@ -119,7 +114,7 @@ class DeviceProgram(Program):
         if self.known(name) in self.kept and self.integrator.shared.bound:
             values = self.integrator.read("memory")
             values[self.kept.index(name)] = value
-            self.integrator.write("memory", values)
+            self.recall({"memory": values})
 
     def known(self, name: str) -> str:
         """The name of a variable, if it is one."""
@@ -136,7 +131,6 @@ class DeviceProgram(Program):
     def remembered(self) -> dict[str, Any]:
         """What belongs to the present state besides x and v."""
         self.integrator.read("memory")  # makes the kernels if there are none yet
-        self.made_under = self.integrator.conditions(self.integrator.context)
         return {name: self.integrator.read(name) for name in self.integrator.saved}
 
     def recall(self, values: Mapping[str, Any]) -> None:
@@ -169,13 +163,14 @@ class DeviceIntegrator(ProjectedIntegrator):
     _seed = 0
     _described = ""
     _recorded: Sequence[int] = ()
+    _box: Any = None
 
     def _make(self, dt: float) -> None:
         library = build.library()
         library.kcons_set_planner(_planner)
         library.kcons_shared.restype = ctypes.POINTER(_Shared)
-        library.kcons_read.restype = library.kcons_plan_given.restype = _DOUBLES
-        made = openmm.XmlSerializer.deserialize(_EMPTY.decode())
+        library.kcons_read.restype = library.kcons_given.restype = _DOUBLES
+        made = openmm.XmlSerializer.deserialize(_EMPTY)
         self.this = made.this  # the proxy of this class owns what XmlSerializer has made
         openmm.Integrator.setStepSize(self, dt)
         self._address = ctypes.c_void_p(int(made.this))
@@ -255,58 +250,36 @@ class DeviceIntegrator(ProjectedIntegrator):
         for part in self.parts:
             if part.left != guard.context.getTime()._value:  # type: ignore[attr-defined]
                 part.reset_multipliers(self)  # type: ignore[attr-defined]
+        context, rows = guard.context, self.rows
         try:
-            self._advance(guard.context, steps)
+            # In blocks, before each of which targets are computed, and cells where others have moved positions.
+            for done in range(0, steps, rows.block):
+                block, time = min(steps - done, rows.block), context.getTime()._value
+                now: tuple[Any, ...] = ()
+                if rows.n_cells and (self.shared.moved or box_of(context) != self._box):
+                    self._box = box_of(context)
+                    now = positions_of(context), np.array(self._box)
+                for name, values in rows.renew(time, self._dt, block, *now).items():
+                    self.write(name, values)
+                self.shared.origin = time if rows.n_movers else 0.0
+                openmm.Integrator.step(self, block)
         except openmm.OpenMMException as error:
-            told = list(self.shared.told)
-            guard.put_back()
+            told, words = list(self.shared.told), str(error) if "NaN" in str(error) else ""
             if told[_FAILED]:
-                raise self._unsolved(told, guard) from error
-            if "NaN" in str(error):
-                raise guard.explosion(str(error), first) from error
+                failure: ConvergenceError = rows.failure(int(told[_ROW]), told[_RESIDUAL], int(told[_STEP]))
+                if np.isfinite(told[_RESIDUAL]):
+                    guard.go_back(failure)
+                    raise failure from error
+                words, first = f"{rows.set.row_name(failure.row)} is not finite.", int(told[_STEP]) - 1
+            guard.put_back()
+            if words:
+                raise guard.explosion(words, first) from error
             raise
         finally:
             for part in self.parts:
                 part.left = guard.context.getTime()._value  # type: ignore[attr-defined]
         if ends:
             guard.look()
-
-    def _advance(self, context: openmm.Context, steps: int) -> None:
-        """Make steps in blocks, before each of which targets and cells are computed."""
-        rows = self.rows
-        for done in range(0, steps, rows.block):
-            block = min(steps - done, rows.block)
-            now = (positions_of(context), np.array(box_of(context))) if rows.n_cells else ()
-            time = context.getTime()._value
-            for name, values in rows.renew(time, self._dt, block, *now).items():
-                self.write(name, values)
-            self.shared.origin = time if rows.n_movers else 0.0
-            openmm.Integrator.step(self, block)
-
-    def _unsolved(self, told: Sequence[float], guard: Guard) -> KconsError:
-        """The error for a row in a step that the Context is then just before.
-
-        It is at the last check. The steps from there are made again if they will be the same: if settings are, and
-        nothing acts on the System that is random. Else it stays there.
-        """
-        step, context = int(told[_STEP]), guard.context
-        error: ConvergenceError = self.rows.failure(int(told[_ROW]), told[_RESIDUAL], step)
-        again = step - 1 - context.getStepCount()
-        if again > 0 and guard.undisturbed and not guard.moving and self.program.made_under == self.conditions(context):
-            try:
-                self._advance(context, again)
-                guard.since_check += again
-                guard.leave()
-            except openmm.OpenMMException:
-                guard.put_back()
-        if not np.isfinite(told[_RESIDUAL]):
-            return guard.explosion(f"{self.rows.set.row_name(error.row)} is not finite.", step - 1)
-        error.args = (f"{error}. The Context is at step {context.getStepCount()}", *error.args[1:])
-        return error
-
-    def conditions(self, context: openmm.Context) -> tuple[Any, ...]:
-        """What a run that is made again has to have in common with the first."""
-        return self._dt, self.getConstraintTolerance(), self._described, dict(context.getParameters())
 
     # -- records ---------------------------------------------------------------------------------
 
@@ -338,10 +311,9 @@ class DeviceIntegrator(ProjectedIntegrator):
             finally:
                 self.shared.every = 0
             made = (context.getStepCount() - since) // every
-            found = self.read("records").reshape(room, n, 3, 3)
-            for k in range(made):
-                x, v, f = found[k].swapaxes(0, 1)
-                yield x, v, f, time + (k + 1) * every * self._dt
+            for k, found in enumerate(self.read("records").reshape(room, n, 3, 3)[:made], 1):
+                x, v, f = found.swapaxes(0, 1)
+                yield x, v, f, time + k * every * self._dt
 
     # -- variables, as the CustomIntegrator has them ------------------------------------------------
 
@@ -386,63 +358,47 @@ class DeviceIntegrator(ProjectedIntegrator):
         return self._seed
 
 
-def _refuse(self: DeviceIntegrator, name: str, *_: Any, **__: Any) -> None:
-    raise UnsupportedError(
-        f"{name} is about the program of a CustomIntegrator, and these steps have kernels; give device=False"
-    )
-
-
-for _name, _method in vars(openmm.CustomIntegrator).items():
-    if _name[0].islower() and getattr(DeviceIntegrator, _name) is _method and not hasattr(openmm.Integrator, _name):
-        setattr(DeviceIntegrator, _name, partialmethod(_refuse, _name))
-
-
 # -- plans for a Context ------------------------------------------------------------------------------
 
 
-@ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_int)
-def _planner(made: int, integrator: int, description: bytes, platform: bytes, groups: int) -> int:
+@ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 2, *[ctypes.c_char_p] * 2, ctypes.c_int)
+def _planner(made: int, address: int, description: bytes, name: bytes, groups: int) -> int:
+    """Hand a plan over to the plugin, for what it tells of a Context."""
+    library, integrator, platform = build.library(), _ALIVE.get(address), name.decode()
+    described, steps = json.loads(description), ctypes.c_void_p(made)
     try:
-        _fill(ctypes.c_void_p(made), _ALIVE.get(integrator), json.loads(description), platform.decode(), groups)
+
+        def given(what: str, *shape: int) -> FloatArray:
+            found = library.kcons_given(steps, what.encode(), ctypes.byref(count := ctypes.c_int()))
+            return np.array(found[: count.value]).reshape(-1, *shape)
+
+        if described["parts"] and integrator is None:
+            raise UnsupportedError(
+                "the parts of an integrator are those of its Python object: keep a reference to it, and in place of "
+                "reading its text make it again, with parts="
+            )
+        part = integrator.parts[0] if integrator is not None and integrator.parts else KernelRows(())
+        assert isinstance(part, KernelRows)
+        masses, box = given("masses"), given("box", 3)
+        at = given("positions", 3), box if box.any() else None, float(given("time")[0])
+        rows = part.rows_at(masses, given("constraints", 3), *at)
+        source, arrays, parts, sizes = plan(described, platform, masses, groups, rows)
+        if integrator is not None:
+            integrator.rows, integrator.saved = rows, [array.name for array in arrays if array.saved]
+        compiled = str(build.kernels_library(source)) if platform in PLAIN else ""
+        library.kcons_source(steps, source.encode(), compiled.encode(), *sizes)
+        for array in arrays:
+            values = np.ascontiguousarray(array.values, dtype=np.float64)
+            about = array.name.encode(), int(array.kind == "int"), int(array.saved)
+            library.kcons_array(steps, *about, values.ctypes.data_as(_DOUBLES), values.size)
+        for number, actions in enumerate(parts):
+            for kernel, mask, slot in actions:
+                library.kcons_action(steps, number, kernel.encode(), ctypes.c_int32(mask), slot)
     except Exception as error:  # told by the exception that OpenMM raises, or by `read`
         _REFUSALS[:] = [error]
-        build.library().kcons_set_error(f"{type(error).__name__}: {error}".encode())
+        library.kcons_set_error(f"{type(error).__name__}: {error}".encode())
         return 0
     return 1
-
-
-def _fill(
-    made: ctypes.c_void_p, integrator: DeviceIntegrator | None, described: dict[str, Any], platform: str, groups: int
-) -> None:
-    """Hand a plan over to the plugin, for what it tells of a Context."""
-    library = build.library()
-
-    def given(name: str) -> FloatArray:
-        found = library.kcons_plan_given(made, name.encode(), ctypes.byref(count := ctypes.c_int()))
-        return np.ctypeslib.as_array(found, (count.value,)).copy() if count.value else np.zeros(0)
-
-    if described["parts"] and integrator is None:
-        raise UnsupportedError(
-            "the parts of an integrator are those of its Python object: keep a reference to it, and in place of "
-            "reading its text make it again, with parts="
-        )
-    part = integrator.parts[0] if integrator is not None and integrator.parts else KernelRows(())
-    assert isinstance(part, KernelRows)
-    masses, box, held = given("masses"), given("box").reshape(3, 3), given("constraints").reshape(-1, 3)
-    at = given("positions").reshape(-1, 3), box if box.any() else None, float(given("time")[0])
-    rows = part.rows_at(masses, held[:, :2].astype(np.int64), held[:, 2], *at)
-    source, arrays, parts, sizes = plan(described, platform, masses, groups, rows)
-    if integrator is not None:
-        integrator.rows, integrator.saved = rows, [array.name for array in arrays if array.saved]
-    compiled = str(build.kernels_library(source)) if platform in PLAIN else ""
-    library.kcons_plan_source(made, source.encode(), compiled.encode(), *sizes)
-    for array in arrays:
-        values = np.ascontiguousarray(array.values, dtype=np.float64)
-        about = array.name.encode(), int(array.kind == "int"), int(array.saved)
-        library.kcons_plan_array(made, *about, values.ctypes.data_as(_DOUBLES), values.size)
-    for number, actions in enumerate(parts):
-        for kernel, groups, slot in actions:
-            library.kcons_plan_action(made, number, kernel.encode(), ctypes.c_int32(groups), slot)
 
 
 class DeviceSurfaceIntegrator(SurfaceIntegrator, DeviceIntegrator):

@@ -7,7 +7,7 @@ work-group has a large cluster.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,8 +49,9 @@ _COMMON = """
 #else
 #define CLAIM(place, value) atomicCAS(place, 0, value)
 #endif
-#define GET_U(a, p) {for (int c_ = 0; c_ < 3; c_++) d[3*(a)+c_] = kept[3*(p)+c_];}
-#define PUT_U(a, p) {for (int c_ = 0; c_ < 3; c_++) kept[3*(p)+c_] = d[3*(a)+c_];}
+#define XYZ for (int c = 0; c < 3; c++)
+#define GET_U(a, p) XYZ d[3*(a)+c] = kept[3*(p)+c];
+#define PUT_U(a, p) XYZ kept[3*(p)+c] = d[3*(a)+c];
 #define AWAY(a, p, sign) {mixed i_ = cells[3*(p)], j_ = cells[3*(p)+1], k_ = cells[3*(p)+2]; \\
   x[3*(a)] = x[3*(a)] sign (i_*box0.x+j_*box1.x+k_*box2.x); \\
   x[3*(a)+1] = x[3*(a)+1] sign (j_*box1.y+k_*box2.y); x[3*(a)+2] = x[3*(a)+2] sign k_*box2.z;}
@@ -60,13 +61,7 @@ _COMMON = """
 #else
 #define HELD_TO tolerance
 #endif
-#ifdef RESTING
 #define RESTS(p) ((p) < 0 ? -1-(p) : (p))
-#define IF_RESTS(p) if ((p) < 0)
-#else
-#define RESTS(p) (p)
-#define IF_RESTS(p) if (0)
-#endif
 #define TINY ((mixed) 1e-37f)
 /* The first failure is kept; kernels that are launched later do nothing. */
 #define FAIL(row, residual) \\
@@ -101,19 +96,11 @@ _PLAIN = """
 template <class T> static inline T max(T a, T b) {return a > b ? a : b;}
 template <class T> static inline T min(T a, T b) {return a < b ? a : b;}
 typedef double real, mixed;
-typedef long mm_long;
 typedef unsigned long mm_ulong;
 struct real4 {double x, y, z, w;};
 typedef real4 mixed4;
-static inline real4 make_real4(double x, double y, double z, double w) {return real4{x, y, z, w};}
-#define make_mixed4 make_real4
 #define DEVICE static inline
 #define KERNEL extern "C"
-#define GLOBAL
-#define LOCAL
-#define LOCAL_ARG
-#define RESTRICT
-#define SYNC_THREADS
 #define LOCAL_ID 0
 #define LOCAL_SIZE 1
 #define WG 1
@@ -133,11 +120,11 @@ struct Numbers {int step, launch; double dt, time, tolerance, box[9];};
   real4 box2 = {box_[6], box_[7], box_[8], 0};
 """
 
-_BOX = ("box0", "box1", "box2")
 #: What kernels are given besides arrays of their own, in the order in which the plugin gives it.
-_GIVEN = ["int padded", "int step", "int launch", "mixed dt", "mixed time", "mixed tolerance"]
-_GIVEN += [f"mixed4 {name}" for name in _BOX]
-_GIVEN += ["GLOBAL real4* RESTRICT posq", "GLOBAL real4* RESTRICT correction", "GLOBAL mixed4* RESTRICT velm"]
+_GIVEN = [
+    "int padded, int step, int launch, mixed dt, mixed time, mixed tolerance, mixed4 box0, mixed4 box1, mixed4 box2"
+]
+_GIVEN += ["GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT correction, GLOBAL mixed4* RESTRICT velm"]
 _GIVEN += ["GLOBAL const int* RESTRICT order"]
 #: Arrays that functions of rows have, too.
 _PASSED = ("parameters", "failure", "failure_residual")
@@ -146,23 +133,24 @@ _PASSED = ("parameters", "failure", "failure_residual")
 def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_group: int = 64, slots: int = 1) -> str:
     """What comes before the source of rows: types and names of the platform, `ROWS`, `FAIL`, random numbers."""
     plain = platform in PLAIN
-    typed = ["int step", "int launch", "mixed tolerance", *(f"mixed4 {name}" for name in _BOX)]
+    typed = ["int step", "int launch", "mixed tolerance", "mixed4 box0", "mixed4 box1", "mixed4 box2"]
     typed += [f"GLOBAL {a.kind}* {a.name}" for a in arrays if a.name in _PASSED or a.name.startswith("rows_")]
     typed += ["LOCAL_ARG mixed* scratch"] * (scratch > 0)
     names = [each.split()[-1].replace("tolerance", "HELD_TO") for each in typed]
     forces = [f"force{k}" for k in range(slots)]
     if plain:
         given = "void** pointers, const Numbers* given, int GROUP_ID, int NUM_GROUPS"
-        own = [("double", name) for name in ("positions", "velocities", "inverse_masses", *forces)]
-        own += [(array.kind.replace("mixed", "double"), array.name) for array in arrays]
-        unpack = "UNPACK_NUMBERS "
-        unpack += " ".join(f"{kind}* {name} = ({kind}*) pointers[{k}];" for k, (kind, name) in enumerate(own))
+        own = [("mixed", name) for name in ("positions", "velocities", "inverse_masses", *forces)]
+        own += [(array.kind, array.name) for array in arrays]
+        pointers = [f"{kind}* {name} = ({kind}*) pointers[{k}];" for k, (kind, name) in enumerate(own)]
+        unpack = f"UNPACK_NUMBERS {' '.join(pointers)}"
     else:
         alone = "" if scratch else "RESTRICT "  # items of a group read what others have written
         own_arrays = [f"GLOBAL {array.kind}* {alone}{array.name}" for array in arrays]
         given = ", ".join([*_GIVEN, *(f"GLOBAL const mm_long* RESTRICT {name}" for name in forces), *own_arrays])
         unpack = ""
-    words = {
+    words = dict.fromkeys(("GLOBAL", "LOCAL", "LOCAL_ARG", "RESTRICT", "SYNC_THREADS") if plain else (), "")
+    words |= {
         "MOST_GROUPS": str(MOST_GROUPS),
         "ARGUMENTS": given,
         "UNPACK": unpack,
@@ -174,9 +162,7 @@ def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_grou
     return start + "".join(f"#define {word} {text}\n" for word, text in words.items()) + _COMMON
 
 
-def standard_arrays(
-    parameters: Sequence[float] = (), memory: int = 0, seed: int = 0, particles: int = 1
-) -> list[Array]:
+def standard_arrays(parameters: Sequence[float] = (), memory: int = 0, seed: int = 0, n: int = 1) -> list[Array]:
     """Arrays of every program: settings, what belongs to the state, failures, sums, what is read at the end."""
     return [
         Array("parameters", "mixed", np.array([*parameters, 0.0])),
@@ -186,7 +172,7 @@ def standard_arrays(
         Array("failure", "int", np.zeros(3, dtype=np.int64)),
         Array("failure_residual", "mixed", np.zeros(1)),
         Array("partial", "mixed", np.zeros(_SUMS * MOST_GROUPS)),
-        Array("kept", "mixed", np.zeros(3 * particles)),
+        Array("kept", "mixed", np.zeros(3 * n)),
         Array("looked", "mixed", np.zeros(7)),
     ]
 
@@ -195,11 +181,10 @@ def standard_arrays(
 
 
 class Op(NamedTuple):
-    """An operation as plain data: a verb of `VERBS`, the fraction of the step that it is over, and whose forces.
+    """An operation as plain data: its verb, the fraction of the step that it is over, and whose forces.
 
-    A drift has `flights`, the RATTLE drifts that it consists of, a chain its parts, all as fractions of the step;
-    `ends` are when flights end, or when other operations are. `begun` is 0 in the step that is being made, -1 in the
-    one before. `use` is the number of its noise within the step.
+    `flights` are fractions too: RATTLE drifts, or parts of a chain; `ends` are when they end, or other operations are.
+    `begun` is 0 in the step that is being made, -1 in the one before; `use` the number of its noise within the step.
     """
 
     verb: str
@@ -209,10 +194,6 @@ class Op(NamedTuple):
     ends: tuple[float, ...] = ()
     begun: int = 0
     use: int = 0
-
-
-#: What kernels can do, as `kcons.steppers.operations` has it; 'note' is for the kinetic energy that a State tells.
-VERBS = ("kick", "fly", "project", "exchange", "turn", "chain", "evaluate", "note", "rescale", "restore")
 
 
 def divided(operations: Sequence[Op], noisy: bool) -> tuple[list[Op], list[Op], list[Op]]:
@@ -267,16 +248,6 @@ def _summed(names: Sequence[str]) -> str:
     return stored + _SUM.replace("COUNT", str(len(names)))
 
 
-def _taken(count: int, bank: int) -> str:
-    """The sums over all particles, of which each work-group has left its share, for the first item of each."""
-    names = [f"acc{k}" for k in range(count)]
-    added = "".join(f"{name} += partial[k+{bank + k}*MOST_GROUPS];" for k, name in enumerate(names))
-    return (
-        f" {{mixed {' = 0, '.join(names)} = 0;\n"
-        f" for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {{{added}}}\n{_summed(names)} }}\n"
-    )
-
-
 def _once(code: str, *names: str) -> str:
     """Numbers that one item computes for all of its work-group."""
     stored = "".join(f" shared[{k}] = {name};" for k, name in enumerate(names))
@@ -318,7 +289,9 @@ _CHAIN = """ mixed sum = shared[0], link[LINKS], factor = 1, place = memory_befo
  }
 """
 #: What the last call did: whether velocities are finite, the kinetic energy that is told, a failure.
-_LOOK = f""" mixed acc0 = 0, acc1 = 0, acc2 = 0;
+_LOOK = f"""KERNEL void look(ARGUMENTS) {{
+ UNPACK LOCAL mixed shared[4*WG];
+ mixed acc0 = 0, acc1 = 0, acc2 = 0;
  if (GROUP_ID != 0) return;
  for (int p = LOCAL_ID; p < PARTICLES; p += LOCAL_SIZE) {{
   mixed v[3], w[1];
@@ -332,17 +305,21 @@ _LOOK = f""" mixed acc0 = 0, acc1 = 0, acc2 = 0;
   looked[6] = shared[2*WG];
   for (int k = 0; k < 3; k++) looked[2+k] = failure[k];
  }}
+}}
 """
 
 #: What is kept of some particles, whose places come last in `atoms`, until the host reads it.
-_RECORD = """ if (failure[0] != 0) return;
+_RECORD = """KERNEL void record(ARGUMENTS) {
+ UNPACK
+ if (failure[0] != 0) return;
  GLOBAL mixed* to = records+9*COUNT*((step-recorded[1])/recorded[0]-1);
  for (int k = GLOBAL_ID; k < COUNT; k += GLOBAL_SIZE) {
   mixed x[3], v[3], w[1];
   int p = atoms[FIRST+k];
   GET_V(0, p) GET_X(0, p)
-  for (int c = 0; c < 3; c++) {to[9*k+c] = x[c]; to[9*k+3+c] = v[c]; to[9*k+6+c] = FORCES;}
+  XYZ {to[9*k+c] = x[c]; to[9*k+3+c] = v[c]; to[9*k+6+c] = FORCES;}
  }
+}
 """
 
 
@@ -355,13 +332,13 @@ _SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};
  mixed keep[COUNT], push[COUNT], kept_own[COUNT];
  SYNC
  if (of[0] >= 0) {
-  EVERY if (w[a] != 0) {mass += 1/w[a]; for (int c = 0; c < 3; c++) {cv[c] += v[3*a+c]/w[a]; cd[c] += PUSHED/w[a];}}
-  for (int c = 0; c < 3; c++) {
+  EVERY if (w[a] != 0) {mass += 1/w[a]; XYZ {cv[c] += v[3*a+c]/w[a]; cd[c] += PUSHED/w[a];}}
+  XYZ {
    cv[c] /= mass; cd[c] /= mass;
    vv[of[c]] += mass*cv[c]*cv[c]; vd[of[c]] += mass*cv[c]*cd[c]; dd[of[c]] += mass*cd[c]*cd[c];
   }
  }
- if (of[3] >= 0) EVERY if (w[a] != 0) for (int c = 0; c < 3; c++) {
+ if (of[3] >= 0) EVERY if (w[a] != 0) XYZ {
   mixed m = 1/w[a], p = v[3*a+c]-cv[c], q = PUSHED-cd[c];
   vv[of[3]] += m*p*p; vd[of[3]] += m*p*q; dd[of[3]] += m*q*q;
  }
@@ -372,7 +349,7 @@ _SPHERES = """ {const int of[4] = {OF}; const mixed squares[COUNT] = {SQUARES};
   RULE
  }
  SYNC
- EACH if (w[a] != 0) for (int c = 0; c < 3; c++) {
+ EACH if (w[a] != 0) XYZ {
   mixed r = v[3*a+c]-cv[c];
   if (of[3] >= 0) r = keep[of[3]]*r+push[of[3]]*(PUSHED-cd[c]);
   if (of[c] >= 0) r += keep[of[c]]*cv[c]+push[of[c]]*cd[c];
@@ -472,24 +449,18 @@ class Kernels:
     # -- one operation each --
 
     def _kick(self, op: Op) -> None:
-        self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] += {_of_dt(op.share)}*{self._force(op)}*w[a];\n")
+        self._add(f" EACH XYZ v[3*a+c] += {_of_dt(op.share)}*{self._force(op)}*w[a];\n")
 
     def _fly(self, op: Op) -> None:
-        lengths, ends = (
-            ", ".join(f"(mixed) {each!r}" for each in some)
-            for some in (op.flights, (end + op.begun for end in op.ends))
-        )
-        count = len(op.flights)
+        count, lengths, ends = len(op.flights), _listed(op.flights), _listed(end + op.begun for end in op.ends)
         # Loops of one pass at least: some compilers write what comes after a barrier under a condition twice.
         loop = f" {{const mixed lengths[{count}] = {{{lengths}}}, ends[{count}] = {{{ends}}}; int flight = 0;\n"
         loop += " do {ROOM const mixed h = lengths[flight]*dt;\n"
-        free = " EACH if (w[a] != 0) for (int c = 0; c < 3; c++) x[3*a+c] += h*v[3*a+c];\n"
+        free = " EACH if (w[a] != 0) XYZ x[3*a+c] += h*v[3*a+c];\n"
         held = (
-            " const mixed per_h = 1/h;\n"
-            " EACH for (int c = 0; c < 3; c++) d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
+            " const mixed per_h = 1/h;\n EACH XYZ d[3*a+c] = w[a] != 0 ? h*v[3*a+c] : (mixed) 0;\n"
             " SYNC positions_NAME(ROWS_PASS CLUSTER, h, time+ends[flight]*dt, x, d, w);\n"
-            " if (failure[0] == 0) EACH if (w[a] != 0) for (int c = 0; c < 3; c++)"
-            " {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n"
+            " if (failure[0] == 0) EACH if (w[a] != 0) XYZ {x[3*a+c] += d[3*a+c]; v[3*a+c] = d[3*a+c]*per_h;}\n"
         )
         end = f" }} while (++flight < {count});}}\n"
         self._add(loop + free + end, loop + held + end)
@@ -504,7 +475,7 @@ class Kernels:
         y = f"(P_friction*{_of_dt(op.share)})"
         self._before += _once(f" mixed {damp} = exp(-{y}), {size} = sqrt(-expm1(-2*{y})*P_kT);\n", damp, size)
         draw = f"mixed g[4]; gaussians(g, ORDER(AT), step+({op.begun}), {{}}, seed[0]);"
-        noise = f"{{{draw.format(op.use)} mixed s = sqrt(w[a]);\n  for (int c = 0; c < 3; c++)"
+        noise = f"{{{draw.format(op.use)} mixed s = sqrt(w[a]);\n  XYZ"
         if not self.spheres:
             # What the drift before has left across the rows is an impulse of theirs; what noise adds is none.
             along = " SYNC velocities_NAME(ROWS_PASS CLUSTER, {}, time, x, v, w);\n"
@@ -513,7 +484,7 @@ class Kernels:
             self._add("", along.format(0) * self.tidy)
             return
         self._tangent(f" EACH {noise} d[3*a+c] = s*g[c];}}\n")
-        self._add(f" EACH for (int c = 0; c < 3; c++) v[3*a+c] = {damp}*v[3*a+c]+{size}*d[3*a+c];\n")
+        self._add(f" EACH XYZ v[3*a+c] = {damp}*v[3*a+c]+{size}*d[3*a+c];\n")
         for k, (_, freedom, first) in enumerate(self.sphere_of):
             number = len(freedom) * self.per_sphere
             own = f"auxiliary[{first}+item*{number}+j]"
@@ -525,53 +496,41 @@ class Kernels:
 
     def _tangent(self, start: str, rest: str = "") -> None:
         """Begin a block with d, of which what is across the rows is taken away."""
-        self._add(
-            f" {{ROOM{start}{rest}",
-            f" {{ROOM{start} SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n{rest}",
-        )
+        along = " SYNC velocities_NAME(ROWS_PASS CLUSTER, 0, time, x, d, w);\n"
+        self._add(f" {{ROOM{start}{rest}", f" {{ROOM{start}{along}{rest}")
 
     def _turn(self, op: Op) -> None:
-        push = f" EACH for (int c = 0; c < 3; c++) d[3*a+c] = {_of_dt(op.share)}*{self._force(op)}*w[a];\n"
+        push = f" EACH XYZ d[3*a+c] = {_of_dt(op.share)}*{self._force(op)}*w[a];\n"
         if self.spheres:
             self._tangent(push)
             self._rescale(op)
             self._add(" }\n")
             return
-        self._tangent(
-            push,
-            " EACH {if (w[a] != 0) for (int c = 0; c < 3; c++) {mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a];"
-            " acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;}\n PUT_U(a, AT)}\n }\n",
-        )
+        sums = "acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;"
+        each = f"if (w[a] != 0) XYZ {{mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a]; {sums}}}"
+        self._tangent(push, f" EACH {{{each} PUT_U(a, AT)}}\n }}\n")
         self._gather(3)
         self._before += _once(_CLOSED_FORM, "keep", "push")
-        self._add(
-            " {ROOM EACH {GET_U(a, AT) for (int c = 0; c < 3; c++) v[3*a+c] = keep*v[3*a+c]+push*d[3*a+c];}\n }\n"
-        )
+        self._add(" {ROOM EACH {GET_U(a, AT) XYZ v[3*a+c] = keep*v[3*a+c]+push*d[3*a+c];}\n }\n")
 
     def _chain(self, op: Op) -> None:
-        self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc0 += v[3*a+c]*v[3*a+c]/w[a];\n")
-        self._before += (
-            " if (GLOBAL_ID == 0) for (int k = 0; k <= LINKS; k++) memory_before[M_link1+k] = memory[M_link1+k];\n"
-        )
+        self._add(" EACH if (w[a] != 0) XYZ acc0 += v[3*a+c]*v[3*a+c]/w[a];\n")
+        kept = "memory_before[M_link1+k] = memory[M_link1+k]"
+        self._before += f" if (GLOBAL_ID == 0) for (int k = 0; k <= LINKS; k++) {kept};\n"
         self._gather(1)
-        shares = ", ".join(f"(mixed) {share!r}" for share in op.flights)
-        self._before += _once(_with(_CHAIN, {"SHARES": shares, "PARTS": len(op.flights)}), "factor")
-        self._add(" EACH for (int c = 0; c < 3; c++) v[3*a+c] *= factor;\n")
+        shares = {"SHARES": _listed(op.flights), "PARTS": len(op.flights)}
+        self._before += _once(_with(_CHAIN, shares), "factor")
+        self._add(" EACH XYZ v[3*a+c] *= factor;\n")
 
     def _rescale(self, op: Op) -> None:
         """Velocities back to their spheres; `restore` and `turn` move auxiliary variables, too."""
         for k, (of, freedom, start) in enumerate(self.sphere_of):
             if freedom:
                 number = self.per_sphere
-                words = {
-                    "RULE": _RULES[op.verb],
-                    "OF}": f"{', '.join(map(str, of))}}}",
-                    "PUSHED": "d[3*a+c]" if op.verb == "turn" else 0,
-                    "SQUARES": ", ".join(f"(mixed) {g + number - 1}" for g in freedom),
-                    "COUNT": len(freedom),
-                    "PLACE": f"{start}+item*{len(freedom) * number}",
-                    "AUXILIARY": number,
-                }
+                words = {"RULE": _RULES[op.verb], "PUSHED": "d[3*a+c]" if op.verb == "turn" else 0}
+                words |= {"OF}": f"{', '.join(map(str, of))}}}", "COUNT": len(freedom), "AUXILIARY": number}
+                words |= {"SQUARES": _listed(g + number - 1 for g in freedom)}
+                words |= {"PLACE": f"{start}+item*{len(freedom) * number}"}
                 self._code[k] += _with(_SPHERES, words)
 
     _restore = _rescale
@@ -580,17 +539,19 @@ class Kernels:
         self._close(("", self.groups[op.group], list(self.groups).index(op.group)))
 
     def _note(self, op: Op) -> None:
-        self._add(" EACH if (w[a] != 0) for (int c = 0; c < 3; c++) acc3 += v[3*a+c]*v[3*a+c]/w[a];\n")
+        self._add(" EACH if (w[a] != 0) XYZ acc3 += v[3*a+c]*v[3*a+c]/w[a];\n")
         self._noted = True
 
     def _force(self, op: Op) -> str:
         return f"FORCE(force{list(self.groups).index(op.group)}, AT, c)"
 
     def _gather(self, count: int) -> None:
-        """What follows needs the sums that each cluster has added to."""
-        self._sums, bank = count, self._bank
+        """What follows needs the sums that clusters have added to: each group adds the shares of all groups."""
+        self._sums, bank, names = count, self._bank, [f"acc{k}" for k in range(count)]
         self._close()
-        self._before = _taken(count, bank)
+        added = "".join(f"{name} += partial[k+{bank + k}*MOST_GROUPS];" for k, name in enumerate(names))
+        self._before = f" {{mixed {' = 0, '.join(names)} = 0;\n"
+        self._before += f" for (int k = LOCAL_ID; k < NUM_GROUPS; k += LOCAL_SIZE) {{{added}}}\n{_summed(names)} }}\n"
 
     # -- text --
 
@@ -636,7 +597,7 @@ class Kernels:
             room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n EACH at[a] = RESTS({atom});\n"
             words |= {"EACH": every, "SYNC": "", "ROOM": f"mixed d[{3 * n}];", "AT": "at[a]", "FIRST": "1"}
         away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
-        load = f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')} IF_RESTS({atom}) w[a] = 0;}}\n"
+        load = f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')} if ({atom} < 0) w[a] = 0;}}\n"
         store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
         return f" {loop} {{\n{_with(room + load + code + store, words)} }}\n"
 
@@ -644,43 +605,40 @@ class Kernels:
 def plan(
     described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, held: Any
 ) -> tuple[str, list[Array], list[list[Action]], tuple[int, int, int]]:
-    """What the plugin needs for a Context, see `Plan` in `plugin/program_integrator.h`.
+    """What the plugin needs for a Context, see `Steps` in `plugin/program_integrator.h`.
 
     Given are what `DeviceIntegrator.describe` says of a step, the bit mask of force groups that act, and the rows.
-    Returns source, arrays, head, middle and tail of a step, and sizes: work-items that there is work for, their number
-    in a group, and how many groups of forces are kept.
+    Returns source, arrays, head, middle and tail of a step, and sizes: work-items, their number in a group, how many
+    groups of forces are kept.
     """
     operations = [Op._make(tuple(v) if isinstance(v, list) else v for v in op) for op in described["operations"]]
-    names_of_groups = dict.fromkeys(op.group for op in operations if op.verb == "evaluate")
-    masks = {name: 1 << int(name) if name else groups for name in names_of_groups}
+    masks = {op.group: 1 << int(op.group) if op.group else groups for op in operations if op.verb == "evaluate"}
     seed = described["seed"] or int(np.random.default_rng().integers(1, 2**31 - 1))
-    parameters, memory, particles = described["settings"], described["memory"], len(masses)
+    parameters, memory, n = described["settings"], described["memory"], len(masses)
     kernels = Kernels(described, masses, masks, held)
     parts = zip(("head", "middle", "tail"), divided(operations, described["noisy"]), strict=True)
     actions = [kernels.write(name, each) for name, each in parts]
     recorded, room = described["recorded"], room_for(len(described["recorded"]))
     order = np.concatenate([*kernels.order, np.array(recorded, dtype=np.int64)])
-    arrays = standard_arrays([*parameters.values()], len(memory), seed, particles)
+    arrays = standard_arrays([*parameters.values()], len(memory), seed, n)
     arrays += [Array("atoms", "int", order), Array("work", "mixed", np.zeros(max(kernels.work, 1))), *held.arrays]
     if kernels.spheres:
         if any(g + kernels.per_sphere < 2 for _, freedom, _ in kernels.sphere_of for g in freedom):
             raise InputError("a sphere of one degree of freedom has the radius 0; give auxiliary=1", item="auxiliary")
         first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
         arrays.append(Array("auxiliary", "mixed", first, saved=True))
-    arrays += [Array("cells", "int", np.zeros(3 * particles))] * (len(held.placed) > 0)
+    arrays += [Array("cells", "int", np.zeros(3 * n))] * (len(held.placed) > 0)
     if recorded:
         arrays += [Array("records", "mixed", np.zeros(9 * len(recorded) * room)), Array("recorded", "int", np.ones(2))]
     work_group = 1 if platform in PLAIN else held.work_group
     names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
     names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}
-    names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(particles)}
-    look = f"KERNEL void look(ARGUMENTS) {{\n UNPACK LOCAL mixed shared[4*WG];\n{_LOOK}}}\n"
+    names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(n)}
+    look = _LOOK
     if recorded:
         forces = "+".join(f"FORCE(force{k}, p, c)" for k in range(len(masks)))
-        text = _with(_RECORD, {"COUNT": len(recorded), "FIRST": kernels.particles, "FORCES": forces})
-        look += f"KERNEL void record(ARGUMENTS) {{\n UNPACK\n{text}}}\n"
-    source = "#define RESTING\n" * (len(held.fixed) > 0)
-    source += preamble(platform, arrays, held.scratch, held.work_group, len(masks))
+        look += _with(_RECORD, {"COUNT": len(recorded), "FIRST": kernels.particles, "FORCES": forces})
+    source = preamble(platform, arrays, held.scratch, held.work_group, len(masks))
     source += "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
     items = kernels.items + kernels.crowds * work_group
@@ -690,6 +648,10 @@ def plan(
 def room_for(particles: int) -> int:
     """How many records of so many particles the device keeps: 8 MB of them, 1,000 at most."""
     return min(1000, 1 + 2**20 // (9 * max(particles, 1)))
+
+
+def _listed(numbers: Iterable[float]) -> str:
+    return ", ".join(f"(mixed) {number!r}" for number in numbers)
 
 
 def _of_dt(share: float) -> str:

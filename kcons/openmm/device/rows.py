@@ -1,14 +1,14 @@
 """Rows on the device: C text and arrays for the kernels, and the part of an integrator that measures and tells of them.
 
 Positions end where x + M^-1 A(x)^T y fulfils the rows, by Newton's method, to the tolerance asked for; velocities where
-A v = c. Residuals are compared so that NaN fails. Impulses of the rows are summed on the device and read when asked.
+A v = c. Impulses of the rows are summed on the device and read when asked.
 """
 
 from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,6 @@ from kcons.motion.motion import Motion
 from kcons.openmm.callback_rows import CarriedConstraints, Engine, refuse_virtual_sites, with_massless_atoms
 from kcons.openmm.device.clusters import (
     IN_CELLS,
-    NEAREST,
     RELATIVE,
     STORED,
     Array,
@@ -65,12 +64,9 @@ _COMMON = f"""
 #define ROWS_ADD(row, impulse) {{volatile mixed y_ = -(impulse)-rows_lost[row], t_ = rows_sums[row]+y_; \
   rows_lost[row] = (t_-rows_sums[row])-y_; rows_sums[row] = t_;}}
 #endif
-/* Where atom a of a list is, after atom b before it, by the shortest image of the vector between them. */
-#define ROWS_STEP(to, at, from, a, b) {{ \\
-  mixed u_ = from[a]-from[b], v_ = from[(a)+1]-from[(b)+1], w_ = from[(a)+2]-from[(b)+2]; \\
-  mixed n_ = rint(w_/box2.z); u_ -= n_*box2.x; v_ -= n_*box2.y; w_ -= n_*box2.z; \\
-  n_ = rint(v_/box1.y); u_ -= n_*box1.x; v_ -= n_*box1.y; u_ -= rint(u_/box0.x)*box0.x; \\
-  to[at] = to[(at)-3]+u_; to[(at)+1] = to[(at)-2]+v_; to[(at)+2] = to[(at)-1]+w_;}}
+#define ROWS_DOT(a, b) ((a)[0]*(b)[0]+(a)[1]*(b)[1]+(a)[2]*(b)[2])
+#define ROWS_SHIFT(to, n) {{to[0] += n[0]*box0.x+n[1]*box1.x+n[2]*box2.x; \\
+  to[1] += n[1]*box1.y+n[2]*box2.y; to[2] += n[2]*box2.z;}}
 /* Moving target j or its rate, by polynomials between knots that have value, rate and acceleration; NaN beyond them.
    Times are those since knots[0], which single numbers of a long run could not tell apart. */
 DEVICE mixed rows_moving(GLOBAL const mixed* knots, int j, mixed time, int rate) {{
@@ -121,22 +117,11 @@ class DeviceRows:
     Masses are 0 for particles that do not move; `positions` are on or near the constraints, nm, in a `cell` where rows
     take periodic images. Raises UnsupportedError for rows that only Python can compute and fixed atoms that move.
 
-    Attributes
-    ----------
-    set : ConstraintSet
-        All rows, the System's first; `motion` is their engine.
-    scale : ndarray, shape (n_rows,)
-        What tolerances are relative to: the length held, 1 for all that is no length.
-    mover, cell : ndarray of int, shape (n_rows,)
-        Number of a row's moving target, and where its cells begin; of other rows the number of the next.
-    shapes, arrays, source
-        Of the functions ``positions_NAME`` and ``velocities_NAME`` of each shape, as C.
-    scratch, work_group : int
-        Numbers of LOCAL memory that a work-group needs, and its size.
-    fixed, placed : ndarray of int
-        Particles that do not move; those whose rows have a place in space, as a State tells of it.
-    block : int
-        Steps after which `renew` is due.
+    Of the `set` of all rows, the System's first, `motion` is the engine; `scale` is the length held, 1 for all that is
+    no length; `mover` and `cell` are numbers of moving targets and where cells begin, of other rows those of the next.
+    `shapes`, `arrays` and `source` belong to the functions ``positions_NAME`` and ``velocities_NAME`` as C, which need
+    `scratch` numbers of LOCAL memory in work-groups of the size `work_group`. Particles that are `fixed` do not move;
+    rows of those that are `placed` have a place in space, as a State tells of it. `renew` is due after `block` steps.
     """
 
     def __init__(
@@ -160,18 +145,10 @@ class DeviceRows:
         # Rows that were converted stand in another order: then all are summed.
         self._summed_from = 0 if motion.conversions else len(pairs)
         self.motion, self.set, self.fixed = motion, motion.constraint_set, motion.fixed_atoms
-        self._write(self._alike(time))
-
-    def _alike(self, time: float) -> list[Shape]:
-        """What is known of rows, and clusters that look alike, whose code or tables are written once."""
-        held, plan = self.set, self.motion.plan
+        held, plan = self.set, motion.plan
         self.target = held.target(time)
         size = np.concatenate([item.scale(time) for item in held.constraints] or [np.zeros(0)])
         self.scale = np.where(size > 0, size, 1.0)
-        #: Rows of clusters in which rows depend on others.
-        self.doubtful = plan.eliminate_last.copy()
-        for some in plan.dependent:
-            self.doubtful[some] = True
         self.parameters: list[FloatArray] = []
         #: Objects whose rows stand in cells that are given.
         self._in_cells: list[Constraint] = []
@@ -186,31 +163,28 @@ class DeviceRows:
             number = -1 if item.fixes_atoms else known.setdefault(function_on_device(item), len(known))
             # OpenMM keeps molecules in one piece: its own constraints know no images.
             open_ = held.lattice is None or start + item.n_rows <= self._summed_from
-            how = np.full(item.n_rows, STORED if not item.relative else RELATIVE if open_ else NEAREST)
-            if item.relative and item.whole is not None and not open_:
-                how[item.whole] = IN_CELLS
+            how = STORED if not item.relative else RELATIVE if open_ else IN_CELLS
+            if how == IN_CELLS:
                 self._in_cells.append(item)
             moves, period = isinstance(item.target, MovingTarget), item.period or 0.0
             for k in range(start, start + item.n_rows):
                 flags = not item.holonomic, moves, bool(plan.eliminate_last[k]), bool(k >= self._summed_from)
-                rows.append(Row(number, (), int(how[k - start]), *flags, period))
+                rows.append(Row(number, (), how, *flags, period))
         self.functions = list(known)
         sizes = [[row.moves, 3 * len(a) * (row.how == IN_CELLS)] for row, a in zip(rows, atoms, strict=True)]
         ends = np.cumsum([[0, 0], *sizes], axis=0)
         (self.mover, self.cell), (self.n_movers, self.n_cells) = ends[:-1].T, ends[-1].tolist()
-        return [
-            Shape(each.atoms, tuple(row._replace(atoms=local) for row, local in key), each.rows)
-            for key, each in alike(plan.labels, plan.eliminate_last, rows, atoms).items()
-        ]
+        found = alike(plan.labels, plan.eliminate_last, rows, atoms).items()
+        self._write([Shape(e.atoms, tuple(r._replace(atoms=a) for r, a in key), e.rows) for key, e in found])
 
     def _write(self, shapes: list[Shape]) -> None:
-        """Code and arrays."""
+        """Code and arrays, once for clusters that look alike."""
         small = [each for each in shapes if not each.together]
         self.shapes = [each._replace(name=f"s{k}") for k, each in enumerate(small)]
         texts = [_COMMON]
         for number in sorted({row.function for shape in small for row in shape.rows}):
             texts.append(c_functions(f"rows_f{number}", self.functions[number]))
-        order, tables = [np.zeros(0, np.int64)], [np.zeros(1)]
+        order, tables = [_NONE], [np.zeros(1)]
         for shape in self.shapes:
             writer = ItemWriter(shape, self, sum(map(len, tables)), sum(map(len, order)))
             texts += [writer.positions(), writer.velocities()]
@@ -227,58 +201,46 @@ class DeviceRows:
             self.scratch, self.work_group = 2, 32 if max(len(shape.rows) for shape in large) <= 64 else 256
         self.source, self._order = "".join(texts), np.concatenate(order)
         placed = [each.atoms[:, a] for each in shapes for r in each.rows if r.how == STORED for a in r.atoms]
-        self.placed: IntArray = np.unique(np.concatenate([*placed, np.zeros(0, np.int64)]))
+        self.placed: IntArray = np.unique(np.concatenate([*placed, _NONE]))
         self.block = BLOCK if self.n_movers else 10**9
         self._n_knots = 4 + self.n_movers * 3 * ((BLOCK + 2 * BEYOND) * KNOTS + 1)
-        self.arrays += [
-            Array("rows_knots", "mixed", np.zeros(self._n_knots)),
-            Array("rows_cells", "mixed", np.zeros(max(self.n_cells, 1))),
-        ]
-        room = np.zeros(max(len(self._order), 1))
-        self.arrays += [Array(name, "mixed", room, saved=True) for name in SUMS]
+        sizes = {"rows_knots": self._n_knots, "rows_cells": self.n_cells} | dict.fromkeys(SUMS, len(self._order))
+        self.arrays += [Array(name, "mixed", np.zeros(max(size, 1)), name in SUMS) for name, size in sizes.items()]
 
     def renew(
         self, time: float, dt: float, steps: int, positions: FloatArray | None = None, cell: FloatArray | None = None
     ) -> dict[str, FloatArray]:
         """What functions of Python say for so many steps, at most `block`, and positions, by the name of the array.
 
-        Positions and the cell are needed where there are `n_cells`.
+        Positions and the cell are needed where they have changed and there are `n_cells`.
         """
         found: dict[str, FloatArray] = {}
         if self.n_movers:
-            known = self._knots(time, -BEYOND * dt, dt / KNOTS, (steps + 2 * BEYOND) * KNOTS + 1)
-            found["rows_knots"] = np.pad(known, (0, self._n_knots - len(known)))
-        if self.n_cells:
-            assert positions is not None
-            if cell is not None:
-                self.motion.set_cell(cell)
-            found["rows_cells"] = self._cells(positions)
+            # Times, those of knots, then value, rate and acceleration of moving rows at each knot, per spacing.
+            start, spacing, count = -BEYOND * dt, dt / KNOTS, (steps + 2 * BEYOND) * KNOTS + 1
+            times = time + start + spacing * np.arange(count)
+            tables: list[Any] = [[time, start, 1 / spacing, count]]
+            for item in self.set.constraints:
+                if isinstance(of := item.target, MovingTarget):
+                    values = np.array([item.target_at(t) for t in times])
+                    if item.period is not None:
+                        values = np.unwrap(values, axis=0, period=item.period)
+                    rates, turns = (
+                        np.array([f(t, item.n_rows, item.period) for t in times])
+                        for f in (of.rate_at, of.acceleration_at)
+                    )
+                    known = np.stack([values, spacing * rates, spacing**2 * turns], axis=2)
+                    tables.append(known.swapaxes(0, 1).ravel())
+            found["rows_knots"] = np.zeros(self._n_knots)
+            found["rows_knots"][: sum(map(len, tables))] = np.concatenate(tables)
+        if self.n_cells and positions is not None and self.set.lattice is not None:
+            self.motion.set_cell(cell)
+            cells = []  # whole ones that bring atoms beside the first one
+            for item in self._in_cells:
+                between = self.set.gather(item, positions) - positions[item.atoms]
+                cells.append(np.round((between - between[:, :1]) @ self.set.lattice[1]).ravel())
+            found["rows_cells"] = np.concatenate(cells)
         return found
-
-    def _cells(self, x: FloatArray) -> FloatArray:
-        """Whole cells that bring the atoms of rows that need it beside the first one, one row after another."""
-        found = [np.zeros(0)]
-        for item in self._in_cells:
-            assert self.set.lattice is not None
-            cells = np.round((self.set.gather(item, x) - x[item.atoms]) @ self.set.lattice[1])
-            found.append((cells - cells[:, :1])[item.whole].ravel())
-        return np.concatenate(found)
-
-    def _knots(self, time: float, start: float, spacing: float, count: int) -> FloatArray:
-        """Times, those of knots after `time`, then value, rate, acceleration of moving rows at each, per spacing."""
-        times = time + start + spacing * np.arange(count)
-        tables = []
-        for item in self.set.constraints:
-            if isinstance(of := item.target, MovingTarget):
-                values = np.array([item.target_at(t) for t in times])
-                if item.period is not None:
-                    values = np.unwrap(values, axis=0, period=item.period)
-                slopes = (
-                    spacing**order * np.array([each(t, item.n_rows, item.period) for t in times])
-                    for order, each in ((1, of.rate_at), (2, of.acceleration_at))
-                )
-                tables.append(np.stack([values, *slopes], axis=2).swapaxes(0, 1).ravel())
-        return np.concatenate([[time, start, 1 / spacing, count], *tables])
 
     def multipliers(self, sums: FloatArray, time: float) -> FloatArray:
         """Mean multipliers by row of the `set`, from the array ``rows_sums`` of a time; NaN where they are not summed.
@@ -295,8 +257,8 @@ class DeviceRows:
         number = int(self._order[row])
         off = f"is off by {abs(residual):.3g}" if np.isfinite(residual) else "is not finite"
         return ConvergenceError(
-            f"step {step}: row {self.set.row_name(number)} {off} after {TURNS} iterations on the device; the step was "
-            "taken back. Use a smaller time step, or start nearer to the constraints",
+            f"step {step}: row {self.set.row_name(number)} {off} after {TURNS} iterations on the device. Use a "
+            "smaller time step, or start nearer to the constraints",
             residual=abs(residual),
             iterations=TURNS,
             row=number,
@@ -308,30 +270,20 @@ class DeviceRows:
 class KernelRows(CarriedConstraints):
     """All rows of a Context that its kernels hold: those of parts and the System's constraints.
 
-    Parameters
-    ----------
-    parts : sequence of Constraint or CarriedConstraints
-        What ``ProjectedIntegrator(..., parts=[...], device=True)`` was given; numbers of nm, ps, dalton, radian.
-        Targets left at None are taken from the positions at the first step.
-
-    Notes
-    -----
-    A target that is a function is asked before each call of `step`, and at every half step that the call will make: it
-    may read a context parameter.
+    `parts` are what ``ProjectedIntegrator(..., parts=[...], device=True)`` was given; in nm, ps, dalton, radian.
+    Targets left at None are taken from the positions at the first step. One that is a function is asked before each
+    call of `step`, at every half step that the call will make: it may read a context parameter.
     """
 
     def __init__(self, parts: Sequence[Any]) -> None:
         self._parts = parts
-        carried = [part for part in parts if isinstance(part, CarriedConstraints)]
+        self._carried = [part for part in parts if isinstance(part, CarriedConstraints)]
         self.given = list(constraints_of(parts))
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
-        self._carried = carried
         #: Whether rows take periodic images: as `hold` was told, else as the System.
-        self._wraps = None if not carried else any(part.motion.lattice is not None for part in carried)
+        self._wraps = not self._carried or any(part.motion.lattice is not None for part in self._carried)
         self._bound: tuple[DeviceRows, Engine] | None = None
         self._of: tuple[Any, ...] = ()
-        self._context: Callable[[], openmm.Context | None] = lambda: None
-        self.code = 0
         #: Time at which sums of multipliers began, and where the last call of `step` left it, ps.
         self._since = self.left = math.nan
 
@@ -346,18 +298,12 @@ class KernelRows(CarriedConstraints):
                 part._engine._integrator = weakref.ref(integrator)
 
     def rows_at(
-        self,
-        masses: FloatArray,
-        pairs: IntArray,
-        lengths: FloatArray,
-        positions: FloatArray,
-        cell: FloatArray | None,
-        time: float,
+        self, masses: FloatArray, held: FloatArray, positions: FloatArray, cell: Any, time: float
     ) -> DeviceRows:
-        """The rows for a System; made where they are asked for first."""
+        """The rows for a System with constraints i, j, length, shape (n, 3); made where they are asked for first."""
         # What OpenMM's own solvers hold, to whom checks and `applyConstraints` leave them.
-        moving = (masses[pairs] > 0).any(axis=1)  # between others OpenMM holds nothing
-        pairs, lengths = pairs[moving], lengths[moving]
+        held = held[(masses[held[:, :2].astype(np.int64)] > 0).any(axis=1)]  # between others OpenMM holds nothing
+        pairs, lengths = held[:, :2].astype(np.int64), held[:, 2]
         lengths = np.where(settled_rows(pairs, lengths, len(masses)), lengths.astype(np.float32), lengths)
         # Between atoms that stay where single numbers have put them a length is what it is there.
         fixed = np.concatenate([_NONE, *(item.atoms.ravel() for item in self.given if item.fixes_atoms)])
@@ -367,7 +313,7 @@ class KernelRows(CarriedConstraints):
         lengths = np.where(np.isin(pairs, fixed).all(axis=1) & rounded, here, lengths)
         made_of = tuple(array.tobytes() for array in (masses, pairs, lengths))
         if self._bound is None or self._of != made_of:
-            cell = None if self._wraps is False else cell
+            cell = cell if self._wraps else None
             rows = DeviceRows(masses, (pairs, lengths), self.given, positions, cell, time)
             self._bound, self._of = (rows, Engine(rows.motion, masses, cell)), made_of
             self._slopes = None
@@ -375,13 +321,10 @@ class KernelRows(CarriedConstraints):
 
     def bind(self, context: openmm.Context) -> DeviceRows:
         """The rows for a Context, at its positions."""
-        program = self.program
-        assert program is not None
-        if self._context() is not context or not program.integrator.shared.planned:
-            system = context.getSystem()
-            refuse_virtual_sites(system, self.atoms, masses_of(system))
-            program.integrator.read("seed")  # makes the plan, which asks `rows_at`
-            self._context = weakref.ref(context)
+        assert self.program is not None
+        if not self.program.integrator.shared.planned:
+            refuse_virtual_sites(context.getSystem(), self.atoms, masses_of(context.getSystem()))
+            self.program.integrator.read("seed")  # makes the plan, which asks `rows_at`
         assert self._bound is not None
         return self._bound[0]
 
@@ -390,7 +333,7 @@ class KernelRows(CarriedConstraints):
         """Particles that a row of the parts touches, and of the System's constraints once they are known."""
         if self._bound is not None:
             return self._bound[1].atoms
-        return np.unique(np.concatenate([np.zeros(0, np.int64), *(item.atoms.ravel() for item in self.given)]))
+        return np.unique(np.concatenate([_NONE, *(item.atoms.ravel() for item in self.given)]))
 
     @property
     def _engine(self) -> Any:  # type: ignore[override]
@@ -417,11 +360,10 @@ class KernelRows(CarriedConstraints):
     def take_precision(self, program: Program, precision: Precision) -> None:
         """Whatever the precision is: residuals are what it can hold."""
 
-    def _check_system(self, system: openmm.System) -> None:
-        """Kernels are made for the System of a Context."""
-
     def check_masses(self, system: openmm.System) -> None:
-        """Kernels are made for the masses of a Context."""
+        """Kernels are made for the System of a Context, and its masses."""
+
+    _check_system = check_masses
 
     def rank(self, context: openmm.Context | None = None) -> int:
         """Degrees of freedom that the rows take, beyond the constraints of the System."""
@@ -433,18 +375,13 @@ class KernelRows(CarriedConstraints):
     # -- results --------------------------------------------------------------------------------
 
     def mean_multipliers(self, integrator: Any) -> FloatArray:
-        """Multipliers averaged over all steps since they were reset, by row of ``motion.constraint_set``.
+        """Multipliers averaged over all steps of an integrator since they were reset, by row of the set of `motion`.
 
         Where the time was set, or a State or checkpoint of another time loaded, they begin anew.
 
         Impulses that the kernels have summed over the time: kJ/mol over the unit of the row; NaN for constraints of the
         System, and before the first step. The weights of `Series.weights`, which blue-moon averages over
         configurations need, are not in them: take samples by `HeldCoordinatesReporter` where masses enter det Z.
-
-        Parameters
-        ----------
-        integrator : ProjectedIntegrator
-            The one that has made the steps.
         """
         rows, time = self.bind(integrator.context), float(integrator.context.getTime()._value) - self._since
         sums = integrator.read("rows_sums")

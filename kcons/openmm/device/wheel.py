@@ -1,8 +1,7 @@
-"""The plugin as a wheel: ``python -m kcons.openmm.device.wheel [folder]``.
+"""The plugin for all platforms as a wheel: ``python -m kcons.openmm.device.wheel [folder]``.
 
-It has the libraries for Reference, CPU, OpenCL, CUDA and HIP, linked with empty libraries of the names of OpenMM's, so
-that neither CUDA nor a GPU need be where it is made. It serves the version of OpenMM that is installed here, and the
-sources of this kcons; where others are installed, the plugin is compiled as without it.
+Neither CUDA nor a GPU need be where it is made. It serves the version of OpenMM that is installed here and the sources
+of this kcons; where others are installed, the plugin is compiled as without it.
 """
 
 from __future__ import annotations
@@ -18,8 +17,6 @@ from pathlib import Path
 import openmm
 
 from kcons import __version__
-from kcons.constraints.arguments import refuse_other
-from kcons.errors import UnsupportedError
 from kcons.openmm.device import build
 
 
@@ -29,11 +26,8 @@ def make_wheel(folder: str | Path = ".") -> Path:
     Raises
     ------
     UnsupportedError
-        There is no compiler, or no headers of OpenMM.
+        There is no compiler, or it refuses the sources.
     """
-    refuse_other(folder, (str, Path), "folder", "the path of a folder")
-    if not build.compiler() or build.headers() is None:
-        raise UnsupportedError(f"a wheel cannot be made: {build.refusal() or 'there is no C++ compiler'}")
     libc = "_".join(platform.libc_ver()[1].split(".")[:2])
     tag = f"py3-none-manylinux_{libc}_{platform.machine()}"
     needed = openmm.version.version.split(".dev")[0]
@@ -48,16 +42,14 @@ def make_wheel(folder: str | Path = ".") -> Path:
     about = f"Metadata-Version: 2.1\nName: {build.PACKAGE}\nVersion: {number}\n{needs}"
     files[f"{info}/METADATA"] = about.encode()
     files[f"{info}/WHEEL"] = f"Wheel-Version: 1.0\nGenerator: kcons\nRoot-Is-Purelib: false\nTag: {tag}\n".encode()
-    record = ""
-    for name, content in files.items():
-        known = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
-        record += f"{name},sha256={known},{len(content)}\n"
-    files[f"{info}/RECORD"] = f"{record}{info}/RECORD,,\n".encode()
-    target = Path(folder) / f"{build.PACKAGE}-{number}-{tag}.whl"
+    target, record = Path(folder) / f"{build.PACKAGE}-{number}-{tag}.whl", f"{info}/RECORD,,\n"
     target.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in files.items():
             archive.writestr(name, content)
+            known = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+            record += f"{name},sha256={known},{len(content)}\n"
+        archive.writestr(f"{info}/RECORD", record)
     return target
 
 

@@ -760,7 +760,7 @@ class Guard:
                 step=step,
             )
         except (ConvergenceError, InputError, NonFiniteError) as error:
-            self._go_back(error)
+            self.go_back(error)
             raise
 
     def count(self, steps: int) -> None:
@@ -782,7 +782,7 @@ class Guard:
         except (CertificateError, ConvergenceError, InputError, NonFiniteError) as error:
             if isinstance(error, CertificateError):
                 error.state = self._good
-            self._go_back(error)
+            self.go_back(error)
             raise
         self._cost = self._checked - begun
 
@@ -810,7 +810,7 @@ class Guard:
             raise
         self._remember(now)
 
-    def _go_back(self, error: KconsError) -> None:
+    def go_back(self, error: KconsError) -> None:
         """The state that was checked last, and the error says so."""
         if self._good is not None:
             self.put_back()

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -31,10 +30,10 @@ from llvmlite import ir
 from numba import types
 from numba.extending import is_jitted, register_jitable
 
-from kcons.constraints.compilation import cfunc, has_a_file, njit
+from kcons.constraints.compilation import cfunc, has_a_file
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.functions.custom import PythonRows
+from kcons.constraints.functions.custom import Custom
 from kcons.constraints.target import FloatArray
 from kcons.solvers.kernels.any_width import DOUBLE, INT64, instruction, place
 from kcons.solvers.sparse.elimination import FAST
@@ -87,28 +86,16 @@ def _compiled(function: Callable[..., None]) -> Any:
     return cfunc(ROW, cache=has_a_file(function), fastmath=FAST, error_model="numpy")(function)
 
 
-def _with_time(function: Any, timed: bool) -> Any:
-    """A function of a place and the time, of one that Numba has compiled, or will."""
-    if timed:
-        return function
-
-    @njit
-    def at_any_time(x, t):
-        return function(x)
-
-    return at_any_time
-
-
 @functools.cache
-def _of_jitted(value: Any, gradient: Any, width: int, timed: bool) -> Any:
+def _of_jitted(value: Any, gradient: Any, width: int) -> Any:
     """A row of two functions that Numba has compiled, or will."""
-    shape, value, gradient = (width, 3), _with_time(value, timed), _with_time(gradient, timed)
+    shape = (width, 3)
 
     @cfunc(ROW)
     def row(r, p, t, out):
         x = nb.carray(r, shape)
-        out[0] = value(x, t)
-        slope = gradient(x, t)
+        out[0] = value(x)
+        slope = gradient(x)
         for i in range(width):
             for j in range(3):
                 out[1 + 3 * i + j] = slope[i, j]
@@ -140,12 +127,11 @@ class CalledRows:
     Beside a function that takes a microsecond everything done here shows.
     """
 
-    def __init__(self, item: PythonRows, numbers: FloatArray) -> None:
+    def __init__(self, item: Custom, numbers: FloatArray) -> None:
         self.error: BaseException | None = None
         width, count = item.width, 3 * item.width
         start = numbers.ctypes.data
-        row = _position_row(item) if item.holonomic else _velocity_row(item)
-        shape = (width, 3) if item.holonomic else (2, width, 3)
+        row = _function_of(item)
         # By address: places, rows, values, gradients.
         places: dict[int, FloatArray] = {}
         rows: dict[int, int] = {}
@@ -158,13 +144,13 @@ class CalledRows:
         def called(r: int, p: int, time: float, out: int) -> None:
             try:
                 if r not in places:
-                    places[r] = piece(r, math.prod(shape)).reshape(shape)
+                    places[r] = piece(r, count).reshape(width, 3)
                 if p not in rows:
                     rows[p] = int(piece(p, 1)[0])
                 if out not in values:
                     values[out] = piece(out, 1), piece(out + 8, count).reshape(width, 3)
                 value, slope = values[out]
-                value[0], slope[...] = row(rows[p], places[r], time)
+                value[0], slope[...] = row(rows[p], places[r])
             except BaseException as error:
                 self.error = self.error or error
                 piece(out, 1 + count)[:] = np.nan
@@ -173,38 +159,24 @@ class CalledRows:
         self.address = ctypes.cast(self._function, ctypes.c_void_p).value
 
 
-def _position_row(item: Any) -> Callable[[int, FloatArray, float], tuple[float, FloatArray]]:
+def _function_of(item: Custom) -> Callable[[int, FloatArray], tuple[float, FloatArray]]:
     """Its rows; of a place that comes twice running, as the end of a step and the start of the next, one gradient.
 
     The value is found again, and the gradient with it where the value is another: what the function reads besides may
     have changed.
     """
-    last: dict[int, tuple[bytes, float, float, FloatArray]] = {}
+    last: dict[int, tuple[bytes, float, FloatArray]] = {}
 
-    def row(k: int, place: FloatArray, time: float) -> tuple[float, FloatArray]:
+    def row(k: int, place: FloatArray) -> tuple[float, FloatArray]:
         # A copy: the function may keep what it sees.
         r = place.copy()
         r.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
-        here, value, before = r.tobytes(), item.row_value(k, r, time), last.get(k)
-        if before is not None and before[0] == here and before[1] == time and before[2] == value:
-            return value, before[3]
-        slope = item.row_gradient(k, r, time)
-        last[k] = here, time, value, slope.copy()
+        here, value, before = r.tobytes(), item.row_value(k, r), last.get(k)
+        if before is not None and before[0] == here and before[1] == value:
+            return value, before[2]
+        slope = item.row_gradient(k, r)
+        last[k] = here, value, slope.copy()
         return value, slope
-
-    return row
-
-
-def _velocity_row(item: PythonRows) -> Callable[[int, FloatArray, float], tuple[float, FloatArray]]:
-    """Its rows as functions of the end of a way; coefficients of a place that comes twice running are found once."""
-    last: dict[int, tuple[bytes, float, FloatArray]] = {}
-
-    def row(k: int, place_and_way: FloatArray, time: float) -> tuple[float, FloatArray]:
-        place = place_and_way[0]
-        here, before = place.tobytes(), last.get(k)
-        if before is None or before[0] != here or before[1] != time:
-            before = last[k] = here, time, item.row_gradient(k, place.copy(), time).copy()
-        return float(np.vdot(before[2], place_and_way[1])), before[2]
 
     return row
 
@@ -216,9 +188,10 @@ def row_function(item: Constraint, numbers: FloatArray) -> Any:
     """
     if item.row is not None:
         return _compiled(item.row)
-    assert isinstance(item, PythonRows)
-    if item.holonomic and all(is_jitted(function) for function in item.called):
-        return _of_jitted(*item.called, item.width, item.time_dependent)
+    assert isinstance(item, Custom)
+    gradient = item.gradient_function
+    if gradient is not None and is_jitted(item.function) and is_jitted(gradient):
+        return _of_jitted(item.function, gradient, item.width)
     return CalledRows(item, numbers)
 
 

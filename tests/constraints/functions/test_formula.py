@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from constraint_cases import MASSES, TIME, saddle, scattered, spread
+from constraint_cases import MASSES, TIME, scattered, spread
 
 from kcons import ConstraintSet, Motion
 from kcons.constraints import (
@@ -17,31 +14,31 @@ from kcons.constraints import (
     Dihedral,
     Distance,
     Formula,
-    ImplicitSurface,
     Sphere,
     from_dict,
 )
-from kcons.constraints.functions import formula as formulas
 from kcons.constraints.functions.formula import FUNCTIONS, code_of
 from kcons.errors import InputError, SingularGeometryError
+from kcons.solvers.sparse.row_functions import row_function
 
 #: What takes for ever or all memory, or is no formula in other ways: some text, and what is said of it.
 FROM_OTHERS = {
-    "x1*9**9**9": r"9 \*\* 9 \*\* 9 is inf",
+    "x1*9**9**9": "is finite nowhere",
     "x1*10**-9**9": "its gradient is zero",
-    "x1+2**2**40": "is inf",
-    "pi**pi**pi**pi*x1": "is inf",
+    "x1+2**2**40": "is finite nowhere",
+    "pi**pi**pi**pi*x1": "is finite nowhere",
+    "x1*1e200*1e200": "is finite nowhere",
     "x1*1e999": "a number that is too large",
     "x1+" + "9" * 400: "a number that is too large",
     "x1+0x" + "f" * 4000: "a number that is too large",
-    "x1+log(0)": "is -inf",
+    "x1+log(0)": "is finite nowhere",
     "x999999": "names atom 999999 of a row and not atom 1",
     "x99999999999999999999999": "is not known",
     "+".join(["x1"] * 900): "more than 200 levels",
     "x1+" * 5000 + "x1": "at most 10000",
     "-" * 3000 + "x1": "nested",
     "(" * 3000 + "x1" + ")" * 3000: "nested",
-    "x1*sin": "sin in .* is a function; write what it is of",
+    "x1*sin": "'sin' in .* is a function; write what it is of",
     "x1*True": "is not allowed",
     "x1\ud800": "cannot be read",
     "x1\0": "cannot be read",
@@ -67,10 +64,7 @@ def row_of(formula, r, t=0.0):
     ("formula", "value"),
     [
         ("x1**(2**40)", 1.0),
-        ("(((9*x1)**99)**99)**99", np.inf),
         ("(" * 40 + "x1" + "**99)" * 40, 1.0),
-        ("exp(1000*(1000*(1000*log(9*x1))))", np.inf),
-        ("x1*1e200*1e200", np.inf),
         ("x1*12345678901234567890*1e100 + (9*x1)**40", 12345678901234567890e100 + 9.0**40),
         ("sin(" * 60 + "0*x1" + ")" * 60 + "+ x1", 1.0),
     ],
@@ -132,36 +126,14 @@ def test_every_function_is_differentiated_exactly():
         np.testing.assert_allclose(found, bend, rtol=1e-7, atol=1e-7, err_msg=name)
 
 
-PROGRAM = """
-import numpy as np
-from kcons import ConstraintSet, Motion
-from kcons.constraints import Formula
-x = np.array([[0.3, 0.2, 0.1]])
-motion = Motion(ConstraintSet(Formula("x1**2 + a*y1 - z1", 0, {"a": 2.0}, None), x, [1.0]), x)
-print(motion.project_positions(x + 0.01, x)[0].tolist())
-"""
-
-
-def projected(folder: Path) -> tuple[str, str]:
-    """What the program prints, and what it says besides."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=Path(formulas.__file__).parents[3],
-        env={**os.environ, "XDG_CACHE_HOME": str(folder), "NUMBA_CACHE_DIR": ""},
-    )
-    return done.stdout, done.stderr
-
-
-def test_another_process_needs_no_compiler(tmp_path):
-    """What the first one wrote serves the second one."""
-    first, _ = projected(tmp_path)
-    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    assert {path.suffix for path in files} == {".py", ".nbi", ".nbc"}
-    assert projected(tmp_path) == (first, "")
-    assert files == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+def test_what_is_compiled_is_found_again(tmp_path, monkeypatch):
+    """By the name of its module, which is the same in each process."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    hits = []
+    for _ in range(3):  # Numba sees the new folder after the first
+        code_of.cache_clear()
+        hits.append(row_function(Formula("x1 + 0.375*y1", 0), np.zeros(1)).cache_hits)
+    assert hits == [0, 0, 1]
 
 
 def test_a_file_that_is_damaged_is_written_anew(tmp_path, monkeypatch):
@@ -199,21 +171,17 @@ def test_files_keep_formulas():
 
 
 @pytest.mark.parametrize(
-    ("formula", "x1", "message"),
-    [
-        ("sqrt(1 - x1**2) - z1", 2.0, r"sqrt\(1 - x1 \*\* 2\) is nan where 1 - x1 \*\* 2 = -3 at the start"),
-        ("log(x1)", 0.0, r"log\(x1\) is -inf where x1 = 0"),
-        ("a/x1 + y1", 0.0, r"a / x1 is inf"),
-        ("x1**2", 0.0, "its gradient is zero"),
-        ("sqrt(x1) + y1", 0.0, "its gradient is not finite"),
-    ],
+    ("formula", "x1"),
+    [("sqrt(1 - x1**2) - z1", 2.0), ("log(x1)", 0.0), ("a/x1 + y1", 0.0), ("x1**2", 0.0), ("sqrt(x1) + y1", 0.0)],
 )
-def test_what_is_undefined_at_the_start_is_named(formula, x1, message):
+def test_what_is_undefined_at_the_start_is_refused(formula, x1):
     row = Formula(formula, 1, {"a": 1.0}, target=None)
     x = np.array([[0.0, 0.0, 0.0], [x1, 0.0, 0.0]])
-    with pytest.raises((SingularGeometryError, InputError), match=message) as caught:
+    with pytest.raises(
+        SingularGeometryError, match=r"row 1, Formula\(1\): value and gradient must be finite"
+    ) as caught:
         ConstraintSet([Sphere(0, [1.0, 0, 0]), row], x, np.ones(2), time=TIME)
-    assert caught.value.atoms in ((1,), ())
+    assert caught.value.atoms == (1,)
 
 
 # -- Python functions: checks of what was given, accuracy of what was not --------------------------
@@ -230,30 +198,17 @@ def gap_gradient(r):
 
 #: The same coordinates as formulas, which are differentiated exactly.
 SQUARES = "((x{0} - x{1})**2 + (y{0} - y{1})**2 + (z{0} - z{1})**2)"
-SADDLE = "z1 - (x1**2 - y1**2)/4 - x1**3/9"
-SPREAD = f"exp(-{SQUARES.format(1, 2)}/8) + {SQUARES.format(2, 3)}/5*cos(t)"
+SPREAD = f"exp(-{SQUARES.format(1, 2)}/8) + {SQUARES.format(2, 3)}/5"
 
 
-@pytest.mark.parametrize(
-    ("make", "formula", "atoms"),
-    [(saddle, SADDLE, [0, 3, 5]), (spread, SPREAD, [[0, 1, 2], [5, 3, 4]])],
-    ids=["surface", "custom"],
-)
-def test_differenced_curvature_has_ten_digits(make, formula, atoms):
-    x, v = scattered(0), 10 * scattered(1)
-    exact, differenced = Formula(formula, atoms), make(atoms)
+@pytest.mark.parametrize("given", [True, False])
+def test_differenced_curvature_has_ten_digits(given):
+    x, v, atoms = scattered(0), 10 * scattered(1), [[0, 1, 2], [5, 3, 4]]
+    exact, differenced = Formula(SPREAD, atoms), spread(atoms, given=given)
     r, u = x[exact.atoms], v[exact.atoms]
     found = differenced.curvature(r, u, TIME)
     expected = exact.curvature(r, u, TIME)
     assert np.abs(found - expected).max() < 1e-10 * np.einsum("kai,kai->k", u, u).max()
-
-
-def test_differenced_curvature_does_not_depend_on_the_unit_of_time():
-    item = spread([[0, 1, 2]])
-    r, v = scattered(0)[item.atoms], scattered(1)[item.atoms]
-    slow, fast = item.curvature(r, 1e-6 * v, TIME), item.curvature(r, 1e6 * v, TIME)
-    assert slow * 1e24 == pytest.approx(fast, rel=1e-9)
-    assert item.curvature(r, 0 * v, TIME).tolist() == [0.0]
 
 
 #: What functions give that does not fit, and what is said of it before anything moves.
@@ -263,20 +218,12 @@ WRONG = [
         r"row 1, Custom\(0, 1\): gradient gives .* but differences .* give",
     ),
     (
-        ImplicitSurface(0, lambda r: r[:, 2] + r[:, 0] ** 2, lambda r: np.eye(3)[[2] * len(r)]),
-        r"row 1, ImplicitSurface\(0\): gradient gives",
-    ),
-    (
         Custom([0, 1], gap, lambda r: gap_gradient(r)[0]),
         r"Custom: gradient returned shape \(3,\) for row 0; it must return \(2, 3\)",
     ),
     (
         Custom([0, 1], lambda r: r[0], gap_gradient),
         r"Custom: function returned shape \(3,\) for row 0; it must return one number",
-    ),
-    (
-        ImplicitSurface([0, 1], lambda r: 1.0, lambda r: r),
-        r"ImplicitSurface: function returned shape \(\).*it must return \(2,\)",
     ),
 ]
 

@@ -13,8 +13,8 @@ MUTANTS = {
         "sums = «-→+»torch.round(": "batched/against_the_engine::rows_take_the_images_that_the_engine_takes",
     },
     "batched/row_functions.py": {
-        "(value * places[«item.width :→: item.width»]).sum()": (
-            "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-CustomVelocity]"
+        "return value«.item() if isinstance(value, np.ndarray) else value→»": (
+            "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-Custom]"
         ),
     },
     "batched/batch.py": {

@@ -18,7 +18,7 @@ MUTANTS = {
     },
     "openmm/device/plugin/program_integrator.cpp": {
         "numbers.time = «→(float) »c.getTime()-shared.origin;": "kernel_rows::targets_move_late_in_a_long_run",
-        '!(exactly || array.name == «"memory"→""»)': "device_integrator::states_of_other_rows_are_refused",
+        'array.name != «"memory"→""»;': "device_integrator::states_of_other_rows_are_refused",
     },
     "openmm/device/build.py": {
         "if not (accelerated() «or→and» is_built()):": "device_integrator::which_steps_are_made_on_the_device",
@@ -37,12 +37,12 @@ MUTANTS = {
     },
     "openmm/device/device_integrator.py": {
         "array in «arrays→rows.arrays» if array.saved": "molecule_spheres::a_failure_puts_auxiliary_variables_back",
-        "self._advance(context, again«→ - 1»)": "device_integrator::a_failure_leaves_the_state_before_the_step",
-        "yield x, v, f, time + (k «+ 1→+ 0») * every * self": "device_integrator::records_are_the_states_after_steps",
+        "np.isfinite(told[_RESIDUAL])«→ and False»:": "device_integrator::a_failure_puts_back_what_was_checked_last",
+        "yield x, v, f, time + «k→(k - 1)» * every * self": "device_integrator::records_are_the_states_after_steps",
         "part.left «!=→is None and» guard.context.getTime(": "kernel_rows::multipliers_are_summed_where_the_rows_are",
         "part if part.program is None «else copy.deepcopy(part)→else part»": (
             "kernel_rows::parts_serve_integrators_of_other_systems"
         ),
-        "if told[_FAILED]«→ and False»:": "device_integrator::a_failure_leaves_the_state_before_the_step",
+        "if told[_FAILED]«→ and False»:": "device_integrator::a_failure_puts_back_what_was_checked_last",
     },
 }

@@ -53,7 +53,7 @@ MUTANTS = {
         "r if together is y else self.gather(item, x, «together→y»)": (
             "images::lengths_found_far_away_can_be_held_near_the_origin"
         ),
-        "«x→whole»[item.atoms] if self.moved is None": "places::a_molecule_is_the_same_in_the_cell_as_in_open_space",
+        "«x→whole»[item.atoms] if self.moved is None": "images::a_molecule_is_the_same_in_the_cell_as_in_open_space",
     },
     "constraints/constraint.py": {
         "self.target is not None and «self.held is LENGTH→True»:": "constraint::the_same_points_fulfil_it",
@@ -86,12 +86,12 @@ MUTANTS = {
         ),
     },
     "plan/clusters.py": {
-        "single &= «~anchored→anchored >= 0»": "places::a_molecule_is_the_same_in_the_cell_as_in_open_space",
+        "single &= «~anchored→anchored >= 0»": "images::a_molecule_is_the_same_in_the_cell_as_in_open_space",
     },
     "motion/solver_sequence.py": {
         "_beside(then[first], then[first + 1]) <= «0→-1».0": "motion::a_dihedral_that_becomes_straight_is_named",
         "                moved = None« if places is None else rows.moved_places(places, x)→»": (
-            "places::a_molecule_is_the_same_in_the_cell_as_in_open_space"
+            "images::a_molecule_is_the_same_in_the_cell_as_in_open_space"
         ),
     },
     "constraints/arguments.py": {

@@ -12,7 +12,7 @@ MUTANTS = {
         "[«x[atoms] +→lined_up(x[atoms], self.lattice) + 0 *» images for": "relaxation::terms_keep_their_images",
     },
     "free_energy/windows/input_file.py": {
-        "np.where([item.held «is ANGLE→is not None» for": "free_energy/windows/input_file::a_difference_of_distances",
+        "[atom «- first→» for atom in atoms]": "free_energy/windows/input_file::a_difference_of_distances",
         'return np.radians(places) if «self.family in ("angle", "dihedral")→self.family != "distance"» else places': (
             "free_energy/windows/input_file::a_difference_of_distances"
         ),
@@ -58,7 +58,7 @@ MUTANTS = {
         "if chance < «_CHANCE→0.0»:": "mean_force_surface::vectors_that_are_no_gradient_are_warned_of",
     },
     "free_energy/profiles/pulls.py": {
-        "np.asarray(«math.log(works.shape[-1]) →»- logsumexp(-works": "pulls::a_spring_that_is_dragged",
+        "if math.isnan(error) else «kT * →»error": "pulls::normal_works_give_the_free_energy_within_the_errors",
         "ahead, «-back→back»]) - difference": "pulls::works_of_no_spread",
     },
     "constraints/constraint_set.py": {

@@ -49,6 +49,6 @@ MUTANTS = {
     "solvers/sparse/row_functions.py": {
         "_from(p, «stride→0» * i)": "single_rows::solutions_are_those_of_rows_called_one_by_one",
         "alike[«first + size - 1→:»] = True": "single_rows::who_is_called_one_by_one",
-        "] == time« and before[2] == value→»": "row_functions::a_gradient_is_found_again_where_the_value_has_changed",
+        "] == here« and before[1] == value→»": "row_functions::a_gradient_is_found_again_where_the_value_has_changed",
     },
 }

@@ -6,7 +6,7 @@ MUTANTS = {
         "«except Exception:  # pickle→except ZeroDivisionError:  # pickle»": "compilation::damaged_files_are_made_anew",
     },
     "constraints/functions/formula.py": {
-        "    undefined = «undefined_part(tree, _PI)→None»": "formula::formulas_without_bound_are_refused_at_once",
+        "np.isfinite([«value→0.0», *slopes]).all(": "formula::formulas_without_bound_are_refused_at_once",
         "lambda _, x: «next(some)→-np.ones(40)»": "formula::shifts_are_found_out",
     },
     "constraints/constraint.py": {
@@ -46,7 +46,7 @@ MUTANTS = {
     "solvers/sparse/mixed_rows.py": {
         "if abs(d) > «PIVOT_TOLERANCE * abs(whole)→0.0» else 0.0": "row_functions::dependent_rows_are_dropped",
         "(along > «0.→-1e30»0)": "row_functions::a_molecule_turned_through_a_point_is_no_solution_though_its_rows_hold",
-        "= «(here - load_quad(moved, 4 * p))→here» +": "places::a_molecule_is_the_same_in_the_cell_as_in_open_space",
+        "= «(here - load_quad(moved, 4 * p))→here» +": "images::a_molecule_is_the_same_in_the_cell_as_in_open_space",
         "= «period * np.rint(→0.5 * period * np.rint(2 * »": (
             "row_functions::rows_with_a_period_miss_by_the_shorter_way"
         ),

@@ -43,7 +43,7 @@ MUTANTS = {
         "d * d«] @ shares.swapaxes(1, 2)→, -d:]»": "held_coordinates::mean_force_is_the_one_of_the_definition",
         "bent[:, 1 + d * d :].sum(axis=1) «-→+» traces)": "held_coordinates::mean_force_is_the_one_of_the_definition",
         "(respond @ b[:, :, None] «-→+» pull)": "held_coordinates::mean_force_is_the_one_of_the_definition",
-        "np.isfinite(before)« and abs(after - before) < _SAME→»": "torsion_force::other_rows_must_not_change",
+        "return «abs(after - before) < _SAME→True»": "torsion_force::other_rows_must_not_change",
         "arms = x[..., self.group, :]« - x[..., self.axis[1:], :]→»": (
             "torsion_force::the_smaller_group_turns_and_its_force_is_the_slope_of_the_energy"
         ),

@@ -78,42 +78,7 @@ def test_a_grid_without_noise_gives_the_surface(name):
         assert turned == pytest.approx(surface.free_energy(at)[0], abs=1e-6 * np.ptp(exact))
 
 
-def test_minima():
-    from scipy.optimize import minimize
-
-    surface = fitted("wells")
-    lowest, second = surface.minima()
-    exact = [minimize(lambda x: wells(x[None])[0], start, tol=1e-10) for start in ([-1.0, 0.4], [1.0, 0.4])]
-    for minimum, expected in zip((lowest, second), exact, strict=True):
-        assert np.abs(minimum.x - expected.x).max() < 0.1
-    difference = surface.difference(lowest.x, second.x)
-    assert abs(difference.off(exact[1].fun - exact[0].fun)) < 3
-    assert difference.value == pytest.approx(second.F - lowest.F, abs=1e-6)
-
-
-def test_minima_around_a_torus():
-    """As many as a fine grid of the closed form has, at the same places, each once."""
-    places = np.linspace(-math.pi, math.pi, 200, endpoint=False)
-    F = torsions(np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 2)).reshape(200, 200)
-    around = [np.roll(F, (a, b), axis=(0, 1)) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
-    exact = places[np.argwhere((np.array(around) > F).all(axis=0))]
-    found = np.array([minimum.x for minimum in fitted("torsions").minima()])
-    assert len(found) == len(exact) == 2
-    away = (found[:, None] - exact[None] + math.pi) % TURN - math.pi
-    assert np.abs(away).max(axis=2).min(axis=0).max() < 0.1
-
-
 def test_vectors_that_are_no_gradient_are_warned_of():
     """Warnings are errors in all other tests."""
     with pytest.warns(UserWarning, match="no gradient"):
         fitted("wells", swirl=3.0)
-
-
-def test_three_coordinates():
-    x = np.random.default_rng(10).uniform(-1, 1, (25, 3))
-    matrix = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, -0.2], [0.0, -0.2, 3.0]])
-    surface = fit_surface(x, x @ matrix, np.full((25, 3), 0.02), zero=[0.0, 0.0, 0.0])
-    at = np.random.default_rng(11).uniform(-0.6, 0.6, (20, 3))
-    F, errors = surface.free_energy(at)
-    assert np.abs((F - 0.5 * np.einsum("ni,ij,nj->n", at, matrix, at)) / errors).max() < 4
-    assert np.abs(surface.minima()[0].x).max() < 0.1

@@ -48,7 +48,7 @@ def off(profile, case):
 
 
 @pytest.mark.parametrize(
-    ("name", "n", "error"), [("Lennard-Jones", 20, 0.3), ("double well", 9, 0.4), ("torsion", 14, 1.0)]
+    ("name", "n", "error"), [("Lennard-Jones", 20, 0.3), ("double well", 9, 0.4), ("torsion", 12, 1.0)]
 )
 @pytest.mark.parametrize(
     ("seeds", "low", "high", "covered"),
@@ -62,22 +62,6 @@ def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error, s
     away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(seeds)])
     assert low < (away**2).mean() < high
     assert covered <= (np.abs(away) < 1.96).mean() <= (1.0 if seeds < 100 else 0.98)
-
-
-@pytest.mark.parametrize(
-    ("seeds", "low", "high"),
-    [(range(6), 0.7, 1.3), pytest.param(range(40), 0.9, 1.15, marks=pytest.mark.validation)],
-    ids=["few", "many"],
-)
-def test_the_band_of_a_torsion_of_few_windows(seeds, low, high):
-    """Twelve windows, four for each wave of the fastest part: the band was 1.8 times what profiles are off by."""
-    case, found = CASES["torsion"], []
-    for seed in seeds:
-        profile = made(case, 12, 1.0, seed, zero=case.grid(12)[3])
-        away = profile.F - (case.F(profile.x) - case.F(profile.zero))
-        found.append((away[20:200:20] ** 2, profile.error[20:200:20] ** 2))
-    square, said = np.mean(found, axis=(0, 2))
-    assert low <= math.sqrt(square / said) <= high
 
 
 def test_mean_forces_that_vanish_within_their_errors():
@@ -114,13 +98,12 @@ def test_windows_of_a_circle_may_be_given_in_any_turn_and_order():
     assert one.difference(0.0, 1.0).value == pytest.approx(other.difference(0.0, 1.0).value, abs=1e-4)
 
 
-@pytest.mark.parametrize("off", [0.0, 2e-16, 1e-12])
-def test_windows_at_one_place_are_put_together(off):
-    """Also those that rounding moves apart."""
-    profile = integrate([0.3, 0.3 + off, 1.0, 2.0], [1.0, 2.0, 1.0, 1.0], [1.0, 0.5, 1.0, 1.0])
-    assert profile.windows.tolist() == [0.3, 1.0, 2.0]
-    assert profile.mean_forces[0] == pytest.approx((1.0 + 4 * 2.0) / 5)
-    assert profile.mean_force_errors[0] == pytest.approx(1 / math.sqrt(5))
+@pytest.mark.parametrize("off", [0.0, 1e-12])
+def test_windows_at_one_place_count_as_one_of_their_mean(off):
+    twice = integrate([0.3, 0.3 + off, 1.0, 2.0], [1.0, 2.0, 1.0, 1.0], [1.0, 0.5, 1.0, 1.0], zero=0.3)
+    once = integrate([0.3, 1.0, 2.0], [(1.0 + 4 * 2.0) / 5, 1.0, 1.0], [1 / math.sqrt(5), 1.0, 1.0], zero=0.3)
+    assert pytest.approx(once.F, abs=0.005) == twice.F
+    assert twice.error == pytest.approx(once.error, rel=0.01)
 
 
 def test_next_windows_lie_apart_and_where_little_is_known():
@@ -164,10 +147,8 @@ def test_a_profile_prints_its_windows_and_not_its_arrays():
 def test_a_profile_with_its_band_and_windows():
     x = np.linspace(0.0, 2.0, 6)
     profile = integrate(x, np.cos(3 * x), np.full(6, 0.05))
-    figure = plot_profile(profile, coordinate="r / Å", energy="eV")
-    above, below = figure.axes
+    above, below = plot_profile(profile, coordinate="r / Å", energy="eV").axes
     assert above.get_ylabel() == "F / eV" and below.get_xlabel() == "r / Å"
-    assert (next(line for line in above.lines if line.get_label() == "F").get_ydata() == profile.F).all()
     band = above.collections[0].get_paths()[0].get_extents()
     assert band.y1 == pytest.approx((profile.F + 2 * profile.error).max())
     (windows,) = (each for each in below.containers if each.get_label() == "windows")

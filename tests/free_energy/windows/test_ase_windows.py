@@ -34,7 +34,7 @@ def test_a_window_far_from_the_structure(tmp_path):
     """From 180 to 60 degrees in one go; the same file whenever it is made."""
     start, periods = sampler().start, sampler().periods
     assert start == pytest.approx([np.pi]) and periods == pytest.approx([2 * np.pi])
-    window = Window(0, "up", (1.0,), (np.pi / 3,), 5)
+    window = Window("up", (1.0,), (np.pi / 3,), 5)
     atoms = molecule("CH3OH")
     atoms.set_constraint(FixAtoms([0]))
     held = pickle.loads(pickle.dumps(sampler(atoms)))
@@ -88,7 +88,7 @@ def test_torsions_over_atoms_that_form_no_bonds():
 
 
 def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
-    sampler().pull(Window(0, "forward", (2.0,), (2.4,), 5), replace(SHORT, pull=200), tmp_path / "pull.npz")
+    sampler().pull(Window("forward", (2.0,), (2.4,), 5), replace(SHORT, pull=200), tmp_path / "pull.npz")
     series = Series.load(tmp_path / "pull.npz")
     assert len(series) == 201
     np.testing.assert_allclose(series.value[:, 0], np.linspace(2.0, 2.4, 201), atol=1e-9)

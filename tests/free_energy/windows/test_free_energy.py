@@ -11,8 +11,8 @@ from window_samplers import Fake
 
 from kcons.cli.terminal import rendered
 from kcons.errors import InputError
-from kcons.free_energy import FreeEnergy, MeanForce, Settings, WindowResult, Windows, pull_free_energy
-from kcons.free_energy.windows.driver import combine_sides
+from kcons.free_energy import FreeEnergy, MeanForce, Settings, WindowResult, Windows
+from kcons.free_energy.windows.driver import combine_sides, with_error
 
 PERIOD = 2 * np.pi
 
@@ -23,7 +23,7 @@ def of_two_sides(apart):
         name: MeanForce(("a", "b"), np.zeros(2), force, error**2 * np.eye(2), force, 100, 50.0)
         for name, force, error in (("up", np.zeros(2), 0.1), ("down", np.array(apart), 0.2))
     }
-    return combine_sides(0, np.zeros(2), sides, Fake("", scales=np.ones(2)))
+    return combine_sides(np.zeros(2), sides, Fake("", scales=np.ones(2)))
 
 
 def test_sides_that_differ_by_more_than_chance_widen_the_error():
@@ -35,7 +35,7 @@ def test_sides_that_differ_by_more_than_chance_widen_the_error():
 
 def result(place, slope, d=1):
     at, force = np.full(d, place), np.full(d, slope)
-    return WindowResult("ab", at, force, 1e-4 * np.eye(d), force, 1, 1.0, number=0, sides={}, p_value=np.nan)
+    return WindowResult("ab", at, force, 1e-4 * np.eye(d), force, 1, 1.0, sides={}, p_value=np.nan)
 
 
 def found(degrees, names=("torsion",), periods=(PERIOD,)):
@@ -61,9 +61,7 @@ def test_windows_across_the_end_of_a_turn_are_a_part_of_it(there):
     part = found(there)
     np.testing.assert_allclose(np.degrees(part.profile.x[-1] - part.profile.x[0]), 60.0)
     assert part.profile.closure is None and part.profile.error.max() < 0.1
-    for a, b in ((150, 180), (-210, -180), (150, -180)):
-        assert part.between(*np.radians([a, b])).value == pytest.approx(0.5, abs=0.01)
-    assert part.between(*np.radians([140, 180])) is None
+    assert part.profile.difference(part.profile.x[0], part.profile.x[100]).value == pytest.approx(0.5, abs=0.01)
     assert max(np.degrees(part.profile.next_windows(3))) <= np.degrees(part.profile.x[-1]) + 1e-9
 
 
@@ -74,16 +72,16 @@ def test_a_turn_with_gaps_of_any_width_is_closed():
     assert half.closure is None and half.difference(0, np.pi / 2).value == pytest.approx(-2.0, abs=0.02)
 
 
-def test_surfaces_of_a_part_of_a_turn_have_no_minima_beyond():
+def test_surfaces_of_a_part_of_a_turn():
     places = [(a, b) for a in (40, 60, 80, 100) for b in (-40, -15, 15, 40)]
     windows = [replace(result(0, 0, 2), value=np.radians(p), force=9 * np.sin(np.radians(p))) for p in places]
     surface = FreeEnergy(("a", "b"), np.full(2, PERIOD), windows).surface
-    assert surface.periods == (None, None) and surface.minima() == []
+    assert surface.periods == (None, None)
 
 
 @pytest.fixture
 def sampled(tmp_path):
-    return run(tmp_path, np.linspace(-np.pi, np.pi, 9)[:-1], fails=("window-0001-up",), shift=0.4)
+    return run(tmp_path, np.linspace(-np.pi, np.pi, 9)[:-1], fails=("window--2.35619449-up",), shift=0.4)
 
 
 def run(folder, places, **fake):
@@ -95,10 +93,11 @@ def test_table_and_sentences(sampled):
     text = rendered(sampled.table())
     assert "torsion (degrees)" in text and "-180" in text and "±" in text
     said = sampled.summary()
-    assert said.startswith("8 windows") and "window-0001-up failed: RuntimeError" in said
+    assert said.startswith("8 windows") and "window--2.35619449-up failed: RuntimeError" in said
     assert "from the lowest to the highest point" in said
-    low = min(w.p_value for w in sampled.windows if w.number != 1)
+    low = min(w.p_value for w in sampled.windows if len(w.sides) == 2)
     assert ("(marked !)" in said) == (low < 0.01) == ("!" in text)
+    assert with_error(123.4, 12.3) == "123 ± 12" and with_error(-2e-9, 3e-17) == "0.000000 ± 3.0e-17"
 
 
 def test_files(sampled, tmp_path):
@@ -128,13 +127,3 @@ def test_a_formula_has_its_own_unit(sampled, tmp_path):
     assert "torsion (own unit)" in text and "kJ/mol per own unit" in text and "angstrom" not in text
     (_, columns, _) = sampled.write(tmp_path)
     assert columns.read_text().startswith("torsion (own unit),F")
-
-
-def test_pulls_beside_windows_that_do_not_reach_their_ends(sampled):
-    pulled = pull_free_energy(np.linspace(0, 1, 20), np.linspace(-1, 0, 20), thermal_energy=2.5)
-    numbers, said = sampled.beside(pulled, np.array([0.1]), np.array([4.0]))
-    assert numbers["windows"][0] == pytest.approx(sampled.profile.difference(0.1, 4.0 - 2 * np.pi).value)
-    sampled.windows[:] = sampled.windows[:4]
-    del sampled.profile
-    numbers, said = sampled.beside(pulled, np.array([0.1]), np.array([4.0]))
-    assert "windows" not in numbers and said.endswith("; the windows do not reach both ends")

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import re
-from pathlib import Path
-
 import numpy as np
 import openmm
 import pytest
@@ -69,21 +65,18 @@ def test_an_input_for_ase(folder):
     assert found.options == {"both_sides": False, "rng": 4}
     assert found.improve == {"error": 0.5, "most": 20, "below": 40}
     assert found.sampler.start == pytest.approx([np.pi])
-    assert found.sampler.held[0].n_rows == 4 and found.pulls is None
+    assert found.sampler.held[0].n_rows == 4
 
 
 def test_a_difference_of_distances(folder):
-    """In angstrom and of either sign; beside a torsion in degrees, with a pull along both."""
-    text = INPUT.replace("rng = 4", "approach = [6, 0.2]").replace("[2, 0, 1, 3]", "[3, 1, 2, 4]").replace(IMPROVE, "")
+    """In angstrom and of either sign; beside a torsion in degrees."""
+    text = INPUT.replace("[2, 0, 1, 3]", "[3, 1, 2, 4]").replace(IMPROVE, "")
     text = text.replace('methanol.xyz"', 'methanol.xyz"\ncount_from = 1')
     text += "\n[[coordinate]]\ndifference = [1, 2, 4, 2]\nfrom = -0.5\nto = 0.5\nwindows = 3.0\n"
-    found = read(folder, text + "[pulls]\nto = [90.0, 0.4]\ncount = 8.0\nsteps = 300\n")
+    found = read(folder, text)
     assert found.sampler.names == ("turn", "difference-1-2-4-2")
     assert found.sampler.coordinates["turn"].atoms.tolist() == [[2, 0, 1, 3]]
     assert found.targets.shape == (36, 2) and found.targets[:3, 1].tolist() == [-0.5, 0.0, 0.5]
-    assert found.options["approach"] == pytest.approx([np.radians(6), 0.2])
-    assert found.pulls["start"] == pytest.approx(found.targets[0]) and found.pulls["count"] == 8
-    assert found.pulls["end"] == pytest.approx([np.pi / 2, 0.4]) and found.pulls["steps"] == 300
     atoms = molecule("CH3OH")
     assert found.sampler.start[1] == pytest.approx(atoms.get_distance(0, 1) - atoms.get_distance(3, 1))
 
@@ -101,7 +94,6 @@ def test_an_input_for_openmm(folder):
         file = "alanine.pdb"
         [forces]
         system = "system.xml"
-        platform = "Reference"
         [[coordinate]]
         name = "r"
         distance = [4, 14]
@@ -141,19 +133,14 @@ def before_improve(text):
         (FILE, 'file = "nothing.xyz"', "there is no file .*nothing.xyz"),
         (FILE, "", r"\[structure\] has no file; write file = "),
         (LJ, "", r"give calculator or system"),
+        (LJ, 'system = "system.xml"', "settings of .forces. is for a calculator of ASE, and no System; leave it out"),
         ("windows = 12", "", "give values, or from, to and windows"),
         (TURN, "", "coordinate turn is nothing"),
         (TURN, f"{TURN}\nangle = [2, 0, 1]", "turn is angle and dihedral"),
         (TURN, "dihedral = [2, 0, 1]", "dihedral names 3 atoms; give 4"),
-        (TURN, "difference = [2, 0, 1]", "difference names 3 atoms; give 4"),
         ("[[coordinate]]", "[coordinate]", r"write \[\[coordinate\]\]"),
         ("temperature = 310", "temperature 310", "is no TOML that can be read: .*line"),
         ('constrain = "hbonds"', 'constrain = "everything"', "everything"),
-        (*before_improve("[pulls]\nfrom = [1.0, 2.0]"), r"from of \[pulls\] has 2 values.*turn"),
-        (*before_improve("[pulls]\ncount = 4"), r"count of \[pulls\] is 4.*5 or more"),
-        (*before_improve("[pulls]\nsteps = 0.5"), r"steps of \[pulls\] is 0.5"),
-        (*before_improve("[pulls]\nfrom = 3\nto = 3"), "begin where they end"),
-        (*before_improve("[pull]\ncount = 5"), r"unknown key 'pull' .did you mean 'pulls'"),
         ("windows = 12", "windows = 12\nvalues = [1, 2, 3]", "turn has values and from"),
         ("windows = 12", "windows = 2", r"\[improve\] adds windows.*has 1, with 2 windows"),
         (*before_improve(f"{MORE}[100, 110]"), "has 2, with 24 windows"),
@@ -162,22 +149,15 @@ def before_improve(text):
         (*before_improve(f"{ROW}1]\nvalues = [1.4, -1]"), "no distance of -1 to hold"),
         (*before_improve(MANY), "the input file has 787,320,000,000,000,000,000 windows"),
         (*before_improve(f"a = {'[' * 5000}{']' * 5000}"), "is no TOML that can be read: .*recursion"),
-        (LJ, f'{LJ}\nplatform = "CPU"', "platform of .forces. says nothing to a calculator"),
         ("windows = 12", 'windows = "x"', r"windows of \[coordinate\] is 'x'; give a number"),
         (TURN, "dihedral = [2.5, 0, 1, 3]", "give whole numbers"),
-        (f"{TURN}\nfrom = -180", f"angle = [2, 0, 1]\nfrom = 1{ZEROS[:30]}", r"there is no angle of 1e\+30"),
         ("both_sides = false", 'both_sides = "no"', "give true or false"),
         ("most = 20", "", r"\[improve\] has no most; write most = "),
-        ("error = 0.5", 'error = "x"', r"error of \[improve\] is 'x'; give a number"),
         (FILE, f"{FILE}\ncount_from = -1", "count_from of .structure. is -1; choose 0 or 1"),
         (FILE, f"{FILE}\ncount_from = 1", "there is no atom 0; atoms are counted from 1"),
         ("sigma = 1.0", "sgima = 1.0", r"lj has no setting 'sgima' .did you mean 'sigma'"),
-        ("rng = 4", "approach = [6, 0.2, 1]", "approach has 3 values; give one for each of turn"),
-        ("rng = 4", 'approach = "x"', "approach of .sampling. is 'x'; give a number, or numbers"),
         ("windows = 12", "windows = 2000000000", "the input file has 2,000,000,000 windows; give at most 100,000"),
         ("windows = 12", f"windows = 1{ZEROS}", r"windows of \[coordinate\] is 10{10,30}\.\.\.0+; give a number"),
-        ("to = 180", f"to = 1{ZEROS}", r"to of \[coordinate\] is 10{10,30}\.\.\.0+; give a number"),
-        ("timestep = 0.5", f"timestep = 1{ZEROS}", r"timestep of \[sampling\] is 10.*; give a number"),
         ("timestep = 0.5", f"timestep.{'.'.join('a' * 3000)} = 0.5", r"timestep of \[sampling\] is .*give a number"),
     ],
 )
@@ -217,37 +197,17 @@ def nothing(state):
     return 0.0, np.zeros((6, 3))
 
 
-class Touches:
-    """Touches a file when its pickle is read."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return Path.touch, (self.path,)
-
-
 def test_a_system_of_an_input_runs_no_code(folder):
     """A PythonForce is code, which OpenMM runs while it reads the file."""
     system = openmm.System()
-    for mass in molecule("CH3OH").get_masses():
-        system.addParticle(mass)
     system.addForce(openmm.PythonForce(nothing))
-    code = pickle.dumps(Touches(folder / "ran")).hex()
-    xml, changed = re.subn('function="[0-9a-f]*"', f'function="{code}"', openmm.XmlSerializer.serialize(system))
-    assert changed == 1
-    (folder / "system.xml").write_text(xml)
+    (folder / "system.xml").write_text(openmm.XmlSerializer.serialize(system))
     text = INPUT.replace(FORCES, 'system = "system.xml"\n').replace('[held]\nconstrain = "hbonds"\n', "")
     with pytest.raises(InputError, match=r"system\.xml has a PythonForce in it, whose code would run"):
         read(folder, text)
-    assert not (folder / "ran").exists()
 
 
 def test_no_file_to_read(folder):
-    for wrong, said in (
-        (folder, "is no TOML that can be read: .*directory"),
-        (None, "give a path"),
-        (folder / "nothing.toml", "No such file"),
-    ):
+    for wrong, said in ((folder, "is no TOML that can be read: .*directory"), (None, "give a path")):
         with pytest.raises(InputError, match=said):
             read_input(wrong)

@@ -20,7 +20,7 @@ from tests.systems.rows_in_cells import MASSES as CHAIN_MASSES
 NONE = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
 STEP = 0.01
 #: Families that only Python computes, and atoms that move by themselves.
-PYTHON = {name for name in CASES if name.startswith(("Custom", "ImplicitSurface"))}
+PYTHON = {name for name in CASES if name.startswith("Custom")}
 MOVED = {"FixedAtoms moving"}
 
 

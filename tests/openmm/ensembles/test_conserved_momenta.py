@@ -10,7 +10,7 @@ from collective_cases import bond
 from ensemble_runs import run, tied
 from openmm_systems import dumbbell, field, masses_of, particles, started
 
-from kcons.constraints import Cylinder, Ellipsoid, Formula, Sphere
+from kcons.constraints import Ellipsoid, Formula, Sphere
 from kcons.openmm import CollectiveRows, Isokinetic, NoseHoover, NoseHooverMiddle, ProjectedIntegrator, Row, hold
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -59,7 +59,7 @@ def between_two(system, x):
 
 
 SPHERE = Sphere(FOUR, [0, 0, 0], 0.6)
-CYLINDER = Cylinder(FOUR, [0.1, 0, 0], [0, 0, 1.0], 0.5)
+CYLINDER = Ellipsoid(FOUR, [0.1, 0, 0], [0.5, 0.5, np.inf])
 FLAT = Ellipsoid(FOUR, [0, 0, 0], [0.6, 0.6, 0.4])
 BALL = Formula("x1**2+y1**2+z1**2-0.36", FOUR)
 LOPSIDED = "30*(x-0.1)^2+40*y^2+20*(z+0.3)^2+9*x*y*z"

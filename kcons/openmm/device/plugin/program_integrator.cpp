@@ -1,19 +1,24 @@
 #include "program_integrator.h"
 #include "openmm/Context.h"
 #include "openmm/Platform.h"
-#include "openmm/System.h"
 #include "openmm/serialization/SerializationNode.h"
 #include "openmm/serialization/SerializationProxy.h"
 #include <cmath>
-#include <cstring>
 #include <sstream>
 using namespace OpenMM;
 using namespace std;
 
 namespace kcons {
 
+// Python's part in the making: fills steps for an integrator, an OpenMM::Integrator*; returns 0 where it cannot.
+typedef int (*Planner)(Steps* steps, const void* integrator, const char* description, const char* platform, int groups);
 static Planner planner = nullptr;
 static thread_local string failure;   // what Python or a C function has to say
+
+map<string, Maker>& makers() {
+    static map<string, Maker> known;
+    return known;
+}
 
 // -- the integrator, as OpenMM wants it -----------------------------------------------------------------
 
@@ -25,15 +30,20 @@ void ProgramIntegrator::initialize(ContextImpl& c) {
     // The base class tells the Context when the integrator goes first.
     owner = &c.getOwner();
     context = &c;
-    handle = c.getPlatform().createKernel(StepKernel::Name(), c);
-    handle.getAs<StepKernel>().begin(c, tied);
+    steps.reset(makers().at(c.getPlatform().getName())(c, tied));
     middleKinetic = -1;
     shared.bound = 1;
 }
-Plan ProgramIntegrator::made() const {
+void ProgramIntegrator::cleanup() {
+    steps.reset();
+    shared.bound = shared.planned = 0;
+}
+Steps& ProgramIntegrator::prepared() const {
+    if (steps == nullptr) throw OpenMMException("This Integrator is not bound to a context!");
+    if (shared.planned) return *steps;
     const System& system = context->getSystem();
-    Plan plan;
-    auto& given = plan.given;
+    auto& given = steps->given;
+    given.clear();
     for (int k = 0; k < system.getNumParticles(); k++) given["masses"].push_back(system.getParticleMass(k));
     for (int k = 0; k < system.getNumConstraints(); k++) {
         int i, j; double length;
@@ -47,53 +57,50 @@ Plan ProgramIntegrator::made() const {
     for (auto& edge : box) given["box"].insert(given["box"].end(), &edge[0], &edge[0]+3);
     given["time"] = {context->getTime()};
     string platform = context->getPlatform().getName();
-    if (!planner(&plan, static_cast<const Integrator*>(this), description.c_str(), platform.c_str(), getIntegrationForceGroups()))
+    if (!planner(steps.get(), static_cast<const Integrator*>(this), description.c_str(), platform.c_str(), getIntegrationForceGroups()))
         throw OpenMMException(failure);
-    return plan;
+    steps->prepare(*context);
+    shared.planned = 1;
+    return *steps;
 }
-void ProgramIntegrator::cleanup() { handle = Kernel(); shared.bound = shared.planned = 0; }
-vector<string> ProgramIntegrator::getKernelNames() { return {StepKernel::Name()}; }
-StepKernel& ProgramIntegrator::kernel() const {
-    if (context == nullptr) throw OpenMMException("This Integrator is not bound to a context!");
-    StepKernel& k = handle.getAs<StepKernel>();
-    if (!shared.planned) { k.build(*context, made()); shared.planned = 1; }
-    return k;
-}
-void ProgramIntegrator::step(int steps) {
-    StepKernel& k = kernel();
+void ProgramIntegrator::step(int count) {
+    Steps& s = prepared();
     fill_n(shared.told, 7, 0);
     try {
-        k.execute(*context, *this, steps);
+        s.execute(*context, *this, shared, count);
     } catch (...) {
         middleKinetic = -1;
-        k.valid = false;
-        if (k.read("failure")[0] == 0) throw;
-        k.lookBack();                              // it came of a failure, which is told
+        s.valid = false;
+        if (s.read("failure")[0] == 0) throw;
+        s.launch("look");                      // it came of a failure, which is told
     }
     shared.moved = 0;                          // by barostats, which keep to the constraints
-    vector<double> told = k.read("looked");    // the only wait of a call
+    vector<double> told = s.read("looked");    // the only wait of a call
     copy(told.begin(), told.end(), shared.told);
     if (told[2] != 0) {
-        k.write("failure", {0, 0, 0});
-        k.valid = false;
+        s.write("failure", {0, 0, 0});
+        s.valid = false;
         throw OpenMMException("kcons: row "+to_string((int) told[4])+" could not be solved at step "+to_string((int) told[3]));
     }
-    middleKinetic = shared.noisy && steps > 0 ? told[1]/2 : -1;
+    middleKinetic = shared.noisy && count > 0 ? told[1]/2 : -1;
     endKinetic = told[6]/2;
 }
 void ProgramIntegrator::stateChanged(State::DataType changed) {
-    if (context == nullptr) return;
-    if (changed != State::Velocities) handle.getAs<StepKernel>().valid = false;
+    if (steps == nullptr) return;
+    if (changed != State::Velocities) steps->valid = false;
     if (changed == State::Positions || changed == State::Velocities) shared.moved = 1;
 }
 double ProgramIntegrator::computeKineticEnergy() {
-    if (middleKinetic < 0) return handle.getAs<StepKernel>().kineticEnergy();
-    kernel().lookBack();
-    double now = kernel().read("looked")[6]/2;
-    return fabs(now-endKinetic) <= 1e-7*endKinetic ? middleKinetic : now;
+    if (middleKinetic >= 0) {
+        steps->launch("look");
+        if (fabs(steps->read("looked")[6]/2-endKinetic) <= 1e-7*endKinetic) return middleKinetic;
+    }
+    vector<Vec3> v;
+    double sum = 0;
+    context->getVelocities(v);
+    for (size_t k = 0; k < v.size(); k++) sum += context->getSystem().getParticleMass(k)*v[k].dot(v[k]);
+    return sum/2;
 }
-vector<double> ProgramIntegrator::read(const string& name) const { return kernel().read(name); }
-void ProgramIntegrator::write(const string& name, const vector<double>& values) { kernel().write(name, values); }
 
 // -- what belongs to a state ------------------------------------------------------------------------------
 
@@ -101,38 +108,36 @@ string ProgramIntegrator::saved() const {
     ostringstream text;
     text.precision(17);
     text << middleKinetic << ' ' << endKinetic;
-    for (auto& array : kernel().plan.arrays) if (array.saved) {
-        text << ' ' << array.values.size();
-        for (double value : read(array.name)) text << ' ' << value;
+    for (auto& array : prepared().arrays) if (array.saved) {
+        text << ' ' << array.name << ' ' << array.values.size();
+        for (double value : steps->read(array.name)) text << ' ' << value;
     }
     return text.str();
 }
 void ProgramIntegrator::restore(const string& text, bool exactly) {
     istringstream words(text);
-    vector<double> all;
-    for (double value; words >> value;) all.push_back(value);
     map<string, vector<double>> found;
-    size_t next = 2;
-    bool known = all.size() >= next;
-    for (auto& array : kernel().plan.arrays) if (array.saved && known) {
-        double size = next < all.size() ? all[next++] : -1;
-        bool same = size == array.values.size();
-        known = size >= 0 && next+size <= all.size() && (same || !(exactly || array.name == "memory"));
-        if (known && same) found[array.name].assign(&all[next], &all[next]+array.values.size());
-        if (known) next += (size_t) size;
+    double middle, end, value;
+    words >> middle >> end;
+    string name;
+    for (long size; words >> name >> size;)
+        while (size-- > 0 && words >> value) found[name].push_back(value);
+    bool known = words.eof();
+    for (auto& array : prepared().arrays) if (array.saved && found[array.name].size() != array.values.size()) {
+        known = known && !exactly && array.name != "memory";
+        found.erase(array.name);
     }
-    if (!known || next != all.size())
+    if (!known)
         throw OpenMMException("kcons: this state belongs to other steps or rows; OpenMM has taken over its positions and velocities, and the rest of it is left out");
-    for (auto& each : found) write(each.first, each.second);
-    middleKinetic = all[0]; endKinetic = all[1];
+    for (auto& array : steps->arrays) if (found.count(array.name)) steps->write(array.name, found[array.name]);
+    middleKinetic = middle; endKinetic = end;
 }
-void ProgramIntegrator::createCheckpoint(ostream& out) const { out << saved() << '\n'; }
 void ProgramIntegrator::loadCheckpoint(istream& in) {
     string text;
     getline(in, text);
     // Where constraints were added, `Context::reinitialize` brings what belongs to fewer rows.
     restore(text, false);
-    kernel().valid = false;
+    steps->valid = false;
 }
 void ProgramIntegrator::serializeParameters(SerializationNode& node) const {
     node.setIntProperty("version", 1).setStringProperty("state", saved());
@@ -162,26 +167,26 @@ public:
         return static_cast<Integrator*>(i);
     }
 };
+static const bool registered = (SerializationProxy::registerProxy(typeid(ProgramIntegrator), new Proxy()), true);
 
 // -- steps on all platforms -------------------------------------------------------------------------------
 
-void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int steps) {
+void Steps::execute(ContextImpl& c, const Integrator& integrator, const Shared& shared, int steps) {
     numbers.dt = integrator.getStepSize();
     numbers.tolerance = integrator.getConstraintTolerance();
     const Vec3 before[] = {numbers.box[0], numbers.box[1], numbers.box[2]};
     c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
     for (int k = 0; k < 3; k++) if (numbers.box[k] != before[k]) valid = false;
-    const Shared& shared = integrator.shared;
     bool ended = true;                         // whether velocities are those of the end of a step
     for (int k = 0; k < steps; k++) {
         if (c.updateContextState()) {          // barostats have moved positions
             valid = false;
             c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
         }
-        if (!valid || (plan.slots == 1 && c.getLastForceGroups() != plan.parts[0].back().groups)) {
+        if (!valid || (slots == 1 && c.getLastForceGroups() != parts[0].back().groups)) {
             positionsMoved();
-            vector<bool> known(plan.slots);
-            for (int part : {0, 1}) for (auto& action : plan.parts[part])
+            vector<bool> known(slots);
+            for (int part : {0, 1}) for (auto& action : parts[part])
                 if (action.kernel.empty() && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
         }
         run(c, shared, ended ? 0 : 1);
@@ -192,37 +197,32 @@ void StepKernel::execute(ContextImpl& c, ProgramIntegrator& integrator, int step
         if (ended) run(c, shared, 2);
         if (recorded) launch("record");
     }
-    lookBack();
+    launch("look");
 }
-void StepKernel::run(ContextImpl& c, const Shared& shared, int part) {
+void Steps::run(ContextImpl& c, const Shared& shared, int part) {
     numbers.time = c.getTime()-shared.origin;
     numbers.step = (int) c.getStepCount();
     bool moved = false;
-    for (auto& action : plan.parts[part]) {
-        if (!action.kernel.empty()) { launch(action.kernel); moved = true; }
-        else {
-            // Atoms may take new places only where no forces are kept that are still needed.
-            if (moved) { c.computeVirtualSites(); positionsMoved(); }
-            moved = false;
-            evaluate(c, action);
-        }
+    for (auto& action : parts[part]) {
+        if (!action.kernel.empty()) launch(action.kernel);
+        // Atoms may take new places only where no forces are kept that are still needed.
+        else if (moved) { c.computeVirtualSites(); positionsMoved(); }
+        moved = !action.kernel.empty();
+        if (!moved) evaluate(c, action);
     }
 }
-void StepKernel::evaluate(ContextImpl& c, const Action& action) {
+void Steps::evaluate(ContextImpl& c, const Action& action) {
     c.calcForcesAndEnergy(true, false, action.groups);
-    if (plan.slots > 1) keepForces(action.slot);
+    if (slots > 1) keepForces(action.slot);
     valid = true;
 }
-const Array& StepKernel::declared(const string& name, long size) const {
-    for (auto& array : plan.arrays) if (array.name == name) {
-        if (size >= 0 && size != (long) array.values.size())
-            throw OpenMMException("kcons: '"+name+"' has "+to_string(array.values.size())+" values, not "+to_string(size));
-        return array;
+const Array& Steps::declared(const string& name, long size) const {
+    for (auto& array : arrays) if (array.name == name) {
+        if (size < 0 || size == (long) array.values.size()) return array;
+        throw OpenMMException("kcons: '"+name+"' has "+to_string(array.values.size())+" values, not "+to_string(size));
     }
     throw OpenMMException("kcons: no array is called '"+name+"'");
 }
-
-static const bool registered = (SerializationProxy::registerProxy(typeid(ProgramIntegrator), new Proxy()), true);
 
 }
 
@@ -245,27 +245,28 @@ Shared* kcons_shared(void* integrator) { return &own(integrator).shared; }
 // The values of an array, until the next is read; null where that fails.
 const double* kcons_read(void* integrator, const char* name, int* n) try {
     static thread_local vector<double> values;
-    values = own(integrator).read(name);
+    values = own(integrator).prepared().read(name);
     *n = values.size();
     return values.data();
 } catch (exception& e) { failure = e.what(); return nullptr; }
 int kcons_write(void* integrator, const char* name, const double* values, int n) try {
-    own(integrator).write(name, vector<double>(values, values+n));
+    own(integrator).prepared().write(name, vector<double>(values, values+n));
     return n;
 } catch (exception& e) { failure = e.what(); return -1; }
-// What a Plan was given for a Context, by name.
-const double* kcons_plan_given(Plan* plan, const char* name, int* n) {
-    *n = plan->given[name].size();
-    return plan->given[name].data();
+const double* kcons_given(Steps* steps, const char* name, int* n) {
+    *n = steps->given[name].size();
+    return steps->given[name].data();
 }
-void kcons_plan_source(Plan* plan, const char* source, const char* library, int items, int workGroup, int slots) {
-    plan->source = source; plan->library = library;
-    plan->items = items; plan->workGroup = workGroup; plan->slots = slots;
+void kcons_source(Steps* steps, const char* source, const char* library, int items, int workGroup, int slots) {
+    steps->arrays.clear();
+    for (auto& part : steps->parts) part.clear();
+    steps->source = source; steps->library = library;
+    steps->items = items; steps->workGroup = workGroup; steps->slots = slots;
 }
-void kcons_plan_array(Plan* plan, const char* name, int whole, int saved, const double* values, int n) {
-    plan->arrays.push_back({name, whole != 0, saved != 0, vector<double>(values, values+n)});
+void kcons_array(Steps* steps, const char* name, int whole, int saved, const double* values, int n) {
+    steps->arrays.push_back({name, whole != 0, saved != 0, vector<double>(values, values+n)});
 }
-void kcons_plan_action(Plan* plan, int part, const char* kernel, int groups, int slot) {
-    plan->parts[part].push_back({kernel, groups, slot});
+void kcons_action(Steps* steps, int part, const char* kernel, int groups, int slot) {
+    steps->parts[part].push_back({kernel, groups, slot});
 }
 }
