@@ -6,9 +6,9 @@ the built-in that fits (`ValueError`, `RuntimeError`, ...), and carries its data
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from difflib import get_close_matches
-from importlib.util import find_spec
 from typing import Any
 
 __all__ = [
@@ -35,24 +35,26 @@ __all__ = [
 
 
 class KconsError(Exception):
-    """Root of all errors raised by kcons."""
+    """Root of all errors raised by kcons; what they know besides the message are attributes, given by name."""
+
+    atoms: tuple[int, ...] = ()  #: Atoms concerned, if any.
+    step: int | None = None  #: Step number, where a stepper knows it.
+
+    def __init__(self, message: str, **known: Any) -> None:
+        super().__init__(message)
+        for name, value in known.items():
+            getattr(type(self), name)  # of an attribute that the kind does not have, an error
+            setattr(self, name, tuple(map(int, value)) if name in ("atoms", "rows") else value)
 
 
 class InputError(KconsError, ValueError):
-    """An argument has the wrong shape, a NaN or infinity, a bad mass, index or cell.
+    """An argument has the wrong shape, a NaN or infinity, a bad mass, index or cell."""
 
-    Attributes
-    ----------
-    item : str
-        The argument or array that is wrong, without the name of what takes it: of ``"Sphere: center"`` the center.
-    atoms : tuple of int
-        The atoms concerned, if any.
-    """
+    #: The argument or array that is wrong, without the name of what takes it: of ``"Sphere: center"`` the center.
+    item: str = ""
 
-    def __init__(self, message: str, *, item: str = "", atoms: Iterable[int] = ()) -> None:
-        super().__init__(message)
-        self.item = item.rpartition(": ")[2]
-        self.atoms = tuple(int(a) for a in atoms)
+    def __init__(self, message: str, *, item: str = "", **known: Any) -> None:
+        super().__init__(message, item=item.rpartition(": ")[2], **known)
 
 
 class UnreadableError(InputError):
@@ -64,20 +66,9 @@ class OccupiedError(InputError):
 
 
 class ConstraintError(KconsError, ValueError):
-    """A constraint cannot be held as it is written.
+    """A constraint cannot be held as it is written."""
 
-    Attributes
-    ----------
-    rows : tuple of int
-        Row numbers concerned.
-    atoms : tuple of int
-        The atoms concerned.
-    """
-
-    def __init__(self, message: str, *, rows: Iterable[int] = (), atoms: Iterable[int] = ()) -> None:
-        super().__init__(message)
-        self.rows = tuple(int(r) for r in rows)
-        self.atoms = tuple(int(a) for a in atoms)
+    rows: tuple[int, ...] = ()  #: Row numbers concerned.
 
 
 class ContradictionError(ConstraintError):
@@ -93,115 +84,35 @@ class OverdeterminedError(ConstraintError):
 
 
 class BudgetError(ConstraintError):
-    """A prescribed production of entropy cannot be met from the start of a run.
+    """A prescribed production of entropy cannot be met from the start of a run."""
 
-    Attributes
-    ----------
-    budget : float
-        What was asked for, T(s_eq - s_0).
-    consistent : float
-        What the start allows.
-    time : float
-        When the prescription would fail; infinite if it would never end at equilibrium.
-    """
-
-    def __init__(self, message: str, *, budget: float, consistent: float, time: float) -> None:
-        super().__init__(message)
-        self.budget = budget
-        self.consistent = consistent
-        self.time = time
+    budget: float = math.nan  #: What was asked for, T(s_eq - s_0).
+    consistent: float = math.nan  #: What the start allows.
+    time: float = math.nan  #: When the prescription would fail; infinite if it would never end at equilibrium.
 
 
 class ImageError(KconsError, ValueError):
-    """Atoms of a row have drifted so far apart that its periodic image is about to become another one.
-
-    Attributes
-    ----------
-    atoms : tuple of int
-        The two atoms whose distance has reached half the cell.
-    step : int or None
-        Step number, where a stepper knows it.
-    """
-
-    def __init__(self, message: str, *, atoms: Iterable[int] = ()) -> None:
-        super().__init__(message)
-        self.atoms = tuple(int(a) for a in atoms)
-        self.step: int | None = None
+    """Two atoms of a row have drifted half the cell apart, so that its image is about to become another one."""
 
 
 class CertificateError(KconsError, RuntimeError):
-    """Results that a solver took for right are off the constraints as the set defines them.
+    """Results that a solver took for right are off the constraints as the set defines them."""
 
-    Attributes
-    ----------
-    row : int
-        The worst row.
-    residual : float
-        |sigma| or |A v - c| of that row, in its natural units.
-    atoms : tuple of int
-    step : int or None
-        Step number, where known.
-    state : object
-        The last state that was certified, where a run knows one; None otherwise.
-    """
-
-    def __init__(
-        self, message: str, *, row: int = -1, residual: float = float("nan"), atoms: Iterable[int] = ()
-    ) -> None:
-        super().__init__(message)
-        self.row = row
-        self.residual = residual
-        self.atoms = tuple(int(a) for a in atoms)
-        self.step: int | None = None
-        self.state: object = None
+    row: int = -1  #: The worst row.
+    residual: float = math.nan  #: abs(sigma) or abs(A v - c) of that row, in its natural units.
+    state: object = None  #: The last state that was certified, where a run knows one; None otherwise.
 
 
 class ConvergenceError(KconsError, RuntimeError):
-    """No solution was found within the tolerance; positions and velocities are unchanged.
+    """No solution was found within the tolerance; positions and velocities are unchanged."""
 
-    Attributes
-    ----------
-    residual, tolerance : float
-        Last residual (relative to the scale of the row) and what was asked for.
-    iterations : int
-        Newton iterations done.
-    row : int
-        The worst row, -1 if unknown.
-    atoms : tuple of int
-        Its atoms.
-    cluster : int
-        Number of the cluster, -1 if unknown.
-    copy : int
-        Number of the system in a batch, -1 elsewhere.
-    step : int or None
-        Step number, where a stepper knows it.
-    positions : ndarray, shape (n_atoms, 3), or None
-        The best place found by a search for a minimum.
-    """
-
-    positions: Any = None
-    copy: int = -1
-
-    def __init__(
-        self,
-        message: str,
-        *,
-        residual: float = float("nan"),
-        tolerance: float = float("nan"),
-        iterations: int = 0,
-        row: int = -1,
-        atoms: Iterable[int] = (),
-        cluster: int = -1,
-        step: int | None = None,
-    ) -> None:
-        super().__init__(message)
-        self.residual = residual
-        self.tolerance = tolerance
-        self.iterations = iterations
-        self.row = row
-        self.atoms = tuple(int(a) for a in atoms)
-        self.cluster = cluster
-        self.step = step
+    residual: float = math.nan  #: Last residual (relative to the scale of the row).
+    tolerance: float = math.nan  #: What was asked for.
+    iterations: int = 0  #: Newton iterations done.
+    row: int = -1  #: The worst row, -1 if unknown.
+    cluster: int = -1  #: Number of its cluster, -1 if unknown.
+    copy: int = -1  #: Number of the system in a batch, -1 elsewhere.
+    positions: Any = None  #: The best place found by a search for a minimum, shape (n_atoms, 3), or None.
 
 
 class InfeasibleError(ConvergenceError):
@@ -213,23 +124,10 @@ class ReversibilityError(ConvergenceError):
 
 
 class NonFiniteError(KconsError, FloatingPointError):
-    """A NaN or infinity appeared during a run.
+    """A NaN or infinity appeared during a run."""
 
-    Attributes
-    ----------
-    item : str
-        'force', 'position', 'velocity' or 'energy'.
-    atom : int
-        First atom concerned, -1 if it is no per-atom quantity.
-    step : int or None
-        Step number, where known.
-    """
-
-    def __init__(self, message: str, *, item: str = "", atom: int = -1, step: int | None = None) -> None:
-        super().__init__(message)
-        self.item = item
-        self.atom = atom
-        self.step = step
+    item: str = ""  #: 'force', 'position', 'velocity' or 'energy'.
+    atom: int = -1  #: First atom concerned, -1 if it is no per-atom quantity.
 
 
 class CalculatorError(KconsError, RuntimeError):
@@ -265,18 +163,13 @@ EXTRAS = {
 
 def with_extra(error: ModuleNotFoundError, what: str) -> ModuleNotFoundError:
     """The same error; where a package of `EXTRAS` is missing, or too old, one that says how `what` gets it."""
-    package, _, inside = (error.name or "").partition(".")
+    package = (error.name or "").partition(".")[0]
     if package not in EXTRAS or isinstance(error, MissingPackageError):
         return error
-    if inside and find_spec(package) is not None:
-        return MissingPackageError(
-            f"{what} needs {error.name}, which the {package} that is installed does not have: "
-            f"python -m pip install --upgrade 'kcons[{EXTRAS[package]}]'",
-            name=error.name,
-        )
     return MissingPackageError(
-        f"{what} needs {package}, which is not installed: python -m pip install 'kcons[{EXTRAS[package]}]'",
-        name=package,
+        f"{what} needs {error.name}, which is not installed, or not in this version: "
+        f"python -m pip install --upgrade 'kcons[{EXTRAS[package]}]'",
+        name=error.name,
     )
 
 

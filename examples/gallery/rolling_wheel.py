@@ -10,10 +10,12 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Distance, Plane, Rolling
+from kcons.constraints import Distance, Plane, VelocityFormula
 
 folder, frames = (sys.argv[1:] + [".", "80"][len(sys.argv) - 1 :])[:2]
 slope, radius = np.radians(10), 1.0
+#: The speed of the hub along the slope, less R times the rate at which a point of the rim turns about it.
+ROLLS = "c*vx1 - s*vz1 - R*((z2 - z1)*(vx2 - vx1) - (x2 - x1)*(vz2 - vz1))/((x2 - x1)**2 + (z2 - z1)**2)"
 along, up = np.array([np.cos(slope), 0, -np.sin(slope)]), np.array([np.sin(slope), 0, np.cos(slope)])
 # A hub, and three masses on the rim.
 turns = np.radians([0, 120, 240])[:, None]
@@ -24,7 +26,7 @@ held = [
     Plane([0], up, radius),  # the hub keeps its height above the slope
     Plane([0, 1, 2, 3], [0.0, 1.0, 0.0], 0.0),
     Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]),
-    Rolling([0], [1], radius, along, up),
+    VelocityFormula(ROLLS, [0, 1], {"R": radius, "s": np.sin(slope), "c": np.cos(slope)}),
 ]
 motion = Motion(ConstraintSet(held, x, masses), x)
 weight = masses[:, None] * np.array([0.0, 0.0, -9.81])

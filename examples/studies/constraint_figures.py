@@ -13,10 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Constraint, Custom, Distance, Formula, KnifeEdge, Plane, Rolling, VelocityFormula
+from kcons.constraints import Constraint, Custom, Distance, Formula, Plane, VelocityFormula
 
 #: Of positions and time.
 Force = Callable[[np.ndarray, float], np.ndarray]
+#: Of the hub of a wheel of radius 1 and a point that turns with it, on the ground z = 0.
+ROLLS = "vx1 - ((z2 - z1)*(vx2 - vx1) - (x2 - x1)*(vz2 - vz1))/((x2 - x1)**2 + (z2 - z1)**2)"
 
 
 def moved(
@@ -34,7 +36,8 @@ def skate(steps: int) -> tuple[np.ndarray, np.ndarray]:
     pull, rate, half = 1.0, 2.0, 0.1
     x = np.array([[-half, 0.0, 0.0], [half, 0.0, 0.0]])
     v = np.array([[pull / rate, -rate * half, 0.0], [pull / rate, rate * half, 0.0]])
-    held = [Distance([[0, 1]]), Plane([0, 1], [0.0, 0.0, 1.0], 0.0), KnifeEdge([0], [1], [0.0, 0.0, 1.0], contact=0.5)]
+    blade = VelocityFormula("(x2 - x1)*(vy1 + vy2) - (y2 - y1)*(vx1 + vx2)", [0, 1])
+    held = [Distance([[0, 1]]), Plane([0, 1], [0.0, 0.0, 1.0], 0.0), blade]
     _, t, path = moved(held, x, v, lambda x, t: np.tile([0.0, -pull, 0.0], (2, 1)), 6.0, steps)
     turned = rate * t
     exact = np.stack([turned + np.sin(turned) * np.cos(turned), np.sin(turned) ** 2], axis=1) * pull / (2 * rate**2)
@@ -52,7 +55,7 @@ def wheel(steps: int) -> tuple[np.ndarray, np.ndarray]:
         Plane([0], up, 1.0),
         Plane([0, 1, 2, 3], [0.0, 1.0, 0.0], 0.0),
         Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]),
-        Rolling([0], [1], 1.0, along, up),
+        VelocityFormula(ROLLS, [0, 1]),
     ]
     _, t, path = moved(held, x, v, None, 12.0, steps)
     return path[:, 1, [0, 2]], np.stack([t + np.sin(t), 1 + np.cos(t)], axis=1)
@@ -93,8 +96,8 @@ def picture(folder: Path, steps: int = 800) -> None:
     figure = plt.figure(figsize=(5.2, 8.0), layout="constrained")
     grid = figure.add_gridspec(4, 2, height_ratios=[0.7, 0.9, 2.2, 2.0])
     beside = {
-        "KnifeEdge: a skate on a slope": (grid[0, :], "y", skate(steps)),
-        "Rolling: a point on the rim": (grid[1, :], "z", wheel(steps)),
+        "VelocityFormula: a skate on a slope": (grid[0, :], "y", skate(steps)),
+        "VelocityFormula: a point on the rim of a wheel": (grid[1, :], "z", wheel(steps)),
         "VelocityFormula:\n80° from the radius": (grid[2, 0], "y", spiral(steps)),
     }
     for title, (place, up, (found, exact)) in beside.items():
@@ -124,7 +127,7 @@ def picture(folder: Path, steps: int = 800) -> None:
 
 
 def main(arguments: list[str], steps: int = 100) -> None:
-    for name, motion in (("KnifeEdge", skate), ("Rolling", wheel), ("VelocityFormula", spiral)):
+    for name, motion in (("Skate", skate), ("Wheel", wheel), ("Spiral", spiral)):
         found, exact = motion(steps)
         print(f"{name:<15} {np.abs(found - exact).max():.1e} from the closed form")
     for name, held in (("Custom", rounded_cube), ("Formula", wave)):

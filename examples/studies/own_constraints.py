@@ -29,9 +29,7 @@ from kcons.constraints import (
     Distance,
     Ellipsoid,
     Formula,
-    KnifeEdge,
     Plane,
-    Rolling,
     Sphere,
     Torus,
     VelocityFormula,
@@ -72,15 +70,17 @@ UP, ALONG = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 TURNS = np.radians([[0], [120], [240]])
 BLADE = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
 WHEEL = UP + np.vstack([0 * UP, np.cos(TURNS) * UP + np.sin(TURNS) * ALONG])
+SKATE = "(x2 - x1)*(vy1 + vy2) - (y2 - y1)*(vx1 + vx2)"
+ROLLS = "vx1 - ((z2 - z1)*(vx2 - vx1) - (x2 - x1)*(vz2 - vz1))/((x2 - x1)**2 + (z2 - z1)**2)"
 SPIRAL = "x1*vy1 - y1*vx1 - 0.2*(x1*vx1 + y1*vy1)"
 #: Name -> where the atoms of a body that glides or rolls are, and what holds them.
 BODIES: dict[str, tuple[np.ndarray, list[Constraint]]] = {
-    "KnifeEdge, 4 rows": (BLADE, [Distance([[0, 1]]), Plane([0, 1], UP), KnifeEdge(0, 1, UP, contact=0.5)]),
-    "Rolling, 11 rows": (
+    "Skate, 4 rows": (BLADE, [Distance([[0, 1]]), Plane([0, 1], UP), VelocityFormula(SKATE, [0, 1])]),
+    "Wheel, 11 rows": (
         WHEEL,
         [
             *(Plane([0], UP), Plane([0, 1, 2, 3], [0.0, 1.0, 0.0])),
-            *(Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]), Rolling(0, 1, 1.0, ALONG)),
+            *(Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]), VelocityFormula(ROLLS, [0, 1])),
         ],
     ),
     "VelocityFormula": (ALONG[None], [Plane([0], UP), VelocityFormula(SPIRAL, 0)]),

@@ -31,7 +31,7 @@ def examine() -> tuple[dict[str, dict[str, str]], list[str]]:
     import numba
 
     from kcons.comparison.machine import kernels_cached, processor, simd_width
-    from kcons.constraints.compilation import announcer, has_a_file, njit
+    from kcons.constraints.compilation import has_a_file, njit
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     found = {
@@ -52,8 +52,6 @@ def examine() -> tuple[dict[str, dict[str, str]], list[str]]:
         },
     }
     wrong = []
-    if not announcer.keeps:
-        wrong.append("every process compiles its kernels anew; set NUMBA_CACHE_DIR to a folder that can keep them")
     if find_spec("openmm"):
         found |= {"OpenMM platforms": _platforms(), "steps on the device": _device()}
         if "runs" not in found["OpenMM platforms"].values():
@@ -113,21 +111,21 @@ NEED_OPENMM = ("alanine", "device")
 
 
 def _warmup(chosen: argparse.Namespace) -> int:
-    from kcons.constraints.compilation import all_compiled, announcer
+    from kcons.constraints import compilation
 
     wanted = [name for given in chosen.what for name in names(given)] or USUAL
     for name in wanted:
         if name != "device":
             check_name(argparse.Namespace(system=name, size=None))
-    announcer.announced = announcer.keeps  # it is said here
+    announcer, compilation.SMALL = compilation.announcer, 0
+    announcer.announced = True  # it is said here
     for name in wanted:
         print(name, end=": ", flush=True)
         if name in NEED_OPENMM and find_spec("openmm") is None:
             print("OpenMM is not installed")
             continue
         begun, before = time.perf_counter(), announcer.seconds
-        with all_compiled():
-            refused = _compiled_device() if name == "device" else _system(name)
+        refused = _compiled_device() if name == "device" else _system(name)
         compiled, whole = announcer.seconds - before, time.perf_counter() - begun
         print(refused or (f"compiled in {compiled:.1f} s" if compiled else f"is there ({whole:.1f} s)"))
     return 0

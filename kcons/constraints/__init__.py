@@ -6,7 +6,6 @@
 - `surface`: fixed atoms, linear relations, surfaces
 - `internal`: distances and their differences, angles, dihedrals, groups
 - `functions`: functions of one's own
-- `velocity`: rows linear in the velocities
 - `periodic`: which images rows mean
 - `constraint_set`: many constraints as one sigma, A and b, in their cell
 - `projection`: the theory, dense and literal
@@ -17,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from kcons.constraints import internal, surface, velocity
+from kcons.constraints import internal, surface
 from kcons.constraints.constraint import FAMILIES, Constraint, RowKind
 from kcons.constraints.functions import custom, formula
 from kcons.constraints.functions.custom import *
@@ -25,12 +24,10 @@ from kcons.constraints.functions.formula import *
 from kcons.constraints.internal import *
 from kcons.constraints.surface import *
 from kcons.constraints.target import MovingTarget
-from kcons.constraints.velocity import *
 from kcons.errors import InputError
 
 __all__ = ["Constraint", "MovingTarget", "RowKind", "from_dict"]
-__all__ += internal.__all__ + surface.__all__ + velocity.__all__
-__all__ += custom.__all__ + formula.__all__
+__all__ += internal.__all__ + surface.__all__ + custom.__all__ + formula.__all__
 
 
 def from_dict(data: Mapping[str, Any]) -> Constraint:

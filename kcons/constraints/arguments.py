@@ -1,10 +1,6 @@
-"""What comes from outside: arrays as the compiled kernels need them, and numbers with units.
+"""What comes from outside: arrays as the compiled kernels need them, and what arguments may be.
 
-Constraints take plain numbers in any consistent units. They also take Quantities of OpenMM, which become numbers in its
-units, nm, ps, dalton, radian. A constraint remembers that (`Constraint.units`), and only what knows the positions to be
-in nm, `kcons.openmm`, accepts it then. Angles are the same in all units, and need not be remembered. OpenMM is not
-imported: a Quantity is known by what it can do.
-
+Numbers are plain, in any consistent units; those with units are refused.
 Arrays of the engine that are lent to functions of the user can be read and not changed.
 """
 
@@ -13,7 +9,6 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-import sys
 from collections.abc import Callable
 from types import NoneType, UnionType
 from typing import (
@@ -128,7 +123,7 @@ def atom_array(atoms: Any, name: str, item: str = "atoms") -> NDArray[Any]:
         return np.atleast_1d(np.asarray(atoms))
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
-            f"{name}: rows name different numbers of atoms, {_value_text(atoms)}; give rows of one width", item=item
+            f"{name}: rows name different numbers of atoms, {atoms!r:.80}; give rows of one width", item=item
         ) from None
 
 
@@ -137,29 +132,30 @@ def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") ->
 
     Of rows of one atom a list of atoms is taken, too.
     """
+
+    def wrong(words: str, row: Any = ()) -> InputError:
+        return InputError(f"{name}: {words}", item=item, atoms=row)
+
     table = atom_array(atoms, name, item)
     if table.size == 0:
         return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
     if not np.issubdtype(table.dtype, np.integer):
         remedy = "; of a mask give np.flatnonzero(mask)" if table.dtype == bool else ""
-        raise InputError(f"{name}: atom indices must be integers, not {table.dtype}{remedy}", item=item)
+        raise wrong(f"atom indices must be integers, not {table.dtype}{remedy}")
     table = table.astype(np.int64)
     table = table.reshape(-1, 1) if width == 1 and table.ndim < 2 else np.atleast_2d(table)
     if table.ndim != 2:
-        raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item=item)
+        raise wrong(f"atoms must have shape (n_rows, width), not {table.shape}")
     if width is not None and table.shape[1] != width:
-        wanted = f"a row has {width} atom{'s' if width > 1 else ''}"
-        raise InputError(f"{name}: {wanted}, but atoms has shape {np.shape(atoms)}", item=item)
+        raise wrong(f"a row has {width} atom{'s' if width > 1 else ''}, but atoms has shape {np.shape(atoms)}")
     if table.min() < 0:
         row, slot = np.argwhere(table < 0)[0]
-        words = f"row {row} has the negative atom index {table[row, slot]}; count atoms from 0"
-        raise InputError(f"{name}: {words}", item=item, atoms=table[row])
+        raise wrong(f"row {row} has the negative atom index {table[row, slot]}; count atoms from 0", table[row])
     ordered = np.sort(table, axis=1)
     repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
     if repeated.any():
         row = int(np.argmax(repeated))
-        words = f"row {row} names an atom twice: {tuple(table[row].tolist())}"
-        raise InputError(f"{name}: {words}", item=item, atoms=table[row])
+        raise wrong(f"row {row} names an atom twice: {tuple(table[row].tolist())}", table[row])
     return table
 
 
@@ -202,7 +198,7 @@ def finite_number(value: Any, item: str) -> float:
     refuse_units(value, item)
     found = _float(value)
     if not math.isfinite(found):
-        raise InputError(f"{item} is {_value_text(value)}; give a finite number", item=item)
+        raise InputError(f"{item} is {value!r:.80}; give a finite number", item=item)
     return found
 
 
@@ -212,14 +208,6 @@ def _float(value: Any) -> float:
         return math.nan if np.ndim(value) or isinstance(value, str | bytes) else float(value)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # of objects that say they are arrays, the last
         return math.nan
-
-
-def _value_text(value: Any) -> str:
-    """A value in a message: of whole numbers of thousands of digits, which Python does not print, the kind."""
-    try:
-        return f"{value!r:.80}"
-    except ValueError:
-        return f"of the type {type(value).__name__}"
 
 
 def all_positive(values: ArrayLike, item: str) -> FloatArray:
@@ -250,7 +238,7 @@ def whole_number(value: Any, item: str, least: int = 1, most: int | None = None)
         good = False
     if not good or isinstance(value, bool):
         bounds = f", {least} or more" if most is None else f" from {least} to {most}"
-        raise InputError(f"{item} is {_value_text(value)}; give a whole number{bounds}", item=item)
+        raise InputError(f"{item} is {value!r:.80}; give a whole number{bounds}", item=item)
     return found
 
 
@@ -258,7 +246,7 @@ def _number_rule(good: Callable[[float], bool], words: str) -> Callable[[Any, st
     def rule(value: Any, item: str) -> float:
         number = math.nan if isinstance(value, bool) else _float(value)
         if not (math.isfinite(number) and good(number)):
-            raise InputError(f"{item} is {_value_text(value)}; give a {words}", item=item)
+            raise InputError(f"{item} is {value!r:.80}; give a {words}", item=item)
         return number
 
     return rule
@@ -274,7 +262,7 @@ def one_of(value: Any, item: str, words: tuple[Any, ...]) -> Any:
     """`value`, which has to be one of `words`."""
     if not isinstance(value, str | int | np.integer) or value not in words:
         *others, last = map(repr, words)
-        raise InputError(f"{item} is {_value_text(value)}; choose {', '.join(others)} or {last}", item=item)
+        raise InputError(f"{item} is {value!r:.80}; choose {', '.join(others)} or {last}", item=item)
     return value
 
 
@@ -292,7 +280,7 @@ Rng: TypeAlias = int | np.random.Generator | None
 def seed_from(rng: Rng, bits: int = 64) -> int:
     """A seed: a whole number of so many bits itself, or one drawn from a generator."""
     if isinstance(rng, int | np.integer) and not 0 <= rng < 2**bits:
-        raise InputError(f"rng is {_value_text(rng)}; give a whole number from 0 to {2**bits - 1}", item="rng")
+        raise InputError(f"rng is {rng!r:.80}; give a whole number from 0 to {2**bits - 1}", item="rng")
     drawn = generator_of(rng)
     return int(rng if isinstance(rng, int | np.integer) else drawn.integers(2 ** (bits - 1)))
 
@@ -303,37 +291,20 @@ def generator_of(rng: Rng) -> np.random.Generator:
         return np.random.default_rng(rng)
     except (TypeError, ValueError):
         raise InputError(
-            f"rng is {_value_text(rng)}; give a whole number from 0 on, a numpy.random.Generator, or None", item="rng"
+            f"rng is {rng!r:.80}; give a whole number from 0 on, a numpy.random.Generator, or None", item="rng"
         ) from None
 
 
 # -- numbers with units -----------------------------------------------------------------------------
 
-#: What numbers made of Quantities are in.
-MD_UNITS = "nm, ps, dalton, radian"
 _PLAIN = (int, float, bool, str, type(None))
 
 
-class Kind(NamedTuple):
-    """What a number is: in words, for messages, and its base dimensions by their names in OpenMM; None for any."""
+#: What the numbers are that a family holds its rows at, where that is known.
+LENGTH, ANGLE = "length", "angle"
 
-    words: str
-    exponents: tuple[tuple[str, int], ...] | None
-
-
-ANY = Kind("any unit", None)
-NUMBER = Kind("a plain number", ())
-LENGTH = Kind("nm", (("length", 1),))
-SPEED = Kind("nm/ps", (("length", 1), ("time", -1)))
-ANGLE = Kind("radian", (("angle", 1),))
-#: A vector of which only the direction counts.
-DIRECTION = Kind("one unit for all components", None)
-#: What the family of a constraint says of its targets.
-HELD = Kind("what is held", None)
-
-Lengths: TypeAlias = Annotated[ArrayLike, LENGTH]
-PositiveLengths: TypeAlias = Annotated[ArrayLike, LENGTH, all_positive]
-Directions: TypeAlias = Annotated[ArrayLike, DIRECTION, unit]
+PositiveLengths: TypeAlias = Annotated[ArrayLike, all_positive]
+Directions: TypeAlias = Annotated[ArrayLike, unit]
 
 
 def has_units(values: Any) -> bool:
@@ -347,29 +318,6 @@ def has_units(values: Any) -> bool:
     return not callable(values) and (hasattr(values, "unit") or hasattr(values, "units"))
 
 
-def without_units(values: Any, item: str, kind: Kind) -> tuple[Any, bool]:
-    """Numbers of Quantities, or of nested lists of them, in nm, ps, dalton, radian; anything else stays as it is.
-
-    The second result is whether they would be others in other units. `kind` is what they must be; plain numbers may be
-    angles, too.
-    """
-    if not has_units(values):
-        return values, False
-    if type(values) is np.ndarray:
-        values = values.tolist()
-    if isinstance(values, list | tuple):
-        parts = [without_units(part, item, kind) for part in values]
-        return [plain for plain, _ in parts], any(remembered for _, remembered in parts)
-    system = getattr(sys.modules.get(type(values).__module__.rpartition(".")[0]), "md_unit_system", None)
-    if system is None or not hasattr(values, "value_in_unit_system"):
-        raise InputError(f"{item} has units that are not those of openmm.unit; give plain numbers", item=item)
-    found = {dimension.name: power for dimension, power in values.unit.iter_base_dimensions() if power}
-    if kind.exponents is not None and found != dict(kind.exponents) and (found or kind is not ANGLE):
-        raise InputError(f"{item} is {quantity_text(values)}; give it in {kind.words}", item=item)
-    matters = kind is not DIRECTION and not set(found) <= {"angle"}
-    return values.value_in_unit_system(system), matters
-
-
 def quantity_text(values: Any) -> str:
     """The beginning of a Quantity in words, on one line."""
     words = " ".join(str(values).split())
@@ -377,11 +325,10 @@ def quantity_text(values: Any) -> str:
 
 
 def refuse_units(values: Any, item: str) -> None:
-    """Refuse Quantities where nobody knows which units the other numbers are in."""
+    """Refuse Quantities: which units the other numbers are in is known to the user alone."""
     if has_units(values):
-        unknown = "and only kcons.openmm knows what the other numbers are in"
-        remedy = "give plain numbers in the units of the run (nm and ps in OpenMM)"
-        raise InputError(f"{item} has units ({quantity_text(values)}), {unknown}; {remedy}", item=item)
+        remedy = "give plain numbers in the units of the run (nm, ps and radian in OpenMM)"
+        raise InputError(f"{item} has units ({quantity_text(values)}); {remedy}", item=item)
 
 
 # -- arguments looked at by what their annotations say ----------------------------------------------
@@ -393,9 +340,7 @@ Rule: TypeAlias = Callable[[Any, str], Any]
 class Rules(NamedTuple):
     """What an annotation says of an argument."""
 
-    kind: Kind
-    #: Whether None may pass, unseen.
-    optional: bool
+    optional: bool  #: Whether None may pass, unseen.
     rules: tuple[Rule, ...]
 
 
@@ -412,38 +357,28 @@ def rules_of(function: Callable[..., Any]) -> dict[str, Rules]:
         told: tuple[Any, ...] = () if said is None else said.__metadata__
         if len(given) == 1 and get_origin(given[0]) is Literal:
             told = (functools.partial(one_of, words=get_args(given[0])),)
-        kind = next((part for part in told if isinstance(part, Kind)), NUMBER)
-        found[name] = Rules(kind, optional, tuple(part for part in told if callable(part)))
+        found[name] = Rules(optional, tuple(part for part in told if callable(part)))
     return found
 
 
-def checked(function: Callable[P, R], *, units: bool = False) -> Callable[P, R]:
+def checked(function: Callable[P, R], *, named: bool = False) -> Callable[P, R]:
     """Let the annotations of a function look at its arguments.
 
-    A rule ``rule(value, item)`` of ``Annotated[type, kind, rule, ...]`` gives what is taken in place of the value, or
-    raises `InputError`; what is no word of a ``Literal`` is refused.
-
-    With `units`, for an ``__init__``, the `Kind` says what units Quantities may have: they become plain numbers, and
-    the object remembers that in its `units`.
+    A rule ``rule(value, item)`` of ``Annotated[type, rule, ...]`` gives what is taken in place of the value, or raises
+    `InputError`; what is no word of a ``Literal`` is refused. With `named`, for an ``__init__``, items are called after
+    the class too.
     """
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def checked_function(*args: P.args, **kwargs: P.kwargs) -> R:
-        bound, rules, remembered = signature.bind(*args, **kwargs), rules_of(function), False
-        self: Any = args[0] if units else None
-        for name, value in list(bound.arguments.items())[units:]:
-            kind, optional, asked = rules[name]
-            item = f"{type(self).__name__}: {name}" if units else name
-            if units:
-                value, matters = without_units(value, item, self.held if kind is HELD else kind)
-                remembered |= matters
+        bound, rules = signature.bind(*args, **kwargs), rules_of(function)
+        of = f"{type(args[0]).__name__}: " if named else ""
+        for name, value in bound.arguments.items():
+            optional, asked = rules[name]
             for rule in () if optional and value is None else asked:
-                value = rule(value, item)
+                value = rule(value, f"{of}{name}")
             bound.arguments[name] = value
-        result = function(*bound.args, **bound.kwargs)
-        if remembered:
-            self.units = MD_UNITS
-        return result
+        return function(*bound.args, **bound.kwargs)
 
     return checked_function

@@ -5,7 +5,7 @@ processor has results of its own in the same folder, and several processes may u
 which `njit` and `cfunc` of this module make:
 
 - Where the folder of kcons cannot be written to, Numba keeps results below the user's home; where that cannot be
-  written to either, in ``$NUMBA_CACHE_DIR``. Without any of these they are kept for one process only.
+  written to either, in ``$NUMBA_CACHE_DIR``, which has to be set then.
 - The machine code of a kernel is the same in the process that compiles it and in those that load it (`_Library`), so
   results are the same to the last bit.
 - A damaged file counts as missing.
@@ -13,12 +13,11 @@ which `njit` and `cfunc` of this module make:
   its own file only, and what was kept would call others as they were.
 - Compiling that has taken a second is announced, once in a process, by the logger ``kcons`` (on standard error unless
   logging is set up otherwise).
-- Garbage is not collected while a kernel is compiled, which takes a fifth of the time.
+- Garbage is not collected while a kernel is compiled: that takes a fifth of the time.
 """
 
 from __future__ import annotations
 
-import atexit
 import functools
 import gc
 import hashlib
@@ -26,35 +25,24 @@ import inspect
 import logging
 import os
 import re
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from kcons.errors import UnsupportedError
+import llvmlite.binding as llvm
+import numba
+from numba.core import caching, codegen, compiler
+from numba.core.ccallback import CFunc
+from numba.core.sigutils import normalize_signature
 
-# Nothing that Numba imports is garbage. To look for it among all that it makes takes a tenth of the time.
-_collected = gc.isenabled()
-gc.disable()
-try:
-    import llvmlite.binding as llvm
-    import numba
-    from numba.core import caching, codegen, compiler
-    from numba.core.ccallback import CFunc
-    from numba.core.sigutils import normalize_signature
-finally:
-    if _collected:
-        gc.enable()
+from kcons.errors import UnsupportedError
 
 logger = logging.getLogger("kcons")
 
-#: Elements of work that Python does in less time than a compiled kernel takes to be loaded from disk.
+#: Elements of work that Python does in less time than a compiled kernel takes to be loaded from disk; 0 leaves none.
 SMALL = 3000
-#: Elements in all after which Python has spent a second or so.
-MUCH = 100_000
 #: Seconds of compiling, in all, before it is announced.
 PATIENCE = 1.0
 
@@ -67,31 +55,13 @@ if _config.DISABLE_JIT:
     )
 
 
-_in_python: dict[Any, int] = {}
-_all_compiled = False
-
-
-@contextmanager
-def all_compiled() -> Iterator[None]:
-    """Leave nothing to Python, however small: where kernels are compiled for larger systems."""
-    global _all_compiled
-    before, _all_compiled = _all_compiled, True
-    try:
-        yield
-    finally:
-        _all_compiled = before
-
-
 def plain_if_small(kernel: Any, size: int) -> Any:
     """A compiled function, or for little work the Python function that it was made of, unless it is loaded already.
 
-    For work on integers, about `size` elements: both return the same. Where little comes again and again, it is loaded
-    after all. What it calls must be `numba.extending.register_jitable`, which is compiled as a part of the caller only.
+    For work on integers, about `size` elements: both return the same. What it calls must be
+    `numba.extending.register_jitable`, which is compiled as a part of the caller only.
     """
-    if _all_compiled or size > SMALL or kernel.signatures or _in_python.get(kernel, 0) > MUCH:
-        return kernel
-    _in_python[kernel] = _in_python.get(kernel, 0) + size
-    return kernel.py_func
+    return kernel if size > SMALL or kernel.signatures else kernel.py_func
 
 
 _PACKAGE = Path(__file__).parents[1]
@@ -252,25 +222,14 @@ def has_a_file(function: Any) -> bool:
     return Path(function.__code__.co_filename).is_file()
 
 
-def keep_somewhere() -> bool:
-    """See that kernels can be kept; whether other processes find them."""
-    try:
-        njit(cache=True)(has_a_file)  # which is not compiled
-    except RuntimeError:  # no locator: neither folder can be written to
-        _config.CACHE_DIR = tempfile.mkdtemp(prefix="kcons-")
-        atexit.register(shutil.rmtree, _config.CACHE_DIR, ignore_errors=True)
-        return False
-    return True
-
-
 class Announcer:
     """Says that kernels of kcons are compiled, the first that begins after `PATIENCE`; keeps garbage meanwhile.
 
-    `seconds` is what compiling has taken in this process, and `keeps` whether other processes find what is compiled.
+    `seconds` is what compiling has taken in this process.
     """
 
-    def __init__(self, keeps: bool = True) -> None:
-        self.seconds, self.announced, self.keeps = 0.0, False, keeps
+    def __init__(self) -> None:
+        self.seconds, self.announced = 0.0, False
         self._depth, self._begun = 0, 0.0  # Numba compiles in one thread at a time
 
     @property
@@ -288,7 +247,11 @@ class Announcer:
         self._depth += 1
         try:
             if not self.announced and self.seconds + now - self._begun >= PATIENCE:
-                self._announce()
+                self.announced = True
+                logger.warning(
+                    "kcons compiles the kernels that this system needs. This happens once on a machine and takes some "
+                    "seconds; `kcons warmup` does it beforehand"
+                )
             yield
         finally:
             self._depth -= 1
@@ -297,20 +260,17 @@ class Announcer:
             if not self._depth:
                 self.seconds += time.perf_counter() - self._begun
 
-    def _announce(self) -> None:
-        self.announced = True
-        said = (
-            "This happens once on a machine and takes some seconds; `kcons warmup` does it beforehand"
-            if self.keeps
-            else "It can keep them nowhere: neither its own folder nor your home can be written to. "
-            "Set NUMBA_CACHE_DIR to a folder of yours, and it happens only once"
-        )
-        logger.warning(f"kcons compiles the kernels that this system needs. {said}")
-
 
 def clock() -> float:
     """`time.perf_counter` without the time that compiling has taken: what is timed by it is what later runs take."""
     return time.perf_counter() - announcer.seconds
 
 
-announcer = Announcer(keep_somewhere())
+announcer = Announcer()
+try:
+    njit(cache=True)(has_a_file)  # which is not compiled
+except RuntimeError:  # no locator
+    raise UnsupportedError(
+        "compiled kernels can be kept nowhere: neither the folder of kcons nor your home can be written to; set "
+        "NUMBA_CACHE_DIR to a folder of yours"
+    ) from None

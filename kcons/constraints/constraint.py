@@ -26,15 +26,12 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import (
     ANGLE,
     LENGTH,
-    MD_UNITS,
-    Kind,
     as_float_array,
     atom_table,
     check_range,
     checked,
     read_only,
     rules_of,
-    without_units,
 )
 from kcons.constraints.compilation import has_a_file, njit
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target, nearest_image
@@ -85,8 +82,7 @@ class Constraint:
 
     Notes
     -----
-    Quantities of OpenMM are taken wherever numbers are, see `kcons.constraints.arguments`. Arrays of constraints cannot
-    be changed: engines have copies of what stands in them. Make another constraint instead.
+    Arrays of constraints cannot be changed: engines have copies of what stands in them. Make another one instead.
     """
 
     family: ClassVar[str]
@@ -94,7 +90,8 @@ class Constraint:
     #: Puts the value into ``out[0]`` and the gradient behind it, x, y, z by atom: of the positions ``r[0]``, ``r[1]``,
     #: ... of the atoms of one row in the same order, of its `parameters`, ``p[0]``, ... and of the time t. Written with
     #: + - * /, ``numpy.sqrt`` and the like, so that it can be compiled, and takes arrays of many rows and complex
-    #: numbers (``numpy.arctan2`` of real parts: only gradients are differentiated). See `VelocityRows` for those.
+    #: numbers (``numpy.arctan2`` of real parts: only gradients are differentiated). Of a velocity row a . v, of the
+    #: middle of a flight and, behind it, its way d: the value a . d, and its change by the end, a + (da/dr)^T d/2.
     row: Any = None
     #: Puts dq/dt into ``out[0]``, where `row` depends on t: of the same.
     rate: Any = None
@@ -110,8 +107,8 @@ class Constraint:
     shared: ClassVar[tuple[str, ...]] = ()
     #: Python functions the object holds; with one of them it cannot be written to a file.
     functions: ClassVar[tuple[str, ...]] = ()
-    #: What targets are, for Quantities.
-    held: ClassVar[Kind] = LENGTH
+    #: What targets are: `LENGTH`, `ANGLE`, or nothing for something else.
+    held: ClassVar[str] = LENGTH
     #: What the target is called where it has to be above zero; nothing where it may be any number.
     positive: str = ""
     #: Where the gradient is undefined, and the remedy, with {atom} for the first one.
@@ -123,8 +120,6 @@ class Constraint:
     #: Whether rows fix all of an atom, three rows each, so that it moves as with infinite mass.
     fixes_atoms: ClassVar[bool] = False
 
-    #: What its numbers are in, where it was given Quantities; None for any consistent units.
-    units: str | None = None
     #: True if q depends on differences of positions alone, so that minimum images apply.
     translation_invariant: bool = False
     #: Pairs of slots between which vectors count, those from a slot to a later one that nothing before led to; shape
@@ -149,7 +144,7 @@ class Constraint:
         if cls.row is not None and cls.kind is RowKind.INTERPRETED:
             cls.kind = RowKind.FUNCTION if cls.holonomic else RowKind.VELOCITY
         if "__init__" in cls.__dict__ or cls.__init__ is Constraint.__init__:
-            cls.__init__ = checked(cls.__init__, units=True)  # type: ignore[method-assign]
+            cls.__init__ = checked(cls.__init__, named=True)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None, **data: ArrayLike) -> None:
         self.atoms: IntArray = read_only(atom_table(atoms, type(self).__name__, self.row_width))
@@ -355,8 +350,7 @@ class Constraint:
 
     def with_target(self, target: Target) -> Self:
         """Copy of this object held at another target."""
-        plain, matters = without_units(target, f"{self.family}: target", self.held)
-        return self.changed(target=as_target(plain, self.n_rows), units=MD_UNITS if matters else self.units)
+        return self.changed(target=as_target(target, self.n_rows))
 
     def rescaled(self, factor: float) -> Self:
         """The same where every length is a number larger by `factor` (0.1 from angstrom to nm).
@@ -368,15 +362,14 @@ class Constraint:
         """
         if factor == 1.0:
             return self
-        powers = {"unknown": 1} if self.held.exponents is None else dict(self.held.exponents)
-        if self.moving or not powers.keys() <= {"length", "angle"}:
+        if self.moving or not self.held:
             what = "a target that moves" if self.moving else "own functions or velocities"
             raise UnsupportedError(
                 f"{self!r} has {what}; it cannot be converted to another unit. Write it in the units of the host"
             )
         own = {name: getattr(self, name) * factor**power for name, power in self.length_powers.items()}
-        if self.target is not None:
-            own["target"] = np.asarray(self.target) * factor ** powers.get("length", 0)
+        if self.target is not None and self.held is LENGTH:
+            own["target"] = np.asarray(self.target) * factor
         copy = self.changed(**{name: read_only(array) for name, array in own.items()})
         copy._settle()
         return copy
@@ -427,8 +420,6 @@ class Constraint:
         target = None if self.target is None else self.target.tolist()  # type: ignore[union-attr]
         data = {name: getattr(self, name).tolist() for name in self.per_row}
         data |= {name: getattr(self, name) for name in self.shared}
-        if self.units is not None:
-            data["units"] = self.units
         return {"family": self.family, "atoms": self.atoms.tolist(), "target": target, **data}
 
     @classmethod
@@ -441,13 +432,10 @@ class Constraint:
             If an entry is missing or unknown.
         """
         names = {"family", "atoms", "target", *cls.per_row, *cls.shared}
-        found = set(data) - {"units"}
-        if cls.functions or found != names:
-            wrong = sorted(names.symmetric_difference(found)) or list(cls.functions)
+        if cls.functions or set(data) != names:
+            wrong = sorted(names.symmetric_difference(data)) or list(cls.functions)
             raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
-        item = cls._rebuilt(data)
-        item.units = data.get("units")
-        return item
+        return cls._rebuilt(data)
 
     @classmethod
     def _rebuilt(cls, data: Mapping[str, Any]) -> Self:

@@ -1,14 +1,12 @@
 """The theory, literally and densely: the oracle against which the fast engine is tested.
 
 Pure functions on arrays. A is s x 3N, one row a constraint; M is diagonal, given as the masses of the
-N atoms (or as 3N numbers), or full, in coordinates of any number n in place of 3N: symmetric, positive definite.
-f and accelerations have length 3N or shape (N, 3) and come back as they came.
+N atoms (or as 3N numbers). f and accelerations have length 3N or shape (N, 3) and come back as they came.
 Generalized inverses, solvability and the projectors P take complex matrices too (appendix A.1); a mechanical system
 is real, and its functions refuse complex numbers.
 Cost grows as the cube of 3N: for systems of up to some hundred atoms, and for reading.
 
-The mass-weighted matrix is B = A M^-1/2; of a full M, its Cholesky factor L, M = L L^T, stands for M^1/2, and
-B = A L^-T. Written with B+ in place of an inverse, every formula holds
+The mass-weighted matrix is B = A M^-1/2. Written with B+ in place of an inverse, every formula holds
 for dependent rows as well: z, the acceleration and M_par+ are unique, and lambda is the one of least norm.
 
 Equation numbers are those of the notes (G. R. Kneller, Systemes dynamiques); 'corrected' marks the
@@ -66,11 +64,6 @@ def pseudo_inverse(matrix: ArrayLike) -> PseudoInverse:
     A = _matrix(matrix)
     V = row_space(A)
     return PseudoInverse(V @ _left_inverse(A @ V), V.shape[1])
-
-
-def rank(matrix: ArrayLike) -> int:
-    """Number of independent rows, by the singular values of the row-normalized matrix."""
-    return int(row_space(matrix).shape[1])
 
 
 def row_space(matrix: ArrayLike) -> NumberArray:
@@ -190,10 +183,10 @@ def parallel_projector(matrix: ArrayLike) -> NumberArray:
 
 def project_velocities(matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0) -> FloatArray:
     """The nearest velocities, in the mass metric, with A v = c: v - M^-1/2 B+ (A v - c)."""
-    A, L, B = _weighted(matrix, masses)
+    A, root, B = _weighted(matrix, masses)
     flat = _vector(v, A.shape[1], "v", real=True)
     off = A @ flat - np.broadcast_to(_numbers(c, "c", real=True), (len(A),))
-    return np.asarray(flat - _back(L, pseudo_inverse(B).matrix @ off)).reshape(np.shape(v))
+    return np.asarray(flat - pseudo_inverse(B).matrix @ off / root).reshape(np.shape(v))
 
 
 # -- dynamics (eqs. 99-107) -------------------------------------------------------------------------
@@ -204,8 +197,8 @@ def constrained_inverse(matrix: ArrayLike, masses: ArrayLike) -> FloatArray:
 
     With independent rows it is M^-1 - M^-1 A^T (A M^-1 A^T)^-1 A M^-1.
     """
-    _, L, B = _weighted(matrix, masses)
-    return _back(L, _back(L, parallel_projector(B)).T)
+    _, root, B = _weighted(matrix, masses)
+    return np.asarray(parallel_projector(B) / root / root[:, None])
 
 
 def multipliers(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> FloatArray:
@@ -213,15 +206,15 @@ def multipliers(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike
 
     (A M^-1 A^T) lambda = b - A M^-1 f, solved by (B B^T)+ = (B+)^T B+.
     """
-    A, L, B = _weighted(matrix, masses)
+    A, root, B = _weighted(matrix, masses)
     B_plus = pseudo_inverse(B).matrix
-    return np.asarray(B_plus.T @ (B_plus @ _lacking(A, L, f, b)))
+    return np.asarray(B_plus.T @ (B_plus @ _lacking(A, root, f, b)))
 
 
 def constraint_force(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """The force z = A^T (A M^-1 A^T)^-1 (b - A M^-1 f) = M^1/2 B+ (b - A M^-1 f), as f (notes eq. 104)."""
-    A, L, B = _weighted(matrix, masses)
-    z = L @ (pseudo_inverse(B).matrix @ _lacking(A, L, f, b))
+    A, root, B = _weighted(matrix, masses)
+    z = root * (pseudo_inverse(B).matrix @ _lacking(A, root, f, b))
     return np.asarray(z).reshape(np.shape(f))
 
 
@@ -230,9 +223,9 @@ def acceleration(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLik
 
     The notes lost the M^-1 in front of A^T. In mass-weighted form the second term is M^-1/2 B+ b.
     """
-    A, L, B = _weighted(matrix, masses)
+    A, root, B = _weighted(matrix, masses)
     free = constrained_inverse(A, masses) @ _vector(f, A.shape[1], "f", real=True)
-    driven = _back(L, pseudo_inverse(B).matrix @ _vector(b, len(A), "b", real=True))
+    driven = pseudo_inverse(B).matrix @ _vector(b, len(A), "b", real=True) / root
     return np.asarray(free + driven).reshape(np.shape(f))
 
 
@@ -241,25 +234,17 @@ def bott_duffin(matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike
 
     M (a_par + A+ b) = f + z with a_par in V_par and z in V_perp. Both parts sit in one vector u, with
     a_par = P_par u and z = P_perp u, and (M P_par - P_perp) u = f - M A+ b has one solution. No mass-weighted
-    matrix and no multipliers: an independent way to the same answer. A full M may be singular here, as long as it is
-    positive on V_par.
+    matrix and no multipliers: an independent way to the same answer.
     """
     A = _matrix(matrix, real=True)
     n = A.shape[1]
-    M = _mass_matrix(masses, n)
+    m = _masses(masses, n)
     P_perp = perpendicular_projector(A)
     P_par = np.eye(n) - P_perp
     a_perp = pseudo_inverse(A).matrix @ _vector(b, len(A), "b", real=True)
     # P_perp u may be given any unit: one of mass keeps both parts of the matrix of one size.
-    diagonal = np.diagonal(M)[np.diagonal(M) > 0]
-    unit = float(np.exp(np.mean(np.log(diagonal)))) if len(diagonal) else 1.0
-    try:
-        u = np.linalg.solve(M @ P_par - unit * P_perp, _vector(f, n, "f", real=True) - M @ a_perp)
-    except np.linalg.LinAlgError:
-        raise InputError(
-            "the mass matrix is singular along what the constraints leave free; give a mass to what moves there",
-            item="masses",
-        ) from None
+    unit = float(np.exp(np.mean(np.log(m))))
+    u = np.linalg.solve(m[:, None] * P_par - unit * P_perp, _vector(f, n, "f", real=True) - m * a_perp)
     shape = np.shape(f)
     return BottDuffinSolution((P_par @ u + a_perp).reshape(shape), unit * (P_perp @ u).reshape(shape))
 
@@ -270,8 +255,9 @@ def gauss_function(trial: ArrayLike, masses: ArrayLike, f: ArrayLike) -> float:
     Among all accelerations with A a = b the true one has the least; there it is (1/2) z^T M^-1 z.
     """
     a = _numbers(trial, "trial", real=True).ravel()
-    off = _mass_matrix(masses, len(a)) @ a - _vector(f, len(a), "f", real=True)
-    return float(0.5 * off @ scipy.linalg.cho_solve((_root(masses, len(a)), True), off))
+    m = _masses(masses, len(a))
+    off = m * a - _vector(f, len(a), "f", real=True)
+    return float(0.5 * np.sum(off * off / m))
 
 
 # -- pieces -----------------------------------------------------------------------------------------
@@ -309,49 +295,28 @@ def _vector(values: ArrayLike, length: int, item: str, real: bool = False) -> Nu
     return array
 
 
-def _root(masses: ArrayLike, n: int) -> FloatArray:
-    """M^1/2, of a full M its Cholesky factor L, M = L L^T, shape (n, n)."""
-    try:
-        return np.asarray(np.linalg.cholesky(_mass_matrix(masses, n)), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        raise InputError(
-            "the mass matrix is not positive definite; where it is so along what the constraints leave free, "
-            "use bott_duffin, or kcons.models.Multibody",
-            item="masses",
-        ) from None
-
-
-def _back(L: FloatArray, x: FloatArray) -> FloatArray:
-    """L^-T x."""
-    return np.asarray(scipy.linalg.solve_triangular(L, x, lower=True, trans="T"))
-
-
 def _weighted(matrix: ArrayLike, masses: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A, M^1/2 = L, and B = A L^-T."""
+    """A, the diagonal of M^1/2, and B = A M^-1/2."""
     A = _matrix(matrix, real=True)
-    L = _root(masses, A.shape[1])
-    return A, L, np.asarray(scipy.linalg.solve_triangular(L, A.T, lower=True).T)
+    root = np.sqrt(_masses(masses, A.shape[1]))
+    return A, root, A / root
 
 
-def _lacking(A: FloatArray, L: FloatArray, f: ArrayLike, b: ArrayLike) -> FloatArray:
+def _lacking(A: FloatArray, root: FloatArray, f: ArrayLike, b: ArrayLike) -> FloatArray:
     """b - A M^-1 f."""
-    free = scipy.linalg.cho_solve((L, True), _vector(f, A.shape[1], "f", real=True))
+    free = _vector(f, A.shape[1], "f", real=True) / root**2
     return np.asarray(_vector(b, len(A), "b", real=True) - A @ free)
 
 
-def _mass_matrix(masses: ArrayLike, n: int) -> FloatArray:
-    """M, shape (n, n): symmetric, or diagonal of n/3 or n masses (notes eq. 79)."""
-    M = _numbers(masses, "masses", real=True)
-    if M.shape == (n, n) and n > 1:
-        if not np.all(np.isfinite(M)) or np.any(np.abs(M - M.T) > 1e-10 * np.max(np.abs(M))):
-            raise InputError("the mass matrix must be finite and symmetric", item="masses")
-        return M
-    m = np.repeat(M.ravel(), 3) if 3 * M.size == n else M.ravel()
+def _masses(masses: ArrayLike, n: int) -> FloatArray:
+    """The diagonal of M, shape (n,), of n/3 or n masses (notes eq. 79)."""
+    m = _numbers(masses, "masses", real=True).ravel()
+    m = np.repeat(m, 3) if 3 * m.size == n else m
     if len(m) != n:
         raise InputError(f"masses must have {n // 3} or {n} entries, not {len(m)}", item="masses")
     if not np.all(np.isfinite(m) & (m > 0)):
         raise InputError("masses must be positive and finite; hold an atom by three rows instead", item="masses")
-    return np.diag(m)
+    return m
 
 
 def _row_sizes(A: NumberArray) -> FloatArray:

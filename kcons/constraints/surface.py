@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import (
     Directions,
     FloatArray,
-    Lengths,
     PositiveLengths,
     as_float_array,
     atom_array,
@@ -164,7 +163,7 @@ class Sphere(Surface):
     singular = "atom {atom} lies at the center of the sphere: gradient undefined; move the atom"
     center: FloatArray
 
-    def __init__(self, atoms: ArrayLike, center: Lengths, radius: Target = None) -> None:
+    def __init__(self, atoms: ArrayLike, center: ArrayLike, radius: Target = None) -> None:
         super().__init__(atoms, radius, center=center)
 
     @staticmethod
@@ -198,7 +197,7 @@ class Torus(Surface):
     def __init__(
         self,
         atoms: ArrayLike,
-        center: Lengths,
+        center: ArrayLike,
         axis: Directions,
         major_radius: PositiveLengths,
         minor_radius: Target = None,
@@ -247,7 +246,7 @@ class Ellipsoid(Surface):
     def __init__(
         self,
         atoms: ArrayLike,
-        center: Lengths,
+        center: ArrayLike,
         semi_axes: PositiveLengths,
         rotation: ArrayLike | None = None,
         target: Target = 0.0,
@@ -324,7 +323,7 @@ class Line(LinearCombination):
 
     row_width = 1
 
-    def __init__(self, atoms: ArrayLike, point: Lengths | None, direction: Directions) -> None:
+    def __init__(self, atoms: ArrayLike, point: ArrayLike | None, direction: Directions) -> None:
         column = atom_table(atoms, self.family, 1)
         along = _for_each(direction, len(column), "direction")
         # Normal to the line and to the coordinate axis it is farthest from.

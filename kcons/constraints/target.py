@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import HELD, as_float_array, check_call, check_range, positive, read_only
 from kcons.constraints.arguments import FloatArray as FloatArray
+from kcons.constraints.arguments import as_float_array, check_call, check_range, positive, read_only
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -100,7 +100,7 @@ class MovingTarget:
                 )
 
 
-Target: TypeAlias = Annotated[float | ArrayLike | MovingTarget | TimeFunction | None, HELD]
+Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
 
 
 def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:

@@ -57,7 +57,6 @@ from kcons.openmm.integrator.guard import (
 from kcons.openmm.integrator.part import NEAR, Part, Precision, Solver, Violation
 from kcons.openmm.integrator.program import Integrator, Program
 from kcons.openmm.quantities import (
-    accepted,
     cell_of,
     forces_at,
     held_pairs,
@@ -583,7 +582,7 @@ class CarriedConstraints(Part):
         periodic: bool | None = None,
         time: unit.Quantity | float = 0.0,
     ) -> None:
-        given = tuple(accepted((constraints,) if isinstance(constraints, Constraint) else constraints))
+        given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
         if not any(getattr(each, "n_rows", 1) for each in given):  # ConstraintSet says what is none
             raise InputError("there are no rows to hold", item="constraints")
         masses = masses_of(system)

@@ -1,10 +1,10 @@
-"""The boundary to OpenMM: one way in for numbers, one for constraints, and what a Context says of its state."""
+"""The boundary to OpenMM: one way in for numbers, and what a Context says of its state."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import openmm
@@ -113,14 +113,6 @@ def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tu
     fixed = [item.atoms.ravel() for item in given if item.fixes_atoms]
     still = np.setdiff1d(still, np.concatenate([*fixed, np.zeros(0, np.int64)]))
     return (*given, FixedAtoms(still)) if len(still) else given
-
-
-T = TypeVar("T")
-
-
-def accepted(constraints: Iterable[T]) -> list[T]:
-    """Constraints in nm, ps, dalton, radian from here on; other things as is."""
-    return [item.changed(units=None) if isinstance(item, Constraint) else item for item in constraints]
 
 
 # -- the state of a Context, in nm, ps and kJ/mol ---------------------------------------------------

@@ -15,7 +15,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.callback_rows import CarriedConstraints, constraints_about, hold
 from kcons.openmm.integrator.projected import ProjectedIntegrator, picoseconds
-from kcons.openmm.quantities import accepted, positions_of
+from kcons.openmm.quantities import positions_of
 from kcons.steppers import Splitting
 
 
@@ -119,7 +119,7 @@ def _is_surface(item: Constraint) -> bool:
 
 
 def _listed(surfaces: Constraint | Iterable[Constraint]) -> list[Constraint]:
-    given = list(accepted((surfaces,) if isinstance(surfaces, Constraint) else surfaces))
+    given = [surfaces] if isinstance(surfaces, Constraint) else list(surfaces)
     if not given:
         raise InputError("no surface was given", item="surfaces")
     for item in given:

@@ -6,8 +6,9 @@ import torch
 
 from kcons import ConstraintSet, Motion
 from kcons.batched import Batch, gbaoab, rattle
-from kcons.constraints import Angle, CenterDistance, Custom, Distance, FixedAtoms, KnifeEdge
+from kcons.constraints import Angle, CenterDistance, Custom, Distance, FixedAtoms
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from tests.systems.constraint_cases import blade
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.9266272, 0]])
 MASSES = np.array([15.999, 1.008, 1.008])
@@ -130,7 +131,7 @@ def test_rattle_is_that_of_the_engine_and_reversible():
     x0 = np.concatenate([WATER, WATER + 3, [[8.0, 0, 0], [9.0, 0.1, 0], [0.0, 8, 0]]])
     masses = np.concatenate([MASSES, MASSES, [2.0, 3.0, 5.0]])
     pairs = np.concatenate([PAIRS, np.array(PAIRS) + 3, [[6, 7]]])
-    items = [Distance(pairs), KnifeEdge([6], [7], [0.0, 0, 1.0]), FixedAtoms([8])]
+    items = [Distance(pairs), blade([6, 7]), FixedAtoms([8])]
     motion = Motion(ConstraintSet(items, x0, masses), x0)
     batch = Batch(motion, copies=copies)
     x = torch.as_tensor(x0).repeat(copies, 1, 1)

@@ -7,8 +7,8 @@ from torch.utils.checkpoint import checkpoint
 
 from kcons import ConstraintSet, Motion
 from kcons.batched import Batch, clusters, gbaoab, rattle
-from kcons.constraints import Angle, Dihedral, Distance, Formula, KnifeEdge, Plane, Sphere
-from tests.systems.constraint_cases import MASSES, scattered
+from kcons.constraints import Angle, Dihedral, Distance, Formula, Plane, Sphere
+from tests.systems.constraint_cases import MASSES, blade, scattered
 
 #: A tree, a ring with a dihedral, atoms on surfaces, and a blade.
 HELD = {
@@ -16,7 +16,7 @@ HELD = {
     "angles": [Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2]]), Dihedral([[0, 1, 2, 3]])],
     "surfaces": [Sphere(0, [5.0, 0, 0]), Plane([1], [1.0, 2.0, 0.5]), Distance([[0, 1], [1, 2]])],
     "formula": [Formula("sin(x1 - x2) + z1*z2/4", [[0, 1]], target=None), Distance([[1, 2]])],
-    "blade": [Distance([[0, 1]]), KnifeEdge([0], [1], [0.0, 0.1, 1.0], contact=[0.3])],
+    "blade": [Distance([[0, 1]]), blade([0, 1], [0.0, 0.1, 1.0], 0.3)],
 }
 
 

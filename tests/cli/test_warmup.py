@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -60,13 +59,11 @@ def test_what_was_compiled_beforehand_is_there():
     assert json.loads(needed) and set(json.loads(needed)) <= set(json.loads(called))
 
 
-@pytest.mark.parametrize("keeps", [True, False])
-def test_kernels_that_nobody_keeps_are_announced(keeps, monkeypatch, capsys):
-    monkeypatch.setattr(announcer, "announced", False)
-    monkeypatch.setattr(announcer, "keeps", keeps)
-    monkeypatch.setattr(machine, "USUAL", ())
-    assert main.main(["warmup"]) == 0
-    assert announcer.announced == keeps
+@pytest.fixture(autouse=True)
+def small_as_before():
+    before = compilation.SMALL
+    yield
+    compilation.SMALL = before
 
 
 def test_it_says_what_was_compiled(monkeypatch, capsys):
@@ -88,7 +85,6 @@ def test_it_says_what_was_compiled(monkeypatch, capsys):
 def test_a_file_of_ones_own(tmp_path, monkeypatch, capsys):
     """Needs no forces; a name that is none is refused before anything is compiled."""
     monkeypatch.setattr(announcer, "announced", True)
-    monkeypatch.setattr(compilation, "all_compiled", nullcontext)
     (tmp_path / "water.xyz").write_text("3\n\nO 0 0 0\nH 0.9572 0 0\nH -0.2400 0.9266 0\n")
     assert main.main(["warmup", str(tmp_path / "water.xyz")]) == 0
     assert "water.xyz: " in capsys.readouterr().out

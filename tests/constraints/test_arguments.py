@@ -202,7 +202,7 @@ RULES = {
     "a finite number": (finite_number, ["0.5", b"1", [1.0], {}, 1j]),
     "a positive number": (positive, [0, -1.0, True, [1.0, 2.0]]),
 }
-NONE_TAKES = [None, "x", np.nan, np.inf, 10**400, 10**5000, NoArray()]
+NONE_TAKES = [None, "x", np.nan, np.inf, 10**400, NoArray()]
 
 
 @pytest.mark.parametrize("words", RULES)

@@ -10,7 +10,7 @@ import pytest
 from ase import Atoms
 from ase.calculators.lj import LennardJones
 from ase.constraints import FixInternals
-from constraint_cases import APART, MASSES, ORIGIN, TRANSFER, UP, VALUES, bent, scattered, twisted
+from constraint_cases import APART, MASSES, ORIGIN, TRANSFER, UP, VALUES, bent, blade, scattered, twisted
 
 from kcons import ConstraintSet, Motion
 from kcons.ase import constrain, from_ase_constraints
@@ -25,12 +25,10 @@ from kcons.constraints import (
     Ellipsoid,
     FixedAtoms,
     Formula,
-    KnifeEdge,
     Line,
     LinearCombination,
     LinearRelation,
     RadiusOfGyration,
-    Rolling,
     Sphere,
     Torus,
     VelocityFormula,
@@ -284,33 +282,17 @@ def rate(held, x, v, time=0.0):
 
 def test_a_blade_glides_along_itself_and_turns_about_its_contact():
     x = np.array([ORIGIN, [3.0, 4.0, 1.0]])
-    held = ConstraintSet(KnifeEdge(0, 1, [0.0, 0.0, 2.0]), x, np.ones(2))
+    held = ConstraintSet(blade([0, 1]), x, np.ones(2))
     along, sideways = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0])
     # The blade's height does not count.
     for v, expected in (([along, along], 0), ([0 * along, sideways], 0), ([sideways] * 2, 1), ([UP, [0, 0, -2.0]], 0)):
         assert rate(held, x, v) == pytest.approx([expected], abs=1e-15)
     assert held.value(2 * x).tolist() == held.target().tolist() == [0.0]
-    between = ConstraintSet(KnifeEdge(0, 1, UP, contact=0.25), x, np.ones(2))
+    between = ConstraintSet(blade([0, 1], contact=0.25), x, np.ones(2))
     assert rate(between, x, [-sideways, 3 * sideways]) == pytest.approx([0.0], abs=1e-15)
     wrapped, whole = np.array([[9.9, 0.0, 0.0], [0.4, 0.0, 0.0]]), np.array([[-0.1, 0.0, 0.0], [0.4, 0.0, 0.0]])
-    there = ConstraintSet(KnifeEdge(0, 1, UP), wrapped, np.ones(2), cell=[10.0] * 3).jacobian(wrapped)
-    assert np.allclose(there.toarray(), ConstraintSet(KnifeEdge(0, 1, UP), whole, np.ones(2)).jacobian(whole).toarray())
-
-
-@pytest.mark.parametrize("marker", [0.3, 1.5])
-def test_a_wheel_rolls_one_circumference_a_turn(marker):
-    """Hub at speed R psi' along x; the marker at `marker` from the hub turns from z to x."""
-    radius, spin, psi = 1.5, 0.7, 0.9
-    hub = np.array([4.0, 0.0, radius])
-    x = np.array([hub, hub + marker * np.array([np.sin(psi), 0, np.cos(psi)])])
-    turn = marker * spin * np.array([np.cos(psi), 0, -np.sin(psi)])
-    v = np.array([[radius * spin, 0, 0], np.array([radius * spin, 0, 0]) + turn])
-    held = ConstraintSet([Rolling(0, 1, radius, [2.0, 0.0, 0.3]), Distance([0, 1])], x, np.ones(2))
-    assert rate(held, x, v)[0] == pytest.approx(0.0, abs=1e-14)
-    # If the marker is on the rim and at the ground, it is at rest.
-    low = np.array([hub, hub - [0, 0, radius]])
-    assert rate(held, low, [[1.0, 0, 0], ORIGIN])[0] == pytest.approx(0.0, abs=1e-14)
-    assert rate(held, low, [[1.0, 0, 0], [1.0, 0, 0]])[0] == pytest.approx(1.0)
+    there = ConstraintSet(blade([0, 1]), wrapped, np.ones(2), cell=[10.0] * 3).jacobian(wrapped)
+    assert np.allclose(there.toarray(), ConstraintSet(blade([0, 1]), whole, np.ones(2)).jacobian(whole).toarray())
 
 
 def test_driven_speeds_and_coefficients_that_turn():
@@ -355,8 +337,6 @@ SINGULAR = [
     (Ellipsoid(0, COINCIDENT[0], [1.0, 2.0, 3.0]), COINCIDENT, "atom 0 lies at the center of the ellipsoid"),
     (CenterDistance([0, 1], [2, 3]), CROSS, "row 0.*two centers coincide"),
     (RadiusOfGyration([3, 4]), CROSS, "row 0.*all of its atoms coincide"),
-    (KnifeEdge(1, 2, UP), BENDS, r"row 0, KnifeEdge\(1, 2\): the blade is normal to its plane"),
-    (Rolling(1, 2, 1.0, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]), BENDS, "the rim atom lies on the axle"),
     (VelocityFormula("x1*vy1 - y1*vx1", 1), BENDS, "the gradient not zero"),
     (VelocityFormula("vy1/x1", 1), BENDS, "must be finite"),
     (Custom([[0], [2]], lambda r: r[0, 0] ** 2, lambda r: 2 * r * UP[::-1]), CROSS, "row 1, .*the gradient not zero"),

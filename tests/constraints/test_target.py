@@ -29,7 +29,7 @@ HUGE = {
     "LinearRelation": lambda t: held.LinearRelation(0, [1, 2], [0.5, 0.5], [[t, 0, 0]]),
     "FixedAtoms": lambda t: held.FixedAtoms([0], [[t, 0, 0]]),
     "parameter": lambda t: held.Formula("x1 - a", 0, {"a": t}),
-    "velocity": lambda t: held.KnifeEdge(0, 1, [0, 0, 1.0], target=t),
+    "velocity": lambda t: held.VelocityFormula("vx1", 0, target=t),
 }
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from constraint_cases import blade
 from stepper_systems import gravity, system_of
 
-from kcons.constraints import Distance, FixedAtoms, KnifeEdge
+from kcons.constraints import Distance, FixedAtoms
 from kcons.steppers import Geodesic, KahanLi6, Rattle, ReversibilityCheck, State, Suzuki4, System, Yoshida4, run
 
 MASSES = np.array([1.0, 2.0, 0.5])
@@ -61,7 +62,7 @@ def test_a_blade_takes_up_a_kick_from_the_side_whole(seed: int) -> None:
     normal /= np.linalg.norm(normal)
     x = np.array([-0.5 * along, 0.6 * along]) + rng.normal(size=3)
     pull = np.outer([3.5, 1.5], np.cross(normal, along))  # at the contact
-    rows = [Distance([0, 1]), KnifeEdge([0], [1], normal, contact=0.3)]
+    rows = [Distance([0, 1]), blade([0, 1], normal, 0.3)]
     system = system_of(rows, x, rng.uniform(0.3, 3, 2), lambda x, t: pull)
     end = run(system, system.initial_state(x), 0.05, 3)
     assert np.abs(end.positions - x).max() <= 1e-15

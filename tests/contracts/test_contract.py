@@ -83,7 +83,7 @@ def test_steps_are_the_same_in_every_host(host: str, name: str) -> None:
 #: In OpenMM the time goes on where velocities are reversed. A composition goes back as its parts do.
 BACK = [
     *((host, name, "rattle") for host in HOSTS for name in CASES if host != "OpenMM" or not CASES[name]().moving),
-    *((host, name, "suzuki4") for host in HOSTS for name in ("Distance", "Angle", "Ellipsoid", "KnifeEdge")),
+    *((host, name, "suzuki4") for host in HOSTS for name in ("Distance", "Angle", "Ellipsoid", "blade")),
 ]
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from constraint_cases import blade
 
 from kcons import ConstraintSet, Motion
-from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, FixedAtoms, Formula, KnifeEdge, MovingTarget
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, FixedAtoms, Formula, MovingTarget
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError
 from kcons.free_energy import HeldCoordinates
 
@@ -224,4 +225,4 @@ def test_what_no_coordinate_touches_may_be_anything():
     far, still = Distance([[4, 5]]), np.zeros((N, 3))
     still[2] = np.nan
     assert np.isfinite(of_chain(R).sample(CHAIN, still, still).off)
-    assert len(of_chain(far, KnifeEdge(0, 1, (0, 0, 1)), named={"far": far})) == 1
+    assert len(of_chain(far, blade([0, 1]), named={"far": far})) == 1

@@ -12,11 +12,12 @@ from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.lj import LennardJones
 from ase.md.verlet import VelocityVerlet
+from constraint_cases import blade
 from scan_systems import chain, threefold
 
 from kcons import ConstraintSet
 from kcons.ase import Constraints
-from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, FixedAtoms, KnifeEdge, Plane, VelocityFormula
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, FixedAtoms, Plane, VelocityFormula
 from kcons.errors import ConstraintError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.free_energy import (
     AseRecorder,
@@ -80,7 +81,7 @@ SAMPLERS = [
     (lambda: methanol(TURN), "coordinates", "no coordinates are named"),
     (lambda: methanol({"turn": 90}), "turn", "'turn' is 90; give a kcons constraint of one row"),
     (lambda: methanol({"q": Distance([[0, 1], [1, 3]])}), "q", "'q' is .*; give a kcons constraint of one row"),
-    (lambda: methanol({"q": KnifeEdge(0, 1, (0, 0, 1))}), "q", "velocity constraint.*holds no coordinate"),
+    (lambda: methanol({"q": blade([0, 1])}), "q", "velocity constraint.*holds no coordinate"),
     (lambda: AseWindows(molecule("C2H2"), CALCULATOR, {"t": _ENDS}), None, "collinear", SingularGeometryError),
     (lambda: two_particles({"r": Distance([[0, 9]])}), "atoms", "no atom 9; the System has 2 part"),
     (lambda: two_particles({"r": LENGTH}, 0), "topology", "Topology has 0 atoms and the System 2 particle"),
@@ -94,7 +95,7 @@ SAMPLERS = [
 
 RING = [[0, 0.1, 0.2], [1.1, 0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9], [3.1, 0.4, 1.9], [2.2, -0.5, 2.4]]
 X = np.array([*RING, [9, 9.1, 9.2], [10.1, 9, 8.9]])
-R, CENTER, EDGE = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5]), KnifeEdge(6, 7, (0, 0, 1))
+R, CENTER, EDGE = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5]), blade([6, 7])
 SET, STILL = ConstraintSet([R, CENTER, EDGE], X, np.ones(8)), np.zeros((8, 3))
 
 

@@ -7,10 +7,9 @@ from collective_cases import bond, with_variable
 from openmm import unit
 from openmm_systems import dumbbell, particles, started, state_of
 
-from kcons.constraints import Angle, Custom, Distance, FixedAtoms, KnifeEdge, Sphere
+from kcons.constraints import Distance
 from kcons.errors import InputError
 from kcons.openmm import (
-    CarriedConstraints,
     CollectiveRows,
     Isokinetic,
     Langevin,
@@ -31,11 +30,6 @@ def atoms():
     return particles(range(12, 16))
 
 
-def sigma(constraints, time=0.0):
-    part = CarriedConstraints(atoms(), constraints, X * 10 * angstrom, time=time)
-    return part.motion.constraint_set
-
-
 def test_numbers_and_arrays():
     assert number(3 * angstrom, nm, "x") == pytest.approx(0.3)
     assert number(3, nm, "x") == 3.0
@@ -46,29 +40,6 @@ def test_numbers_and_arrays():
             number(value, nm, "length")
     with pytest.raises(InputError, match="positions is 1 K; give it in nm"):
         array([1 * kelvin], nm, "positions")
-
-
-def test_rows_are_held_at_what_was_written():
-    given = [
-        Distance([[0, 1]], 1.0 * angstrom),
-        Angle([[0, 1, 2]], [115.0] * unit.degrees),
-        Sphere([3], [0, 0, 0] * angstrom, radius=3.8 * angstrom),
-        KnifeEdge([0], [1], [0, 0, 1], target=0.001 * angstrom / unit.femtosecond),
-    ]
-    held = sigma(given)
-    np.testing.assert_allclose(held.target(), [0.1, np.radians(115), 0.38, 0.1])
-    assert all(item.units is None for item in held.constraints) and given[0].units is not None
-    np.testing.assert_allclose(sigma([FixedAtoms([0], X[:1] * 10 * angstrom)]).target(), X[0])
-
-
-def test_functions_give_plain_numbers():
-    for wrong in (
-        Distance([[0, 1]], lambda t: 0.1 * nm),
-        Custom([3], lambda r: r[0, 2] * nm),
-        Custom([3], lambda r: r[0, 2], lambda r: np.array([[0, 0, 1.0]]) * unit.dimensionless),
-    ):
-        with pytest.raises(InputError, match=r"has units \(.*give plain numbers in .* \(nm and ps in OpenMM\)"):
-            sigma([wrong])
 
 
 def test_collective_variables_of_composite_units():

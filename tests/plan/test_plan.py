@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from ase.build import molecule
 from ase.collections import g2
+from constraint_cases import blade
 
 from kcons import constraints as held
 from kcons.ase.topology import bonds_of
@@ -83,7 +84,7 @@ def test_table_for_distances(shape, pairs, times, expected) -> None:
         ([held.Angle([[0, 1, 2], [2, 1, 0]])], ("SparseRows", 1, 2, 1)),
         ([held.Distance([0, 1]), held.CenterOfMass([[0, 1, 2, 3, 4]])], ("SparseRows", 1, 4, 4)),
         ([held.RadiusOfGyration([[0, 1, 2], [2, 1, 0]])], ("SparseRows", 1, 2, 1)),
-        ([held.KnifeEdge(0, 1, [0, 0, 1.0])], ("SparseRows", 1, 1, 1)),
+        ([blade([0, 1])], ("SparseRows", 1, 1, 1)),
     ],
 )
 def test_table_for_other_rows(rows, expected) -> None:

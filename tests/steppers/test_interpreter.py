@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import thermostat_systems
+from constraint_cases import blade
 from stepper_systems import SYMMETRIC, assert_same, system_of
 from thermostat_systems import SHAPE, distance, springs
 
@@ -21,7 +22,6 @@ from kcons.constraints import (
     Distance,
     Ellipsoid,
     FixedAtoms,
-    KnifeEdge,
     MovingTarget,
     Plane,
     Sphere,
@@ -105,7 +105,7 @@ MIXED = {
     "dihedral and a surface": ([Distance(BONDS), Dihedral([[0, 1, 2, 3]]), Sphere([4], [0.0, 0, 0])], {}),
     "distances apart": ([Distance([*BONDS, [4, 5]]), Angle([[0, 1, 2]])], {}),
     "rigid triangles, and a plane": ([Distance([[0, 1], [0, 2], [1, 2]]), Plane([5], [0, 0.6, 0.8])], {}),
-    "a blade": ([Distance([4, 5]), KnifeEdge(4, 5, [0, 0.1, 1.0], contact=0.1)], {}),
+    "a blade": ([Distance([4, 5]), blade([4, 5], [0, 0.1, 1.0], 0.1)], {}),
     "centers": ([CenterDistance([[0, 1], [2, 3]], [[4], [5]])], {}),
     "rows beside fixed atoms": (
         [Distance(BONDS), Angle([[0, 1, 2]]), Sphere([4], [0.0, 0, 0]), FixedAtoms([0, 5])],

@@ -7,6 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from constraint_cases import blade
 from stepper_systems import (
     COMPOSED,
     NYSTROM,
@@ -24,10 +25,8 @@ from kcons.constraints import (
     Distance,
     FixedAtoms,
     Formula,
-    KnifeEdge,
     MovingTarget,
     Plane,
-    Rolling,
     Sphere,
     VelocityFormula,
 )
@@ -267,13 +266,18 @@ def literal_flight(system, state, h: float):
     return x1, u.reshape(x0.shape)
 
 
+#: Of a hub and a point that turns about it, on a slope whose direction has the sine s and the cosine c; radius 1.
+ROLLS = "c*vx1 - s*vz1 - ((z2 - z1)*(vx2 - vx1) - (x2 - x1)*(vz2 - vz1))/((x2 - x1)**2 + (z2 - z1)**2)"
+
+
 def rolling(masses, turns, size: float, slope: float = 0.0, force=None):
     """A wheel of three masses and a hub that rolls down a slope."""
     along, up = np.array([np.cos(slope), 0, -np.sin(slope)]), np.array([np.sin(slope), 0, np.cos(slope)])
     turns = np.radians(turns)[:, None]
     x = up + np.vstack([np.zeros(3), size * (np.cos(turns) * along + np.sin(turns) * up)])
     held = [Plane([0], up), Plane([0, 1, 2, 3], [0.0, 1, 0]), Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]])]
-    return system_of([*held, Rolling([0], [1], 1.0, along, up)], x, masses, force), x, along
+    rolls = VelocityFormula(ROLLS, [0, 1], {"s": np.sin(slope), "c": np.cos(slope)})
+    return system_of([*held, rolls], x, masses, force), x, along
 
 
 def wheel():
@@ -285,7 +289,7 @@ def wheel():
 def pivoting_skate():
     """A blade that touches at its back, so that what keeps it from sliding turns it."""
     x = np.array([[0.2, -0.1, 0.0], [0.7, 0.3, 0.1]])
-    rows = [Distance([0, 1]), Plane([0, 1], [0.0, 0.1, 1.0]), KnifeEdge(0, 1, [0.0, 0.0, 1.0], contact=0.1)]
+    rows = [Distance([0, 1]), Plane([0, 1], [0.0, 0.1, 1.0]), blade([0, 1], contact=0.1)]
     system = system_of(rows, x, [1.0, 3.0])
     return system, system.initial_state(x, np.array([[1.0, 0.5, 0], [0.2, 2.0, 0]]), project=True)
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from constraint_cases import blade
 
 from kcons.comparison.projected_equation import ProjectedEquation
-from kcons.constraints import Distance, FixedAtoms, KnifeEdge, MovingTarget
+from kcons.constraints import Distance, FixedAtoms, MovingTarget
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import RungeKuttaNystrom, State, Stepper, System
@@ -75,7 +76,7 @@ def rotor(omega=1.0, force=None, offset=0.0, **options) -> tuple[System, State]:
 def skate() -> tuple[System, State]:
     """A skate (two equal masses, blade under their center) on a slope: a closed cycloid-like motion."""
     positions = np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
-    rows = [Distance([0, 1]), KnifeEdge([0], [1], [0, 0, 1], contact=0.5)]
+    rows = [Distance([0, 1]), blade([0, 1], contact=0.5)]
     system = system_of(
         rows, positions, [1, 1], gravity([1, 1], (0.7, 0, 0)), potential=lambda x, t: -0.7 * x[:, 0].sum()
     )

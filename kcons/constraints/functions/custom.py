@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, LENGTH, FloatArray, as_float_array, check_call, positive, read_only_view
+from kcons.constraints.arguments import FloatArray, Positive, as_float_array, check_call, read_only_view
 from kcons.constraints.constraint import Constraint, Fault, RowKind
 from kcons.constraints.target import FIRST_4, WRONG, Target, first_derivative_4, nearest_image, second_derivative
 from kcons.errors import InputError
@@ -49,7 +49,7 @@ class Custom(Constraint):
         Length over which the function varies; by default the spread of the atoms of the row, 1 for one atom.
     """
 
-    held = ANY
+    held = ""
     functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function")
     kind = RowKind.FUNCTION
     singular = "value and gradient must be finite, and the gradient not zero; move the atoms"
@@ -62,8 +62,8 @@ class Custom(Constraint):
         target: Target = None,
         *,
         translation_invariant: bool = False,
-        period: Annotated[float, ANY, positive] | None = None,
-        length: Annotated[float, LENGTH, positive] | None = None,
+        period: Positive | None = None,
+        length: Positive | None = None,
     ) -> None:
         super().__init__(atoms, target)
         for name, given in (("function", function), ("gradient", gradient)):

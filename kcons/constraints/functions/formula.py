@@ -24,13 +24,13 @@ from functools import cache
 from keyword import iskeyword
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import ANY, MD_UNITS, FloatArray, as_float_array, positive, refuse_other, without_units
+from kcons.constraints.arguments import FloatArray, Positive, as_float_array, refuse_other
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.functions.straight_line import Operand, Tape, differentiated
 from kcons.constraints.target import Target
@@ -321,7 +321,7 @@ class Formula(Constraint):
     (1, True)
     """
 
-    held = ANY
+    held = ""
     singular = "value and gradient must be finite, and the gradient not zero; move the atoms, or write another formula"
     shared: ClassVar[tuple[str, ...]] = ("formula", "names", "period")
     per_row: Mapping[str, tuple[int, ...]] = {"values": ()}  # type: ignore[misc]
@@ -334,7 +334,7 @@ class Formula(Constraint):
         parameters: Mapping[str, ArrayLike] | None = None,
         target: Target = 0.0,
         *,
-        period: Annotated[float, ANY, positive] | None = None,
+        period: Positive | None = None,
     ) -> None:
         refuse_other(parameters, (Mapping, type(None)), "parameters", "numbers by name, such as {'k': 2.0}")
         refuse_other(formula, str, "formula", "text, such as 'x1**2 + y1**2 - 1'")
@@ -351,11 +351,7 @@ class Formula(Constraint):
                 )
         self.row_width = self.code().width
         super().__init__(atoms, target)
-        columns = []
-        for name, value in given.items():
-            plain, matters = without_units(value, f"Formula: {name}", ANY)
-            self.units = MD_UNITS if matters else self.units
-            columns.append(self._of_each_row(name, plain, ()))
+        columns = [self._of_each_row(name, value, ()) for name, value in given.items()]
         self.per_row = {"values": (len(columns),)}
         self._keep(values=np.stack(columns, axis=1) if columns else np.zeros((self.n_rows, 0)))
         self.translation_invariant = self.code().invariant

@@ -25,7 +25,6 @@ from kcons.openmm import CollectiveRows, DeviceIntegrator, Isokinetic, Langevin,
 from kcons.openmm.callback_rows import CarriedConstraints, constraints_about, refuse_virtual_sites
 from kcons.openmm.device.device_integrator import choose
 from kcons.openmm.quantities import (
-    accepted,
     cell_of,
     masses_of,
     nanometers,
@@ -72,7 +71,7 @@ class HeldCoordinatesReporter:
     reportInterval : int
         Steps from one report to the next.
     coordinates : mapping of str to Constraint
-        Quantities, or plain numbers of nm, ps, dalton, radian.
+        Their numbers are of nm, ps, dalton, radian.
     beside : iterable of Constraint
         Other rows that are held on the same atoms.
 
@@ -105,8 +104,8 @@ class HeldCoordinatesReporter:
     ) -> None:
         self._interval = whole_number(reportInterval, "reportInterval")
         names = list(named(coordinates))
-        self._coordinates = dict(zip(names, accepted(coordinates.values()), strict=True))
-        self._beside = accepted(beside)
+        self._coordinates = dict(zip(names, coordinates.values(), strict=True))
+        self._beside = list(beside)
         self._own = not hasattr(file, "write")
         self._file: TextIO = open(file, "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
         self._held: HeldCoordinates | None = None

@@ -36,7 +36,7 @@ from kcons.openmm.device.clusters import (
 from kcons.openmm.integrator.guard import SystemRows, settled_rows
 from kcons.openmm.integrator.part import SINGLE, Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.quantities import accepted, masses_of, positions_of
+from kcons.openmm.quantities import masses_of, positions_of
 from kcons.plan.clusters import alike
 
 #: Newton iterations at most; those after which a large cluster is factored again.
@@ -278,7 +278,7 @@ class KernelRows(CarriedConstraints):
     def __init__(self, parts: Sequence[Any]) -> None:
         self._parts = parts
         self._carried = [part for part in parts if isinstance(part, CarriedConstraints)]
-        self.given = list(accepted(constraints_of(parts)))
+        self.given = list(constraints_of(parts))
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
         #: Whether rows take periodic images: as `hold` was told, else as the System.
         self._wraps = not self._carried or any(part.motion.lattice is not None for part in self._carried)

@@ -56,8 +56,8 @@ MUTANTS = {
         "«x→whole»[item.atoms] if self.moved is None": "images::a_molecule_is_the_same_in_the_cell_as_in_open_space",
     },
     "constraints/constraint.py": {
-        'powers.get("length", «0→1»)': "constraint::the_same_points_fulfil_it",
-        'not powers.keys() <= {«→"unknown", »': "constraint::what_has_no_known_units_is_refused",
+        "self.target is not None and «self.held is LENGTH→True»:": "constraint::the_same_points_fulfil_it",
+        "if self.moving or «not self.held→False»:": "constraint::what_has_no_known_units_is_refused",
     },
     "topology/rows_by_name.py": {
         "«_refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))→pass»": (

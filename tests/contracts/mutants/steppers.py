@@ -30,11 +30,11 @@ MUTANTS = {
     },
     "solvers/general_clusters.py": {
         "subset.jacobian(«0.5 * (start + state)→state», middle)": (
-            "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]"
+            "row_functions::rows_of_velocities_agree_with_the_dense_solver[blade-flight]"
         ),
     },
-    "constraints/velocity.py": {
-        "half = «→-»0.5 * (bx *": "row_functions::rows_of_velocities_agree_with_the_dense_solver[KnifeEdge-flight]",
+    "constraints/functions/formula.py": {
+        '[f"{part} «+→-» 0.5*{bent}"': "row_functions::rows_of_velocities_agree_with_the_dense_solver[blade-flight]",
     },
     "thermostats/monte_carlo.py": {
         "velocities=«-→»begin.velocities)": "monte_carlo::every_decision_follows_from_the_energies[0.7]",

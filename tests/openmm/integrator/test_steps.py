@@ -6,6 +6,7 @@ import numpy as np
 import openmm
 import pytest
 from collective_cases import bond
+from constraint_cases import blade
 from ensemble_runs import in_calls, run
 from openmm import unit
 from openmm_parts import HeldCoordinates
@@ -28,7 +29,7 @@ from openmm_systems import (
 )
 from tied_cluster import KINDS, carried_at, row_at
 
-from kcons.constraints import KnifeEdge, Plane
+from kcons.constraints import Plane
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, LangevinRespa, ProjectedIntegrator, Row, hold
 
@@ -171,7 +172,7 @@ def held(kind, **arguments):
         part = hold(system, Plane([0], [0, 0, 1]), x)
         assert system.getNumConstraints()
     elif kind == "carried, with a velocity":
-        part = hold(system, KnifeEdge(8, 20, [0, 0, 1]), x)
+        part = hold(system, blade([8, 20]), x)
     elif kind.endswith("row"):
         part = CollectiveRows(system, [Row(bond(4, 20), rate=0.05), Row(bond(0, 9))], positions=x)
     else:
