@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping
+from hashlib import sha256
 from importlib import import_module
 from importlib.util import find_spec
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from ase.calculators.names import names as ase_names
 from kcons.ase.binding import FORCES_ONLY
 from kcons.errors import InputError, KconsError, UnsupportedError, did_you_mean
 
+#: Endings of files that say what a calculator computes, not what it writes.
+WEIGHTS = [".model", ".pt", ".pth", ".ckpt", ".pb", ".safetensors", ".h5", ".npz", ".xml", ".eam", ".alloy", ".yace"]
 #: Calculators of ASE that take any setting, and know those alone that they list.
 _FULLY_LISTED = ("emt", "lj", "morse")
 #: Calculators that compute in this process, whatever their settings: others start programs that settings name.
@@ -123,30 +126,32 @@ def described(calculator: Any, atoms: Atoms) -> list[Any]:
     """What tells a calculator from others: its kind, its parameters, and the calculators that it is made of.
 
     Initial charges and magnetic moments of the atoms, which it may take for the charge and the spin, are in it where
-    there are any, and constraints of ASE that add forces. Plain data, the same in each process. What a calculator does
-    not give as parameters is not in it, nor what files have in them that it names.
+    there are any, and constraints of ASE that add forces. Plain data, the same in each process; of parameters that are
+    files of weights, the contents. What a calculator does not give as parameters is not in it.
     """
-    initial = {
-        name: atoms.arrays[name]
-        for name in ("initial_charges", "initial_magmoms")
-        if name in atoms.arrays and atoms.arrays[name].any()
-    }
+    given = {name: atoms.arrays.get(name, np.zeros(0)) for name in ("initial_charges", "initial_magmoms")}
+    initial = {name: values for name, values in given.items() if values.any()}
     added = [item.todict() for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
-    found = [*_kind(calculator), *([initial] if initial else []), *added]
-    plain: list[Any] = json.loads(json.dumps(found, default=_plain, sort_keys=True, skipkeys=True))
-    return plain
+    return [_plain(part) for part in (*_kind(calculator), *([initial] if initial else []), *added)]
 
 
 def _kind(calculator: Any) -> list[Any]:
     """Its class, its parameters, and those of what it is made of."""
     parts = getattr(getattr(calculator, "mixer", calculator), "calcs", ())
-    kind = type(calculator)
-    parameters = dict(getattr(calculator, "parameters", {}))
+    kind, parameters = type(calculator), getattr(calculator, "parameters", {})
     return [f"{kind.__module__}.{kind.__qualname__}", parameters, [_kind(part) for part in parts]]
 
 
 def _plain(value: Any) -> Any:
-    """Arrays as lists, paths as text, of other objects their kind."""
+    """As data of JSON; of other objects their kind."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(value[key]) for key in sorted(value, key=str)}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
     if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return str(value) if isinstance(value, PathLike) else type(value).__qualname__
+        return _plain(value.tolist())
+    if isinstance(value, str | PathLike):
+        file = Path(value)
+        weights = file.suffix in WEIGHTS and file.is_file()
+        return [str(file), sha256(file.read_bytes()).hexdigest()] if weights else str(value)
+    return value if value is None or isinstance(value, int | float) else type(value).__qualname__

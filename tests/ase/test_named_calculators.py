@@ -49,6 +49,22 @@ def test_what_tells_calculators_from_each_other():
     other = LennardJones(epsilon=0.1)
     other.parameters["beside"] = {"a": [0, 1], "b": object}
     assert described(same, Atoms()) == described(other, Atoms())
+    by_pair = [LennardJones(), LennardJones()]
+    for each, size in zip(by_pair, (1.0, 2.0), strict=True):  # names of all kinds, which JSON does not have
+        each.parameters["pairs"] = {("Si", "C"): size, 3: np.float64(0.5), "rest": None}
+    assert described(by_pair[0], Atoms()) != described(by_pair[1], Atoms())
+
+
+def test_weights_in_a_file_belong_to_a_calculator(tmp_path):
+    calculator, model, log = LennardJones(), tmp_path / "net.model", tmp_path / "out.txt"
+    model.write_bytes(b"weights")
+    log.write_text("one")
+    calculator.parameters.update(model=str(model), log=log)
+    before = described(calculator, Atoms())
+    log.write_text("another")
+    assert json.dumps(described(calculator, Atoms())) == json.dumps(before)
+    model.write_bytes(b"others!")
+    assert described(calculator, Atoms()) != before
 
 
 # -- what names a calculator may be somebody else ---------------------------------------------------
