@@ -375,11 +375,11 @@ class MultipleTimeSteps(ThermostattedDynamics):
         self.groups = ForceGroups.difference(*forces.values()) if difference else ForceGroups(forces)
         self._force = self.groups  # type: ignore[method-assign, assignment]
         kind = IsokineticSpheres if bath == "spheres" else LangevinRespa
-        kwargs |= {"friction": friction, "steps": {"slow": 1, "fast": fast_steps}}
+        steps = {"slow": 1, "fast": fast_steps}
         before = atoms.calc
         atoms.calc = self._whole = slow if difference else SumCalculator([fast, slow])
         try:
-            super().__init__(atoms, timestep, temperature_K, kind, **kwargs)
+            super().__init__(atoms, timestep, temperature_K, kind, friction=friction, steps=steps, **kwargs)
         except BaseException:
             atoms.calc = before
             raise

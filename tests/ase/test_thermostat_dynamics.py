@@ -228,6 +228,8 @@ def test_another_calculator_on_the_atoms():
     atoms.calc = whole
     moving.run(1)
     assert moving.evaluations == {"fast": 13, "slow": 4}
+    with pytest.raises(TypeError, match="steps"):  # and not one of both without a word
+        made("two steps", atoms, steps={"slow": 1, "fast": 2})
 
 
 # -- Monte Carlo ------------------------------------------------------------------------------------
