@@ -130,8 +130,8 @@ class ConstrainedGrowth:
                 rows=range(model.n, len(self.rows)),
             )
 
-    #: Least error of ln x that a run asks for.
-    tolerance = 1e-9
+    #: Least error of ln x that a run asks for, and from when on its motion is the slow one.
+    tolerance, settled_time = 1e-9, math.inf
 
     @property
     def entropy_row(self) -> EntropyRow | None:
@@ -324,7 +324,7 @@ def solve(
     rtol, atol = (as_float_array(options[name], name) for name in ("rtol", "atol"))
     p0 = Populations.from_values(span[0], x0)
     bound, end = system.bind(p0), p0
-    bound.tolerance = max(float(np.min(rtol + atol)), 1e-13)
+    bound.tolerance, bound.settled_time = max(float(np.min(rtol + atol)), 1e-13), math.inf
 
     def slope(t: float, y: FloatArray) -> FloatArray:
         return bound.logarithmic_velocity(Populations.from_logarithms(t, y))
@@ -457,8 +457,6 @@ class ConstrainedHypercycle(ConstrainedGrowth):
     """A hypercycle with a fixed sum of populations and, perhaps, a law of entropy production."""
 
     model: Hypercycle
-    #: From when on the motion is the slow one.
-    settled_time = math.inf
 
     def logarithmic_velocity(self, p: Populations) -> FloatArray:
         row = self.entropy_row
