@@ -10,7 +10,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from kcons.batched.clusters import Lanes, Levels, Pattern, Problem, Row, tape_of
 from kcons.constraints.arguments import FloatArray, IntArray, whole_number
@@ -534,8 +533,9 @@ class Projection(torch.autograd.Function):
         return found, push
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, by_found: Any, by_push: Any) -> Any:
+        if torch.is_grad_enabled():  # PyTorch would leave out what second derivatives have of this without a word
+            raise UnsupportedError("projections have first derivatives alone; leave out create_graph")
         found, place, held, w, multipliers = ctx.saved_tensors
         task = ctx.task
         by_found = torch.zeros_like(found) if by_found is None else by_found

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcons.batched.batch import Batch
+from kcons.constraints.arguments import positive
 from kcons.errors import InputError
 
 
@@ -28,7 +29,7 @@ def kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: Any, masses: Ten
 def drift(batch: Batch, x: Tensor, v: Tensor, h: Any, **held: Any) -> tuple[Tensor, Tensor]:
     """Positions a time h later on the rows, and velocities with the impulse that has kept them there."""
     found, push = batch.solve_positions(x + h * v, x, flight=h, **held)
-    return found, v + push / h
+    return found, v + push / (h if isinstance(h, Tensor) else h or 1.0)
 
 
 def drift_in_bath(
@@ -103,6 +104,7 @@ def gbaoab(
     ----------
     B. Leimkuhler and C. Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
+    positive(dt, "dt")  # noise cannot be taken back
     masses = held.get("masses")
     v = kick(batch, x, v, forces, 0.5 * dt, masses)
     x, v = drift_in_bath(batch, x, v, dt, (kT, friction, generator), **held)

@@ -96,6 +96,9 @@ def test_what_is_refused():
     v = torch.zeros_like(x)
     with pytest.raises(InputError, match=r"forces must have shape \(6, 3\), not \(1, 3\)"):
         rattle(batch, lambda x: x[:1], x, v, v, 0.1)
+    with pytest.raises(InputError, match="dt is -0"):
+        gbaoab(batch, lambda x: -x, x, v, v, -0.1, 1.0, 1.0)
+    assert torch.equal(rattle(batch, lambda x: -x, x, v, v, 0.0)[1], v)
     with pytest.raises(InputError, match=r"x_reference must be .*torch.float64 on cpu; convert it"):
         batch.project_positions(x, x.float())
     for item in ("masses", "targets"):

@@ -8,6 +8,7 @@ from torch.utils.checkpoint import checkpoint
 from kcons import ConstraintSet, Motion
 from kcons.batched import Batch, clusters, gbaoab, rattle
 from kcons.constraints import Angle, Dihedral, Distance, Formula, Plane, Sphere
+from kcons.errors import UnsupportedError
 from tests.systems.constraint_cases import MASSES, blade, scattered
 
 #: A tree, a ring with a dihedral, atoms on surfaces, and a blade.
@@ -54,6 +55,8 @@ def test_derivatives_are_those_of_the_solution(name, elimination):
     assert torch.autograd.gradcheck(positions, (y, x, targets, masses), atol=1e-7, rtol=1e-6)
     assert torch.autograd.gradcheck(velocities, (x, v, masses), atol=1e-7, rtol=1e-6)
     assert torch.autograd.gradcheck(multipliers, (x, v, y), atol=1e-6, rtol=1e-5)
+    with pytest.raises(UnsupportedError, match="first derivatives alone"):  # and no zeros for second ones
+        torch.autograd.functional.hessian(lambda y: positions(y, x, targets, masses)[0].pow(2).sum(), y)
 
 
 def test_lengths_and_charges_through_a_trajectory():
