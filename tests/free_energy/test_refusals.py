@@ -164,6 +164,11 @@ def surface(**change):
 PROFILES = [
     (lambda: integrate(N3[:2], N3[:2], [1.0] * 2), "x", "too few"),
     (lambda: integrate([0.0, 1.0, 1.0], N3, [1.0] * 3), "x", "2 different windows"),
+    (
+        lambda: integrate([0.0, 1.0, 1.0, 2.0], [0.0, 1.0, 2.0, 2.0], [0.0] * 4),
+        "e",
+        "windows at 1 have other mean forces",
+    ),
     (lambda: integrate(N3, [0.0, np.nan, 2.0], [1.0] * 3), "f", "window 1 is not finite"),
     (lambda: integrate(N3, N3[:2], [1.0] * 3), "f", r"shape \(3,\)"),
     (lambda: integrate(N3, N3, [1.0, 1.0, -1.0]), "e", "window 2 is negative"),
@@ -187,6 +192,11 @@ PROFILES = [
     (lambda: surface().difference([0.0, 0.0], 0.5), "a", "a and b must be places of 2 coordinates"),
     (lambda: pull_free_energy([1.0] * 4, [1.0] * 5, thermal_energy=1.0), "forward", "5 pulls"),
     (lambda: pull_free_energy([1.0] * 5, [1.0] * 4, thermal_energy=1.0), "backward", "5 pulls"),
+    (
+        lambda: pull_free_energy([1.0] * 5, [0.0] * 5, thermal_energy=1.0),
+        "forward",
+        "the same each way, and 1 kT are lost",
+    ),
     (lambda: pull_free_energy([1.0] * 5 + [np.inf], [1.0] * 5, thermal_energy=1.0), "forward", "work 5"),
     (lambda: pull_free_energy([1.0] * 5, [1.0] * 5, thermal_energy="1"), "thermal_energy", "positive"),
 ]

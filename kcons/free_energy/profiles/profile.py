@@ -186,7 +186,12 @@ def integrate(
         place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
     order = np.argsort(place, kind="stable")
     places, forces, errors = place[order], force[order], error[order]
-    different = int((np.diff(places, prepend=-np.inf) > _SAME * (np.ptp(places) if places.size else 0.0)).sum())
+    apart = np.diff(places, prepend=-np.inf) > _SAME * (np.ptp(places) if places.size else 0.0)
+    exact = ~apart[1:] & (errors[1:] + errors[:-1] == 0) & (np.abs(np.diff(forces)) > 1e-9 * np.abs(forces[1:]))
+    if exact.any():
+        said = f"windows at {places[1:][exact][0]:g} have other mean forces, all with an error of 0"
+        raise InputError(f"{said}; give their errors", item="e")
+    different = int(apart.sum())
     if different < 3:
         raise InputError(f"{different} different windows are too few for a profile; give 3 or more", item="x")
     low, high = float(places[0]), float(places[-1] if period is None else places[0] + period)

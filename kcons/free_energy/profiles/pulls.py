@@ -95,6 +95,9 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike, *, thermal_energy:
             stacklevel=2,
         )
     lost = float(ahead.mean() + back.mean())
+    if max(np.ptp(ahead), np.ptp(back)) <= _NO_SPREAD < abs(lost):
+        said = f"all works are the same each way, and {lost:g} kT are lost"
+        raise InputError(f"{said}; start each pull from another state of equilibrium", item="forward")
     off = math.sqrt(ahead.var(ddof=1) / len(ahead) + back.var(ddof=1) / len(back))
     if lost < -max(_NO_SPREAD, _GAIN * off):
         warnings.warn(
