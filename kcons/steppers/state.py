@@ -198,7 +198,7 @@ class System:
     velocity_dependent : bool
         Whether `force` takes the velocities too (magnetic fields, drag that is not linear).
     far : float
-        From this many (at least 1) times the size of what is held away from the origin, states carry the remainder of
+        From this many times the size of what is held away from the origin, states carry the remainder of
         their positions. Infinite: never, so that positions and velocities alone are the whole state.
 
     Raises
@@ -223,7 +223,9 @@ class System:
         taken = ("x", "v", "t") if velocity_dependent else ("x", "t")
         check_call("force", force, taken, "; velocity_dependent says whether it gets velocities v")
         check_call("potential", potential, ("x", "t"))
-        self.motion, self.far = motion, far
+        self.motion, self.far = motion, far if far == math.inf else finite_number(far, "far")
+        if not self.far >= 1:
+            raise InputError(f"far is {far}; give a number of 1 or more", item="far")
         self.force, self.potential = force, potential
         self.velocity_dependent = bool(velocity_dependent) and force is not None
         self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)

@@ -245,6 +245,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("ORACLE.penrose_residuals(X, X)", "inverse"),
     ("minimize(MOTION, lambda y: y, X, tolerance=1.0, longest=1.0)", "force"),
     ("CellSystem(CELL, lambda x, t, cell: x, lambda x, t, cell: 0.0, force)", "stress"),
+    ("System(MOTION, force, far=?)", "far", "0.0", "-1.0", "nan", '"far"'),
     ("SYSTEM.initial_state(?, V)", "positions", "X[:2]", "X * nan", "X * 1.5"),
     ("SYSTEM.initial_state(X, V[:2])", "velocities"),
     ("SYSTEM.total_energy(STATE)", "potential"),
