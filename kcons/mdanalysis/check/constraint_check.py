@@ -269,10 +269,10 @@ class _Uncopied(Timestep):  # type: ignore[misc]
         self.given = given
 
     def read(self, reader: Any) -> _Uncopied:
-        """Take the next frame. The reader turns the cell of each into lengths and angles; here only one that is new."""
+        """Take the next frame. Only a new cell is for the reader to turn into lengths and angles, and other units."""
         frame, reader.ts = reader._file.read(), self
         reader._frame = self.frame = reader._frame + 1
-        if frame.unitcell.tobytes() != self.cell:
+        if reader.convert_units or frame.unitcell.tobytes() != self.cell:
             reader._frame_to_ts(frame, self)
             header, self.cell = reader._file.header, frame.unitcell.tobytes()
             self.first = header["istart"] / header["nsavc"]

@@ -129,6 +129,16 @@ def test_where_atoms_coincide_nothing_is_told_of_their_angle(tmp_path):
     assert unit.rate_largest > 0.1  # of the other angle in this frame
 
 
+def test_dcd_of_lammps_in_other_units(tmp_path, positions):
+    path = files.write(tmp_path / "nm.dcd", positions / 10, SIDE / 10)
+    made = files.universe(N)
+    made.load_new(str(path), format="LAMMPS", lengthunit="nm")
+    result = ConstraintCheck(made, ROWS).run().check
+    assert result.worst[0].largest == pytest.approx(
+        checked(files.write(tmp_path / "a.dcd", positions)).worst[0].largest, 1e-4
+    )
+
+
 # -- cells ------------------------------------------------------------------------------------------
 
 
