@@ -62,7 +62,7 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike, *, thermal_energy:
     Raises
     ------
     InputError
-        Fewer than 5 pulls in a direction; a NaN or infinity; kT is not positive.
+        Fewer than 5 pulls in a direction; works that are all the same and do not fit; a NaN; kT is not positive.
     UnsupportedError
         pymbar is not installed.
 
@@ -82,8 +82,15 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike, *, thermal_energy:
         raise UnsupportedError(f"BAR is left to pymbar, which is not installed: {remedy}") from None
     finally:
         logging.disable(loud)
-    with np.errstate(invalid="ignore"):  # of the error of works that are all the same
-        difference, error = map(float, pymbar.bar(ahead, back).values())
+    lost = float(ahead.mean() + back.mean())
+    if max(np.ptp(ahead), np.ptp(back)) > _NO_SPREAD:
+        with np.errstate(invalid="ignore"):  # without any overlap there is no error
+            difference, error = map(float, pymbar.bar(ahead, back).values())
+    elif abs(lost) <= _NO_SPREAD:  # where pymbar finds no bounds
+        difference, error = float(ahead.mean() - back.mean()) / 2, 0.0
+    else:
+        said = f"all works are the same each way, and {lost:g} kT are lost"
+        raise InputError(f"{said}; start each pull from another state of equilibrium", item="forward")
     # What MBAR's overlap matrix has off its diagonal: Klimovich et al., J. Comput.-Aided Mol. Des. 29, 397 (2015).
     odds = np.concatenate([ahead, -back]) - difference + math.log(len(ahead) / len(back))
     overlap = float((expit(odds) * expit(-odds)).sum() * (1 / len(ahead) + 1 / len(back)))
@@ -94,10 +101,6 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike, *, thermal_energy:
             UserWarning,
             stacklevel=2,
         )
-    lost = float(ahead.mean() + back.mean())
-    if max(np.ptp(ahead), np.ptp(back)) <= _NO_SPREAD < abs(lost):
-        said = f"all works are the same each way, and {lost:g} kT are lost"
-        raise InputError(f"{said}; start each pull from another state of equilibrium", item="forward")
     off = math.sqrt(ahead.var(ddof=1) / len(ahead) + back.var(ddof=1) / len(back))
     if lost < -max(_NO_SPREAD, _GAIN * off):
         warnings.warn(
@@ -106,7 +109,7 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike, *, thermal_energy:
             UserWarning,
             stacklevel=2,
         )
-    return Pulled(Estimate(kT * difference, 0.0 if math.isnan(error) else kT * error), overlap)
+    return Pulled(Estimate(kT * difference, kT * error), overlap)
 
 
 def _works(works: ArrayLike, item: str) -> FloatArray:

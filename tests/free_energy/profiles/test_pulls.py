@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.profiles.pulls import pull_free_energy
 
 F, KT = 7.0, 2.5
@@ -28,15 +28,20 @@ def test_normal_works_give_the_free_energy_within_the_errors():
 
 
 def test_works_of_no_spread():
-    """Pulls of what nothing resists: the difference is the work."""
+    """Pulls of what nothing resists: the difference is the work. Pulls of one start are no sample."""
     same = pull_free_energy(np.full(6, 2.0), np.full(7, -2.0), thermal_energy=0.5)
     assert same.bar.value == pytest.approx(2.0) and same.bar.error == 0
     assert same.overlap == pytest.approx(1.0)
+    with pytest.raises(InputError, match="all works are the same each way, and 4 kT are lost"):
+        pull_free_energy(np.full(6, 2.0), np.full(7, 0.0), thermal_energy=0.5)
 
 
 def test_pulls_that_do_not_overlap_are_warned_of():
     with pytest.warns(UserWarning, match=r"overlap of 0\.\d%"):
         pull_free_energy(*normal(np.random.default_rng(8), 50, 12 * KT), thermal_energy=KT)
+    with pytest.warns(UserWarning, match="overlap of 0.0%"):
+        found = pull_free_energy(*normal(np.random.default_rng(8), 50, 90 * KT), thermal_energy=KT)
+    assert np.isnan(found.bar.error)
 
 
 def test_bar_is_left_to_pymbar(monkeypatch):
