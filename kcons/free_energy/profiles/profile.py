@@ -127,11 +127,13 @@ class Profile:
         # What is known exactly has a variance of rounding, from which nothing more is to be learned.
         least = _KNOWN * float((np.diag(covariance)[m:] + noise).max())
         chosen = []
+        taken = np.abs(grid[:, None] - self.windows).min(axis=1) < _SAME * np.ptp(grid)  # a place has one window
         for _ in range(whole_number(count, "count")):
             shared = covariance[:m, m:]
             variance = np.maximum(np.maximum(np.diag(covariance)[m:], 0.0) + noise, least)
             gain = ((shared - shared.mean(axis=0)) ** 2).sum(axis=0) / variance
-            best = int(np.argmax(gain))
+            best = int(np.argmax(np.where(taken, -1.0, gain)))
+            taken[best] = True
             column = covariance[:, m + best]
             covariance = covariance - np.outer(column, column) / variance[best]
             chosen.append(float(grid[best]))

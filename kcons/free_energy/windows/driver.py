@@ -585,7 +585,9 @@ class Windows:
             return self._run(map(tuple, places_of(targets, self.sampler.names).tolist()))
 
     def _run(self, places: Iterable[tuple[float, ...]]) -> FreeEnergy:
-        asked = dict.fromkeys(places)
+        # Places that are one but for rounding have one file, which counts once.
+        known = {self._jobs(place)[0].name: place for place in self._targets}
+        asked = dict.fromkeys(known.setdefault(self._jobs(place)[0].name, place) for place in places)
         self._targets |= asked
         jobs = [job for place in asked for job in self._jobs(place)]
         missing = [job for job in jobs if not self.file(job).exists()]
@@ -618,9 +620,9 @@ class Windows:
                 if profile.error[profile.lower_than(np.inf if below is None else below)].max() <= error:
                     break
                 places = profile.next_windows(min(at_once, most - len(self._targets)), below=below)
-                known = len(self._failed)
+                failed, known = len(self._failed), len(self._targets)
                 result = self._run((place,) for place in places)
-                if len(self._failed) > known:
+                if len(self._failed) > failed or len(self._targets) == known:
                     break
         return result
 

@@ -92,6 +92,9 @@ def test_windows_are_known_by_their_places(tmp_path):
     _, other = run(tmp_path, [2.0, 0.5, 1.0])
     assert [w.value[0] for w in other.windows] == [0.5, 1.0, 2.0] and other.kept == 4 and len(diary(tmp_path)) == 11
     assert other.windows[1].force == again.windows[2].force
+    # A place that another sum gives is the same: its samples count once.
+    _, same = run(tmp_path, [0.3, 0.1 + 0.2, 0.5])
+    assert len(same.windows) == 2 and len(diary(tmp_path)) == 13
 
 
 def test_windows_are_added_where_they_help(tmp_path):
@@ -99,6 +102,9 @@ def test_windows_are_added_where_they_help(tmp_path):
     better = windows.improve(0.5, 20, at_once=2)
     assert first.profile.error.max() > 0.5 and len(first.windows) == 5
     assert 5 < len(better.windows) < 20 and better.profile.error.max() <= 0.5
+    # Also where those that are there tell little: beside them, since a place has one window.
+    noisy, _ = run(tmp_path, np.linspace(0.0, 0.3, 11))
+    assert len({round(w.value[0], 6) for w in noisy.improve(1e-9, 14, at_once=2).windows}) == 14
     # Of the lowest place alone nothing is to be known.
     near, _ = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1])
     found = near.improve(0.5, 20, below=1e-6)
