@@ -58,7 +58,7 @@ MUTANTS = {
         "if chance < «_CHANCE→0.0»:": "mean_force_surface::vectors_that_are_no_gradient_are_warned_of",
     },
     "free_energy/profiles/pulls.py": {
-        "if math.isnan(error) else «kT * →»error": "pulls::normal_works_give_the_free_energy_within_the_errors",
+        "Estimate(kT * difference, «kT * →»error)": "pulls::normal_works_give_the_free_energy_within_the_errors",
         "ahead, «-back→back»]) - difference": "pulls::works_of_no_spread",
     },
     "constraints/constraint_set.py": {
