@@ -25,8 +25,8 @@ _ANY = (
 _CALLED = """
 extern "C" void run_{what}_{name}({any}, {arguments}) {{
   int step = steps, launch = launches; mixed tolerance = allowed, scratch[4], x[3*{room}], d[3*{room}], w[{room}];
-  mixed4 box0 = {{(mixed) b[0], 0, 0, 0}}, box1 = {{(mixed) b[3], (mixed) b[4], 0, 0}};
-  mixed4 box2 = {{(mixed) b[6], (mixed) b[7], (mixed) b[8], 0}};
+  mixed4 box0 = {{(mixed) b[0], 0, 0}}, box1 = {{(mixed) b[3], (mixed) b[4], 0}};
+  mixed4 box2 = {{(mixed) b[6], (mixed) b[7], (mixed) b[8]}};
   for (int c = 0; c < clusters; c++) {{
     for (int a = 0; a < n; a++) {{
       int i = atoms[c*n+a]; w[a] = masses[i];
@@ -59,7 +59,7 @@ class PlainRows:
         head = head.replace("typedef double real, mixed;", _TYPES[precision])
         if precision != "double":
             head = head.replace("#define USE_DOUBLE_PRECISION\n", "")
-        head = head.replace("struct real4 {double x, y, z, w;};", "struct real4 {mixed x, y, z, w;};")
+        head = head.replace("struct real4 {double x, y, z;};", "struct real4 {mixed x, y, z;};")
         needed = [a for a in arrays if f" {a.name}," in head.split("#define ROWS ")[1].split("\n")[0] + ","]
         arguments = ", ".join(f"{a.kind}* {a.name}" for a in needed)
         self.needed = [a.name for a in needed]

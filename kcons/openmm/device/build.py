@@ -28,9 +28,8 @@ from kcons.errors import UnsupportedError
 logger = logging.getLogger("kcons.openmm")
 
 SOURCES = Path(__file__).parent / "plugin"
-#: OpenMM's libraries, and beside them its headers, as pip and conda have them.
-LIBRARIES = Path(openmm.version.openmm_library_path)
-HEADERS = LIBRARIES.parent / "include"
+#: Beside OpenMM's libraries, as pip and conda have them.
+HEADERS = Path(openmm.version.openmm_library_path).parent / "include"
 #: Platforms that have a library of their own.
 ACCELERATED = ("OpenCL", "CUDA", "HIP")
 #: Name of the package that `python -m kcons.openmm.device.wheel` makes.
@@ -69,15 +68,6 @@ def refusal() -> str:
     return "" if (HEADERS / "OpenMM.h").exists() else f"OpenMM's headers are not at {HEADERS}"
 
 
-def reluctance() -> str:
-    """Why the plugin is not taken where nobody demands it; empty if it is."""
-    if not (accelerated() or is_built()):
-        return "the plugin is not compiled, and OpenMM has no platform for GPUs here; kcons warmup device compiles it"
-    if not (accelerated() or compiler()):
-        return "the platforms Reference and CPU need a C++ compiler, and there is none"
-    return ""
-
-
 def is_built() -> bool:
     """Whether the library of the integrator is there: in the cache, or in an installed wheel."""
     return any((path / "libKcons.so").exists() for path in places())
@@ -96,19 +86,14 @@ def accelerated() -> list[str]:
     return [name for name in names if name in ACCELERATED]
 
 
-def build(target: Path, platforms: Sequence[str], stubs: bool = False) -> None:
-    """Compile the libraries of some of the platforms `ACCELERATED` into a folder.
-
-    With `stubs`, link with empty libraries of the names of OpenMM's, so that none of the platforms need be here.
-    """
+def build(target: Path, platforms: Sequence[str]) -> None:
+    """Compile the libraries of some of the platforms `ACCELERATED`, which need not be here, into a folder."""
     target.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target) as made:
-        where = [f"-L{LIBRARIES}", f"-L{LIBRARIES / 'plugins'}", f"-Wl,-rpath,{LIBRARIES}:{LIBRARIES / 'plugins'}"]
-        if stubs:
-            where = [f"-L{made}"]
-            for name in ("OpenMM", *(f"OpenMM{platform}" for platform in platforms)):
-                _compile(["-shared", "-xc++", os.devnull, f"-Wl,-soname,lib{name}.so", "-o", f"{made}/lib{name}.so"])
-        shared = [*_FLAGS, f"-I{HEADERS}", *where, f"-L{made}", "-Wl,-rpath,$ORIGIN"]
+        # Linked with empty libraries of the names of OpenMM's, which Python has loaded before.
+        for name in ("OpenMM", *(f"OpenMM{platform}" for platform in platforms)):
+            _compile(["-shared", "-xc++", os.devnull, f"-Wl,-soname,lib{name}.so", "-o", f"{made}/lib{name}.so"])
+        shared = [*_FLAGS, f"-I{HEADERS}", f"-L{made}", "-Wl,--no-as-needed,-rpath,$ORIGIN"]
         core = [str(SOURCES / name) for name in ("program_integrator.cpp", "plain_platforms.cpp")]
         _compile([*core, *shared, "-lOpenMM", "-Wl,-soname,libKcons.so", "-o", f"{made}/libKcons.so"])
         for platform in platforms:
@@ -118,10 +103,10 @@ def build(target: Path, platforms: Sequence[str], stubs: bool = False) -> None:
             os.replace(path, target / path.name)
 
 
-def _compile(arguments: Sequence[str]) -> None:
+def _compile(arguments: Sequence[str], source: str = "") -> None:
     if not compiler():
         raise UnsupportedError("there is no C++ compiler, which steps on Reference and CPU and a wheel need")
-    done = subprocess.run([*compiler(), *arguments], capture_output=True, text=True)
+    done = subprocess.run([*compiler(), *arguments], input=source, capture_output=True, text=True)
     if done.returncode:
         raise UnsupportedError(f"the C++ compiler refused the plugin: {done.stderr.strip()[:2000]}")
 
@@ -148,8 +133,6 @@ def kernels_library(source: str) -> Path:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as made:
-            text = Path(made) / "kernels.cpp"
-            text.write_text(source)
-            _compile([str(text), *_FLAGS, "-o", f"{made}/kernels.so"])
+            _compile(["-xc++", "-", *_FLAGS, "-o", f"{made}/kernels.so"], source)
             os.replace(f"{made}/kernels.so", path)
     return path

@@ -1,9 +1,8 @@
 """Clusters of rows as C: families as functions, small clusters as straight code, large ones as tables.
 
-The same text is compiled as OpenCL C, CUDA, HIP and C++; its numbers are `mixed`. A work-item has a small cluster in
-registers: Newton's method with J = A(x + d) M^-1 A(x)^T, whose elimination is written out; what stays zero has no code.
-Distances are held as u.u/2 = t^2/2, which needs neither root nor division. A work-group has a large cluster, with an
-order of elimination by levels (see `clusters.c`).
+A work-item has a small cluster in registers: Newton's method with J = A(x + d) M^-1 A(x)^T, whose elimination is
+written out; what stays zero has no code. Distances are held as u.u/2 = t^2/2, which needs neither root nor division.
+A work-group has a large cluster, with an order of elimination by levels (see `clusters.c`).
 """
 
 from __future__ import annotations
@@ -363,18 +362,18 @@ def large_clusters(shapes: list[Shape], held: Any, first_row: int) -> tuple[list
     both = np.concatenate([_pairs(np.arange(*ends)) for ends in zip(diagonal[:-1] + 1, diagonal[1:], strict=True)])
     update_key = entry_column[both] @ [count, 1]
     update = np.column_stack([both, entry_row[both[:, 0]]])
+    begins = [np.searchsorted(np.sort(keys), key) for keys in (product_key, update_key)]
     earlier = np.flatnonzero(entry_row < entry_column)
     earlier = earlier[np.argsort(entry_column[earlier], kind="stable")]
-    sizes = [len(held.parameters[row]) for row in rows]
-    moves = np.array([row.moves for row in kinds])
+    function, how, flags, moves = np.array([(r.function, r.how, r.rolls + 2 * r.summed, r.moves) for r in kinds]).T
     columns: list[Any] = [
-        [*(row.function for row in kinds), 0],
+        [*function, 0],
         np.searchsorted(slot_row, np.arange(count + 1)),
-        np.cumsum([0, *sizes]),
-        [*(row.how for row in kinds), 0],
+        np.cumsum([0, *(len(held.parameters[row]) for row in rows)]),
+        [*how, 0],
         diagonal,
         np.searchsorted(entry_column[earlier], np.arange(count + 1)),
-        [*(row.rolls + 2 * row.summed for row in kinds), 0],
+        [*flags, 0],
         [*np.where(moves, held.mover[rows], -1), 0],
         [*held.cell[rows], 0],
     ]
@@ -384,25 +383,15 @@ def large_clusters(shapes: list[Shape], held: Any, first_row: int) -> tuple[list
         "row": np.stack(columns, axis=1),
         "slot": np.stack([slot_atom - base[slot_row], slot_row], axis=1),
         "level": [*levels, count],
-        "entry": np.stack(
-            [
-                [*entry_row, 0],
-                [*entry_column, 0],
-                [*np.searchsorted(np.sort(product_key), key), len(product)],
-                [*np.searchsorted(np.sort(update_key), key), len(update)],
-            ],
-            axis=1,
-        ),
+        "entry": np.vstack([np.stack([entry_row, entry_column, *begins], axis=1), [0, 0, len(product), len(update)]]),
         "product": product[np.argsort(product_key, kind="stable")],
         "update": update[np.argsort(update_key, kind="stable")],
         "earlier": earlier,
         "atom": np.searchsorted(slot_atom[touch], np.arange(n_atoms + 1)),
         "touch": touch,
     }
-    arrays = [Array(f"rows_{name}", "int", np.ravel(table)) for name, table in tables.items()]
-    arrays = [array if array.values.size else array._replace(values=np.zeros(1)) for array in arrays]
-    periods = [row.period for row in kinds]
-    numbers = np.stack([held.target[rows], held.scale[rows], periods], axis=1)
+    arrays = [Array(f"rows_{k}", "int", np.ravel(t) if np.size(t) else np.zeros(1)) for k, t in tables.items()]
+    numbers = np.stack([held.target[rows], held.scale[rows], [row.period for row in kinds]], axis=1)
     parameters = np.concatenate([*(held.parameters[row] for row in rows), np.zeros(1)])
     arrays += [Array("rows_number", "mixed", numbers.ravel()), Array("rows_parameter", "mixed", parameters)]
     slots, entries = len(slot_row), len(entry_row)

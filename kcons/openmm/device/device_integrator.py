@@ -78,16 +78,13 @@ def refusal(scheme: Any, parts: Sequence[Any], ensemble: Ensemble) -> str:
 def plain_operations(operations: Sequence[Operation], ensemble: Ensemble) -> list[Op]:
     """Operations as plain data, with the time of each; what acts in the middle of a drift is written out."""
     done: list[Op] = []
-    flights: tuple[float, ...]
     ends: tuple[float, ...] = (0.0,)
     if isinstance(ensemble, NoseHooverMiddle):
         middle = (Project(), Chain(0.5), Chain(0.5))
         operations = [o for given in operations for o in (middle if isinstance(given, Exchange) else (given,))]
     for operation in operations:
-        flights, ends = (), ends[-1:]
-        if isinstance(operation, Fly):
-            flights, ends = operation.flights, operation.ends
-        elif isinstance(operation, Chain):
+        flights, ends = getattr(operation, "flights", ()), getattr(operation, "ends", ends[-1:])
+        if isinstance(operation, Chain):
             flights = tuple(operation.fraction * f for f in FRACTIONS)
         done.append(Op(operation.verb, operation.fraction, operation.group, flights, ends))
         if isinstance(ensemble, IsokineticSpheres) and isinstance(operation, Project):
@@ -148,8 +145,6 @@ class DeviceProgram(Program):
 class DeviceIntegrator(ProjectedIntegrator):
     """`ProjectedIntegrator` whose steps are kernels of a plugin: what ``ProjectedIntegrator(..., device=True)`` gives.
 
-    Made with the same arguments.
-
     Raises
     ------
     UnsupportedError
@@ -170,20 +165,18 @@ class DeviceIntegrator(ProjectedIntegrator):
         library.kcons_set_planner(_planner)
         library.kcons_shared.restype = ctypes.POINTER(_Shared)
         library.kcons_read.restype = library.kcons_given.restype = _DOUBLES
-        made = openmm.XmlSerializer.deserialize(_EMPTY)
-        self.this = made.this  # the proxy of this class owns what XmlSerializer has made
+        self.this = openmm.XmlSerializer.deserialize(_EMPTY).this  # of which the proxy of this class is the owner
         openmm.Integrator.setStepSize(self, dt)
-        self._address = ctypes.c_void_p(int(made.this))
+        self._address = ctypes.c_void_p(int(self.this))
         self.shared: _Shared = library.kcons_shared(self._address).contents
-        _ALIVE[int(made.this)] = self
+        _ALIVE[int(self.this)] = self
 
     def _held(self, parts: Any) -> tuple[Part, ...]:
         given = tuple(parts) if isinstance(parts, Iterable) else (parts,)
-        made = [part for part in given if isinstance(part, KernelRows)]
-        if len(given) == len(made) < 2:
+        if len(given) == 1 and isinstance(part := given[0], KernelRows):
             # Kernels are those of one Context: what serves another integrator is made again.
-            return tuple(part if part.program is None else copy.deepcopy(part) for part in made)
-        return (KernelRows(given),)
+            return (part if part.program is None else copy.deepcopy(part),)
+        return (KernelRows(given),) if given else ()
 
     def _write(self) -> Program:
         """A step without parts: kernels hold their rows."""
@@ -427,8 +420,9 @@ def choose(
     kind = ConstantEnergy() if ensemble is None else ensemble
     why = refusal(to_scheme(scheme), [*around, *given], kind) or build.refusal()
     nowhere_else = isinstance(ensemble, IsokineticSpheres) or any(isinstance(part, Constraint) for part in given)
-    if not why and device is None and not nowhere_else:
-        why = build.reluctance()
+    wanted = device or nowhere_else or build.accelerated() or (build.is_built() and build.compiler())
+    if not (why or wanted):
+        why = "the plugin is not compiled, or the compiler is gone, and OpenMM sees no GPU here; see kcons doctor"
     if not why:
         try:
             build.library()

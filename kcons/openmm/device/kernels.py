@@ -1,8 +1,7 @@
 """Operations of a step as kernels: one text that OpenCL, CUDA, HIP and C++ compile.
 
 Operations that nobody looks between are joined. What is left is cut where forces are evaluated and where a sum over all
-particles is needed; each piece is one kernel. A work-item has a cluster of atoms that rows join, or a single atom; a
-work-group has a large cluster.
+particles is needed; each piece is one kernel.
 """
 
 from __future__ import annotations
@@ -97,7 +96,7 @@ template <class T> static inline T max(T a, T b) {return a > b ? a : b;}
 template <class T> static inline T min(T a, T b) {return a < b ? a : b;}
 typedef double real, mixed;
 typedef unsigned long mm_ulong;
-struct real4 {double x, y, z, w;};
+struct real4 {double x, y, z;};
 typedef real4 mixed4;
 #define DEVICE static inline
 #define KERNEL extern "C"
@@ -113,19 +112,17 @@ typedef real4 mixed4;
 #define PUT_V(a, p) GET_3(velocities, p, v, a)
 #define GET_X(a, p) GET_3(x, a, positions, p)
 #define PUT_X(a, p) GET_3(positions, p, x, a)
-struct Numbers {int step, launch; double dt, time, tolerance, box[9];};
-#define UNPACK_NUMBERS int step = given->step, launch = given->launch; \\
-  double dt = given->dt, time = given->time, tolerance = given->tolerance; const double* box_ = given->box; \\
-  real4 box0 = {box_[0], box_[1], box_[2], 0}, box1 = {box_[3], box_[4], box_[5], 0}; \\
-  real4 box2 = {box_[6], box_[7], box_[8], 0};
+struct Numbers {int step, launch; double dt, time, tolerance; real4 box0, box1, box2;};
+#define UNPACK_NUMBERS int step = given->step, launch = given->launch; double dt = given->dt, time = given->time; \\
+  double tolerance = given->tolerance; real4 box0 = given->box0, box1 = given->box1, box2 = given->box2;
 """
 
 #: What kernels are given besides arrays of their own, in the order in which the plugin gives it.
-_GIVEN = [
-    "int padded, int step, int launch, mixed dt, mixed time, mixed tolerance, mixed4 box0, mixed4 box1, mixed4 box2"
-]
-_GIVEN += ["GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT correction, GLOBAL mixed4* RESTRICT velm"]
-_GIVEN += ["GLOBAL const int* RESTRICT order"]
+_GIVEN = (
+    "int padded, int step, int launch, mixed dt, mixed time, mixed tolerance, mixed4 box0, mixed4 box1, mixed4 box2",
+    "GLOBAL real4* RESTRICT posq, GLOBAL real4* RESTRICT correction, GLOBAL mixed4* RESTRICT velm",
+    "GLOBAL const int* RESTRICT order",
+)
 #: Arrays that functions of rows have, too.
 _PASSED = ("parameters", "failure", "failure_residual")
 
@@ -200,17 +197,15 @@ def divided(operations: Sequence[Op], noisy: bool) -> tuple[list[Op], list[Op], 
     """Head, middle and tail of a step: up to its last evaluation of forces, joined with the next step, and its end."""
     uses = iter(range(len(operations)))
     ops = [op._replace(use=next(uses)) if op.verb == "exchange" else op for op in operations]
-    last = max((k for k, op in enumerate(ops) if op.verb == "evaluate"), default=-1) + 1
+    last, flown = (max((k for k, op in enumerate(ops, 1) if op.verb == v), default=0) for v in ("evaluate", "fly"))
     if not last:
         raise UnsupportedError("a step on the device evaluates forces at its end; the leapfrog does not")
-    flown = max((k for k, op in enumerate(ops) if op.verb == "fly"), default=-1) + 1
-    if noisy and all(op.verb in ("evaluate", "project") for op in ops[flown:last]):
-        flown = last  # nothing changes v before: only the end of a call has to take the sum
-    head, tail = ops[:last], [op._replace(begun=-1) for op in ops[last:]]
-    noted = [Op("note"), *tail] if noisy and flown == last else tail
-    if noisy and flown < last:
-        head = [*head[:flown], Op("note"), *head[flown:]]
-    return joined(head), joined([*tail, *head]), joined(noted)
+    head, tail, note = ops[:last], [op._replace(begun=-1) for op in ops[last:]], [Op("note")] * noisy
+    if all(op.verb in ("evaluate", "project") for op in ops[flown:last]):
+        # Nothing changes v before: only the end of a call has to take the sum.
+        return joined(head), joined([*tail, *head]), joined([*note, *tail])
+    head = [*head[:flown], *note, *head[flown:]]
+    return joined(head), joined([*tail, *head]), joined(tail)
 
 
 def joined(operations: Sequence[Op]) -> list[Op]:
@@ -218,10 +213,8 @@ def joined(operations: Sequence[Op]) -> list[Op]:
     done: list[Op] = []
     for k, op in enumerate(operations):
         after = next((later.verb for later in operations[k + 1 :] if later.verb != "kick"), "")
-        if op.verb == "project" and after == "fly":
-            continue  # the drift absorbs what v has across the rows
-        if op.verb == "project" and done and done[-1].verb == "turn":
-            continue  # turned velocities are tangent
+        if op.verb == "project" and (after == "fly" or (done and done[-1].verb == "turn")):
+            continue  # the drift absorbs what v has across the rows; turned velocities are tangent
         if done and done[-1][0:3:2] == op[0:3:2] and op.verb in ("kick", "turn"):
             done[-1] = done[-1]._replace(share=done[-1].share + op.share)
         elif done and done[-1].verb == op.verb == "chain":
@@ -605,11 +598,9 @@ class Kernels:
 def plan(
     described: Mapping[str, Any], platform: str, masses: FloatArray, groups: int, held: Any
 ) -> tuple[str, list[Array], list[list[Action]], tuple[int, int, int]]:
-    """What the plugin needs for a Context, see `Steps` in `plugin/program_integrator.h`.
+    """Source, arrays, head, middle and tail of a step, and sizes: work-items, those of a group, groups of forces kept.
 
     Given are what `DeviceIntegrator.describe` says of a step, the bit mask of force groups that act, and the rows.
-    Returns source, arrays, head, middle and tail of a step, and sizes: work-items, their number in a group, how many
-    groups of forces are kept.
     """
     operations = [Op._make(tuple(v) if isinstance(v, list) else v for v in op) for op in described["operations"]]
     masks = {op.group: 1 << int(op.group) if op.group else groups for op in operations if op.verb == "evaluate"}

@@ -116,7 +116,6 @@ class DeviceRows:
 
     Masses are 0 for particles that do not move; `positions` are on or near the constraints, nm, in a `cell` where rows
     take periodic images. Raises UnsupportedError for rows that only Python can compute and fixed atoms that move.
-
     Of the `set` of all rows, the System's first, `motion` is the engine; `scale` is the length held, 1 for all that is
     no length; `mover` and `cell` are numbers of moving targets and where cells begin, of other rows those of the next.
     `shapes`, `arrays` and `source` belong to the functions ``positions_NAME`` and ``velocities_NAME`` as C, which need
@@ -210,10 +209,7 @@ class DeviceRows:
     def renew(
         self, time: float, dt: float, steps: int, positions: FloatArray | None = None, cell: FloatArray | None = None
     ) -> dict[str, FloatArray]:
-        """What functions of Python say for so many steps, at most `block`, and positions, by the name of the array.
-
-        Positions and the cell are needed where they have changed and there are `n_cells`.
-        """
+        """What functions of Python say for so many steps, at most `block`, and of positions where they have changed."""
         found: dict[str, FloatArray] = {}
         if self.n_movers:
             # Times, those of knots, then value, rate and acceleration of moving rows at each knot, per spacing.
@@ -268,11 +264,10 @@ class DeviceRows:
 
 
 class KernelRows(CarriedConstraints):
-    """All rows of a Context that its kernels hold: those of parts and the System's constraints.
+    """All rows of a Context that its kernels hold: those of parts and the System's constraints; nm, ps, dalton, radian.
 
-    `parts` are what ``ProjectedIntegrator(..., parts=[...], device=True)`` was given; in nm, ps, dalton, radian.
     Targets left at None are taken from the positions at the first step. One that is a function is asked before each
-    call of `step`, at every half step that the call will make: it may read a context parameter.
+    call of `step`, at every half step that the call will make.
     """
 
     def __init__(self, parts: Sequence[Any]) -> None:
@@ -377,11 +372,10 @@ class KernelRows(CarriedConstraints):
     def mean_multipliers(self, integrator: Any) -> FloatArray:
         """Multipliers averaged over all steps of an integrator since they were reset, by row of the set of `motion`.
 
-        Where the time was set, or a State or checkpoint of another time loaded, they begin anew.
-
         Impulses that the kernels have summed over the time: kJ/mol over the unit of the row; NaN for constraints of the
-        System, and before the first step. The weights of `Series.weights`, which blue-moon averages over
-        configurations need, are not in them: take samples by `HeldCoordinatesReporter` where masses enter det Z.
+        System, and before the first step. They begin anew where the time was set, or a State of another time loaded.
+        The weights of `Series.weights`, which blue-moon averages over configurations need, are not in them: take
+        samples by `HeldCoordinatesReporter` where masses enter det Z.
         """
         rows, time = self.bind(integrator.context), float(integrator.context.getTime()._value) - self._since
         sums = integrator.read("rows_sums")

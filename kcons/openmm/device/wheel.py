@@ -35,7 +35,7 @@ def make_wheel(folder: str | Path = ".") -> Path:
     info = f"{build.PACKAGE}-{number}.dist-info"
     files: dict[str, bytes] = {f"{build.PACKAGE}/__init__.py": b'"""Libraries of kcons for OpenMM."""\n'}
     with tempfile.TemporaryDirectory() as made:
-        build.build(Path(made), build.ACCELERATED, stubs=True)
+        build.build(Path(made), build.ACCELERATED)
         for path in sorted(Path(made).glob("*.so")):
             files[f"{build.PACKAGE}/{build.digest()}/{path.name}"] = path.read_bytes()
     needs = f"Requires-Dist: openmm=={needed}\nRequires-Dist: kcons=={__version__}\n"

@@ -20,9 +20,6 @@ MUTANTS = {
         "numbers.time = «→(float) »c.getTime()-shared.origin;": "kernel_rows::targets_move_late_in_a_long_run",
         'array.name != «"memory"→""»;': "device_integrator::states_of_other_rows_are_refused",
     },
-    "openmm/device/build.py": {
-        "if not (accelerated() «or→and» is_built()):": "device_integrator::which_steps_are_made_on_the_device",
-    },
     "plan/clusters.py": {
         "for k in left if not «(k in last and coupled[k] - last)→False»]": "rows::levels_have_rows_that_share_no_entry",
         "if «k not in beside→True» and count": "rows::levels_have_rows_that_share_no_entry",
@@ -36,6 +33,7 @@ MUTANTS = {
         '"there« && last→»"': "surface_integrator::the_device_holds_the_same_surfaces",
     },
     "openmm/device/device_integrator.py": {
+        "or build.accelerated() «or→and» (build.is_built()": "device_integrator::which_steps_are_made_on_the_device",
         "array in «arrays→rows.arrays» if array.saved": "molecule_spheres::a_failure_puts_auxiliary_variables_back",
         "np.isfinite(told[_RESIDUAL])«→ and False»:": "device_integrator::a_failure_puts_back_what_was_checked_last",
         "yield x, v, f, time + «k→(k - 1)» * every * self": "device_integrator::records_are_the_states_after_steps",

@@ -15,12 +15,7 @@ typedef void (*PlainKernel)(void** pointers, const void* numbers, int group, int
 class PlainSteps : public Steps {
 public:
     PlainSteps(ContextImpl& c, bool parallel)
-            : data(*static_cast<ReferencePlatform::PlatformData*>(c.getPlatformData())), parallel(parallel) {
-        for (int k = 0; k < c.getSystem().getNumParticles(); k++) {
-            double mass = c.getSystem().getParticleMass(k);
-            inverse.push_back(mass == 0 ? 0 : 1/mass);
-        }
-    }
+            : data(*static_cast<ReferencePlatform::PlatformData*>(c.getPlatformData())), parallel(parallel) {}
     ~PlainSteps() { if (library != nullptr) dlclose(library); }
     vector<double> read(const string& name) override {
         if (!declared(name).whole) return reals[name];
@@ -31,6 +26,7 @@ public:
         else copy(values.begin(), values.end(), reals[name].begin());
     }
     void prepare(ContextImpl& c) override {
+        for (double mass : given["masses"]) inverse.push_back(mass == 0 ? 0 : 1/mass);
         forces.resize(slots);
         for (auto& array : arrays) {
             if (array.whole) integers[array.name].assign(array.values.begin(), array.values.end());
