@@ -19,8 +19,6 @@ from kcons.plan.clusters import elimination
 
 #: Rows, atoms of a cluster and atoms of a row up to which a work-item has the cluster in registers.
 ITEM_ROWS, ITEM_ATOMS, ITEM_WIDTH = 6, 10, 4
-#: Rows from which a matrix has the precision of forces: registers are then scarce, and residuals are exact still.
-FEW = 4
 #: How rows take their atoms, see `clusters.c`.
 STORED, RELATIVE, IN_CELLS = range(3)
 #: Where a function has no tape.
@@ -139,8 +137,6 @@ class ItemWriter:
         self.rows, self.count = shape.rows, len(shape.rows)
         self.single = shape.atoms.shape[1] == 1
         self.row_number = f"{first_row}+cluster*{self.count}"
-        #: Whether the matrix is in the precision of forces.
-        self.coarse = self.count >= FEW and not any(row.depends for row in self.rows)
         self.filled: list[set[int]] = []
         #: Of each row, as C: its target or the number of its moving one, its scale, where cells and parameters begin.
         self.targets: list[str] = []
@@ -200,8 +196,8 @@ class ItemWriter:
         text = (
             f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
             f"mixed* d, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
-            f"{self.table.shape[1]};\n mixed off[{self.count}], sum[{self.count}], whole;\n "
-            f"{'real' if self.coarse else 'mixed'} J[{self.count**2}], y[{self.count}];\n"
+            f"{self.table.shape[1]};\n mixed off[{self.count}], sum[{self.count}], whole, J[{self.count**2}], "
+            f"y[{self.count}];\n"
         )
         for k, row in enumerate(self.rows):
             size, kept = 3 * len(row.atoms), 3 * len(self._legs(row))
@@ -241,7 +237,7 @@ class ItemWriter:
                     lines.append(f" J[{k * n + j}] = {f'J[{j * n + k}]' if left == 'g' and j < k else text};\n")
         for k, row in enumerate(self.rows):
             pivot = f"J[{k * n + k}]"
-            lines.append(f" whole = fabs((mixed) {pivot});\n" * row.depends)
+            lines.append(f" whole = fabs({pivot});\n" * row.depends)
             for m in range(k):
                 if m not in filled[k]:  # which grows
                     continue
@@ -250,7 +246,7 @@ class ItemWriter:
                     old = f"J[{k * n + j}]" if j in filled[k] else "0"
                     filled[k].add(j)
                     lines.append(f" J[{k * n + j}] = {old}-J[{k * n + m}]*J[{m * n + j}];\n")
-            none = f"fabs((mixed) {pivot}) <= ROWS_PIVOT*whole ? 0 : " * row.depends
+            none = f"fabs({pivot}) <= ROWS_PIVOT*whole ? 0 : " * row.depends
             lines.append(f" {pivot} = {none}1/{pivot};\n")
         return "".join(lines)
 
@@ -305,19 +301,17 @@ class ItemWriter:
 
     def velocities(self) -> str:
         """v, which is called d, along the rows."""
-        demanded = speeds = ""
+        speeds = ""
         for k, row in enumerate(self.rows):
             rate = self._wanted(k, row, "time", 0 if row.rolls else 1)
             if self.held.functions[row.function].rate is not None:
                 rate += f"-rows_f{row.function}_rate(r{k}, {self.parameters[k]}, rows_knots[0]+time)"
-            demanded += f" mixed c{k} = {'0' if rate == '0' else f'rate == 0 ? 0 : rate*({rate})'};\n"
-            speeds += f" off[{k}] = -c{k};\n"
+            speeds += f" off[{k}] = {'0' if rate == '0' else f'rate == 0 ? 0 : -rate*({rate})'};\n"
             for p, leg in enumerate(self._legs(row)):
                 speed = "".join(f"{sign}d[{3 * a}+c]" for a, sign in leg.items())
                 speeds += f" XYZ off[{k}] += g{k}[{3 * p}+c]*({speed});\n"
         return (
-            f"{self._begin('velocities', 'rate', 'time')}{demanded}{self._factored('g')}"
-            f" for (int pass = 0; pass < {1 + self.coarse}; pass++) {{\n{speeds}{self._solved()} }}\n"
+            f"{self._begin('velocities', 'rate', 'time')}{speeds}{self._factored('g')}{self._solved()}"
             f" if (rate != 0) {{{self._sums('')} }}\n}}\n"
         )
 

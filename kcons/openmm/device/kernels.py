@@ -51,7 +51,7 @@ _COMMON = """
 #define XYZ for (int c = 0; c < 3; c++)
 #define GET_U(a, p) XYZ d[3*(a)+c] = kept[3*(p)+c];
 #define PUT_U(a, p) XYZ kept[3*(p)+c] = d[3*(a)+c];
-#define AWAY(a, p, sign) {mixed i_ = cells[3*(p)], j_ = cells[3*(p)+1], k_ = cells[3*(p)+2]; \\
+#define AWAY(a, p, sign) {mixed i_ = cells[4*(p)], j_ = cells[4*(p)+1], k_ = cells[4*(p)+2]; \\
   x[3*(a)] = x[3*(a)] sign (i_*box0.x+j_*box1.x+k_*box2.x); \\
   x[3*(a)+1] = x[3*(a)+1] sign (j_*box1.y+k_*box2.y); x[3*(a)+2] = x[3*(a)+2] sign k_*box2.z;}
 /* In double precision Newton's last turn has all digits. */
@@ -618,7 +618,7 @@ def plan(
             raise InputError("a sphere of one degree of freedom has the radius 0; give auxiliary=1", item="auxiliary")
         first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
         arrays.append(Array("auxiliary", "mixed", first, saved=True))
-    arrays += [Array("cells", "int", np.zeros(3 * n))] * (len(held.placed) > 0)
+    arrays += [Array("cells", "int", np.zeros(4 * n))] * (len(held.placed) > 0)
     if recorded:
         arrays += [Array("records", "mixed", np.zeros(9 * len(recorded) * room)), Array("recorded", "int", np.ones(2))]
     work_group = 1 if platform in PLAIN else held.work_group

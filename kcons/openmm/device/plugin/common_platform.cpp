@@ -110,13 +110,7 @@ private:
         // Of particles that rest -1-k, as at first.
         for (int k : declared("atoms").values) now.push_back(k < 0 ? -1-place[-1-k] : place[k]);
         own.at("atoms").upload(now);
-        if (own.count("cells") == 0) return;
-        vector<int> cells;
-        for (int k = 0; k < cc.getNumAtoms(); k++) {
-            mm_int4 by = cc.getPosCellOffsets()[k];
-            cells.insert(cells.end(), {by.x, by.y, by.z});
-        }
-        own.at("cells").upload(cells);
+        if (own.count("cells")) own.at("cells").uploadSubArray(cc.getPosCellOffsets().data(), 0, 4*cc.getNumAtoms());
     }
     ComputeContext& cc;
     ComputeProgram program;

@@ -174,15 +174,12 @@ static const bool registered = (SerializationProxy::registerProxy(typeid(Program
 void Steps::execute(ContextImpl& c, const Integrator& integrator, const Shared& shared, int steps) {
     numbers.dt = integrator.getStepSize();
     numbers.tolerance = integrator.getConstraintTolerance();
-    const Vec3 before[] = {numbers.box[0], numbers.box[1], numbers.box[2]};
-    c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
-    for (int k = 0; k < 3; k++) if (numbers.box[k] != before[k]) valid = false;
     bool ended = true;                         // whether velocities are those of the end of a step
     for (int k = 0; k < steps; k++) {
-        if (c.updateContextState()) {          // barostats have moved positions
-            valid = false;
-            c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
-        }
+        if (c.updateContextState()) valid = false;     // barostats have moved positions
+        const Vec3 before[] = {numbers.box[0], numbers.box[1], numbers.box[2]};
+        c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
+        if (!equal(before, before+3, numbers.box)) valid = false;
         if (!valid || (slots == 1 && c.getLastForceGroups() != parts[0].back().groups)) {
             positionsMoved();
             vector<bool> known(slots);
