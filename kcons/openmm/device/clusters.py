@@ -117,11 +117,6 @@ class Shape(NamedTuple):
         widest = max((len(row.atoms) for row in self.rows), default=0)
         return len(self.rows) > ITEM_ROWS or self.atoms.shape[1] > ITEM_ATOMS or widest > ITEM_WIDTH
 
-    @property
-    def n_rows(self) -> int:
-        """Independent rows of a cluster."""
-        return sum(not row.depends for row in self.rows)
-
 
 # -- small ones ---------------------------------------------------------------------------------------
 

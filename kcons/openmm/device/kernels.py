@@ -365,7 +365,7 @@ _RULES = {
 
 def _spheres_of(kind: str, shape: Shape, moving: Any, placed: bool) -> tuple[tuple[int, ...], list[int]]:
     """Spheres of the center of mass along x, y, z and of the rest, -1 for none; degrees of freedom on each."""
-    free = 3 * int(moving.sum()) - shape.n_rows
+    free = 3 * int(moving.sum()) - sum(not row.depends for row in shape.rows)
     if kind == "cluster" or placed or not moving.all():
         return (-1, -1, -1, 0 if free else -1), [free] if free else []
     centers, parts = ((0, 1, 2), [1, 1, 1]) if kind == "axes" else ((0, 0, 0), [3])

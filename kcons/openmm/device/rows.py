@@ -363,9 +363,8 @@ class KernelRows(CarriedConstraints):
     def rank(self, context: openmm.Context | None = None) -> int:
         """Degrees of freedom that the rows take, beyond the constraints of the System."""
         assert context is not None
-        rows = self.bind(context)
-        fixed = int(np.count_nonzero(rows.motion.masses[self.atoms] == 0))
-        return rows.motion.rank - 3 * fixed - SystemRows.of(context.getSystem()).rank(positions_of(context))
+        self.bind(context)
+        return super().rank() - SystemRows.of(context.getSystem()).rank(positions_of(context))
 
     # -- results --------------------------------------------------------------------------------
 

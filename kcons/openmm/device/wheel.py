@@ -1,7 +1,6 @@
 """The plugin for all platforms as a wheel: ``python -m kcons.openmm.device.wheel [folder]``.
 
-Neither CUDA nor a GPU need be where it is made. It serves the version of OpenMM that is installed here and the sources
-of this kcons; where others are installed, the plugin is compiled as without it.
+It serves the OpenMM that is installed here and the sources of this kcons; elsewhere the plugin is compiled as without.
 """
 
 from __future__ import annotations
