@@ -86,7 +86,7 @@ def test_nothing_is_written_where_nothing_was_done(tmp_path, monkeypatch, capsys
 
     monkeypatch.setattr(measure, "all_settings", stopped)
     assert run(*CHAIN, "--methods", "rattle", "--out", tmp_path) == 130
-    assert capsys.readouterr().err.endswith("kcons: interrupted\n") and list(tmp_path.iterdir()) == []
+    assert capsys.readouterr().err.endswith("kcons: interrupted\n") and list(tmp_path.glob("[!.]*")) == []
 
 
 def test_a_file_of_ones_own(tmp_path, monkeypatch, capsys):
