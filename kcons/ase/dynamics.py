@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -95,6 +96,7 @@ class ConstrainedDynamics(MolecularDynamics):
 
     #: Besides that of the atoms.
     _calculators: tuple[Any, ...] = ()
+    _longest = 20.1 * units.fs  # others look like a slip of units: 2 is 20.4 fs
     #: What changes the cell, beside a stepper that keeps a temperature.
     barostat: Barostat | None = None
 
@@ -150,6 +152,9 @@ class ConstrainedDynamics(MolecularDynamics):
     def set_timestep(self, timestep: float) -> None:
         """Use another time step from now on."""
         self.dt = finite_number(timestep, "timestep")
+        if abs(timestep) > self._longest:
+            said = f"the step is {timestep / units.fs:.4g} fs. Is that meant? Give 2 fs as 2 * ase.units.fs"
+            warnings.warn(said, UserWarning, stacklevel=3)
 
     def get_time(self) -> float:
         """The time reached, in ASE's unit; right also if the time step was changed."""

@@ -362,15 +362,12 @@ class MultipleTimeSteps(ThermostattedDynamics):
     ) -> None:
         require_atoms(atoms)
         if fast is slow:
-            raise InputError(
-                "fast and slow are the same calculator: its forces would count twice. Give two, or use "
-                "ConstrainedLangevin",
-                item="slow",
-            )
+            said = "fast and slow are the same calculator: its forces would count twice; give two"
+            raise InputError(said, item="slow")
         for name, calculator in (("fast", fast), ("slow", slow)):
             if not hasattr(calculator, "get_forces") or isinstance(calculator, Atoms):
                 raise InputError(f"{name} is {calculator!r:.80}; give an ASE calculator", item=name)
-        self._calculators = fast, slow
+        self._calculators, self._longest = (fast, slow), np.inf
         forces = {"fast": self._forces_of(fast, True), "slow": self._forces_of(slow, difference)}
         self.groups = ForceGroups.difference(*forces.values()) if difference else ForceGroups(forces)
         self._force = self.groups  # type: ignore[method-assign, assignment]

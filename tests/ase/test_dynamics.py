@@ -138,6 +138,14 @@ def test_masses_of_free_atoms_changed_between_steps_are_taken(name, value):
 # -- time steps -------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("long", [2.0, -2000 * FS], ids=["without units", "back"])
+def test_a_step_that_looks_like_a_slip_of_units_is_asked_about(long):
+    """2 is 20.4 fs; 20 fs are nobody's slip."""
+    with pytest.warns(UserWarning, match=rf"is {long / FS:.4g} fs. Is that meant.*2 \* ase.units.fs"):
+        dyn = ConstrainedDynamics(water()[0], long)
+    dyn.set_timestep(20 * FS)
+
+
 @pytest.mark.parametrize(
     ("kind", "step", "options", "said"),
     [

@@ -502,9 +502,8 @@ class Scan:
             Numbers of its values in the lists of the scan.
         """
         if point not in self.best:
-            raise InputError(
-                f"there is no structure at {point}: {self.failed.get(point, 'no such point')}", item="point"
-            )
+            why = self.failed.get(point, "no such point")
+            raise InputError(f"there is no structure at {point}: {why}", item="point")
         found = self.atoms.copy()
         found.positions[:] = self.best[point].positions
         found.info |= {"energy": self.best[point].energy, **self._values(point)}

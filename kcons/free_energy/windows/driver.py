@@ -280,9 +280,8 @@ def places_of(targets: ArrayLike | Iterable[Sequence[float]], names: Sequence[st
     places = np.array(as_float_array(listed, "targets"))
     places = places[:, None] if places.ndim == len(names) == 1 else places
     if places.ndim != 2 or places.shape[1] != len(names) or not len(places) or not np.all(np.isfinite(places)):
-        raise InputError(
-            f"targets must be finite numbers, one of {' and '.join(names)} for each window", item="targets"
-        )
+        said = f"targets must be finite numbers, one of {' and '.join(names)} for each window"
+        raise InputError(said, item="targets")
     return places
 
 

@@ -123,9 +123,8 @@ class Coordinate:
             places = np.linspace(float(self.begin), float(self.to), self.count, endpoint=not turn)
         low, high = _RANGES.get(self.family, (-math.inf, math.inf))
         for place in places[(places <= low) | (places >= high)].tolist():
-            raise InputError(
-                f"there is no {self.family} of {place:g} to hold {self.called} at; leave it out", item="coordinate"
-            )
+            said = f"there is no {self.family} of {place:g} to hold {self.called} at; leave it out"
+            raise InputError(said, item="coordinate")
         return np.radians(places) if self.family in ("angle", "dihedral") else places
 
 
