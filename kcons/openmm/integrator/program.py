@@ -134,7 +134,7 @@ class Ensemble:
 
     def operations(self, scheme: Splitting) -> tuple[Operation, ...]:
         """What a step consists of. Where there is an `Exchange`, `middle` writes it."""
-        return scheme.operations()
+        return scheme.program(None).operations
 
     # -- the program ----------------------------------------------------------------------------
 
