@@ -189,7 +189,7 @@ def test_clusters_that_look_alike_share_their_code():
     lengths = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
     masses = np.tile([16.0, 1.0, 1.0], 20)
     rows = DeviceRows(masses, (pairs, lengths), [Distance([[0, 3]])], positions=x)
-    assert sorted((s.together, s.atoms.shape, s.n_rows) for s in rows.shapes) == [
+    assert sorted((s.together, s.atoms.shape, len(s.rows)) for s in rows.shapes) == [
         (False, (18, 3), 3),
         (True, (1, 6), 7),
     ]
