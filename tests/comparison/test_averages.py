@@ -106,7 +106,7 @@ def test_a_step_that_is_too_long_and_a_run_that_is_too_short_are_shown():
 
 @functools.cache
 def table():
-    return compare_averages(chain(), ["langevin", "isokinetic"], steps=[10.0, 5.0], budget=0.8)
+    return compare_averages(chain(), ["langevin", "isokinetic"], steps=[10.0, 5.0], budget=2.0)
 
 
 def test_one_table_as_that_of_trajectories():
@@ -114,7 +114,7 @@ def test_one_table_as_that_of_trajectories():
     assert list(found.columns) == [*COLUMNS, *AVERAGES] and set(found.status) == {"ok"}
     assert list(found.setting) == [5, 5, 10, 10, 5, 10]
     assert list(found.friction) == pytest.approx([16, 4, 16, 4, 0, 0])  # 1 in 12.5 and 1 in 50 steps of 5 fs, a ps
-    assert found.attrs["environment"]["cpu"] and found.attrs["budget"] == 0.8
+    assert found.attrs["environment"]["cpu"] and found.attrs["budget"] == 2.0
 
 
 def row(title, error, seconds, setting=2.0, friction=5.0):
@@ -156,8 +156,8 @@ def test_a_sampler_of_ones_own_goes_on_and_its_lines_run():
     kept = []
     with patch.dict(SAMPLERS):
         add_sampler("mine", lambda s: Langevin(s.thermal_energy, 2 * s.friction, s.seed), "twice the friction")
-        compare_averages(chain(), ["mine"], steps=[5.0], budget=0.5, keep=kept.append)
-        found = compare_averages(chain(), ["mine", "isokinetic"], steps=[5.0], budget=0.5, done=kept[-1])
+        compare_averages(chain(), ["mine"], steps=[5.0], budget=1.5, keep=kept.append)
+        found = compare_averages(chain(), ["mine", "isokinetic"], steps=[5.0], budget=1.5, done=kept[-1])
         assert list(found.method) == ["mine", "mine", "isokinetic"]
         assert list(found.energy[:2]) == list(kept[-1].energy)
         space = {}
