@@ -175,6 +175,9 @@ def hold(
     objects = [item for item in given if not isinstance(item, str)]
     words = [word.strip().lower() for text in given if isinstance(text, str) for word in text.split(",")]
     kind = ", ".join(word for word in words if word != "water") or "none"
+    if options and not words:
+        remedy = "give 'none' beside the objects where nothing else is held by name"
+        raise InputError(f"{', '.join(options)}: options of names, of which there are none; {remedy}", item="constraints")
     options.setdefault("guess_bonds", True)  # a state has none
     known: dict[tuple[bytes, ...], tuple[Motion, Any]] = {}
     found = []

@@ -35,7 +35,7 @@ SAID = {
     "H40": "InputError: the cutoff 1 must be above 0 and at most half the box",
     "X06": "SingularGeometryError: row 2, Angle.*: angle constraint singular at 180 deg, use a linear constraint",
     "X10": "SingularGeometryError: .*10 linearized degrees of freedom here but 9 at positions nearby",
-    "X33": r"InputError: initial positions are off row #0 Distance\(0, 1\) by 0\.2; pass project=True",
+    "X33": r"InputError: initial positions are off row #[01] Distance\(0, [12]\) by 0\.2; pass project=True",
     "X34": "InputError: initial velocities violate the constraints: atom 4 .*pass project=True",
     "X35": "InputError: .*target 3 is not shorter than half the box.*Use a larger cell",
     "X40": r"ConvergenceError: step 1: time step too large \(dt = 1\.01\)",

@@ -30,6 +30,7 @@ def held(n=2):
         ([Distance([0, 40])], {}, "40"),
         ([Distance([0, 1], [2.0])], {}, "project=True"),
         ([3.0], {}, "is no kcons constraint"),
+        ([Distance([0, 1])], {"rigid_bodies": [[0, 1, 2]]}, "rigid_bodies: options of names"),
     ],
     ids=str,
 )

@@ -27,10 +27,13 @@ void ProgramIntegrator::initialize(ContextImpl& c) {
         throw OpenMMException("This Integrator is already bound to a context");
     if (planner == nullptr)
         throw OpenMMException("kcons: this integrator is made for its Context by Python; import kcons.openmm");
+    auto maker = makers().find(c.getPlatform().getName());
+    if (maker == makers().end())
+        throw OpenMMException("kcons: there are no steps on the platform "+c.getPlatform().getName()+"; give device=False");
     // The base class tells the Context when the integrator goes first.
     owner = &c.getOwner();
     context = &c;
-    steps.reset(makers().at(c.getPlatform().getName())(c, tied));
+    steps.reset(maker->second(c, tied));
     middleKinetic = -1;
     shared.bound = 1;
 }
