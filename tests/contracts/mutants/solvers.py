@@ -6,7 +6,7 @@ MUTANTS = {
         "«except Exception:  # pickle→except ZeroDivisionError:  # pickle»": "compilation::damaged_files_are_made_anew",
     },
     "constraints/functions/formula.py": {
-        "np.isfinite([«value→0.0», *slopes]).all(": "formula::formulas_without_bound_are_refused_at_once",
+        "np.isfinite([«value→slopes[0]», *slopes]).all(": "formula::formulas_without_bound_are_refused_at_once",
         "lambda _, x: «next(some)→-np.ones(40)»": "formula::shifts_are_found_out",
     },
     "constraints/constraint.py": {
