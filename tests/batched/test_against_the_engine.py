@@ -6,7 +6,7 @@ import torch
 
 from kcons import ConstraintSet, Motion
 from kcons.batched import Batch, clusters
-from kcons.constraints import Angle, Distance
+from kcons.constraints import Angle, Custom, Distance, VelocityFormula
 from kcons.errors import ConvergenceError
 from tests.systems.constraint_cases import CASES, MASSES, scattered
 from tests.systems.rows_in_cells import CHAIN, ROWS
@@ -15,6 +15,8 @@ from tests.systems.rows_in_cells import MASSES as CHAIN_MASSES
 STEP = 0.01
 #: Families at rest.
 STILL = {name: make for name, make in CASES.items() if not make().moving}
+STILL["VelocityFormula-driven"] = lambda: VelocityFormula("vz1 + x1*vy1", [0, 3], target=[0.3, -0.2])
+STILL["Custom-array"] = lambda: Custom([[0, 1], [3, 5]], lambda r: np.asarray(r[0, 0] * r[1, 1] + r[0, 2]))
 #: Functions of Python, of which the engine takes differences of eleven digits.
 DIFFERENCED = {name for name in STILL if name.startswith("Custom")}
 

@@ -8,7 +8,7 @@ MUTANTS = {
         "(d @ d.mT, «lam→2 * lam».T": "batched/against_the_engine::chains_and_rows_that_depend_on_others",
         "(0, numbers, terms, alpha=«-1→1»)": "batched/against_the_engine::chains_and_rows_that_depend_on_others",
         "return value«.item() if isinstance(value, np.ndarray) else value→»": (
-            "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-Custom]"
+            "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-Custom-array]"
         ),
     },
     "batched/batch.py": {
@@ -17,7 +17,7 @@ MUTANTS = {
         "«group.worst→size», size / group.scale": "batched/batch::a_failure_names_copy_and_row_when_it_is_looked_for",
         "if «getattr(self, item) is not own or own._version→False»:": "batched/batch::what_is_refused",
         "torch.where(self._is_position, held, «flight→1.0» * held)": (
-            "batched/against_the_engine::families_are_held_as_the_engine_holds_them"
+            "batched/against_the_engine::families_are_held_as_the_engine_holds_them[lanes-VelocityFormula-driven]"
         ),
     },
     "batched/steps.py": {
