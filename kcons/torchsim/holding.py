@@ -176,8 +176,8 @@ def hold(
     words = [word.strip().lower() for text in given if isinstance(text, str) for word in text.split(",")]
     kind = ", ".join(word for word in words if word != "water") or "none"
     if options and not words:
-        remedy = "give 'none' beside the objects where nothing else is held by name"
-        raise InputError(f"{', '.join(options)}: options of names, of which there are none; {remedy}", item="constraints")
+        said = f"{', '.join(options)}: options of names, of which there are none"
+        raise InputError(f"{said}; give 'none' beside the objects", item="constraints")
     options.setdefault("guess_bonds", True)  # a state has none
     known: dict[tuple[bytes, ...], tuple[Motion, Any]] = {}
     found = []
