@@ -28,7 +28,7 @@ def rank(rows: FloatArray) -> int:
     """Independent rows of a stack of matrices, shape (n, K, C), in all; the rows need not be scaled."""
     size = np.linalg.norm(rows, axis=2, keepdims=True)
     unit = np.divide(rows, size, out=np.zeros_like(rows), where=size > 0)
-    # Squares of singular values, beyond all rounding of squares: that all rows are independent is seen a hundred times
+    # Squares of singular values, beyond all rounding of squares: that all rows are independent is seen eight times
     # as fast by Cholesky's factors.
     with suppress(np.linalg.LinAlgError):
         np.linalg.cholesky(unit @ unit.swapaxes(1, 2) - SURELY_INDEPENDENT * np.eye(rows.shape[1]))
