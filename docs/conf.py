@@ -80,8 +80,8 @@ def keep_bars(app: object, what: str, name: str, thing: object, options: object,
 
 
 def write_notebooks(app: object) -> None:
-    """Tutorials as notebooks, run where KCONS_RUN_NOTEBOOKS is set."""
-    notebooks.write(Path(__file__).parent / "_notebooks", executed=bool(os.environ.get("KCONS_RUN_NOTEBOOKS")))
+    """Tutorials as notebooks, run where KCONS_RUN_NOTEBOOKS is 1."""
+    notebooks.write(Path(__file__).parent / "_notebooks", executed=os.environ.get("KCONS_RUN_NOTEBOOKS") == "1")
 
 
 def offer_notebook(app: object, docname: str, source: list[str]) -> None:
