@@ -51,7 +51,7 @@ class Motion:
     plan : Plan
         Clusters and the solver picked for each.
     rank, degrees_of_freedom : int
-        Independent rows, and 3 n - rank for the n atoms that have a mass.
+        Independent rows, and 3 n - rank for the n atoms that are no virtual sites.
     conversions : tuple of FlatBody
         What was converted, by atoms and rows of the set that was given; printed, a sentence each.
 
