@@ -13,7 +13,7 @@ from openmm_systems import field as on_each
 from kcons import ConstraintSet, Motion, State, System
 from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, Formula, LinearRelation, Plane, Sphere
 from kcons.errors import ContradictionError
-from kcons.openmm import Langevin, ProjectedIntegrator, hold
+from kcons.openmm import Isokinetic, IsokineticSpheres, Langevin, NoseHoover, ProjectedIntegrator, hold
 from kcons.openmm.device import build
 from kcons.steppers import Rattle
 
@@ -311,6 +311,29 @@ def test_multipliers_in_single_precision(platform):
     _, context = run(pulled_apart(), x, 0 * x, platform, 20_000, Distance([[0, 1]]))
     integrator = context.getIntegrator()
     assert integrator.parts[0].mean_multipliers(integrator) == pytest.approx([-100.0], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "ensemble", [NoseHoover(300, 10.0), Isokinetic(300), IsokineticSpheres(300, 0.1)], ids=lambda e: type(e).__name__
+)
+def test_multipliers_of_ensembles_are_those_of_configurations(ensemble):
+    """Also where forces turn velocities along the rows; by a work-item, and by a work-group (eight rows)."""
+    rng = np.random.default_rng(4)
+    x = np.cumsum(np.tile([[0.12, 0.09, 0.0], [0.12, -0.09, 0.0]], (6, 1)), axis=0) + 0.01 * rng.normal(size=(12, 3))
+    chain = np.arange(2, 10)
+    rows = Distance([[0, 1], *np.stack([chain, chain + 1], axis=1)])
+    integrator = ProjectedIntegrator(0.0002, parts=rows, device=True, ensemble=ensemble)
+    forces = field(12, rng, 60.0), on_each("100*z^2", range(12))
+    context = started(particles([12.0] * 12, *forces), integrator, x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(1)
+    part, found = integrator.parts[0], []
+    part.reset_multipliers(integrator)
+    for _ in range(200):
+        integrator.step(1)
+        found.append(part.multipliers(context))
+    wanted = np.mean(found, axis=0)
+    np.testing.assert_allclose(part.mean_multipliers(integrator), wanted, rtol=0, atol=0.02 * np.abs(wanted).max())
 
 
 def test_noise_is_in_no_multiplier():
