@@ -7,7 +7,6 @@ units nor the masses.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.tolerances import RANK_TOLERANCE, SURELY_INDEPENDENT
+from kcons.solvers.tolerances import RANK_TOLERANCE
 
 
 def independent(singular: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
@@ -28,11 +27,6 @@ def rank(rows: FloatArray) -> int:
     """Independent rows of a stack of matrices, shape (n, K, C), in all; the rows need not be scaled."""
     size = np.linalg.norm(rows, axis=2, keepdims=True)
     unit = np.divide(rows, size, out=np.zeros_like(rows), where=size > 0)
-    # Squares of singular values, beyond all rounding of squares: that all rows are independent is seen eight times
-    # as fast by Cholesky's factors.
-    with suppress(np.linalg.LinAlgError):
-        np.linalg.cholesky(unit @ unit.swapaxes(1, 2) - SURELY_INDEPENDENT * np.eye(rows.shape[1]))
-        return len(rows) * rows.shape[1]
     return int(np.sum(independent(np.linalg.svd(unit, compute_uv=False))))
 
 

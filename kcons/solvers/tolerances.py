@@ -58,8 +58,6 @@ TINY = 1e-300
 #: on each other come out at the rounding of their gradients, eps |x| / d for rows of the size d at the place x, which
 #: stays below it up to 10^7 bond lengths from the origin.
 RANK_TOLERANCE = 1e-8
-#: Rows of unit length are independent if all squares of their singular values are above this: no rounding is as large.
-SURELY_INDEPENDENT = 1e-6
 #: A pivot below this part of its diagonal marks a row that depends on earlier ones: the square of the sine of the angle
 #: between the row and these. Where rank counts and clusters are not large it is counted by singular values, and
 #: dependent rows are eliminated last, where their pivots vanish to rounding.

@@ -487,21 +487,22 @@ class Kernels:
             )
         self._rescale(Op("restore"))
 
-    def _tangent(self, start: str, rest: str = "", rate: str = "0") -> None:
-        """Begin a block with d, of which what is across the rows is taken away."""
+    def _tangent(self, start: str, rest: str = "", summed: bool = False) -> None:
+        """Begin a block with d, of which what is across the rows is taken away; its impulses are `summed` or not."""
+        rate = "TINY" if summed else "0"  # targets ask for no speed
         along = f" SYNC velocities_NAME(ROWS_PASS CLUSTER, {rate}, time, x, d, w);\n"
         self._add(f" {{ROOM{start}{rest}", f" {{ROOM{start}{along}{rest}")
 
     def _turn(self, op: Op) -> None:
         push = f" EACH XYZ d[3*a+c] = {_of_dt(op.share)}*{self._force(op)}*w[a];\n"
         if self.spheres:
-            self._tangent(push, rate="TINY")  # impulses of forces are summed, and targets ask for no speed
+            self._tangent(push, summed=True)
             self._rescale(op)
             self._add(" }\n")
             return
         sums = "acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;"
         each = f"if (w[a] != 0) XYZ {{mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a]; {sums}}}"
-        self._tangent(push, f" EACH {{{each} PUT_U(a, AT)}}\n }}\n", "TINY")
+        self._tangent(push, f" EACH {{{each} PUT_U(a, AT)}}\n }}\n", summed=True)
         self._gather(3)
         self._before += _once(_CLOSED_FORM, "keep", "push")
         self._add(" {ROOM EACH {GET_U(a, AT) XYZ v[3*a+c] = keep*v[3*a+c]+push*d[3*a+c];}\n }\n")

@@ -5,8 +5,10 @@ MUTANTS = {
         "_replace(share=done[-1].share «+→-» op.share": "device_integrator::operations_are_joined_where_nobody_looks",
         "step+({op.begun}), {{}}, «seed[0]→7»);": "device_integrator::noise_belongs_to_particle_and_step",
         "link[k] = (link[k]*damp+h*push«/2→»)*damp;": "device_integrator::settings_change_what_is_done",
-        'self._tangent(push, «rate="TINY"→»)': "kernel_rows::multipliers_of_ensembles_are_those_of_configurations",
-        'PUT_U(a, AT)}}\\n }}\\n", "«TINY→0»")': ("kernel_rows::multipliers_of_ensembles_are_those_of_configurations"),
+        "self._tangent(push, «summed=True→»)": "kernel_rows::multipliers_of_ensembles_are_those_of_configurations",
+        'PUT_U(a, AT)}}\\n }}\\n", summed=«True→False»)': (
+            "kernel_rows::multipliers_of_ensembles_are_those_of_configurations"
+        ),
         "scale = 1+(1«-→+»cosine)*twice/2;": "molecule_spheres::trajectories_are_those_on_arrays",
     },
     "openmm/device/rows.py": {
