@@ -363,7 +363,7 @@ class Constraint:
         if factor == 1.0:
             return self
         if self.moving or not self.held:
-            what = "a target that moves" if self.moving else "own functions or velocities"
+            what = "a target that moves" if self.moving else "a value in a unit of its own"
             raise UnsupportedError(
                 f"{self!r} has {what}; it cannot be converted to another unit. Write it in the units of the host"
             )

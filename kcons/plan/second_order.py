@@ -307,7 +307,7 @@ class LocalRows:
         return unit[0], norms[0]
 
     def decomposed(self, x: FloatArray, rows: IntArray | slice = slice(None)) -> tuple[FloatArray, int]:
-        """v^T of these rows (all by default), with all singular vectors, and their rank."""
+        """v^T of these rows (all by default), with all singular vectors, and how many are above `LOST`."""
         _, s, vt = np.linalg.svd(self.linear(x)[0][rows], full_matrices=True)
         return vt, int(np.sum(s > LOST * s[0]))
 

@@ -14,10 +14,10 @@ EPS = float(np.finfo(float).eps)
 
 # -- positions ------------------------------------------------------------------------------------------------
 
-#: Newton stops at this relative error in relative coordinates: a few roundings, of which a bond vector has 1e-15.
-NEWTON_TOLERANCE = 4e-15
-#: Part of its scale that rounding may leave of a row.
+#: Part of its scale that rounding may leave of a row; all Newton tolerances follow from it.
 ROUNDING = 1e-14
+#: Newton stops at this relative error in relative coordinates: a few roundings, of which a bond vector has 1e-15.
+NEWTON_TOLERANCE = 0.4 * ROUNDING
 #: Roundings of its positions that a row may be left with where Newton's method gains no more, for a cluster of one row;
 #: they add up like errors at random. Rows that depend on each other miss each other's targets by them.
 ROUNDINGS = 4.0

@@ -186,5 +186,5 @@ def test_the_same_points_fulfil_it(name):
 @pytest.mark.parametrize("name", sorted(CASES.keys() - POWERS))
 def test_what_has_no_known_units_is_refused(name):
     item = CASES[name]()
-    with pytest.raises(UnsupportedError, match="target that moves" if item.moving else "own functions or velocities"):
+    with pytest.raises(UnsupportedError, match="target that moves" if item.moving else "unit of its own"):
         item.rescaled(0.1)

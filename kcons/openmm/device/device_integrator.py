@@ -180,6 +180,8 @@ class DeviceIntegrator(ProjectedIntegrator):
 
     def _write(self) -> Program:
         """A step without parts: kernels hold their rows."""
+        if why := refusal(self.scheme, self.parts, self._ensemble):
+            raise UnsupportedError(f"no steps on the device: {why}; take ProjectedIntegrator")
         for part in self.parts:
             assert isinstance(part, KernelRows)
             part.serve(self)

@@ -153,9 +153,9 @@ class Ensemble:
         """What comes before the first kick of a step, v tangent to all constraints; also what the last step owes."""
 
     def close(self, p: Program) -> None:
-        """What comes at the end of a step, v tangent to all constraints; `behind` says that the next step is to do it.
+        """What comes at the end of a step, v tangent to all constraints.
 
-        Only with `owes`, and where the program has `between`.
+        With `owes`, and where the program has `between`, `behind` says that the next step is to do it.
         """
 
     def take_back(self, p: Program) -> None:

@@ -14,7 +14,7 @@ MUTANTS = {
     },
     "solvers/tolerances.py": {
         "DENSE_SPEED_TOLERANCE = 1e-«11→7»": "general_clusters::velocities_that_cannot_be_tangent_are_refused",
-        "NEWTON_TOLERANCE = 4e-1«5→1»": "distance_solvers::matches_dense_newton[sparse-comb]",
+        "NEWTON_TOLERANCE = «0.4→4e3» * ROUNDING": "distance_solvers::matches_dense_newton[sparse-comb]",
     },
     "solvers/general_clusters.py": {
         "np.maximum(«ROUNDING→1e-10», 2 * EPS": "general_clusters::no_more_is_left_than_rounding",

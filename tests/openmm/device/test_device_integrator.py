@@ -306,6 +306,8 @@ def test_which_steps_are_made_on_the_device(monkeypatch):
 def test_what_the_device_has_not_is_refused_or_left_to_the_custom_integrator(monkeypatch):
     with pytest.raises(UnsupportedError, match="ReversedDrifts has no kernels"):
         HamiltonianMonteCarlo.reversing_integrator(0.001, device=True)
+    with pytest.raises(UnsupportedError, match="OtherLangevin has no kernels"):
+        DeviceIntegrator(0.001, ensemble=type("OtherLangevin", (Langevin,), {})(300, 1))
     assert type(HamiltonianMonteCarlo.reversing_integrator(0.001, device=None)) is ProjectedIntegrator
     assert type(ProjectedIntegrator(0.001, device=False)) is ProjectedIntegrator
     monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
