@@ -70,15 +70,27 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None)
     Raises
     ------
     InputError
-        No water, or one that is odd.
+        No water, or one that is odd. (A hydrogen too far from all atoms to be bonded gives a warning.)
     """
     require_atoms(atoms)
     numbers = np.where(np.isin(atoms.numbers, (1, 8)), atoms.numbers, atomic_numbers["Ar"])  # which has no bonds
     others = Atoms(numbers, atoms.positions, masses=atoms.get_masses(), cell=atoms.cell, pbc=atoms.pbc)
     with warnings.catch_warnings(action="ignore"):  # of hydrogens elsewhere
-        (rows,) = constraints_of(others, "none", water_geometry=geometry, guess_bonds=True)
-    assert isinstance(rows, Distance)
-    return rows
+        found = constraints_of(others, "none", water_geometry=geometry, guess_bonds=True)
+        loose = found.loose_hydrogens
+        loose = np.setdiff1d(loose, guess_bonds(snapshot_of(atoms))) if len(loose) else loose
+    if len(loose):
+        away = atoms.get_distances(loose[0], range(len(atoms)), mic=True)
+        near = np.argsort(away)[1]
+        warnings.warn(
+            f"hydrogen {loose[0]}, {away[near]:.3g} angstrom from {atoms.symbols[near]} {near}, and {len(loose) - 1} "
+            "others are bonded to nothing: water that they belong to is not held. Move them nearer; or, if molecules "
+            "are cut at faces, set atoms.cell and atoms.pbc",
+            UserWarning,
+            stacklevel=2,
+        )
+    assert isinstance(found[0], Distance)
+    return found[0]
 
 
 def require_atoms(atoms: object) -> None:
