@@ -77,16 +77,13 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None)
     others = Atoms(numbers, atoms.positions, masses=atoms.get_masses(), cell=atoms.cell, pbc=atoms.pbc)
     with warnings.catch_warnings(action="ignore"):  # of hydrogens elsewhere
         found = constraints_of(others, "none", water_geometry=geometry, guess_bonds=True)
-        loose = found.loose_hydrogens
-        loose = np.setdiff1d(loose, guess_bonds(snapshot_of(atoms))) if len(loose) else loose
+        loose = np.setdiff1d(found.loose_hydrogens, guess_bonds(snapshot_of(atoms)))
     if len(loose):
-        away = atoms.get_distances(loose[0], range(len(atoms)), mic=True)
-        near = np.argsort(away)[1]
+        near = np.argsort(atoms.get_distances(loose[0], range(len(atoms)), mic=True))[1]
         warnings.warn(
-            f"hydrogen {loose[0]}, {away[near]:.3g} angstrom from {atoms.symbols[near]} {near}, and {len(loose) - 1} "
-            "others are bonded to nothing: water that they belong to is not held. Move them nearer; or, if molecules "
-            "are cut at faces, set atoms.cell and atoms.pbc",
-            UserWarning,
+            f"hydrogen {loose[0]}, nearest to {atoms.symbols[near]} {near}, and {len(loose) - 1} others are bonded to "
+            "nothing: no water has them, and water without them is not held. Move them nearer; or set atoms.cell and "
+            "atoms.pbc, if molecules are cut at faces",
             stacklevel=2,
         )
     assert isinstance(found[0], Distance)

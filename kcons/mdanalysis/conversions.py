@@ -234,7 +234,10 @@ def ase_to_openmm(atoms: ase.Atoms, *, force_field: Sequence[str] = (), **option
     """Topology, positions and System of `Atoms`, with what is held on them; see `to_openmm`."""
     from kcons.ase.topology import snapshot_of as snapshot_of_atoms
 
-    return _openmm(snapshot_of_atoms(atoms), _constraints_on(atoms), force_field, options)
+    snapshot = snapshot_of_atoms(atoms)
+    if snapshot.cell is not None:
+        check_box(snapshot.cell, snapshot.pbc, stacklevel=3)
+    return _openmm(snapshot, _constraints_on(atoms), force_field, options)
 
 
 def openmm_to_ase(

@@ -254,8 +254,7 @@ def _in_molecules(snapshot: Snapshot) -> tuple[FloatArray, IntArray]:
 def whole_molecules(snapshot: Snapshot, links: IntArray | None = None, roots: IntArray | None = None) -> Snapshot:
     """Every molecule in one piece: atoms moved to nearest images along bonds, from the first atom on.
 
-    `links`, shape (n, 2), are what counts as bonded; by default the bonds of the topology. `roots` are all atoms, the
-    first of which in a molecule stays.
+    `links`, (n, 2), count as bonded; by default the bonds of the topology. The first of `roots` in a molecule stays.
     """
     if snapshot.lattice is None:
         return snapshot

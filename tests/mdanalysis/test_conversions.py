@@ -239,6 +239,8 @@ def test_a_cell_with_a_vector_turned_round_is_the_same_lattice(tmp_path, turned)
     for box in (from_ase(atoms).universe.dimensions, written):
         steps = cell @ np.linalg.inv(triclinic_vectors(box, dtype=np.float64))
         np.testing.assert_allclose(steps, np.round(steps), atol=1e-5)
+    with pytest.warns(UserWarning, match="periodic in all directions; this cell is not"):
+        ase_to_openmm(Atoms("N2", atoms.positions, cell=np.abs(cell), pbc=[True, True, False]))
 
 
 def test_molecules_cut_by_a_box_that_is_not_there_are_said():
