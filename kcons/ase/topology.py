@@ -77,13 +77,13 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None)
     others = Atoms(numbers, atoms.positions, masses=atoms.get_masses(), cell=atoms.cell, pbc=atoms.pbc)
     with warnings.catch_warnings(action="ignore"):  # of hydrogens elsewhere
         found = constraints_of(others, "none", water_geometry=geometry, guess_bonds=True)
-        loose = np.setdiff1d(found.loose_hydrogens, guess_bonds(snapshot_of(atoms)))
+        loose = found.loose_hydrogens
+        loose = np.setdiff1d(loose, guess_bonds(snapshot_of(atoms), np.isin(range(len(atoms)), loose)))
     if len(loose):
         near = np.argsort(atoms.get_distances(loose[0], range(len(atoms)), mic=True))[1]
         warnings.warn(
-            f"hydrogen {loose[0]}, nearest to {atoms.symbols[near]} {near}, and {len(loose) - 1} others are bonded to "
-            "nothing: no water has them, and water without them is not held. Move them nearer; or set atoms.cell and "
-            "atoms.pbc, if molecules are cut at faces",
+            f"hydrogen {loose[0]} (nearest to {atoms.symbols[near]} {near}) and {len(loose) - 1} others have no bond, "
+            "too far from any atom: no water has them. Move them nearer; if faces cut molecules, set cell and pbc",
             stacklevel=2,
         )
     assert isinstance(found[0], Distance)

@@ -234,10 +234,7 @@ def ase_to_openmm(atoms: ase.Atoms, *, force_field: Sequence[str] = (), **option
     """Topology, positions and System of `Atoms`, with what is held on them; see `to_openmm`."""
     from kcons.ase.topology import snapshot_of as snapshot_of_atoms
 
-    snapshot = snapshot_of_atoms(atoms)
-    if snapshot.cell is not None:
-        check_box(snapshot.cell, snapshot.pbc, stacklevel=3)
-    return _openmm(snapshot, _constraints_on(atoms), force_field, options)
+    return _openmm(snapshot_of_atoms(atoms), _constraints_on(atoms), force_field, options)
 
 
 def openmm_to_ase(
@@ -358,6 +355,8 @@ def _openmm(
     if isinstance(constraints, HeldRows):
         sites = constraints.virtual_sites.in_unit(NM / constraints.snapshot.angstrom)
     snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)
+    if snapshot.cell is not None:
+        check_box(snapshot.cell, snapshot.pbc, stacklevel=4)
     _warn_of_cut(snapshot)
     links = np.concatenate(
         [snapshot.topology.bonds, *(item.linked.reshape(-1, 2) for item in rows if item.translation_invariant)]
