@@ -70,15 +70,24 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None)
     Raises
     ------
     InputError
-        No water, or one that is odd.
+        No water, or one that is odd. (A hydrogen too far from all atoms to be bonded gives a warning.)
     """
     require_atoms(atoms)
     numbers = np.where(np.isin(atoms.numbers, (1, 8)), atoms.numbers, atomic_numbers["Ar"])  # which has no bonds
     others = Atoms(numbers, atoms.positions, masses=atoms.get_masses(), cell=atoms.cell, pbc=atoms.pbc)
     with warnings.catch_warnings(action="ignore"):  # of hydrogens elsewhere
-        (rows,) = constraints_of(others, "none", water_geometry=geometry, guess_bonds=True)
-    assert isinstance(rows, Distance)
-    return rows
+        found = constraints_of(others, "none", water_geometry=geometry, guess_bonds=True)
+        loose = found.loose_hydrogens
+        loose = np.setdiff1d(loose, guess_bonds(snapshot_of(atoms), np.isin(range(len(atoms)), loose)))
+    if len(loose):
+        near = np.argsort(atoms.get_distances(loose[0], range(len(atoms)), mic=True))[1]
+        warnings.warn(
+            f"hydrogen {loose[0]} (nearest to {atoms.symbols[near]} {near}) and {len(loose) - 1} others have no bond, "
+            "too far from any atom: no water has them. Move them nearer; if faces cut molecules, set cell and pbc",
+            stacklevel=2,
+        )
+    assert isinstance(found[0], Distance)
+    return found[0]
 
 
 def require_atoms(atoms: object) -> None:

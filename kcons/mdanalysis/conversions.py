@@ -355,11 +355,15 @@ def _openmm(
     if isinstance(constraints, HeldRows):
         sites = constraints.virtual_sites.in_unit(NM / constraints.snapshot.angstrom)
     snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)
+    if snapshot.cell is not None:
+        check_box(snapshot.cell, snapshot.pbc, stacklevel=4)
     _warn_of_cut(snapshot)
     links = np.concatenate(
         [snapshot.topology.bonds, *(item.linked.reshape(-1, 2) for item in rows if item.translation_invariant)]
     )
-    snapshot = whole_molecules(snapshot, links)
+    in_space = [item.atoms.ravel() for item in rows if not item.translation_invariant]
+    firm = np.isin(np.arange(snapshot.topology.n_atoms), np.concatenate([[], *in_space]))
+    snapshot = whole_molecules(snapshot, links, np.argsort(~firm, kind="stable"))  # what is held in space stays
     x = snapshot.positions
     if rows:
         held = ConstraintSet(rows, x, snapshot.topology.masses, cell=snapshot.cell, pbc=snapshot.pbc.tolist())

@@ -251,14 +251,14 @@ def _in_molecules(snapshot: Snapshot) -> tuple[FloatArray, IntArray]:
     return y, np.where(endless, count + np.arange(n), molecule)
 
 
-def whole_molecules(snapshot: Snapshot, links: IntArray | None = None) -> Snapshot:
+def whole_molecules(snapshot: Snapshot, links: IntArray | None = None, roots: IntArray | None = None) -> Snapshot:
     """Every molecule in one piece: atoms moved to nearest images along bonds, from the first atom on.
 
-    `links`, shape (n, 2), are what counts as bonded; by default the bonds of the topology.
+    `links`, (n, 2), count as bonded; by default the bonds of the topology. The first of `roots` in a molecule stays.
     """
     if snapshot.lattice is None:
         return snapshot
-    tree = spanning_tree(snapshot.topology.bonds if links is None else links, snapshot.topology.n_atoms)
+    tree = spanning_tree(snapshot.topology.bonds if links is None else links, snapshot.topology.n_atoms, roots)
     x = make_whole(snapshot.positions, *tree, snapshot.lattice)
     return snapshot if np.array_equal(x, snapshot.positions) else replace(snapshot, positions=x)
 

@@ -190,3 +190,13 @@ def test_rigid_water_has_a_geometry_and_may_lie_across_a_boundary():
     water.positions *= 0.1  # nm
     with pytest.raises(InputError, match=r"0\.097 angstrom apart"):
         rigid_water(water, "tip3p")
+
+
+def test_rigid_water_tells_of_stretched_water():
+    atoms = molecule("CH3OH") + molecule("H2O") + molecule("H2O")
+    atoms.positions[6:9] += 5.0
+    atoms.positions[9:] -= 5.0
+    assert len(rigid_water(atoms).atoms) == 6
+    atoms.set_distance(9, 11, 1.3, fix=0)
+    with pytest.warns(UserWarning, match=r"hydrogen 11 \(nearest to O 9\) and 0 others"):
+        rigid_water(atoms)

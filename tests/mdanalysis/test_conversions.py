@@ -16,7 +16,7 @@ from MDAnalysis.lib.mdamath import triclinic_vectors
 from openmm import app, unit
 
 from kcons.ase import constrain
-from kcons.constraints import CenterOfMass, Distance, LinearRelation, RadiusOfGyration
+from kcons.constraints import CenterOfMass, Distance, FixedAtoms, LinearRelation, RadiusOfGyration
 from kcons.errors import InputError, UnsupportedError
 from kcons.mdanalysis import (
     TrajectoryWriter,
@@ -239,6 +239,8 @@ def test_a_cell_with_a_vector_turned_round_is_the_same_lattice(tmp_path, turned)
     for box in (from_ase(atoms).universe.dimensions, written):
         steps = cell @ np.linalg.inv(triclinic_vectors(box, dtype=np.float64))
         np.testing.assert_allclose(steps, np.round(steps), atol=1e-5)
+    with pytest.warns(UserWarning, match="periodic in all directions; this cell is not"):
+        ase_to_openmm(Atoms("N2", atoms.positions, cell=np.abs(cell), pbc=[True, True, False]))
 
 
 def test_molecules_cut_by_a_box_that_is_not_there_are_said():
@@ -250,6 +252,9 @@ def test_molecules_cut_by_a_box_that_is_not_there_are_said():
         system = to_openmm(ethane_cut(box=True), [Distance([(0, 1), (2, 3)])]).system
         held = [system.getConstraintParameters(k) for k in range(2)]
         assert [(i, j, round(length._value, 6)) for i, j, length in held] == [(0, 1, 0.1), (2, 3, 0.1)]
+        cut = ethane_cut(box=True)  # made whole around what is held in space
+        x = to_openmm(cut, [FixedAtoms([2], cut.atoms.positions[2])]).positions.value_in_unit(unit.angstrom)
+        assert np.linalg.norm(x[2] - x[1]) < 2.0
         whole = ethane_cut(box=False)
         whole.atoms[2:].positions += [10.0, 0.0, 0.0]
         to_ase(whole)

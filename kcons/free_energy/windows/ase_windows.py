@@ -22,6 +22,7 @@ from kcons.ase.binding import applied_forces
 from kcons.ase.named_calculators import described
 from kcons.ase.topology import bonds_of, velocities_of
 from kcons.constraints import Constraint, Dihedral
+from kcons.constraints.constraint import constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates, named
@@ -140,7 +141,7 @@ class AseWindows(Sampler):
         atoms: Atoms,
         calculator: Callable[[], Any],
         coordinates: Mapping[str, Constraint],
-        held: Sequence[Constraint] = (),
+        held: Constraint | Sequence[Constraint] = (),
     ) -> None:
         if not callable(calculator):
             raise InputError(
@@ -148,7 +149,7 @@ class AseWindows(Sampler):
                 item="calculator",
             )
         self.atoms, self.calculator = atoms.copy(), calculator
-        rows, atoms = [*from_ase_constraints(self.atoms), *held], self.atoms
+        rows, atoms = [*from_ase_constraints(self.atoms), *constraints_in(held, "held")], self.atoms
         atoms.set_constraint()
         where = (atoms.get_positions(), atoms.get_masses(), atoms.cell.array if atoms.pbc.any() else None, atoms.pbc)
         super().__init__(coordinates, rows, *where, *2 * (bonds_of(atoms),))
