@@ -80,12 +80,8 @@ def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None)
         loose = found.loose_hydrogens
         loose = np.setdiff1d(loose, guess_bonds(snapshot_of(atoms), np.isin(range(len(atoms)), loose)))
     if len(loose):
-        near = np.argsort(atoms.get_distances(loose[0], range(len(atoms)), mic=True))[1]
-        warnings.warn(
-            f"hydrogen {loose[0]} (nearest to {atoms.symbols[near]} {near}) and {len(loose) - 1} others have no bond, "
-            "too far from any atom: no water has them. Move them nearer; if faces cut molecules, set cell and pbc",
-            stacklevel=2,
-        )
+        text = f"{len(loose)} hydrogens have no bond, the first of which is {loose[0]}: no held water has them"
+        warnings.warn(f"{text}. Move them nearer; if faces cut molecules, set atoms.cell and atoms.pbc", stacklevel=2)
     assert isinstance(found[0], Distance)
     return found[0]
 
