@@ -657,8 +657,9 @@ class CarriedConstraints(Part):
         self._check_system(system)
         held = self.motion.constraint_set
         bound = next((repr(item) for item in held.constraints if not item.translation_invariant), None)
-        starts = zip(held.constraints, held.starts, strict=False)
-        rows = [(item.atoms, lambda k, start=start: held.row_name(start + k)) for item, start in starts]
+        x, rows = self._state(context)[0], []
+        for item, start in zip(held.constraints, held.starts, strict=False):
+            rows.append((item.atoms, lambda k, s=start: held.row_name(s + k), held.gather(item, x) - x[item.atoms]))
         refuse_agents(system, bound, rows, context.getMolecules)
         miss = self.worst_violation(context)
         if miss is not None:

@@ -649,7 +649,7 @@ class CollectiveRows(Part):
         sizes, totals = np.linalg.norm(gradients, axis=(1, 2)), np.linalg.norm(gradients.sum(axis=1), axis=1)
         in_space = np.flatnonzero(totals > max(1e-9, 10 * Precision.of(context).forces) * sizes)
         bound = f"collective row {self._named(int(in_space[0]))}" if len(in_space) else None
-        held = [(np.array([atoms]), lambda _, k=k: self._named(k)) for k, atoms in enumerate(self.atoms)]
+        held = [(np.array([a]), lambda _, k=k: self._named(k), np.zeros((1, 1, 3))) for k, a in enumerate(self.atoms)]
         refuse_agents(system, bound, held, context.getMolecules)
         found = self.worst_violation(context)
         if found is not None:

@@ -147,6 +147,7 @@ def barostat():
         (Distance([[0, 3]]), barostat(), r"MonteCarloBarostat.*row #7 Distance\(0, 3\).*join=True"),
         (Plane([6], [0, 0, 1]), barostat(), "holds particles in space"),
         (Plane([6], [0, 0, 1]), openmm.CMMotionRemover(), "momentum is not conserved"),
+        (Distance([[6, 7]]), openmm.AndersenThermostat(300, 1), "draws velocities of single atoms.* use Langevin"),
         (
             Distance([[6, 7]]),
             openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False),
@@ -175,6 +176,19 @@ def test_agents_that_break_rows_are_refused(rows, force, words):
     with pytest.raises((UnsupportedError, InputError), match=words):
         integrator.step(1)
     np.testing.assert_array_equal(state_of(context)[0], x)
+
+
+def test_a_barostat_in_place_of_another_force_refuses_rows_through_the_faces_of_the_box():
+    system, x = waters(2, field("0", 1))
+    x[3:6, 0] += 3.0
+    parts = hold(system, Distance([[0, 3]]), x, join=True)
+    context = started(system, integrator := ProjectedIntegrator(0.001, parts=parts), x)
+    integrator.step(1)
+    system.removeForce(1)
+    system.addForce(barostat())
+    context.reinitialize(preserveState=True)
+    with pytest.raises(UnsupportedError, match=r"Distance\(0, 3\) goes through its faces"):
+        integrator.step(1)
 
 
 @pytest.mark.usefixtures("without_device")
