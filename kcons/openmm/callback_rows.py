@@ -659,7 +659,8 @@ class CarriedConstraints(Part):
         bound = next((repr(item) for item in held.constraints if not item.translation_invariant), None)
         x, rows = self._state(context)[0], []
         for item, start in zip(held.constraints, held.starts, strict=False):
-            rows.append((item.atoms, lambda k, s=start: held.row_name(s + k), held.gather(item, x) - x[item.atoms]))
+            cut = (np.ptp(held.gather(item, x) - x[item.atoms], axis=1) > NEAR).any(axis=1)
+            rows.append((item.atoms, lambda k, start=start: held.row_name(start + k), cut))
         refuse_agents(system, bound, rows, context.getMolecules)
         miss = self.worst_violation(context)
         if miss is not None:

@@ -317,6 +317,7 @@ def check_system(system: openmm.System, row_groups: Iterable[int]) -> None:
     `row_groups`: they would act as forces, or do nothing, and nothing would be held.
     """
     _refuse_lopsided(SystemRows.of(system))
+    taken: set[int] = set()
     found = [force for force in forces_of(system) if type(force).__name__ in BAROSTATS]
     acting = [type(force).__name__ for force in found if force.getFrequency() > 0]
     if len(acting) > 1:
@@ -332,6 +333,13 @@ def check_system(system: openmm.System, row_groups: Iterable[int]) -> None:
                 "no part for it: pass what hold or CollectiveRows returned, ProjectedIntegrator(..., parts=[rows])",
                 item="parts",
             )
+        if shared := groups_of(force) & taken & set(row_groups):
+            raise InputError(
+                f"force group {min(shared)} carries a row that is held, and other forces are in it too, which would be "
+                "part of the row and not act; give them another group",
+                item="force group",
+            )
+        taken |= groups_of(force)
         if name in _FOREIGN:
             raise UnsupportedError(f"the System has a {name}: {_FOREIGN[name]}")
         if name in BAROSTATS and not np.isfinite(force.getDefaultPressure()._value).all():
@@ -404,13 +412,13 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
 def refuse_agents(
     system: openmm.System,
     bound: str | None,
-    rows: Iterable[tuple[IntArray, Callable[[int], str], FloatArray]] = (),
+    rows: Iterable[tuple[IntArray, Callable[[int], str], NDArray[np.bool_]]] = (),
     molecules: Callable[[], Iterable[Sequence[int]]] = tuple,
 ) -> None:
     """Refuse, by `UnsupportedError`, what disturbs rows between steps: barostats, CMMotionRemover, AndersenThermostat.
 
     `bound` names a row that holds particles in space; `rows` are the particles of rows of one kind, shape (n, width),
-    their names by number, and what brings particles to their images; barostats move each molecule by its own vector.
+    their names by number, and which go through faces of the box; barostats move each molecule by a vector of its own.
     """
     for force in forces_of(system):
         name = type(force).__name__
@@ -430,8 +438,8 @@ def refuse_agents(
         label = np.empty(system.getNumParticles(), dtype=np.int64)
         for number, members in enumerate(molecules()):
             label[list(members)] = number
-        for atoms, name_of, shift in rows:
-            if (cut := (np.ptp(shift, axis=1) > NEAR).any(axis=1)).any():
+        for atoms, name_of, cut in rows:
+            if cut.any():
                 raise UnsupportedError(
                     f"{name} changes the box, and row {name_of(int(np.argmax(cut)))} goes through its faces; shift "
                     "molecules by box vectors until the atoms of each row lie side by side, or run at constant volume"

@@ -6,7 +6,7 @@ import numpy as np
 import openmm
 import pytest
 from carried_systems import PEPTIDE, begun, driven, off_target, start
-from collective_cases import dihedral
+from collective_cases import bond, dihedral
 from openmm import app, unit
 from openmm_systems import context_of, field, particles, started, state_of, with_and_without_device
 
@@ -178,17 +178,30 @@ def test_agents_that_break_rows_are_refused(rows, force, words):
     np.testing.assert_array_equal(state_of(context)[0], x)
 
 
-def test_a_barostat_in_place_of_another_force_refuses_rows_through_the_faces_of_the_box():
+@pytest.mark.parametrize("kind", ["hold", "collective"])
+def test_a_barostat_in_place_of_another_force_refuses_rows_through_the_faces_of_the_box(kind):
     system, x = waters(2, field("0", 1))
     x[3:6, 0] += 3.0
-    parts = hold(system, Distance([[0, 3]]), x, join=True)
+    (ends := bond(0, 3)).setUsesPeriodicBoundaryConditions(True)
+    by_hold = kind == "hold"
+    parts = hold(system, Distance([[0, 3]]), x, join=True) if by_hold else CollectiveRows(system, ends, positions=x)
     context = started(system, integrator := ProjectedIntegrator(0.001, parts=parts), x)
     integrator.step(1)
     system.removeForce(1)
     system.addForce(barostat())
     context.reinitialize(preserveState=True)
-    with pytest.raises(UnsupportedError, match=r"Distance\(0, 3\) goes through its faces"):
+    with pytest.raises(UnsupportedError, match=r"row .* goes through its faces"):
         integrator.step(1)
+
+
+def test_another_force_in_the_group_of_a_row_is_refused():
+    system, x = waters(2)
+    parts = CollectiveRows(system, [bond(0, 3)], positions=x)
+    system.getForce(0).setForceGroup(1)
+    context = started(system, integrator := ProjectedIntegrator(0.001, parts=parts), x)
+    with pytest.raises(InputError, match="force group 1 carries a row that is held, and other forces are in it"):
+        integrator.step(1)
+    del context
 
 
 @pytest.mark.usefixtures("without_device")
