@@ -135,8 +135,8 @@ def hold(
     system : openmm.System
         Changed in place.
     constraints : Constraint or iterable of Constraint
-        What is held: Quantities, or plain numbers of nm, ps, dalton, radian; functions get numbers and may return
-        either. Empty if only constraints of the System are to move over.
+        What is held, in plain numbers of nm, ps, dalton, radian. Empty if only constraints of the System are to move
+        over.
     positions : Quantity or array_like, shape (n_particles, 3)
         On or near the constraints, in nm if without unit; targets left at None are taken from them.
     take : {'touched', 'all'}
