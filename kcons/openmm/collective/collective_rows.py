@@ -651,8 +651,7 @@ class CollectiveRows(Part):
         sizes, totals = np.linalg.norm(gradients, axis=(1, 2)), np.linalg.norm(gradients.sum(axis=1), axis=1)
         in_space = np.flatnonzero(totals > max(1e-9, 10 * Precision.of(context).forces) * sizes)
         bound = f"collective row {self._named(int(in_space[0]))}" if len(in_space) else None
-        box = (1.01 * np.array(box_of(context))).tolist()
-        wide = forces_alone(system, self._forces(context), box, context.getParameters())
+        wide = forces_alone(system, self._forces(context), 1.01 * np.array(box_of(context)), context.getParameters())
         wide.setPositions(positions_of(context))
         change = [energy_of(wide, {k}) for k in range(self.n_rows)] - self.values(context)
         cut = np.abs(change) > SAME * np.array(self.scales)

@@ -269,7 +269,7 @@ def groups_in(integrator: openmm.Integrator) -> set[int]:
 def forces_alone(
     system: openmm.System,
     forces: Sequence[openmm.Force],
-    box: Sequence | None = None,
+    box: Any = None,
     parameters: Mapping[str, float] | None = None,
 ) -> openmm.Context:
     """A Context of copies of some Forces alone, each in the group of its number, in double precision.
@@ -318,8 +318,7 @@ def check_system(system: openmm.System, row_groups: Iterable[int]) -> None:
     """
     _refuse_lopsided(SystemRows.of(system))
     taken: set[int] = set()
-    found = [force for force in forces_of(system) if type(force).__name__ in BAROSTATS]
-    acting = [type(force).__name__ for force in found if force.getFrequency() > 0]
+    acting = [type(f).__name__ for f in forces_of(system) if type(f).__name__ in BAROSTATS and f.getFrequency() > 0]
     if len(acting) > 1:
         raise UnsupportedError(
             f"the System has {len(acting)} barostats ({', '.join(acting)}): the volume would follow all of them, and "
@@ -334,11 +333,7 @@ def check_system(system: openmm.System, row_groups: Iterable[int]) -> None:
                 item="parts",
             )
         if shared := groups_of(force) & taken & set(row_groups):
-            raise InputError(
-                f"force group {min(shared)} carries a row that is held, and other forces are in it too, which would be "
-                "part of the row and not act; give them another group",
-                item="force group",
-            )
+            raise InputError(f"force group {min(shared)} carries a row: give other forces in it another", item="groups")
         taken |= groups_of(force)
         if name in _FOREIGN:
             raise UnsupportedError(f"the System has a {name}: {_FOREIGN[name]}")
