@@ -135,8 +135,8 @@ def hold(
     system : openmm.System
         Changed in place.
     constraints : Constraint or iterable of Constraint
-        What is held: Quantities, or plain numbers of nm, ps, dalton, radian; functions get numbers and may return
-        either. Empty if only constraints of the System are to move over.
+        What is held, in plain numbers of nm, ps, dalton, radian. Empty if only constraints of the System are to move
+        over.
     positions : Quantity or array_like, shape (n_particles, 3)
         On or near the constraints, in nm if without unit; targets left at None are taken from them.
     take : {'touched', 'all'}
@@ -657,8 +657,10 @@ class CarriedConstraints(Part):
         self._check_system(system)
         held = self.motion.constraint_set
         bound = next((repr(item) for item in held.constraints if not item.translation_invariant), None)
-        starts = zip(held.constraints, held.starts, strict=False)
-        rows = [(item.atoms, lambda k, start=start: held.row_name(start + k)) for item, start in starts]
+        x, rows = self._state(context)[0], []
+        for item, start in zip(held.constraints, held.starts, strict=False):
+            cut = (np.ptp(held.gather(item, x) - x[item.atoms], axis=1) > NEAR).any(axis=1)
+            rows.append((item.atoms, lambda k, start=start: held.row_name(start + k), cut))
         refuse_agents(system, bound, rows, context.getMolecules)
         miss = self.worst_violation(context)
         if miss is not None:

@@ -29,7 +29,7 @@ class SurfaceIntegrator(ProjectedIntegrator):
     timestep : Quantity or float
         In ps if a float.
     surfaces : Constraint or iterable of Constraint
-        Those of `kcons.constraints` over one particle each, also of your own: Quantities, or plain numbers of nm.
+        Those of `kcons.constraints` over one particle each, also of your own, in plain numbers of nm.
     system : openmm.System, optional
         Gets the forces that carry the rows, see `hold`; the device does not need it.
     positions : array_like or Quantity, shape (n_particles, 3), optional

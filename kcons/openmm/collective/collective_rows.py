@@ -558,9 +558,8 @@ class CollectiveRows(Part):
         given = (*self._in_engine(context, x, masses, plain), *self._beside(context))
         return Solver(Motion(ConstraintSet(with_massless_atoms(given, masses), x, masses), x))
 
-    def _in_engine(self, context: openmm.Context, x: FloatArray, masses: FloatArray, plain: bool) -> list[Constraint]:
-        system = context.getSystem()
-        in_groups = {force.getForceGroup(): force for force in forces_of(system)}
+    def _forces(self, context: openmm.Context) -> list[openmm.Force]:
+        in_groups = {force.getForceGroup(): force for force in forces_of(context.getSystem())}
         missing = [k for k, group in enumerate(self._groups) if group not in in_groups]
         if missing:
             raise InputError(
@@ -568,8 +567,11 @@ class CollectiveRows(Part):
                 "rows were added to",
                 item="context",
             )
-        forces = [in_groups[group] for group in self._groups]
-        alone, values = forces_alone(system, forces, box_of(context), context.getParameters()), self.values(context)
+        return [in_groups[group] for group in self._groups]
+
+    def _in_engine(self, context: openmm.Context, x: FloatArray, masses: FloatArray, plain: bool) -> list[Constraint]:
+        system, forces, values = context.getSystem(), self._forces(context), self.values(context)
+        alone = forces_alone(system, forces, box_of(context), context.getParameters())
         rows: list[Constraint] = []
         for k, (target, rate) in enumerate(zip(*self._targets_and_rates(context), strict=True)):
             atoms = np.array(self.atoms[k])
@@ -649,7 +651,11 @@ class CollectiveRows(Part):
         sizes, totals = np.linalg.norm(gradients, axis=(1, 2)), np.linalg.norm(gradients.sum(axis=1), axis=1)
         in_space = np.flatnonzero(totals > max(1e-9, 10 * Precision.of(context).forces) * sizes)
         bound = f"collective row {self._named(int(in_space[0]))}" if len(in_space) else None
-        held = [(np.array([atoms]), lambda _, k=k: self._named(k)) for k, atoms in enumerate(self.atoms)]
+        wide = forces_alone(system, self._forces(context), 1.01 * np.array(box_of(context)), context.getParameters())
+        wide.setPositions(positions_of(context))
+        change = [energy_of(wide, {k}) for k in range(self.n_rows)] - self.values(context)
+        cut = np.abs(change) > SAME * np.array(self.scales)
+        held = [(np.array([a]), lambda _, k=k: self._named(k), cut[k : k + 1]) for k, a in enumerate(self.atoms)]
         refuse_agents(system, bound, held, context.getMolecules)
         found = self.worst_violation(context)
         if found is not None:

@@ -397,7 +397,7 @@ class Kernels:
         #: degrees of freedom on them, and where the auxiliary variables of the shape begin.
         self.spheres, self.per_sphere = described["spheres"]
         self.sphere_of: list[tuple[tuple[int, ...], list[int], int]] = []
-        self.auxiliary = self.items = self.crowds = self.work = self.particles = 0
+        held.warm = self.auxiliary = self.items = self.crowds = self.work = self.particles = 0
         #: Shapes, and where their clusters are: among the items of a kernel, in `atoms` and in `work`.
         self.places: list[tuple[Shape, int, int, int]] = []
         self.order: list[IntArray] = []
@@ -418,6 +418,7 @@ class Kernels:
                 of, freedom = _spheres_of(self.spheres, shape, moving[shape.atoms[0]], placed)
                 self.sphere_of.append((of, freedom, self.auxiliary))
                 self.auxiliary += clusters * len(freedom) * self.per_sphere
+                held.warm += clusters * sum(g - g / (g + self.per_sphere) for g in freedom)  # 2K/kT on average
         self.source: list[str] = []
         self._reset()
         self._bank = 0

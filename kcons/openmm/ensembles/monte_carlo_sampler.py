@@ -188,8 +188,9 @@ class HamiltonianMonteCarlo:
             self._propose(first=number == 0)
             for reporter in due:
                 asked = _asked(reporter.describeNextReport(self.simulation))
+                acting = self.integrator.getIntegrationForceGroups()
                 found = self.context.getState(
-                    positions=True, velocities=True, forces=True, energy=True, enforcePeriodicBox=asked
+                    positions=True, velocities=True, forces=True, energy=True, groups=acting, enforcePeriodicBox=asked
                 )
                 reporter.report(self.simulation, found)
 

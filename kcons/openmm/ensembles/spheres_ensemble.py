@@ -120,13 +120,16 @@ class IsokineticSpheres(Ensemble):
         """Refuse targets that move, and forces of groups without a number of steps."""
         if any(part.driven for part in integrator.parts):
             raise UnsupportedError(f"{self!r} needs constant targets; use Langevin")
-        if self.steps is not None:
-            refuse_other_groups(integrator, context, self.steps)
+        self.verify(integrator)
 
     def verify(self, integrator: Integrator) -> None:
         """Refuse forces that got another group in the run."""
         if self.steps is not None:
             refuse_other_groups(integrator, integrator.context, self.steps)
+
+    def warmth(self, integrator: Integrator) -> float:
+        integrator.read("seed")  # makes the kernels if there are none yet
+        return float(integrator.degrees_of_freedom() / integrator.rows.warm)
 
     def settings(self) -> dict[str, float]:
         return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}

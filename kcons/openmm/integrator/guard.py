@@ -14,7 +14,7 @@ import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import openmm
@@ -269,7 +269,7 @@ def groups_in(integrator: openmm.Integrator) -> set[int]:
 def forces_alone(
     system: openmm.System,
     forces: Sequence[openmm.Force],
-    box: Sequence | None = None,
+    box: Any = None,
     parameters: Mapping[str, float] | None = None,
 ) -> openmm.Context:
     """A Context of copies of some Forces alone, each in the group of its number, in double precision.
@@ -317,8 +317,8 @@ def check_system(system: openmm.System, row_groups: Iterable[int]) -> None:
     `row_groups`: they would act as forces, or do nothing, and nothing would be held.
     """
     _refuse_lopsided(SystemRows.of(system))
-    found = [force for force in forces_of(system) if type(force).__name__ in BAROSTATS]
-    acting = [type(force).__name__ for force in found if force.getFrequency() > 0]
+    taken: set[int] = set()
+    acting = [type(f).__name__ for f in forces_of(system) if type(f).__name__ in BAROSTATS and f.getFrequency() > 0]
     if len(acting) > 1:
         raise UnsupportedError(
             f"the System has {len(acting)} barostats ({', '.join(acting)}): the volume would follow all of them, and "
@@ -332,6 +332,9 @@ def check_system(system: openmm.System, row_groups: Iterable[int]) -> None:
                 "no part for it: pass what hold or CollectiveRows returned, ProjectedIntegrator(..., parts=[rows])",
                 item="parts",
             )
+        if shared := groups_of(force) & taken & set(row_groups):
+            raise InputError(f"force group {min(shared)} carries a row: give other forces in it another", item="groups")
+        taken |= groups_of(force)
         if name in _FOREIGN:
             raise UnsupportedError(f"the System has a {name}: {_FOREIGN[name]}")
         if name in BAROSTATS and not np.isfinite(force.getDefaultPressure()._value).all():
@@ -404,13 +407,13 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
 def refuse_agents(
     system: openmm.System,
     bound: str | None,
-    rows: Iterable[tuple[IntArray, Callable[[int], str]]] = (),
+    rows: Iterable[tuple[IntArray, Callable[[int], str], NDArray[np.bool_]]] = (),
     molecules: Callable[[], Iterable[Sequence[int]]] = tuple,
 ) -> None:
-    """Refuse, by `UnsupportedError`, what moves particles off rows between steps: barostats, and a CMMotionRemover.
+    """Refuse, by `UnsupportedError`, what disturbs rows between steps: barostats, CMMotionRemover, AndersenThermostat.
 
     `bound` names a row that holds particles in space; `rows` are the particles of rows of one kind, shape (n, width),
-    and their names by number; barostats move each of the molecules by a vector of its own.
+    their names by number, and which go through faces of the box; barostats move each molecule by a vector of its own.
     """
     for force in forces_of(system):
         name = type(force).__name__
@@ -421,6 +424,8 @@ def refuse_agents(
                 f"{name} {what}, and {bound} holds particles in space, so that momentum is not conserved: take it out "
                 "of the System (createSystem(..., removeCMMotion=False)), or hold differences of positions only"
             )
+        if isinstance(force, openmm.AndersenThermostat):
+            raise UnsupportedError(f"{name} draws velocities of single atoms, which makes rows cold; use Langevin")
         if name not in BAROSTATS:
             continue
         if _scales_atoms(force):
@@ -428,7 +433,12 @@ def refuse_agents(
         label = np.empty(system.getNumParticles(), dtype=np.int64)
         for number, members in enumerate(molecules()):
             label[list(members)] = number
-        for atoms, name_of in rows:
+        for atoms, name_of, cut in rows:
+            if cut.any():
+                raise UnsupportedError(
+                    f"{name} changes the box, and row {name_of(int(np.argmax(cut)))} goes through its faces; shift "
+                    "molecules by box vectors until the atoms of each row lie side by side, or run at constant volume"
+                )
             apart = (label[atoms] != label[atoms[:, :1]]).any(axis=1)
             if apart.any():
                 raise UnsupportedError(
@@ -521,15 +531,11 @@ class Guard:
 
     @property
     def context(self) -> openmm.Context:
-        context = self._context()
-        assert context is not None
-        return context
+        return cast(openmm.Context, self._context())
 
     @property
     def integrator(self) -> Integrator:
-        integrator = self._integrator()
-        assert integrator is not None
-        return integrator
+        return self._integrator()
 
     def _refuse_old_positions(self) -> None:
         """Raise where rows would be computed at old positions."""
@@ -608,13 +614,14 @@ class Guard:
         if all(np.array_equal(value, vars(self.rows)[name]) for name, value in vars(now).items()):
             return False
         self.rows, self._freedom, self.thermal, self.momenta = now, None, None, None
+        self.started = False  # the next call finds g anew
         return True
 
     # -- calls ----------------------------------------------------------------------------------
 
     @property
     def knows(self) -> bool:
-        """Whether the Context is where the last call left it, as far as clock, box and size of its System tell."""
+        """Whether the Context is where the last call left it, as far as clock, box, and what the System has tell."""
         context = self._context()
         if context is None or self._size != _size(self.system):
             return False
@@ -802,6 +809,8 @@ class Guard:
             check_finite(x, v, step, self.rows.n_rows > 0)
             for part in integrator.parts:
                 part.check_masses(self.system)
+            if self.thermal is not None and not np.array_equal(masses_of(self.system), self.rows.masses):
+                self._read_again()
             self.check_lengths(x, step)
             for miss in (self.speed_violation(x, v), *(part.worst_violation(context) for part in integrator.parts)):
                 self.certify(miss, f"at step {step} ")
@@ -873,8 +882,8 @@ class Guard:
         return self.independent_momenta() - (3 if removes_center_of_mass_motion(self.system) else 0)
 
 
-def _size(system: openmm.System) -> tuple[int, int, int]:
-    return system.getNumParticles(), system.getNumConstraints(), system.getNumForces()
+def _size(system: openmm.System) -> tuple[int, int, list[type]]:
+    return system.getNumParticles(), system.getNumConstraints(), [type(force) for force in forces_of(system)]
 
 
 def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Violation]:

@@ -26,7 +26,7 @@ MUTANTS = {
         "«context.setParameter(name, parameters[name])→pass»": (
             "conserved_momenta::forces_are_looked_at_with_the_parameters_of_the_context"
         ),
-        "if force.getFrequency() > «→100»0]": "system_checks::two_barostats_are_refused",
+        "f.getFrequency() > «→100»0]": "system_checks::two_barostats_are_refused",
         "apex = i« if of[j] == of[k] else j if of[j] == sides[j][k] else k→»": (
             "system_checks::triangles_with_unequal_masses_beside_the_apex_are_refused"
         ),

@@ -6,7 +6,7 @@ import numpy as np
 import openmm
 import pytest
 from carried_systems import PEPTIDE, begun, driven, off_target, start
-from collective_cases import dihedral
+from collective_cases import bond, dihedral
 from openmm import app, unit
 from openmm_systems import context_of, field, particles, started, state_of, with_and_without_device
 
@@ -147,6 +147,7 @@ def barostat():
         (Distance([[0, 3]]), barostat(), r"MonteCarloBarostat.*row #7 Distance\(0, 3\).*join=True"),
         (Plane([6], [0, 0, 1]), barostat(), "holds particles in space"),
         (Plane([6], [0, 0, 1]), openmm.CMMotionRemover(), "momentum is not conserved"),
+        (Distance([[6, 7]]), openmm.AndersenThermostat(300, 1), "draws velocities of single atoms.* use Langevin"),
         (
             Distance([[6, 7]]),
             openmm.MonteCarloFlexibleBarostat(1.0, 300.0, 25, False),
@@ -175,6 +176,32 @@ def test_agents_that_break_rows_are_refused(rows, force, words):
     with pytest.raises((UnsupportedError, InputError), match=words):
         integrator.step(1)
     np.testing.assert_array_equal(state_of(context)[0], x)
+
+
+@pytest.mark.parametrize("kind", ["hold", "collective"])
+def test_a_barostat_in_place_of_another_force_refuses_rows_through_the_faces_of_the_box(kind):
+    system, x = waters(2, field("0", 1))
+    x[3:6, 0] += 3.0
+    (ends := bond(0, 3)).setUsesPeriodicBoundaryConditions(True)
+    by_hold = kind == "hold"
+    parts = hold(system, Distance([[0, 3]]), x, join=True) if by_hold else CollectiveRows(system, ends, positions=x)
+    context = started(system, integrator := ProjectedIntegrator(0.001, parts=parts), x)
+    integrator.step(1)
+    system.removeForce(1)
+    system.addForce(barostat())
+    context.reinitialize(preserveState=True)
+    with pytest.raises(UnsupportedError, match=r"row .* goes through its faces"):
+        integrator.step(1)
+
+
+def test_another_force_in_the_group_of_a_row_is_refused():
+    system, x = waters(2)
+    parts = CollectiveRows(system, [bond(0, 3)], positions=x)
+    system.getForce(0).setForceGroup(1)
+    context = started(system, integrator := ProjectedIntegrator(0.001, parts=parts), x)
+    with pytest.raises(InputError, match="force group 1 carries a row: give other forces"):
+        integrator.step(1)
+    del context
 
 
 @pytest.mark.usefixtures("without_device")

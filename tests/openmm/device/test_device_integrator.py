@@ -100,10 +100,14 @@ def test_noise_belongs_to_particle_and_step():
     for seed, calls, platform in ((1, (9,), "Reference"), (1, (4, 5), "Reference"), (1, (9,), "CPU"), (2, (9,), "CPU")):
         integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300.0, 20.0), device=True)
         integrator.setRandomNumberSeed(seed)
-        runs.append(state_of(run(integrator, system, x, v, platform, calls))[0])
+        runs.append(state_of(context := run(integrator, system, x, v, platform, calls))[0])
     assert np.abs(runs[0] - runs[1]).max() < 1e-12
     assert np.abs(runs[0] - runs[2]).max() < 1e-6
     assert np.abs(runs[2] - runs[3]).max() > 1e-4
+    # A state has its own noise if it is a whole one; to another one no noise comes twice.
+    states = [context.getState(positions=True, velocities=True, integratorParameters=p) for p in (False, True)]
+    ends = [(context.setState(states[k]), integrator.step(9), state_of(context)[0])[2] for k in (0, 0, 1, 1)]
+    assert np.abs(ends[0] - ends[1]).max() > 1e-4 and np.array_equal(ends[2], ends[3])
 
 
 # -- operations -----------------------------------------------------------------------------------------

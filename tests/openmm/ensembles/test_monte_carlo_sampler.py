@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import openmm
 import pytest
+from collective_cases import bond
 from ensemble_runs import twice_kinetic
 from openmm import app, unit
 from openmm_systems import (
@@ -26,7 +27,7 @@ from openmm_systems import (
 )
 
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, hold
+from kcons.openmm import CollectiveRows, HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, hold
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats.monte_carlo import POTENTIAL, PROPOSAL
 from kcons.thermostats.noise import noise_generator
@@ -116,8 +117,10 @@ def test_what_cannot_be_taken_back_is_rejected(kind):
     assert sampler.counts.accepted > 0
 
 
-def test_reporters_of_a_simulation_see_every_proposal():
+@pytest.mark.parametrize("rows", [False, True])
+def test_reporters_of_a_simulation_see_every_proposal(rows):
     system, x = water_box(8)
+    parts = [CollectiveRows(system, [bond(0, 3)], positions=x)] if rows else []
     topology = app.Topology()
     chain = topology.addChain()
     for _ in range(8):
@@ -127,7 +130,7 @@ def test_reporters_of_a_simulation_see_every_proposal():
     simulation = app.Simulation(
         topology,
         system,
-        HamiltonianMonteCarlo.reversing_integrator(0.005),
+        ProjectedIntegrator(0.005, parts=parts) if rows else reversing(0.005),
         openmm.Platform.getPlatformByName("Reference"),
     )
     simulation.context.setPositions(x)

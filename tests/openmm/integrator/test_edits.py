@@ -7,12 +7,13 @@ import logging
 import numpy as np
 import openmm
 import pytest
-from ensemble_runs import run
+from ensemble_runs import run, twice_kinetic
 from openmm_systems import potential_energy, started, state_of, with_and_without_device
 from tied_cluster import ON_DEVICE, X, carried_at, cluster, row_at, thermostatted
 
 from kcons.errors import CertificateError, InputError, KconsError
-from kcons.openmm import ProjectedIntegrator
+from kcons.openmm import Isokinetic, ProjectedIntegrator
+from kcons.openmm.quantities import GAS_CONSTANT
 
 parts = pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective", "carried"])
 everywhere = pytest.mark.parametrize(
@@ -68,6 +69,18 @@ def test_masses_and_lengths_after_reinitialize(device):
     integrator.check()
     x = state_of(context)[0]
     assert np.linalg.norm(x[0] - x[1]) == pytest.approx(1.002 * length, rel=1e-9)
+
+
+@with_and_without_device
+def test_particles_that_lose_their_mass_take_no_heat(device):
+    system, ensemble = cluster(), Isokinetic(300, momentum="free")
+    context = run(system, integrator := ProjectedIntegrator(0.002, ensemble=ensemble, device=device), X, X, 3)
+    system.setParticleMass(2, 0.0)
+    context.reinitialize(preserveState=True)
+    integrator.step(100)
+    integrator.step(1)
+    assert integrator.degrees_of_freedom() == 21
+    assert twice_kinetic(system, state_of(context)[1]) == pytest.approx(20 * GAS_CONSTANT * 300, rel=1e-9)
 
 
 # -- forces change --------------------------------------------------------------------------------------

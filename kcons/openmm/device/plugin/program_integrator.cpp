@@ -133,7 +133,7 @@ void ProgramIntegrator::restore(const string& text, bool exactly) {
     if (!known)
         throw OpenMMException("kcons: this state belongs to other steps or rows; OpenMM has taken over its positions and velocities, and the rest of it is left out");
     for (auto& array : steps->arrays) if (found.count(array.name)) steps->write(array.name, found[array.name]);
-    middleKinetic = middle; endKinetic = end;
+    middleKinetic = middle; endKinetic = end; steps->last = 0;
 }
 void ProgramIntegrator::loadCheckpoint(istream& in) {
     string text;
@@ -177,6 +177,8 @@ static const bool registered = (SerializationProxy::registerProxy(typeid(Program
 void Steps::execute(ContextImpl& c, const Integrator& integrator, const Shared& shared, int steps) {
     numbers.dt = integrator.getStepSize();
     numbers.tolerance = integrator.getConstraintTolerance();
+    if (c.getStepCount() < last)               // others went back, and the same noise would come again
+        write("seed", {fmod(read("seed")[0]+1140071481, 2147483647)});
     bool ended = true;                         // whether velocities are those of the end of a step
     for (int k = 0; k < steps; k++) {
         if (c.updateContextState()) valid = false;     // barostats have moved positions
@@ -197,6 +199,7 @@ void Steps::execute(ContextImpl& c, const Integrator& integrator, const Shared& 
         if (ended) run(c, shared, 2);
         if (recorded) launch("record");
     }
+    last = c.getStepCount();
     launch("look");
 }
 void Steps::run(ContextImpl& c, const Shared& shared, int part) {

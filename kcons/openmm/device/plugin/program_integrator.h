@@ -49,6 +49,7 @@ public:
     std::vector<Action> parts[3];
     int items = 0, workGroup = 64, slots = 1;
     bool valid = false;            // whether forces are those at the present positions
+    long long last = 0;            // the step that the last call ended with; 0 where a state brought its own noise
     virtual void prepare(OpenMM::ContextImpl& c) = 0;
     virtual void execute(OpenMM::ContextImpl& c, const OpenMM::Integrator& integrator, const Shared& shared, int steps);
     virtual std::vector<double> read(const std::string& name) = 0;
