@@ -30,6 +30,7 @@ import uuid
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from threading import get_ident
 from typing import Any, Literal, Self, cast
 
 import numpy as np
@@ -304,6 +305,8 @@ class CallbackEngine(Engine):
         #: Whether an integrator of kcons knows of the rows; where none does, the step count at the last evaluation.
         self.served, self._count = False, -1
         self._fractions: Sequence[float] = (1.0,)
+        #: The thread that is making steps; 0 for none.
+        self._thread = 0
         #: Whether velocities are projected between the drifts of a step, too.
         self._within = False
         self._error: BaseException | None = None
@@ -332,7 +335,16 @@ class CallbackEngine(Engine):
 
     def begin_run(self) -> None:
         """Whatever was asked between steps, the next call belongs to the beginning of one."""
+        if self._thread not in (0, get_ident()):
+            raise UnsupportedError(
+                "a Context in another thread is making steps with these rows; call hold for a System of each thread"
+            )
+        self._thread = get_ident()
         self._between_steps, self._rest_to_come, self._ran = True, False, None
+
+    def end_run(self) -> None:
+        if self._thread == get_ident():
+            self._thread = 0
 
     # -- what passes ----------------------------------------------------------------------------
 
@@ -800,6 +812,9 @@ class CarriedConstraints(Part):
 
     def begin_run(self) -> None:
         self._engine.begin_run()
+
+    def end_run(self) -> None:
+        self._engine.end_run()
 
     def remember(self, program: Program) -> None:
         words = "carried rows: positions whose gradients are taken"

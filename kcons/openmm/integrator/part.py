@@ -227,6 +227,9 @@ class Part(ABC):
     def begin_run(self) -> None:
         """Called before steps are made."""
 
+    def end_run(self) -> None:
+        """Called after them, also where they failed."""
+
     def begin(self, program: Program) -> None:
         """What to compute where x is not where the last step ended, for parts that keep something between steps.
 

@@ -338,9 +338,9 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         context, dt = guard.context, self._dt
         time, first = context.getTime()._value, context.getStepCount()
         before = self.getGlobalVariableByName("good_steps") if self.parts else 0.0
-        for part in self.parts:
-            part.begin_run()
         try:
+            for part in self.parts:
+                part.begin_run()
             summed = int(ends and guard.sums)
             self._execute(guard, steps - summed)
             if summed:
@@ -351,6 +351,9 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             if "NaN" not in str(error):
                 raise
             raise guard.explosion(str(error), first) from error
+        finally:
+            for part in self.parts:
+                part.end_run()
         code = int(self.getGlobalVariableByName("failed")) if self.parts else 0
         done = int(self.getGlobalVariableByName("good_steps") - before) if code else steps
         # OpenMM's clock goes on with the first step size after setStepSize.

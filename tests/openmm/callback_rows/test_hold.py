@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from threading import Thread
+
 import numpy as np
 import openmm
 import pytest
@@ -10,7 +12,17 @@ from collective_cases import bond, dihedral
 from openmm import app, unit
 from openmm_systems import context_of, field, particles, started, state_of, with_and_without_device
 
-from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, FixedAtoms, Plane, RadiusOfGyration, Sphere
+from kcons.constraints import (
+    Angle,
+    CenterOfMass,
+    Custom,
+    Dihedral,
+    Distance,
+    FixedAtoms,
+    Plane,
+    RadiusOfGyration,
+    Sphere,
+)
 from kcons.errors import ContradictionError, InputError, UnsupportedError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold, move_constraints
 from kcons.steppers import System, run
@@ -202,6 +214,30 @@ def test_another_force_in_the_group_of_a_row_is_refused():
     with pytest.raises(InputError, match="force group 1 carries a row: give other forces"):
         integrator.step(1)
     del context
+
+
+@pytest.mark.usefixtures("without_device")
+def test_rows_serve_one_thread_at_a_time():
+    told, contexts = [], []
+
+    def another():
+        with pytest.raises(UnsupportedError, match=r"a Context in another thread .* System of each thread"):
+            contexts[1].getIntegrator().step(1)
+        told.append(True)
+
+    def height(r):
+        if len(contexts) == 2 and contexts[0].getStepCount() and not told:
+            (thread := Thread(target=another)).start()
+            thread.join()
+        return r[0, 2]
+
+    system = particles([1.0])
+    rows = hold(system, Custom([0], height, lambda r: np.array([[0, 0, 1.0]])), [[0, 0, 0]])
+    for _ in range(2):
+        contexts.append(started(system, ProjectedIntegrator(0.001, parts=rows), [[0, 0, 0]]))
+    for context in (contexts[0], contexts[0], contexts[1]):
+        context.getIntegrator().step(1)
+    assert told == [True]
 
 
 @pytest.mark.usefixtures("without_device")
