@@ -119,6 +119,8 @@ def test_steps_are_found_for_an_error():
     whole = table_of([*table.to_dict("records"), *rows], table.attrs)
     found = rank(whole, limit=target)
     assert found.table.method.iloc[0] == "blanes-moan4" and found.table.error.iloc[0] <= target
+    again = table_of([*whole.to_dict("records"), *find_steps(system, whole, target, reference)], table.attrs)
+    assert not again.duplicated(["method", "setting"]).any()  # as --resume asks: what has run is not run again
     with pytest.raises(InputError, match="the target error is -1; give a positive number"):
         find_steps(system, table, -1, reference)
     assert find_steps(system, table, 1e-16, reference) == []
