@@ -259,8 +259,10 @@ def find_steps(
     predicted = (predict(rows, SAFETY * target, least) for _, rows in with_errors(table).groupby("method"))
     promising = sorted((p for p in predicted if p is not None), key=lambda p: float(p[cost]))
     found: list[dict[str, Any]] = []
+    before = with_errors(table).to_dict("records")
     for promise in promising[:FINALISTS]:
-        best = min((row[cost] for row in found if (row.get("error") or math.inf) <= target), default=math.inf)
+        reached = (row[cost] for row in [*before, *found] if row.get("error", math.inf) <= target)
+        best = min(reached, default=math.inf)
         seconds = promise["seconds"] * system.horizon / system.units.long_time_unit
         if promise[cost] < 1.5 * best and seconds <= budget:
             found += _search(system, promise, table, target, reference, budget, watcher)
