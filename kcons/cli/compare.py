@@ -125,9 +125,8 @@ def _compare(chosen: argparse.Namespace) -> int:
         report.write_csv(path, table)
 
     with results.taken(), Watcher(shown=True) as watcher:
-        if done is None:  # what an earlier run left is not what --resume is to go on from
-            for name in files:
-                (folder / name).unlink(missing_ok=True)
+        for name in files[done is not None :]:  # an earlier table goes unless --resume goes on from it
+            (folder / name).unlink(missing_ok=True)
         try:
             table, words = _measured(chosen, averages, budget=budget, done=done, keep=keep, watcher=watcher)
         except KeyboardInterrupt:

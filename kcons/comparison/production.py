@@ -78,8 +78,10 @@ def right(row: Mapping[str, Any]) -> bool:
 
 def known(row: Mapping[str, Any]) -> bool:
     """Whether this run can tell that."""
-    if row["status"] != "ok" or row["climb"] > CLIMBS:
+    if row["status"] == "failed" or row["climb"] > CLIMBS:
         return True
+    if row["status"] != "ok":  # too few samples for an error
+        return False
     _, off, error = _worst(row)
     return 2 * error <= RIGHT or abs(off) - WRONG * error > RIGHT
 
@@ -97,15 +99,17 @@ def sentence(rows: Sequence[Mapping[str, Any]], unit: str, kelvin: float = 300.0
     doubt = next((row for row in rows if not known(row)), None)
     if doubt is not None and (not good or doubt["setting"] > good[-1]):
         before = f"A step of {good[-1]:g} {unit} is right for averages at {kelvin:g} K; at" if good else "At"
+        if doubt["status"] != "ok":
+            return f"{before} {doubt['setting']:g} {unit} {doubt['note']}: give a larger --budget."
         known_to = float(f"{200 * _worst(doubt)[2]:.2g}")  # 140, not 1.4e+02
         return (
             f"{before} {doubt['setting']:g} {unit} the temperature of configurations is known to "
             f"{known_to:g} % only (two standard errors): a larger --budget makes it {100 * RIGHT:g} %."
         )
     last = rows[-1]
-    if last["status"] != "ok":
+    if last["status"] == "failed":
         why = last["note"].split("\n")[0]
-    elif last["error"] <= RIGHT:
+    elif not last.get("error", 0.0) > RIGHT:
         why = "the energy climbs"
     else:
         kind, off, error = _worst(last)

@@ -259,17 +259,20 @@ def find_steps(
     predicted = (predict(rows, SAFETY * target, least) for _, rows in with_errors(table).groupby("method"))
     promising = sorted((p for p in predicted if p is not None), key=lambda p: float(p[cost]))
     found: list[dict[str, Any]] = []
+    before = with_errors(table).to_dict("records")
     for promise in promising[:FINALISTS]:
-        best = min((row[cost] for row in found if (row.get("error") or math.inf) <= target), default=math.inf)
+        reached = (row[cost] for row in [*before, *found] if row.get("error", math.inf) <= target)
+        best = min(reached, default=math.inf)
         seconds = promise["seconds"] * system.horizon / system.units.long_time_unit
         if promise[cost] < 1.5 * best and seconds <= budget:
-            found += _search(system, promise, target, reference, budget, watcher)
+            found += _search(system, promise, table, target, reference, budget, watcher)
     return found
 
 
 def _search(
     system: TestSystem,
     promise: dict[str, Any],
+    table: pd.DataFrame,
     target: float,
     reference: Reference,
     budget: float,
@@ -278,13 +281,16 @@ def _search(
     """Runs of one method at the predicted step and near it, until its longest step that makes the error is known."""
     method, found = METHODS[promise["method"]], list[dict[str, Any]]()
     unit = 1.0 if method.adaptive else system.units.time_unit
-    # The longest step that reaches the error, the shortest that does not.
-    setting, good, bad = promise["setting"] * unit, 0.0, math.inf
+    tried = table[(table.method == method.name) & table.status.isin(["ok", "failed"])]
+    settings, reached = unit * tried.setting, tried.error <= target
+    # The shortest step that does not reach the error, the longest of shorter ones that does.
+    setting, bad = promise["setting"] * unit, min(settings[~reached], default=math.inf)
+    good = max(settings[reached & (settings < bad)], default=0.0)
     for _ in range(TRIES):
         if not method.adaptive:  # the longest step that divides the horizon and is not longer, shorter than a bad one
             count = max(1, math.ceil(system.horizon / setting * (1 - 1e-9)))
             setting = system.horizon / (count + (system.horizon / count >= bad * (1 - 1e-9)))
-        if not good < setting < bad:
+        if not good * (1 + 1e-9) < setting < bad:
             break
         found.append(measure(system, method, setting, reference, budget, watcher=watcher))
         error = found[-1].get("error", math.inf)

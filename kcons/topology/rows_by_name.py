@@ -536,4 +536,4 @@ def _nothing(topology: Topology, kind: str, selected: BoolArray | None) -> str:
         return "nothing to hold: there are no hydrogens; add them to the file, or hold all bonds (allbonds)"
     if kind == "none":
         return "nothing to hold: there is no water that would be rigid; name bonds, such as hbonds"
-    return f"nothing to hold: found no water, and {CONSTRAIN[kind]} are none"
+    return f"nothing to hold: found no water, and {CONSTRAIN[kind]} are none; give a file that has them (PDB: CONECT)"

@@ -59,7 +59,7 @@ def test_it_goes_on_from_the_rows_that_are_there(tmp_path, monkeypatch, capsys):
 
     def stopped(system, method, *more):
         asked.append(method.name)
-        if asked == ["rattle", "suzuki4"]:
+        if 1 < len(asked) < 4:
             raise KeyboardInterrupt
         return whole(system, method, *more)
 
@@ -69,8 +69,10 @@ def test_it_goes_on_from_the_rows_that_are_there(tmp_path, monkeypatch, capsys):
     assert "--resume goes on from what is in" in capsys.readouterr().err
     assert list(read_csv(tmp_path / "compare.csv").method) == ["rattle", "rattle"]
     first = read_csv(tmp_path / "compare.csv").error.tolist()
+    (tmp_path / "compare.txt").touch()
+    assert run(*words, "--resume") == 130 and not (tmp_path / "compare.txt").exists()  # it was of another table
     assert run(*words, "--resume") == 0
-    assert asked == ["rattle", "suzuki4", "suzuki4"]
+    assert asked == ["rattle", "suzuki4", "suzuki4", "suzuki4"]
     table = read_csv(tmp_path / "compare.csv")
     assert set(table.method) == {"rattle", "suzuki4"} and table.error.tolist()[:2] == first
     capsys.readouterr()

@@ -20,6 +20,7 @@ RIGHT, WRONG = row(2.0, 0.001, 0.002, "shift", 0.5), row(4.0, 0.08, 0.002, "turn
 DOUBTFUL, FAR = row(1.0, -0.137, 0.039, "turn", 0.1), row(1.0, -0.3, 0.02, "turn", 0.1)
 VAGUE, CLIMBING = row(3.0, 0.01, 0.02, "turn", 0.1), row(4.0, 0.0, 0.002, "turn", 9.0)
 FAILED = {"setting": 6.0, "status": "failed", "note": "ConvergenceError: no solution", "climb": 0.0}
+FEW = {"setting": 3.0, "status": "partial", "note": "18 samples are too few for an error", "climb": 0.0}
 
 
 @pytest.mark.parametrize(
@@ -33,6 +34,8 @@ FAILED = {"setting": 6.0, "status": "failed", "note": "ConvergenceError: no solu
         ([RIGHT, VAGUE], "A step of 2 fs is right for averages at 300 K; at 3 fs .* known to 4 % only .* --budget"),
         ([FAR], "No step that was tried, from 1 fs on, is right for averages: turn motions are off by -30.0 %"),
         ([DOUBTFUL], "At 1 fs the temperature of configurations is known to 7.8 % only"),
+        ([FEW], "^At 3 fs 18 samples are too few for an error: give a larger --budget"),
+        ([{**FEW, "climb": 9.0}], "No step that was tried, from 3 fs on, is right for averages: the energy climbs"),
         ([VAGUE], "At 3 fs the temperature of configurations is known to 4 % only"),
     ],
 )

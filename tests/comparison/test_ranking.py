@@ -112,13 +112,15 @@ def test_steps_are_found_for_an_error():
     system = test_systems.build("chain", 4)
     reference = system.reference()
     table = compare(system, ["rattle", "blanes-moan4"], reference=reference, rounds=0)
-    target = 1e-6
+    target = 1e-8
     rows = find_steps(system, table, target, reference)
     good = [r for r in rows if r["error"] <= target]
     assert good and min(r["error"] for r in good) > 0.2 * target
     whole = table_of([*table.to_dict("records"), *rows], table.attrs)
     found = rank(whole, limit=target)
     assert found.table.method.iloc[0] == "blanes-moan4" and found.table.error.iloc[0] <= target
+    assert find_steps(system, whole, target, reference) == []  # as --resume asks: what has run is not run again
+    assert find_steps(system, table, 1e-6, reference) == []  # the step of 40 fs does, and RATTLE is dearer
     with pytest.raises(InputError, match="the target error is -1; give a positive number"):
         find_steps(system, table, -1, reference)
     assert find_steps(system, table, 1e-16, reference) == []

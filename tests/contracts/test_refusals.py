@@ -493,6 +493,8 @@ REFUSED: list[tuple[str, ...]] = [
     ("HamiltonianFlow(half, 0)", "f"),
     ("HamiltonianFlow(half, 3).solve((0, 1), [1, 2, 3, 4])", "X"),
     ("HamiltonianFlow(lambda q, p: 0.0, 2)", "hamiltonian"),
+    ("HamiltonianFlow(lambda q, p, t: 0.5 * p**2, 1).energy([1.0, 2.0])", "hamiltonian"),
+    ("momentum(lambda q, v, t: 0.5 * v**2, [0.0], [1.0])", "lagrangian"),
     ("find_equilibria(Pendulum(), ?)", "box", "[[0.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]"),
     ("find_equilibria(Pendulum(), [[0.0, 1.0]] * 2, starts=0)", "starts"),
     ("Flow(lambda t, X: X, 2).velocity(0.0, ?)", "X", "[1.0]", "[1.0, nan]", "[1.0, 1j]"),

@@ -155,6 +155,8 @@ def test_no_masses_no_hydrogens_and_torn_molecules():
         held_rows(solution(masses=np.zeros(12)), "allbonds")
     with pytest.raises(InputError, match="there are no hydrogens; add them"):
         held_rows(snapshot(["C", "C"], [[0, 0, 0], [1.5, 0, 0]], [(0, 1)]), "hbonds")
+    with pytest.raises(InputError, match="bonds with a hydrogen are none; give a file that has them"):
+        held_rows(snapshot(["H", "C", "C"], np.eye(3), [(1, 2)]), "hbonds")
     torn = [[0.0, 0, 0], [28.5, 0, 0]]
     with pytest.raises(InputError, match=r"28.5 angstrom apart; give the periodic cell"):
         held_rows(snapshot(["C", "C"], torn, [(0, 1)]), "allbonds")

@@ -188,7 +188,7 @@ class HamiltonianFlow(Flow):
     def energy(self, X: ArrayLike, t: float = 0.0) -> float:
         """H(q, p, t)."""
         q, p = np.split(read_only_view(self._state(X)), 2)
-        return float(self.hamiltonian(q, p, t))
+        return float(called("hamiltonian", self.hamiltonian, (), q, p, t))
 
     def _gradient(self, t: float, X: FloatArray, step: float = STEP) -> FloatArray:
         """(dH/dq, dH/dp), shape (2f,)."""
@@ -222,14 +222,14 @@ def action(lagrangian: Lagrangian, times: ArrayLike, path: ArrayLike) -> float:
     q = q.reshape(len(t), -1)
     steps = np.diff(t)
     middles, velocities = 0.5 * (q[1:] + q[:-1]), np.diff(q, axis=0) / steps[:, None]
-    values = [lagrangian(x, v, float(s)) for x, v, s in zip(middles, velocities, 0.5 * (t[1:] + t[:-1]), strict=True)]
-    return float(np.dot(values, steps))
+    places = zip(middles, velocities, 0.5 * (t[1:] + t[:-1]), strict=True)
+    return float(np.dot([called("lagrangian", lagrangian, (), x, v, float(s)) for x, v, s in places], steps))
 
 
 def momentum(lagrangian: Lagrangian, q: ArrayLike, v: ArrayLike, t: float = 0.0) -> FloatArray:
     """p = dL/dv, shape (f,) (notes eq. 45)."""
     q = as_float_array(q, "q")
-    return jacobian_by_differences(lambda s, w: lagrangian(q, w, t), t, v)
+    return jacobian_by_differences(lambda s, w: called("lagrangian", lagrangian, (), q, w, t), t, v)
 
 
 def lagrange_residual(
@@ -241,7 +241,8 @@ def lagrange_residual(
     def along(h: float) -> FloatArray:
         return momentum(lagrangian, q + h * v + 0.5 * h * h * a, v + h * a, t + h)
 
-    return first_derivative_4(along, 0.0, step) - jacobian_by_differences(lambda s, x: lagrangian(x, v, t), t, q)
+    slope = jacobian_by_differences(lambda s, x: called("lagrangian", lagrangian, (), x, v, t), t, q)
+    return first_derivative_4(along, 0.0, step) - slope
 
 
 def hamiltonian(lagrangian: Lagrangian, q: ArrayLike, p: ArrayLike, t: float = 0.0) -> float:
