@@ -7,6 +7,7 @@ A work-group has a large cluster, with an order of elimination by levels (see `c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -132,7 +133,6 @@ class ItemWriter:
         self.rows, self.count = shape.rows, len(shape.rows)
         self.single = shape.atoms.shape[1] == 1
         self.row_number = f"{first_row}+cluster*{self.count}"
-        self.filled: list[set[int]] = []
         #: Of each row, as C: its target or the number of its moving one, its scale, where cells and parameters begin.
         self.targets: list[str] = []
         self.scales: list[str] = []
@@ -220,44 +220,67 @@ class ItemWriter:
                 ] * bool(weight)
         return "+".join(terms)
 
-    def _factored(self, left: str) -> str:
-        """J, and its L and U in place, without pivoting: it is nearly symmetric and positive."""
-        n, lines = self.count, []
-        filled = self.filled = [set[int]() for _ in self.rows]
+    def _solved(self, left: str) -> str:
+        """J y = off, y, and what it takes from d or v, which is called `d`; gradients of J's rows are in `left`."""
+        n, text = self.count, ""
+        filled = [set[int]() for _ in self.rows]
         for k in range(n):
             for j in range(n):
-                text = self._product(k, j, left)
-                if text:
+                entry = self._product(k, j, left)
+                if entry:
                     filled[k].add(j)
-                    lines.append(f" J[{k * n + j}] = {f'J[{j * n + k}]' if left == 'g' and j < k else text};\n")
-        for k, row in enumerate(self.rows):
-            pivot = f"J[{k * n + k}]"
-            lines.append(f" whole = fabs({pivot});\n" * row.depends)
-            for m in range(k):
-                if m not in filled[k]:  # which grows
-                    continue
-                lines.append(f" J[{k * n + m}] *= J[{m * n + m}];\n")
-                for j in sorted(each for each in filled[m] if each > m):
-                    old = f"J[{k * n + j}]" if j in filled[k] else "0"
-                    filled[k].add(j)
-                    lines.append(f" J[{k * n + j}] = {old}-J[{k * n + m}]*J[{m * n + j}];\n")
-            none = f"fabs({pivot}) <= ROWS_PIVOT*whole ? 0 : " * row.depends
-            lines.append(f" {pivot} = {none}1/{pivot};\n")
-        return "".join(lines)
-
-    def _solved(self) -> str:
-        """J y = off, y, and what it takes from d or v, which is called `d`."""
-        n, text = self.count, ""
-        for k in range(n):
-            taken = "".join(f"-J[{k * n + m}]*y[{m}]" for m in sorted(self.filled[k]) if m < k)
-            text += f" y[{k}] = off[{k}]{taken};\n"
-        for k in range(n - 1, -1, -1):
-            taken = "".join(f"-J[{k * n + j}]*y[{j}]" for j in sorted(self.filled[k]) if j > k)
-            text += f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}]; sum[{k}] += y[{k}];\n"
+                    text += f" J[{k * n + j}] = {f'J[{j * n + k}]' if left == 'g' and j < k else entry};\n"
+        few = 1 < n < 4 and all(self._plain(row) and not row.depends for row in self.rows)
+        text += self._by_cofactors(filled) if few else self._by_elimination(filled)
+        text += "".join(f" sum[{k}] += y[{k}];" for k in range(n)) + "\n"
         for k, row in enumerate(self.rows):
             for p, leg in enumerate(self._legs(row)):
                 pushed = " ".join(f"d[{3 * a}+c] {'-' if sign == '+' else '+'}= w[{a}]*z;" for a, sign in leg.items())
                 text += f" XYZ {{mixed z = g{k}[{3 * p}+c]*y[{k}]; {pushed}}}\n"
+        return text
+
+    def _by_cofactors(self, filled: Sequence[set[int]]) -> str:
+        """y for two or three lengths: one division, where elimination has one after another."""
+        n = self.count
+
+        def minor(k: int, j: int) -> str:
+            """Cofactor of an entry, with J filled up to three rows by those of the identity."""
+            terms = []
+            for sign, side in (("+", 1), ("-", 2)):
+                places = [((k + 1) % 3, (j + side) % 3), ((k + 2) % 3, (j + 3 - side) % 3)]
+                if all(q in filled[p] if p < n else p == q for p, q in places):
+                    terms.append(sign + "*".join(f"J[{p * n + q}]" for p, q in places if p < n))
+            return "".join(terms) or "0"
+
+        whole = "+".join(f"J[{j}]*C[{j}]" for j in sorted(filled[0]))
+        text = " ".join(f"C[{k * n + j}] = {minor(k, j)};" for k in range(n) for j in range(n))
+        text = f" {{mixed C[{n * n}]; {text}\n whole = 1/({whole});\n"
+        for j in range(n):
+            text += f" y[{j}] = whole*({'+'.join(f'C[{k * n + j}]*off[{k}]' for k in range(n))});\n"
+        return text + " }\n"
+
+    def _by_elimination(self, filled: Sequence[set[int]]) -> str:
+        """J's L and U in place, without pivoting: it is nearly symmetric and positive; and y."""
+        n, text = self.count, ""
+        for k, row in enumerate(self.rows):
+            pivot = f"J[{k * n + k}]"
+            text += f" whole = fabs({pivot});\n" * row.depends
+            for m in range(k):
+                if m not in filled[k]:  # which grows
+                    continue
+                text += f" J[{k * n + m}] *= J[{m * n + m}];\n"
+                for j in sorted(each for each in filled[m] if each > m):
+                    old = f"J[{k * n + j}]" if j in filled[k] else "0"
+                    filled[k].add(j)
+                    text += f" J[{k * n + j}] = {old}-J[{k * n + m}]*J[{m * n + j}];\n"
+            none = f"fabs({pivot}) <= ROWS_PIVOT*whole ? 0 : " * row.depends
+            text += f" {pivot} = {none}1/{pivot};\n"
+        for k in range(n):
+            taken = "".join(f"-J[{k * n + m}]*y[{m}]" for m in sorted(filled[k]) if m < k)
+            text += f" y[{k}] = off[{k}]{taken};\n"
+        for k in range(n - 1, -1, -1):
+            taken = "".join(f"-J[{k * n + j}]*y[{j}]" for j in sorted(filled[k]) if j > k)
+            text += f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}];\n"
         return text
 
     def _sums(self, by: str) -> str:
@@ -290,7 +313,7 @@ class ItemWriter:
         return (
             f"{self._begin('positions', 'h', 'time-h')}{starts} int bad = -1{first};\n"
             f" for (int turn = 0;; turn++) {{\n int there = 1;\n{turns} if ({stop}) break;{then}\n"
-            f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored('o')}{self._solved()} }}\n"
+            f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._solved('o')} }}\n"
             f"{turned} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
         )
 
@@ -306,7 +329,7 @@ class ItemWriter:
                 speed = "".join(f"{sign}d[{3 * a}+c]" for a, sign in leg.items())
                 speeds += f" XYZ off[{k}] += g{k}[{3 * p}+c]*({speed});\n"
         return (
-            f"{self._begin('velocities', 'rate', 'time')}{speeds}{self._factored('g')}{self._solved()}"
+            f"{self._begin('velocities', 'rate', 'time')}{speeds}{self._solved('g')}"
             f" if (rate != 0) {{{self._sums('')} }}\n}}\n"
         )
 
