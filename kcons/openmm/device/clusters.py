@@ -32,13 +32,14 @@ _NAMES = {"absolute": "fabs", "power": "pow", "arctan2": "atan2", "arcsin": "asi
 class Array(NamedTuple):
     """An array of 'mixed' or 'int' numbers, which kernels know by its name, and what it begins with.
 
-    One that is `saved` belongs to a state: checkpoints and States have it.
+    One that is `saved` belongs to a state: checkpoints and States have it. Kernels are given those that are `passed`.
     """
 
     name: str
     kind: str
     values: FloatArray | IntArray
     saved: bool = False
+    passed: bool = True
 
 
 # -- families -----------------------------------------------------------------------------------------
