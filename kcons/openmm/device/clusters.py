@@ -7,7 +7,6 @@ A work-group has a large cluster, with an order of elimination by levels (see `c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -224,15 +223,15 @@ class ItemWriter:
     def _solved(self, left: str) -> str:
         """J y = off, y, and what it takes from d or v, which is called `d`; gradients of J's rows are in `left`."""
         n, text = self.count, ""
+        few = n == 3 and all(self._plain(row) and not row.depends for row in self.rows)
         filled = [set[int]() for _ in self.rows]
         for k in range(n):
             for j in range(n):
-                entry = self._product(k, j, left)
+                entry = self._product(k, j, left) or "0" * few
                 if entry:
                     filled[k].add(j)
                     text += f" J[{k * n + j}] = {f'J[{j * n + k}]' if left == 'g' and j < k else entry};\n"
-        few = 1 < n < 4 and all(self._plain(row) and not row.depends for row in self.rows)
-        text += self._by_cofactors(filled) if few else self._by_elimination(filled)
+        text += self._by_cofactors() if few else self._by_elimination(filled)
         text += "".join(f" sum[{k}] += y[{k}];" for k in range(n)) + "\n"
         for k, row in enumerate(self.rows):
             for p, leg in enumerate(self._legs(row)):
@@ -240,27 +239,19 @@ class ItemWriter:
                 text += f" XYZ {{mixed z = g{k}[{3 * p}+c]*y[{k}]; {pushed}}}\n"
         return text
 
-    def _by_cofactors(self, filled: Sequence[set[int]]) -> str:
-        """y for two or three lengths: one division, where elimination has one after another."""
-        n = self.count
+    def _by_cofactors(self) -> str:
+        """y of three lengths with one division; elimination has three, each of which waits for the one before."""
+        J = np.pad([[f"J[{3 * k + j}]" for j in range(3)] for k in range(3)], (0, 2), "wrap")
+        minors = [
+            [f"({J[k + 1, j + 1]}*{J[k + 2, j + 2]}-{J[k + 1, j + 2]}*{J[k + 2, j + 1]})" for j in range(3)]
+            for k in range(3)
+        ]
+        text = f" whole = 1/({'+'.join(f'{J[0, j]}*{minors[0][j]}' for j in range(3))});\n"
+        for j in range(3):
+            text += f" y[{j}] = whole*({'+'.join(f'{minors[k][j]}*off[{k}]' for k in range(3))});\n"
+        return text
 
-        def minor(k: int, j: int) -> str:
-            """Cofactor of an entry, with J filled up to three rows by those of the identity."""
-            terms = []
-            for sign, side in (("+", 1), ("-", 2)):
-                places = [((k + 1) % 3, (j + side) % 3), ((k + 2) % 3, (j + 3 - side) % 3)]
-                if all(q in filled[p] if p < n else p == q for p, q in places):
-                    terms.append(sign + "*".join(f"J[{p * n + q}]" for p, q in places if p < n))
-            return "".join(terms) or "0"
-
-        whole = "+".join(f"J[{j}]*C[{j}]" for j in sorted(filled[0]))
-        text = " ".join(f"C[{k * n + j}] = {minor(k, j)};" for k in range(n) for j in range(n))
-        text = f" {{mixed C[{n * n}]; {text}\n whole = 1/({whole});\n"
-        for j in range(n):
-            text += f" y[{j}] = whole*({'+'.join(f'C[{k * n + j}]*off[{k}]' for k in range(n))});\n"
-        return text + " }\n"
-
-    def _by_elimination(self, filled: Sequence[set[int]]) -> str:
+    def _by_elimination(self, filled: list[set[int]]) -> str:
         """J's L and U in place, without pivoting: it is nearly symmetric and positive; and y."""
         n, text = self.count, ""
         for k, row in enumerate(self.rows):
