@@ -640,11 +640,11 @@ def plan(
 
 def _words(text: str) -> set[str]:
     """What is named in a text, by macros too if they are used: launches cost less with fewer arguments."""
-    macros = dict(re.findall(r"#define (\w+)(.*)", (_COMMON + text).replace("\\\n", "")))
+    macros = re.findall(r"#define (\w+)(.*)", (_COMMON + text).replace("\\\n", ""))
     found, more = set[str](), set(re.findall(r"\w+", re.sub(r"#define.*", "", text)))
     while more:
         found |= more
-        more = {word for name in more & macros.keys() for word in re.findall(r"\w+", macros[name])} - found
+        more = {word for name, body in macros if name in more for word in re.findall(r"\w+", body)} - found
     return found
 
 
