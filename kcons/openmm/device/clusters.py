@@ -189,7 +189,7 @@ class ItemWriter:
     def _begin(self, what: str, first: str, time: str) -> str:
         """What a function begins with: its numbers, and gradients at x."""
         text = (
-            f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
+            f"INLINED void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
             f"mixed* d, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
             f"{self.table.shape[1]};\n mixed off[{self.count}], sum[{self.count}], whole, J[{self.count**2}], "
             f"y[{self.count}];\n"
@@ -197,8 +197,8 @@ class ItemWriter:
         for k, row in enumerate(self.rows):
             size, kept = 3 * len(row.atoms), 3 * len(self._legs(row))
             text += f" mixed r{k}[{size * (1 + row.rolls)}], o{k}[{1 + size}], g{k}[{size}];\n"
-            text += f"{self._value(k, row, time, False)} for (int c = 0; c < {kept}; c++) g{k}[c] = o{k}[1+c];\n"
-            text += f" sum[{k}] = 0;\n"
+            text += self._value(k, row, time, False)
+            text += f" UNROLLED for (int c = 0; c < {kept}; c++) g{k}[c] = o{k}[1+c];\n sum[{k}] = 0;\n"
         return text
 
     def _wanted(self, k: int, row: Row, time: str, rate: int) -> str:

@@ -49,7 +49,15 @@ _COMMON = """
 #else
 #define CLAIM(place, value) atomicCAS(place, 0, value)
 #endif
-#define XYZ for (int c = 0; c < 3; c++)
+/* Some compilers for OpenCL leave short loops and functions as they are, and the arrays in them in memory. */
+#ifdef __OPENCL_VERSION__
+#define INLINED DEVICE __attribute__((always_inline))
+#define UNROLLED _Pragma("unroll")
+#else
+#define INLINED DEVICE
+#define UNROLLED
+#endif
+#define XYZ UNROLLED for (int c = 0; c < 3; c++)
 #define GET_U(a, p) XYZ d[3*(a)+c] = kept[3*(p)+c];
 #define PUT_U(a, p) XYZ kept[3*(p)+c] = d[3*(a)+c];
 #define AWAY(a, p, sign) {mixed i_ = cells[4*(p)], j_ = cells[4*(p)+1], k_ = cells[4*(p)+2]; \\
@@ -575,7 +583,7 @@ class Kernels:
         """A loop over the clusters of a shape that a group has, or an item."""
         shape, begin, atoms, work = place
         clusters, n = shape.atoms.shape
-        every = f"for (int a = 0; a < {n}; a++)"
+        every = f"UNROLLED for (int a = 0; a < {n}; a++)"
         words = {"NAME": shape.name, "CLUSTER": f"item+{shape.first}", "EVERY": every}
         if shape.together:  # barriers are inside, which no condition may be about
             loop = f"for (int item = GROUP_ID; item < {clusters}; item += NUM_GROUPS)"
