@@ -583,7 +583,7 @@ class Kernels:
         """A loop over the clusters of a shape that a group has, or an item."""
         shape, begin, atoms, work = place
         clusters, n = shape.atoms.shape
-        every = f"UNROLLED for (int a = 0; a < {n}; a++)"
+        every = f"for (int a = 0; a < {n}; a++)"
         words = {"NAME": shape.name, "CLUSTER": f"item+{shape.first}", "EVERY": every}
         if shape.together:  # barriers are inside, which no condition may be about
             loop = f"for (int item = GROUP_ID; item < {clusters}; item += NUM_GROUPS)"
@@ -596,7 +596,8 @@ class Kernels:
             loop = f"for (int item = GLOBAL_ID-{begin}; item < {clusters}; item += GLOBAL_SIZE) if (item >= 0)"
             atom = f"atoms[{atoms}+a*{clusters}+item]"
             room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n EACH at[a] = RESTS({atom});\n"
-            words |= {"EACH": every, "SYNC": "", "ROOM": f"mixed d[{3 * n}];", "AT": "at[a]", "FIRST": "1"}
+            words |= {"EACH": f"UNROLLED {every}", "SYNC": "", "ROOM": f"mixed d[{3 * n}];"}
+            words |= {"AT": "at[a]", "FIRST": "1"}
         away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
         load = f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')} if ({atom} < 0) w[a] = 0;}}\n"
         store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
