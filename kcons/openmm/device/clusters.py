@@ -31,13 +31,14 @@ _NAMES = {"absolute": "fabs", "power": "pow", "arctan2": "atan2", "arcsin": "asi
 class Array(NamedTuple):
     """An array of 'mixed' or 'int' numbers, which kernels know by its name, and what it begins with.
 
-    One that is `saved` belongs to a state: checkpoints and States have it.
+    One that is `saved` belongs to a state: checkpoints and States have it. Kernels are given those that are `passed`.
     """
 
     name: str
     kind: str
     values: FloatArray | IntArray
     saved: bool = False
+    passed: bool = True
 
 
 # -- families -----------------------------------------------------------------------------------------
@@ -132,7 +133,6 @@ class ItemWriter:
         self.rows, self.count = shape.rows, len(shape.rows)
         self.single = shape.atoms.shape[1] == 1
         self.row_number = f"{first_row}+cluster*{self.count}"
-        self.filled: list[set[int]] = []
         #: Of each row, as C: its target or the number of its moving one, its scale, where cells and parameters begin.
         self.targets: list[str] = []
         self.scales: list[str] = []
@@ -189,7 +189,7 @@ class ItemWriter:
     def _begin(self, what: str, first: str, time: str) -> str:
         """What a function begins with: its numbers, and gradients at x."""
         text = (
-            f"DEVICE void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
+            f"INLINED void {what}_{self.name}(ROWS int cluster, mixed {first}, mixed time, const mixed* x, "
             f"mixed* d, const mixed* w) {{\n GLOBAL const mixed* n = rows_numbers+{self.start}+cluster*"
             f"{self.table.shape[1]};\n mixed off[{self.count}], sum[{self.count}], whole, J[{self.count**2}], "
             f"y[{self.count}];\n"
@@ -197,8 +197,8 @@ class ItemWriter:
         for k, row in enumerate(self.rows):
             size, kept = 3 * len(row.atoms), 3 * len(self._legs(row))
             text += f" mixed r{k}[{size * (1 + row.rolls)}], o{k}[{1 + size}], g{k}[{size}];\n"
-            text += f"{self._value(k, row, time, False)} for (int c = 0; c < {kept}; c++) g{k}[c] = o{k}[1+c];\n"
-            text += f" sum[{k}] = 0;\n"
+            text += self._value(k, row, time, False)
+            text += f" UNROLLED for (int c = 0; c < {kept}; c++) g{k}[c] = o{k}[1+c];\n sum[{k}] = 0;\n"
         return text
 
     def _wanted(self, k: int, row: Row, time: str, rate: int) -> str:
@@ -220,44 +220,59 @@ class ItemWriter:
                 ] * bool(weight)
         return "+".join(terms)
 
-    def _factored(self, left: str) -> str:
-        """J, and its L and U in place, without pivoting: it is nearly symmetric and positive."""
-        n, lines = self.count, []
-        filled = self.filled = [set[int]() for _ in self.rows]
+    def _solved(self, left: str) -> str:
+        """J y = off, y, and what it takes from d or v, which is called `d`; gradients of J's rows are in `left`."""
+        n, text = self.count, ""
+        few = n == 3 and all(self._plain(row) and not row.depends for row in self.rows)
+        filled = [set[int]() for _ in self.rows]
         for k in range(n):
             for j in range(n):
-                text = self._product(k, j, left)
-                if text:
+                entry = self._product(k, j, left) or "0" * few
+                if entry:
                     filled[k].add(j)
-                    lines.append(f" J[{k * n + j}] = {f'J[{j * n + k}]' if left == 'g' and j < k else text};\n")
-        for k, row in enumerate(self.rows):
-            pivot = f"J[{k * n + k}]"
-            lines.append(f" whole = fabs({pivot});\n" * row.depends)
-            for m in range(k):
-                if m not in filled[k]:  # which grows
-                    continue
-                lines.append(f" J[{k * n + m}] *= J[{m * n + m}];\n")
-                for j in sorted(each for each in filled[m] if each > m):
-                    old = f"J[{k * n + j}]" if j in filled[k] else "0"
-                    filled[k].add(j)
-                    lines.append(f" J[{k * n + j}] = {old}-J[{k * n + m}]*J[{m * n + j}];\n")
-            none = f"fabs({pivot}) <= ROWS_PIVOT*whole ? 0 : " * row.depends
-            lines.append(f" {pivot} = {none}1/{pivot};\n")
-        return "".join(lines)
-
-    def _solved(self) -> str:
-        """J y = off, y, and what it takes from d or v, which is called `d`."""
-        n, text = self.count, ""
-        for k in range(n):
-            taken = "".join(f"-J[{k * n + m}]*y[{m}]" for m in sorted(self.filled[k]) if m < k)
-            text += f" y[{k}] = off[{k}]{taken};\n"
-        for k in range(n - 1, -1, -1):
-            taken = "".join(f"-J[{k * n + j}]*y[{j}]" for j in sorted(self.filled[k]) if j > k)
-            text += f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}]; sum[{k}] += y[{k}];\n"
+                    text += f" J[{k * n + j}] = {f'J[{j * n + k}]' if left == 'g' and j < k else entry};\n"
+        text += self._by_cofactors() if few else self._by_elimination(filled)
+        text += "".join(f" sum[{k}] += y[{k}];" for k in range(n)) + "\n"
         for k, row in enumerate(self.rows):
             for p, leg in enumerate(self._legs(row)):
                 pushed = " ".join(f"d[{3 * a}+c] {'-' if sign == '+' else '+'}= w[{a}]*z;" for a, sign in leg.items())
                 text += f" XYZ {{mixed z = g{k}[{3 * p}+c]*y[{k}]; {pushed}}}\n"
+        return text
+
+    def _by_cofactors(self) -> str:
+        """y of three lengths with one division; elimination has three, each of which waits for the one before."""
+        J = np.pad([[f"J[{3 * k + j}]" for j in range(3)] for k in range(3)], (0, 2), "wrap")
+        minors = [
+            [f"({J[k + 1, j + 1]}*{J[k + 2, j + 2]}-{J[k + 1, j + 2]}*{J[k + 2, j + 1]})" for j in range(3)]
+            for k in range(3)
+        ]
+        text = f" whole = 1/({'+'.join(f'{J[0, j]}*{minors[0][j]}' for j in range(3))});\n"
+        for j in range(3):
+            text += f" y[{j}] = whole*({'+'.join(f'{minors[k][j]}*off[{k}]' for k in range(3))});\n"
+        return text
+
+    def _by_elimination(self, filled: list[set[int]]) -> str:
+        """J's L and U in place, without pivoting: it is nearly symmetric and positive; and y."""
+        n, text = self.count, ""
+        for k, row in enumerate(self.rows):
+            pivot = f"J[{k * n + k}]"
+            text += f" whole = fabs({pivot});\n" * row.depends
+            for m in range(k):
+                if m not in filled[k]:  # which grows
+                    continue
+                text += f" J[{k * n + m}] *= J[{m * n + m}];\n"
+                for j in sorted(each for each in filled[m] if each > m):
+                    old = f"J[{k * n + j}]" if j in filled[k] else "0"
+                    filled[k].add(j)
+                    text += f" J[{k * n + j}] = {old}-J[{k * n + m}]*J[{m * n + j}];\n"
+            none = f"fabs({pivot}) <= ROWS_PIVOT*whole ? 0 : " * row.depends
+            text += f" {pivot} = {none}1/{pivot};\n"
+        for k in range(n):
+            taken = "".join(f"-J[{k * n + m}]*y[{m}]" for m in sorted(filled[k]) if m < k)
+            text += f" y[{k}] = off[{k}]{taken};\n"
+        for k in range(n - 1, -1, -1):
+            taken = "".join(f"-J[{k * n + j}]*y[{j}]" for j in sorted(filled[k]) if j > k)
+            text += f" y[{k}] = (y[{k}]{taken})*J[{k * n + k}];\n"
         return text
 
     def _sums(self, by: str) -> str:
@@ -290,7 +305,7 @@ class ItemWriter:
         return (
             f"{self._begin('positions', 'h', 'time-h')}{starts} int bad = -1{first};\n"
             f" for (int turn = 0;; turn++) {{\n int there = 1;\n{turns} if ({stop}) break;{then}\n"
-            f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._factored('o')}{self._solved()} }}\n"
+            f" if (turn == ROWS_TURNS) {{{missed} {fail} }}\n{self._solved('o')} }}\n"
             f"{turned} if (bad >= 0) {fail}{self._sums('/h')}}}\n"
         )
 
@@ -306,7 +321,7 @@ class ItemWriter:
                 speed = "".join(f"{sign}d[{3 * a}+c]" for a, sign in leg.items())
                 speeds += f" XYZ off[{k}] += g{k}[{3 * p}+c]*({speed});\n"
         return (
-            f"{self._begin('velocities', 'rate', 'time')}{speeds}{self._factored('g')}{self._solved()}"
+            f"{self._begin('velocities', 'rate', 'time')}{speeds}{self._solved('g')}"
             f" if (rate != 0) {{{self._sums('')} }}\n}}\n"
         )
 

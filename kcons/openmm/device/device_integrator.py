@@ -384,7 +384,7 @@ def _planner(made: int, address: int, description: bytes, name: bytes, groups: i
         library.kcons_source(steps, source.encode(), compiled.encode(), *sizes)
         for array in arrays:
             values = np.ascontiguousarray(array.values, dtype=np.float64)
-            about = array.name.encode(), int(array.kind == "int"), int(array.saved)
+            about = array.name.encode(), array.kind == "int", array.saved, array.passed
             library.kcons_array(steps, *about, values.ctypes.data_as(_DOUBLES), values.size)
         for number, actions in enumerate(parts):
             for kernel, mask, slot in actions:

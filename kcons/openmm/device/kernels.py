@@ -6,6 +6,7 @@ particles is needed; each piece is one kernel.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -48,7 +49,15 @@ _COMMON = """
 #else
 #define CLAIM(place, value) atomicCAS(place, 0, value)
 #endif
-#define XYZ for (int c = 0; c < 3; c++)
+/* Some compilers for OpenCL leave short loops and functions as they are, and the arrays in them in memory. */
+#ifdef __OPENCL_VERSION__
+#define INLINED DEVICE __attribute__((always_inline))
+#define UNROLLED _Pragma("unroll")
+#else
+#define INLINED DEVICE
+#define UNROLLED
+#endif
+#define XYZ UNROLLED for (int c = 0; c < 3; c++)
 #define GET_U(a, p) XYZ d[3*(a)+c] = kept[3*(p)+c];
 #define PUT_U(a, p) XYZ kept[3*(p)+c] = d[3*(a)+c];
 #define AWAY(a, p, sign) {mixed i_ = cells[4*(p)], j_ = cells[4*(p)+1], k_ = cells[4*(p)+2]; \\
@@ -64,7 +73,7 @@ _COMMON = """
 #define TINY ((mixed) 1e-37f)
 /* The first failure is kept; kernels that are launched later do nothing. */
 #define FAIL(row, residual) \\
-  {if (CLAIM(&failure[0], launch+1) == 0) {failure[1] = step+1; failure[2] = row; failure_residual[0] = residual;}}
+  {if (CLAIM(&failure[0], launch+1) == 0) {failure[1] = step+1; failure[2] = row; looked[5] = residual;}}
 /* Four normal numbers of a particle, a step and a use within it (Philox 4x32, Box and Muller): an angle is a quarter of
    the circle and what is left of it, from -pi/4 to pi/4, of which sine and cosine are polynomials. CUDA's fast
    logarithm of a number just below 1 may be positive. */
@@ -124,12 +133,12 @@ _GIVEN = (
     "GLOBAL const int* RESTRICT order",
 )
 #: Arrays that functions of rows have, too.
-_PASSED = ("parameters", "failure", "failure_residual")
+_PASSED = ("parameters", "failure", "looked")
 
 
 def preamble(platform: str, arrays: Sequence[Array], scratch: int = 0, work_group: int = 64, slots: int = 1) -> str:
     """What comes before the source of rows: types and names of the platform, `ROWS`, `FAIL`, random numbers."""
-    plain = platform in PLAIN
+    plain, arrays = platform in PLAIN, [array for array in arrays if array.passed]
     typed = ["int step", "int launch", "mixed tolerance", "mixed4 box0", "mixed4 box1", "mixed4 box2"]
     typed += [f"GLOBAL {a.kind}* {a.name}" for a in arrays if a.name in _PASSED or a.name.startswith("rows_")]
     typed += ["LOCAL_ARG mixed* scratch"] * (scratch > 0)
@@ -167,7 +176,6 @@ def standard_arrays(parameters: Sequence[float] = (), memory: int = 0, seed: int
         Array("memory_before", "mixed", np.zeros(memory + 1)),
         Array("seed", "int", np.array([seed]), saved=True),
         Array("failure", "int", np.zeros(3, dtype=np.int64)),
-        Array("failure_residual", "mixed", np.zeros(1)),
         Array("partial", "mixed", np.zeros(_SUMS * MOST_GROUPS)),
         Array("kept", "mixed", np.zeros(3 * n)),
         Array("looked", "mixed", np.zeros(7)),
@@ -294,8 +302,7 @@ _LOOK = f"""KERNEL void look(ARGUMENTS) {{
  }}
  for (int k = LOCAL_ID; k < MOST_GROUPS; k += LOCAL_SIZE) acc1 += partial[k+6*MOST_GROUPS];
 {_summed(["acc0", "acc1", "acc2"])} if (LOCAL_ID == 0) {{
-  looked[0] = shared[0]; looked[1] = shared[WG]; looked[5] = failure_residual[0];
-  looked[6] = shared[2*WG];
+  looked[0] = shared[0]; looked[1] = shared[WG]; looked[6] = shared[2*WG];
   for (int k = 0; k < 3; k++) looked[2+k] = failure[k];
  }}
 }}
@@ -590,7 +597,8 @@ class Kernels:
             loop = f"for (int item = GLOBAL_ID-{begin}; item < {clusters}; item += GLOBAL_SIZE) if (item >= 0)"
             atom = f"atoms[{atoms}+a*{clusters}+item]"
             room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n EACH at[a] = RESTS({atom});\n"
-            words |= {"EACH": every, "SYNC": "", "ROOM": f"mixed d[{3 * n}];", "AT": "at[a]", "FIRST": "1"}
+            words |= {"EACH": f"UNROLLED {every}", "SYNC": "", "ROOM": f"mixed d[{3 * n}];"}
+            words |= {"AT": "at[a]", "FIRST": "1"}
         away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
         load = f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')} if ({atom} < 0) w[a] = 0;}}\n"
         store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
@@ -631,11 +639,23 @@ def plan(
     if recorded:
         forces = "+".join(f"FORCE(force{k}, p, c)" for k in range(len(masks)))
         look += _with(_RECORD, {"COUNT": len(recorded), "FIRST": kernels.particles, "FORCES": forces})
-    source = preamble(platform, arrays, held.scratch, held.work_group, len(masks))
-    source += "".join(f"#define {name} {text}\n" for name, text in names.items())
+    source = "".join(f"#define {name} {text}\n" for name, text in names.items())
     source += "".join([held.source, *kernels.source, look])
+    known = _words(source)
+    arrays = [array._replace(passed=array.name in known) for array in arrays]
+    source = preamble(platform, arrays, held.scratch, held.work_group, len(masks)) + source
     items = kernels.items + kernels.crowds * work_group
     return source, arrays, actions, (items, work_group, len(masks))
+
+
+def _words(text: str) -> set[str]:
+    """What is named in a text, by macros too if they are used: launches cost less with fewer arguments."""
+    macros = re.findall(r"#define (\w+)(.*)", (_COMMON + text).replace("\\\n", ""))
+    found, more = set[str](), set(re.findall(r"\w+", re.sub(r"#define.*", "", text)))
+    while more:
+        found |= more
+        more = {word for name, body in macros if name in more for word in re.findall(r"\w+", body)} - found
+    return found
 
 
 def room_for(particles: int) -> int:

@@ -247,7 +247,7 @@ def test_rows_without_a_solution_are_told(n, what):
     found = start + plain.positions(start, d, w)
     launch, step, row = plain.arrays["failure"]
     assert (launch, step) == (8, 4)
-    error = plain.rows.failure(int(row), float(plain.arrays["failure_residual"][0]), int(step))
+    error = plain.rows.failure(int(row), float(plain.arrays["looked"][5]), int(step))
     assert error.step == 4 and 0 <= error.row < n and error.row in error.atoms
     assert error.row in (0, 1) or (what, n) == ("far", 40)
     assert ("not finite" in str(error)) == (what == "nan") and "smaller time step" in str(error)

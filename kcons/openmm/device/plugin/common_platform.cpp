@@ -74,7 +74,7 @@ public:
             kernel->addArg(cc.getAtomIndexArray());
             if (forces.empty()) kernel->addArg(cc.getLongForceBuffer());
             for (auto& saved : forces) kernel->addArg(saved);
-            for (auto& array : arrays) kernel->addArg(own[array.name]);
+            for (auto& array : arrays) if (array.passed) kernel->addArg(own[array.name]);
         }
         kernel->setArg(1, numbers.step);
         kernel->setArg(2, numbers.launch++);

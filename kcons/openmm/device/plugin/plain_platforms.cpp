@@ -31,7 +31,7 @@ public:
         for (auto& array : arrays) {
             if (array.whole) integers[array.name].assign(array.values.begin(), array.values.end());
             else reals[array.name] = array.values;
-            own.push_back(array.whole ? (void*) integers[array.name].data() : (void*) reals[array.name].data());
+            if (array.passed) own.push_back(array.whole ? (void*) integers[array.name].data() : (void*) reals[array.name].data());
         }
         library = dlopen(Steps::library.c_str(), RTLD_NOW | RTLD_LOCAL);
         if (library == nullptr) throw OpenMMException(string("kcons: ")+dlerror());

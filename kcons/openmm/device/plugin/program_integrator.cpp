@@ -266,8 +266,8 @@ void kcons_source(Steps* steps, const char* source, const char* library, int ite
     steps->source = source; steps->library = library;
     steps->items = items; steps->workGroup = workGroup; steps->slots = slots;
 }
-void kcons_array(Steps* steps, const char* name, int whole, int saved, const double* values, int n) {
-    steps->arrays.push_back({name, whole != 0, saved != 0, vector<double>(values, values+n)});
+void kcons_array(Steps* steps, const char* name, int whole, int saved, int passed, const double* values, int n) {
+    steps->arrays.push_back({name, whole != 0, saved != 0, passed != 0, vector<double>(values, values+n)});
 }
 void kcons_action(Steps* steps, int part, const char* kernel, int groups, int slot) {
     steps->parts[part].push_back({kernel, groups, slot});

@@ -13,10 +13,10 @@
 
 namespace kcons {
 
-// An array that kernels know by its name; `saved` if it belongs to a state.
+// An array that kernels know by its name; `saved` if it belongs to a state, `passed` if it is an argument of theirs.
 struct Array {
     std::string name;
-    bool whole, saved;             // whole numbers
+    bool whole, saved, passed;     // whole numbers
     std::vector<double> values;    // that it begins with
 };
 
