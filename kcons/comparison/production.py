@@ -18,7 +18,7 @@ from kcons.comparison.measure import first_line
 from kcons.comparison.progress import Watcher
 from kcons.comparison.ranking import RIGHT
 from kcons.comparison.test_systems import TestSystem
-from kcons.steppers import Rattle, State, System, run
+from kcons.steppers import State, System, run
 from kcons.thermostats.correlated_series import slope
 
 #: Seconds a force evaluation may take for each second of the budget of a step.
@@ -57,15 +57,14 @@ def check_steps(
 def _climb(system: TestSystem, dt: float, seconds: float) -> float:
     """Slope of the energy at constant energy, in standard errors, of a run of about so many seconds."""
     made = System(system.motion, system.potential.forces)
-    stepper = Rattle()
-    state = run(made, State(system.positions, system.velocities), dt, 2, stepper=stepper)  # loads kernels
+    state = run(made, State(system.positions, system.velocities), dt, 2)  # loads kernels
     begun = perf_counter()
-    state = run(made, state, dt, 10, stepper=stepper)
+    state = run(made, state, dt, 10)
     each = (perf_counter() - begun) / 10
     every = max(1, int(seconds / max(each, 1e-7) / RECORDS))
     energies: list[float] = []
     for _ in range(RECORDS):
-        state = run(made, state, dt, every, stepper=stepper)
+        state = run(made, state, dt, every)
         energies.append(system.potential.watched(state.positions)[0] + made.kinetic_energy(state.velocities))
     later = np.array(energies[RECORDS // 2 :])  # a start that is not at equilibrium changes the energy, once
     found = slope(np.arange(float(len(later))), later)

@@ -242,8 +242,7 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
             item="cell",
         )
     if not np.all(pbc):
-        text = "boxes of MDAnalysis and OpenMM are periodic in all directions; this cell is not"
-        warnings.warn(text, UserWarning, stacklevel=stacklevel)
+        warnings.warn("boxes of files and of OpenMM are periodic in all directions; this cell is not", stacklevel=stacklevel)
     require_standard_form(cell, "MDAnalysis")
 
 
