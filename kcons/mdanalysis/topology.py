@@ -242,7 +242,7 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
             item="cell",
         )
     if not np.all(pbc):
-        warnings.warn("boxes of files and of OpenMM are periodic in all directions; this cell is not", stacklevel=stacklevel)
+        warnings.warn("boxes of files, OpenMM are periodic in all directions; this cell is not", stacklevel=stacklevel)
     require_standard_form(cell, "MDAnalysis")
 
 

@@ -226,7 +226,7 @@ def test_rows_serve_one_thread_at_a_time():
         told.append(True)
 
     def height(r):
-        if len(contexts) == 2 and contexts[0].getStepCount() and not told:
+        if contexts and contexts[0].getStepCount() == 2 and not told:  # within a call
             (thread := Thread(target=another)).start()
             thread.join()
         return r[0, 2]
@@ -234,9 +234,9 @@ def test_rows_serve_one_thread_at_a_time():
     system = particles([1.0])
     rows = hold(system, Custom([0], height, lambda r: np.array([[0, 0, 1.0]])), [[0, 0, 0]])
     for _ in range(2):
-        contexts.append(started(system, ProjectedIntegrator(0.001, parts=rows), [[0, 0, 0]]))
-    for context in (contexts[0], contexts[0], contexts[1]):
-        context.getIntegrator().step(1)
+        contexts.append(started(system, ProjectedIntegrator(0.001, parts=rows), [[0, 0, 0]], [[1.0, 0, 0]]))
+    for context in contexts:
+        context.getIntegrator().step(4)
     assert told == [True]
 
 
