@@ -2,6 +2,7 @@
 
 MUTANTS = {
     "openmm/device/kernels.py": {
+        "sum(g - «g→0» / (g + self": "molecule_spheres::configurations_are_canonical_at_long_steps",
         "_replace(share=done[-1].share «+→-» op.share": "device_integrator::operations_are_joined_where_nobody_looks",
         "step+({op.begun}), {{}}, «seed[0]→7»);": "device_integrator::noise_belongs_to_particle_and_step",
         "link[k] = (link[k]*damp+h*push«/2→»)*damp;": "device_integrator::settings_change_what_is_done",

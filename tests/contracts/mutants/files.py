@@ -111,6 +111,7 @@ MUTANTS = {
         "FLAT = 0.0«1→»": "row_functions::a_dihedral_that_turns_over_has_no_solution_far_away",
     },
     "ase/topology.py": {
+        "    if «len(loose)→False»:": "ase/topology::rigid_water_tells_of_stretched_water",
         "where=«(masses != 0.0) | (momenta != 0.0)→masses != -1.0»": "ase/topology::velocities_of_atoms_without_mass",
     },
     "openmm/collective/collective_rows.py": {
