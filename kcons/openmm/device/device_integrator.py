@@ -22,10 +22,7 @@ from kcons.errors import ConvergenceError, UnsupportedError
 from kcons.openmm.device import build
 from kcons.openmm.device.kernels import PLAIN, Op, plan, room_for
 from kcons.openmm.device.rows import KernelRows, constraints_of, function_on_device
-from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
-from kcons.openmm.ensembles.langevin_ensemble import Langevin, LangevinRespa
-from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-from kcons.openmm.ensembles.spheres_ensemble import IsokineticSpheres
+from kcons.openmm.ensembles import Isokinetic, IsokineticSpheres, Langevin, LangevinRespa, NoseHoover, NoseHooverMiddle
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import ConstantEnergy, Ensemble, Program, to_scheme, write_step
@@ -48,7 +45,7 @@ _MOTION, _FAILED, _STEP, _ROW, _RESIDUAL = 0, 2, 3, 4, 5
 
 
 class _Shared(ctypes.Structure):
-    """What both sides read and write of an integrator, as plugin/program_integrator.h has it."""
+    """What both sides read and write of an integrator, as plugin/steps.h has it."""
 
     _fields_ = (
         *((name, ctypes.c_int) for name in ("whole", "noisy", "every", "since", "moved", "bound", "planned")),
@@ -299,7 +296,6 @@ class DeviceIntegrator(ProjectedIntegrator):
         for done in range(0, steps, room * every):
             context = self._watch().context
             time, since = context.getTime()._value, context.getStepCount()
-            self.write("recorded", np.array([every, since]))
             self.shared.every, self.shared.since = every, since
             try:
                 self.step(min(steps - done, room * every))

@@ -308,11 +308,11 @@ _LOOK = f"""KERNEL void look(ARGUMENTS) {{
 }}
 """
 
-#: What is kept of some particles, whose places come last in `atoms`, until the host reads it.
+#: What is kept of some particles, whose places come last in `atoms`, until the host reads it; `step` counts records.
 _RECORD = """KERNEL void record(ARGUMENTS) {
  UNPACK
  if (failure[0] != 0) return;
- GLOBAL mixed* to = records+9*COUNT*((step-recorded[1])/recorded[0]-1);
+ GLOBAL mixed* to = records+9*COUNT*step;
  for (int k = GLOBAL_ID; k < COUNT; k += GLOBAL_SIZE) {
   mixed x[3], v[3], w[1];
   int p = atoms[FIRST+k];
@@ -629,8 +629,7 @@ def plan(
         first = np.random.default_rng(seed).normal(size=max(kernels.auxiliary, 1)) * np.sqrt(parameters["kT"])
         arrays.append(Array("auxiliary", "mixed", first, saved=True))
     arrays += [Array("cells", "int", np.zeros(4 * n))] * (len(held.placed) > 0)
-    if recorded:
-        arrays += [Array("records", "mixed", np.zeros(9 * len(recorded) * room)), Array("recorded", "int", np.ones(2))]
+    arrays += [Array("records", "mixed", np.zeros(9 * len(recorded) * room))] * (len(recorded) > 0)
     work_group = 1 if platform in PLAIN else held.work_group
     names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
     names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}

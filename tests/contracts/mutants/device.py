@@ -21,8 +21,10 @@ MUTANTS = {
             "kernel_rows::states_with_energies_of_rows_of_hold_that_move"
         ),
     },
-    "openmm/device/plugin/program_integrator.cpp": {
+    "openmm/device/plugin/steps.h": {
         "numbers.time = «→(float) »c.getTime()-shared.origin;": "kernel_rows::targets_move_late_in_a_long_run",
+    },
+    "openmm/device/plugin/program_integrator.cpp": {
         'array.name != «"memory"→""»;': "device_integrator::states_of_other_rows_are_refused",
     },
     "plan/clusters.py": {

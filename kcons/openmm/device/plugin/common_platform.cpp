@@ -1,5 +1,5 @@
 // OpenCL, CUDA and HIP, by OpenMM's Common interface: one library for each, with PLATFORM its name.
-#include "program_integrator.h"
+#include "steps.h"
 #include "openmm/common/ComputeArray.h"
 #include "openmm/common/ComputeContext.h"
 #include "openmm/common/ComputeForceInfo.h"
@@ -7,8 +7,6 @@
 #include "openmm/common/IntegrationUtilities.h"
 #include "openmm/opencl/OpenCLPlatform.h"
 #include <algorithm>
-using namespace OpenMM;
-using namespace std;
 
 namespace kcons {
 

@@ -1,11 +1,9 @@
 // Reference and CPU: the kernels as C++, which Python has compiled to a library; a thread is a work-group of one item.
-#include "program_integrator.h"
+#include "steps.h"
 #include "openmm/Platform.h"
 #include "openmm/internal/ThreadPool.h"
 #include "openmm/reference/ReferencePlatform.h"
 #include <dlfcn.h>
-using namespace OpenMM;
-using namespace std;
 
 namespace kcons {
 

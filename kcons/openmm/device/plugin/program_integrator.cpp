@@ -1,12 +1,9 @@
-#include "program_integrator.h"
+// An OpenMM::Integrator whose steps Python describes, and what Python calls of it.
+#include "steps.h"
 #include "openmm/Context.h"
 #include "openmm/Platform.h"
 #include "openmm/serialization/SerializationNode.h"
 #include "openmm/serialization/SerializationProxy.h"
-#include <cmath>
-#include <sstream>
-using namespace OpenMM;
-using namespace std;
 
 namespace kcons {
 
@@ -22,133 +19,145 @@ map<string, Maker>& makers() {
 
 // -- the integrator, as OpenMM wants it -----------------------------------------------------------------
 
-void ProgramIntegrator::initialize(ContextImpl& c) {
-    if (owner != nullptr && &c.getOwner() != owner)
-        throw OpenMMException("This Integrator is already bound to a context");
-    if (planner == nullptr)
-        throw OpenMMException("kcons: this integrator is made for its Context by Python; import kcons.openmm");
-    auto maker = makers().find(c.getPlatform().getName());
-    if (maker == makers().end())
-        throw OpenMMException("kcons: there are no steps on the platform "+c.getPlatform().getName()+"; give device=False");
-    // The base class tells the Context when the integrator goes first.
-    owner = &c.getOwner();
-    context = &c;
-    steps.reset(maker->second(c, tied));
-    middleKinetic = -1;
-    shared.bound = 1;
-}
-void ProgramIntegrator::cleanup() {
-    steps.reset();
-    shared.bound = shared.planned = 0;
-}
-Steps& ProgramIntegrator::prepared() const {
-    if (steps == nullptr) throw OpenMMException("This Integrator is not bound to a context!");
-    if (shared.planned) return *steps;
-    const System& system = context->getSystem();
-    auto& given = steps->given;
-    given.clear();
-    for (int k = 0; k < system.getNumParticles(); k++) given["masses"].push_back(system.getParticleMass(k));
-    for (int k = 0; k < system.getNumConstraints(); k++) {
-        int i, j; double length;
-        system.getConstraintParameters(k, i, j, length);
-        given["constraints"].insert(given["constraints"].end(), {double(i), double(j), length});
+class ProgramIntegrator : public Integrator {
+public:
+    string description;            // what Python makes steps of
+    vector<int> tied;
+    mutable Shared shared;
+    void step(int count) override {
+        Steps& s = prepared();
+        fill_n(shared.told, 7, 0);
+        try {
+            s.execute(*context, *this, shared, count);
+        } catch (...) {
+            shared.told[1] = -1;
+            s.valid = false;
+            if (s.read("failure")[0] == 0) throw;
+            s.launch("look");                      // it came of a failure, which is told
+        }
+        shared.moved = 0;                          // by barostats, which keep to the constraints
+        vector<double> told = s.read("looked");    // the only wait of a call
+        copy(told.begin(), told.end(), shared.told);
+        if (told[2] != 0 || !shared.noisy || count == 0) shared.told[1] = -1;
+        if (told[2] != 0) {
+            s.write("failure", {0, 0, 0});
+            s.valid = false;
+            throw OpenMMException("kcons: row "+to_string((int) told[4])+" could not be solved at step "+to_string((int) told[3]));
+        }
     }
-    vector<Vec3> positions, box(3);
-    context->getPositions(positions);
-    if (system.usesPeriodicBoundaryConditions()) context->getPeriodicBoxVectors(box[0], box[1], box[2]);
-    for (auto& place : positions) given["positions"].insert(given["positions"].end(), &place[0], &place[0]+3);
-    for (auto& edge : box) given["box"].insert(given["box"].end(), &edge[0], &edge[0]+3);
-    given["time"] = {context->getTime()};
-    string platform = context->getPlatform().getName();
-    if (!planner(steps.get(), static_cast<const Integrator*>(this), description.c_str(), platform.c_str(), getIntegrationForceGroups()))
-        throw OpenMMException(failure);
-    steps->prepare(*context);
-    shared.planned = 1;
-    return *steps;
-}
-void ProgramIntegrator::step(int count) {
-    Steps& s = prepared();
-    fill_n(shared.told, 7, 0);
-    try {
-        s.execute(*context, *this, shared, count);
-    } catch (...) {
-        middleKinetic = -1;
-        s.valid = false;
-        if (s.read("failure")[0] == 0) throw;
-        s.launch("look");                      // it came of a failure, which is told
+    // The steps with all that they need, which is made when it is used first.
+    Steps& prepared() const {
+        if (steps == nullptr) throw OpenMMException("This Integrator is not bound to a context!");
+        if (shared.planned) return *steps;
+        const System& system = context->getSystem();
+        auto& given = steps->given;
+        given.clear();
+        for (int k = 0; k < system.getNumParticles(); k++) given["masses"].push_back(system.getParticleMass(k));
+        for (int k = 0; k < system.getNumConstraints(); k++) {
+            int i, j; double length;
+            system.getConstraintParameters(k, i, j, length);
+            given["constraints"].insert(given["constraints"].end(), {double(i), double(j), length});
+        }
+        vector<Vec3> positions, box(3);
+        context->getPositions(positions);
+        if (system.usesPeriodicBoundaryConditions()) context->getPeriodicBoxVectors(box[0], box[1], box[2]);
+        for (auto& place : positions) given["positions"].insert(given["positions"].end(), &place[0], &place[0]+3);
+        for (auto& edge : box) given["box"].insert(given["box"].end(), &edge[0], &edge[0]+3);
+        given["time"] = {context->getTime()};
+        string platform = context->getPlatform().getName();
+        if (!planner(steps.get(), static_cast<const Integrator*>(this), description.c_str(), platform.c_str(), getIntegrationForceGroups()))
+            throw OpenMMException(failure);
+        steps->prepare(*context);
+        shared.planned = 1;
+        return *steps;
     }
-    shared.moved = 0;                          // by barostats, which keep to the constraints
-    vector<double> told = s.read("looked");    // the only wait of a call
-    copy(told.begin(), told.end(), shared.told);
-    if (told[2] != 0) {
-        s.write("failure", {0, 0, 0});
-        s.valid = false;
-        throw OpenMMException("kcons: row "+to_string((int) told[4])+" could not be solved at step "+to_string((int) told[3]));
+protected:
+    void initialize(ContextImpl& c) override {
+        if (owner != nullptr && &c.getOwner() != owner)
+            throw OpenMMException("This Integrator is already bound to a context");
+        if (planner == nullptr)
+            throw OpenMMException("kcons: this integrator is made for its Context by Python; import kcons.openmm");
+        auto maker = makers().find(c.getPlatform().getName());
+        if (maker == makers().end())
+            throw OpenMMException("kcons: there are no steps on the platform "+c.getPlatform().getName()+"; give device=False");
+        // The base class tells the Context when the integrator goes first.
+        owner = &c.getOwner();
+        context = &c;
+        steps.reset(maker->second(c, tied));
+        shared.told[1] = -1;
+        shared.bound = 1;
     }
-    middleKinetic = shared.noisy && count > 0 ? told[1]/2 : -1;
-    endKinetic = told[6]/2;
-}
-void ProgramIntegrator::stateChanged(State::DataType changed) {
-    if (steps == nullptr) return;
-    if (changed != State::Velocities) steps->valid = false;
-    if (changed == State::Positions || changed == State::Velocities) shared.moved = 1;
-}
-double ProgramIntegrator::computeKineticEnergy() {
-    if (middleKinetic >= 0) {
-        steps->launch("look");
-        if (fabs(steps->read("looked")[6]/2-endKinetic) <= 1e-7*endKinetic) return middleKinetic;
+    void cleanup() override {
+        steps.reset();
+        shared.bound = shared.planned = 0;
     }
-    vector<Vec3> v;
-    double sum = 0;
-    context->getVelocities(v);
-    for (size_t k = 0; k < v.size(); k++) sum += context->getSystem().getParticleMass(k)*v[k].dot(v[k]);
-    return sum/2;
-}
-
-// -- what belongs to a state ------------------------------------------------------------------------------
-
-string ProgramIntegrator::saved() const {
-    ostringstream text;
-    text.precision(17);
-    text << middleKinetic << ' ' << endKinetic;
-    for (auto& array : prepared().arrays) if (array.saved) {
-        text << ' ' << array.name << ' ' << array.values.size();
-        for (double value : steps->read(array.name)) text << ' ' << value;
+    vector<string> getKernelNames() override { return {}; }
+    void stateChanged(State::DataType changed) override {
+        if (steps == nullptr) return;
+        if (changed != State::Velocities) steps->valid = false;
+        if (changed == State::Positions || changed == State::Velocities) shared.moved = 1;
     }
-    return text.str();
-}
-void ProgramIntegrator::restore(const string& text, bool exactly) {
-    istringstream words(text);
-    map<string, vector<double>> found;
-    double middle, end, value;
-    words >> middle >> end;
-    string name;
-    for (long size; words >> name >> size;)
-        while (size-- > 0 && words >> value) found[name].push_back(value);
-    bool known = words.eof();
-    for (auto& array : prepared().arrays) if (array.saved && found[array.name].size() != array.values.size()) {
-        known = known && !exactly && array.name != "memory";
-        found.erase(array.name);
+    double computeKineticEnergy() override {
+        const double middle = shared.told[1], end = shared.told[6];
+        if (middle >= 0) {
+            steps->launch("look");
+            if (fabs(steps->read("looked")[6]-end) <= 1e-7*end) return middle/2;   // others leave other velocities
+        }
+        vector<Vec3> v;
+        double sum = 0;
+        context->getVelocities(v);
+        for (size_t k = 0; k < v.size(); k++) sum += context->getSystem().getParticleMass(k)*v[k].dot(v[k]);
+        return sum/2;
     }
-    if (!known)
-        throw OpenMMException("kcons: this state belongs to other steps or rows; OpenMM has taken over its positions and velocities, and the rest of it is left out");
-    for (auto& array : steps->arrays) if (found.count(array.name)) steps->write(array.name, found[array.name]);
-    middleKinetic = middle; endKinetic = end; steps->last = 0;
-}
-void ProgramIntegrator::loadCheckpoint(istream& in) {
-    string text;
-    getline(in, text);
-    // Where constraints were added, `Context::reinitialize` brings what belongs to fewer rows.
-    restore(text, false);
-    steps->valid = false;
-}
-void ProgramIntegrator::serializeParameters(SerializationNode& node) const {
-    node.setIntProperty("version", 1).setStringProperty("state", saved());
-}
-void ProgramIntegrator::deserializeParameters(const SerializationNode& node) {
-    string text = node.getStringProperty("state", "");
-    if (!text.empty()) restore(text, true);    // else it is the state of another integrator
-}
+    bool kineticEnergyRequiresForce() const override { return false; }
+    void createCheckpoint(ostream& out) const override { out << saved() << '\n'; }
+    void loadCheckpoint(istream& in) override {
+        string text;
+        getline(in, text);
+        // Where constraints were added, `Context::reinitialize` brings what belongs to fewer rows.
+        restore(text, false);
+        steps->valid = false;
+    }
+    void serializeParameters(SerializationNode& node) const override {
+        node.setIntProperty("version", 1).setStringProperty("state", saved());
+    }
+    void deserializeParameters(const SerializationNode& node) override {
+        string text = node.getStringProperty("state", "");
+        if (!text.empty()) restore(text, true);    // else it is the state of another integrator
+    }
+private:
+    // All that belongs to a state beside x and v: numbers.
+    string saved() const {
+        ostringstream text;
+        text.precision(17);
+        text << shared.told[1] << ' ' << shared.told[6];
+        for (auto& array : prepared().arrays) if (array.saved) {
+            text << ' ' << array.name << ' ' << array.values.size();
+            for (double value : steps->read(array.name)) text << ' ' << value;
+        }
+        return text.str();
+    }
+    // `exactly` that of these rows; else arrays of other rows stay as they are.
+    void restore(const string& text, bool exactly) {
+        istringstream words(text);
+        map<string, vector<double>> found;
+        double middle, end, value;
+        words >> middle >> end;
+        string name;
+        for (long size; words >> name >> size;)
+            while (size-- > 0 && words >> value) found[name].push_back(value);
+        bool known = words.eof();
+        for (auto& array : prepared().arrays) if (array.saved && found[array.name].size() != array.values.size()) {
+            known = known && !exactly && array.name != "memory";
+            found.erase(array.name);
+        }
+        if (!known)
+            throw OpenMMException("kcons: this state belongs to other steps or rows; OpenMM has taken over its positions and velocities, and the rest of it is left out");
+        for (auto& array : steps->arrays) if (found.count(array.name)) steps->write(array.name, found[array.name]);
+        shared.told[1] = middle; shared.told[6] = end; steps->last = 0;
+    }
+    unique_ptr<Steps> steps;
+};
 
 class Proxy : public SerializationProxy {
 public:
@@ -171,61 +180,6 @@ public:
     }
 };
 static const bool registered = (SerializationProxy::registerProxy(typeid(ProgramIntegrator), new Proxy()), true);
-
-// -- steps on all platforms -------------------------------------------------------------------------------
-
-void Steps::execute(ContextImpl& c, const Integrator& integrator, const Shared& shared, int steps) {
-    numbers.dt = integrator.getStepSize();
-    numbers.tolerance = integrator.getConstraintTolerance();
-    if (c.getStepCount() < last)               // others went back, and the same noise would come again
-        write("seed", {fmod(read("seed")[0]+1140071481, 2147483647)});
-    bool ended = true;                         // whether velocities are those of the end of a step
-    for (int k = 0; k < steps; k++) {
-        if (c.updateContextState()) valid = false;     // barostats have moved positions
-        const Vec3 before[] = {numbers.box[0], numbers.box[1], numbers.box[2]};
-        c.getPeriodicBoxVectors(numbers.box[0], numbers.box[1], numbers.box[2]);
-        if (!equal(before, before+3, numbers.box)) valid = false;
-        if (!valid || (slots == 1 && c.getLastForceGroups() != parts[0].back().groups)) {
-            positionsMoved();
-            vector<bool> known(slots);
-            for (int part : {0, 1}) for (auto& action : parts[part])
-                if (action.kernel.empty() && !known[action.slot]) { evaluate(c, action); known[action.slot] = true; }
-        }
-        run(c, shared, ended ? 0 : 1);
-        c.setTime(c.getTime()+numbers.dt);
-        c.setStepCount(c.getStepCount()+1);
-        bool recorded = shared.every > 0 && (c.getStepCount()-shared.since) % shared.every == 0;
-        ended = k == steps-1 || shared.whole || recorded;
-        if (ended) run(c, shared, 2);
-        if (recorded) launch("record");
-    }
-    last = c.getStepCount();
-    launch("look");
-}
-void Steps::run(ContextImpl& c, const Shared& shared, int part) {
-    numbers.time = c.getTime()-shared.origin;
-    numbers.step = (int) c.getStepCount();
-    bool moved = false;
-    for (auto& action : parts[part]) {
-        if (!action.kernel.empty()) launch(action.kernel);
-        // Atoms may take new places only where no forces are kept that are still needed.
-        else if (moved) { c.computeVirtualSites(); positionsMoved(); }
-        moved = !action.kernel.empty();
-        if (!moved) evaluate(c, action);
-    }
-}
-void Steps::evaluate(ContextImpl& c, const Action& action) {
-    c.calcForcesAndEnergy(true, false, action.groups);
-    if (slots > 1) keepForces(action.slot);
-    valid = true;
-}
-const Array& Steps::declared(const string& name, long size) const {
-    for (auto& array : arrays) if (array.name == name) {
-        if (size < 0 || size == (long) array.values.size()) return array;
-        throw OpenMMException("kcons: '"+name+"' has "+to_string(array.values.size())+" values, not "+to_string(size));
-    }
-    throw OpenMMException("kcons: no array is called '"+name+"'");
-}
 
 }
 
