@@ -94,8 +94,8 @@ def build(target: Path, platforms: Sequence[str]) -> None:
         for name in ("OpenMM", *(f"OpenMM{platform}" for platform in platforms)):
             _compile(["-shared", "-xc++", os.devnull, f"-Wl,-soname,lib{name}.so", "-o", f"{made}/lib{name}.so"])
         shared = [*_FLAGS, f"-I{HEADERS}", f"-L{made}", "-Wl,--no-as-needed,-rpath,$ORIGIN"]
-        core = [str(SOURCES / name) for name in ("program_integrator.cpp", "plain_platforms.cpp")]
-        _compile([*core, *shared, "-lOpenMM", "-Wl,-soname,libKcons.so", "-o", f"{made}/libKcons.so"])
+        core = [str(SOURCES / "program_integrator.cpp"), *shared, "-lOpenMM", "-Wl,-soname,libKcons.so"]
+        _compile([*core, "-o", f"{made}/libKcons.so"])
         for platform in platforms:
             linked = [*shared, "-lKcons", f"-lOpenMM{platform}", "-lOpenMM", "-o", f"{made}/libKcons{platform}.so"]
             _compile([str(SOURCES / "common_platform.cpp"), f'-DPLATFORM="{platform}"', *linked])

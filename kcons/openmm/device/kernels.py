@@ -60,9 +60,7 @@ _COMMON = """
 #define XYZ UNROLLED for (int c = 0; c < 3; c++)
 #define GET_U(a, p) XYZ d[3*(a)+c] = kept[3*(p)+c];
 #define PUT_U(a, p) XYZ kept[3*(p)+c] = d[3*(a)+c];
-#define AWAY(a, p, sign) {mixed i_ = cells[4*(p)], j_ = cells[4*(p)+1], k_ = cells[4*(p)+2]; \\
-  x[3*(a)] = x[3*(a)] sign (i_*box0.x+j_*box1.x+k_*box2.x); \\
-  x[3*(a)+1] = x[3*(a)+1] sign (j_*box1.y+k_*box2.y); x[3*(a)+2] = x[3*(a)+2] sign k_*box2.z;}
+#define AWAY(a, p, sign) {mixed n_[3]; XYZ n_[c] = sign cells[4*(p)+c]; ROWS_SHIFT((x+3*(a)), n_)}
 /* In double precision Newton's last turn has all digits. */
 #ifdef USE_DOUBLE_PRECISION
 #define HELD_TO min(tolerance, (mixed) 1e-13)

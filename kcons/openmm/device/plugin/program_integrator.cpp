@@ -1,9 +1,12 @@
-// An OpenMM::Integrator whose steps Python describes, and what Python calls of it.
+// An OpenMM::Integrator whose steps Python describes, the platforms Reference and CPU, and what Python calls.
 #include "steps.h"
 #include "openmm/Context.h"
 #include "openmm/Platform.h"
+#include "openmm/internal/ThreadPool.h"
+#include "openmm/reference/ReferencePlatform.h"
 #include "openmm/serialization/SerializationNode.h"
 #include "openmm/serialization/SerializationProxy.h"
+#include <dlfcn.h>
 
 namespace kcons {
 
@@ -12,8 +15,65 @@ typedef int (*Planner)(Steps* steps, const void* integrator, const char* descrip
 static Planner planner = nullptr;
 static thread_local string failure;   // what Python or a C function has to say
 
+// -- Reference and CPU ------------------------------------------------------------------------------------
+
+// Kernels are C++, which Python has compiled to a library; a thread is a work-group of one item. See `kernels.py`.
+typedef void (*PlainKernel)(void** pointers, const void* numbers, int group, int groups);
+
+class PlainSteps : public Steps {
+public:
+    PlainSteps(ContextImpl& c, bool parallel)
+            : data(*static_cast<ReferencePlatform::PlatformData*>(c.getPlatformData())), parallel(parallel) {}
+    ~PlainSteps() { if (library != nullptr) dlclose(library); }
+    vector<double> read(const string& name) override {
+        const Array& array = declared(name);
+        return array.whole ? vector<double>(integers[name].begin(), integers[name].end()) : array.values;
+    }
+    void write(const string& name, const vector<double>& values) override {
+        copy(values.begin(), values.end(), declared(name, values.size()).values.begin());
+        if (integers.count(name)) copy(values.begin(), values.end(), integers[name].begin());
+    }
+    void prepare(ContextImpl& c) override {
+        for (double mass : given["masses"]) inverse.push_back(mass == 0 ? 0 : 1/mass);
+        forces.resize(slots);
+        for (auto& array : arrays) {
+            if (array.whole) integers[array.name].assign(array.values.begin(), array.values.end());
+            if (array.passed) own.push_back(array.whole ? (void*) integers[array.name].data() : (void*) array.values.data());
+        }
+        library = dlopen(Steps::library.c_str(), RTLD_NOW | RTLD_LOCAL);
+        if (library == nullptr) throw OpenMMException(string("kcons: ")+dlerror());
+    }
+    void launch(const string& kernel) override {
+        PlainKernel& code = kernels[kernel];
+        if (code == nullptr) code = (PlainKernel) dlsym(library, kernel.c_str());
+        vector<void*> pointers = {data.positions->data(), data.velocities->data(), inverse.data()};
+        for (auto& kept : forces) pointers.push_back(slots == 1 ? data.forces->data() : kept.data());
+        pointers.insert(pointers.end(), own.begin(), own.end());
+        const Numbers given = numbers;
+        numbers.launch++;
+        // A sum of few shares does not depend on the number of threads more than one of many.
+        int groups = parallel && kernel != "look" ? min(data.threads.getNumThreads(), 256) : 1;
+        if (groups == 1) { code(pointers.data(), &given, 0, 1); return; }
+        data.threads.execute([&](ThreadPool&, int thread) { if (thread < groups) code(pointers.data(), &given, thread, groups); });
+        data.threads.waitForThreads();
+    }
+protected:
+    void keepForces(int slot) override { forces[slot] = *data.forces; }
+private:
+    ReferencePlatform::PlatformData& data;
+    const bool parallel;
+    void* library = nullptr;
+    map<string, PlainKernel> kernels;
+    map<string, vector<int>> integers;
+    vector<void*> own;             // where arrays are, in the order of the plan
+    vector<double> inverse;
+    vector<vector<Vec3>> forces;
+};
+
 map<string, Maker>& makers() {
-    static map<string, Maker> known;
+    static map<string, Maker> known = {
+        {"Reference", [](ContextImpl& c, const vector<int>&) { return new PlainSteps(c, false); }},
+        {"CPU", [](ContextImpl& c, const vector<int>&) { return new PlainSteps(c, true); }}};
     return known;
 }
 

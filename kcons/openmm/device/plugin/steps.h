@@ -91,7 +91,7 @@ protected:
     struct Numbers { int step, launch; double dt, time, tolerance; Vec3 box[3]; };
     Numbers numbers = {};
     // Refuses values of another number.
-    const Array& declared(const string& name, long size = -1) const {
+    Array& declared(const string& name, long size = -1) {
         for (auto& array : arrays) if (array.name == name) {
             if (size < 0 || size == (long) array.values.size()) return array;
             throw OpenMMException("kcons: '"+name+"' has "+to_string(array.values.size())+" values, not "+to_string(size));
