@@ -32,16 +32,15 @@ def make_wheel(folder: str | Path = ".") -> Path:
     needed = openmm.version.version.split(".dev")[0]
     number = f"{__version__}+openmm{needed}"
     info = f"{build.PACKAGE}-{number}.dist-info"
-    needs = f"Requires-Dist: openmm=={needed}\nRequires-Dist: kcons=={__version__}\n"
-    files = {
-        f"{build.PACKAGE}/__init__.py": b'"""Libraries of kcons for OpenMM."""\n',
-        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {build.PACKAGE}\nVersion: {number}\n{needs}".encode(),
-        f"{info}/WHEEL": f"Wheel-Version: 1.0\nGenerator: kcons\nRoot-Is-Purelib: false\nTag: {tag}\n".encode(),
-    }
+    files: dict[str, bytes] = {f"{build.PACKAGE}/__init__.py": b'"""Libraries of kcons for OpenMM."""\n'}
     with tempfile.TemporaryDirectory() as made:
         build.build(Path(made), build.ACCELERATED)
-        paths = sorted(Path(made).glob("*.so"))
-        files |= {f"{build.PACKAGE}/{build.digest()}/{path.name}": path.read_bytes() for path in paths}
+        for path in sorted(Path(made).glob("*.so")):
+            files[f"{build.PACKAGE}/{build.digest()}/{path.name}"] = path.read_bytes()
+    needs = f"Requires-Dist: openmm=={needed}\nRequires-Dist: kcons=={__version__}\n"
+    about = f"Metadata-Version: 2.1\nName: {build.PACKAGE}\nVersion: {number}\n{needs}"
+    files[f"{info}/METADATA"] = about.encode()
+    files[f"{info}/WHEEL"] = f"Wheel-Version: 1.0\nGenerator: kcons\nRoot-Is-Purelib: false\nTag: {tag}\n".encode()
     target, record = Path(folder) / f"{build.PACKAGE}-{number}-{tag}.whl", f"{info}/RECORD,,\n"
     target.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
