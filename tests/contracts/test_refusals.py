@@ -523,7 +523,6 @@ REFUSED: list[tuple[str, ...]] = [
     ('kcons.mdanalysis.OpenMMReporter("nowhere/a.trr", 0)', "interval"),
     ('kcons.mdanalysis.write_ase(ATOMS, "nowhere/a.trr")', "dynamics"),
     ('kcons.comparison.compare("chain")', "system"),
-    ('kcons.comparison.compare(kcons.comparison.test_systems.build("chain"), "rattle")', "methods"),
 ]
 #: Errors of other types.
 OTHERS: list[tuple[str, type[KconsError], str | None]] = [
