@@ -398,9 +398,8 @@ class ConstraintsWithFixedAtoms(Constraints, FixAtoms):
         others = sum(item.n_rows for item in self.constraints if not item.fixes_atoms)
         if others:
             warnings.warn(
-                f"the fixed atoms are told, of the other {others} rows nothing: a file does not have them, and a "
-                "program that asks (Sella) does not hold them; give it kcons.ase.to_ase_constraints(atoms)",
-                UserWarning,
+                f"only the fixed atoms are passed on: a file of this format does not have the other {others} rows, and "
+                "a program that asks (Sella) does not hold them; give it kcons.ase.to_ase_constraints(atoms)",
                 stacklevel=2,
             )
         return self.get_indices()
@@ -423,9 +422,9 @@ def listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -
     for item in result:
         if not isinstance(item, Constraint):
             raise InputError(
-                f"{item!r} is no kcons constraint; from_ase_constraints(atoms) translates those of ASE, "
-                "constraints_of(atoms, name) gives those of a name as a list, and the attribute constraints those of a "
-                "Constraints object",
+                f"{item!r} is no kcons constraint; from_ase_constraints(atoms) gives those of ASE as a list, "
+                "constraints_of(atoms, name) those of a name, and the attribute constraints those of a Constraints "
+                "object. Put a list into a list by *: [*rows, FixedAtoms([0])]",
                 item="constraints",
             )
     return result
@@ -604,6 +603,8 @@ class ConstrainedCalculator(Calculator):
 
     def __init__(self, inner: Any, constraints: Constraints | Constraint | Iterable[Constraint]) -> None:
         super().__init__()
+        if not hasattr(inner, "get_property"):
+            raise InputError(f"inner is {inner!r:.80}; give a calculator of ASE, such as atoms.calc", item="inner")
         self.inner = inner
         given = constraints if isinstance(constraints, Constraints) else Constraints(constraints)
         self.constraints = given.copy()

@@ -256,7 +256,6 @@ def _repaired(
             f"{int(left.sum())} elements are not what names suggest, such as {elements[atom]} of {names[atom]} in "
             f"{residue_names[residues[atom]]}; they are left, since other atoms have elements that ASE read from the "
             "file and not from names. Set atoms.symbols where they are wrong",
-            UserWarning,
             stacklevel=4,
         )
         wrong &= ~left
@@ -267,7 +266,6 @@ def _repaired(
         f"{int(wrong.sum())} atoms have elements that their names contradict, such as {names[atom]} of "
         f"{residue_names[residues[atom]]}, which is no {elements[atom]}; the names are followed. "
         "kcons.ase.repair_elements(atoms) corrects the atoms",
-        UserWarning,
         stacklevel=4,
     )
     return np.where(wrong, by_name, elements)

@@ -28,7 +28,7 @@ from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.test_systems.potential import Potential
 from kcons.constraints.arguments import Positive, checked
 from kcons.constraints.compilation import announcer, clock
-from kcons.errors import KconsError, UnsupportedError
+from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.thermostats.correlated_series import slope
 
 #: A run is observed about so many times.
@@ -122,6 +122,8 @@ def compare(
     KconsError
         The reference solution cannot be computed.
     """
+    if not isinstance(system, TestSystem):
+        raise InputError(f"system is {system!r:.80}; give one of test_systems.build or from_file", item="system")
     chosen, watching = choose(methods, system), watcher or Watcher()
     if system.openmm is not None:
         system.openmm.patience = budget

@@ -131,6 +131,8 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
         return usual
     groups = {"all": list(METHODS.values())} | {e.lower(): [m for m in usual if m.engine == e] for e in ENGINES}
     picked: dict[str, Method] = {}
+    if isinstance(names, str):
+        raise InputError(f"methods is {names!r:.80}; give a list, such as ['rattle']", item="methods")
     for name in names:
         if name in METHODS:
             picked[name] = METHODS[name]

@@ -107,7 +107,6 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
         warnings.warn(
             f"all values of column {np.flatnonzero(constant).tolist()} are the same: their error is given as 0. "
             "Either they are known exactly, or they were recorded once and repeated",
-            UserWarning,
             stacklevel=2,
         )
         fluctuation[:, constant] = 0.0
@@ -126,7 +125,6 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
             f"{n} samples are worth {effective:.1f} independent ones, or a few of them make up the spread (the "
             f"heaviest has {heaviest:.0%} of the weight, memory lasts for {inefficiency.max():.0f} samples): the error "
             "is not to be relied on. Sample longer",
-            UserWarning,
             stacklevel=2,
         )
     return Mean(value, covariance, np.sqrt(np.diag(covariance)), n, effective, inefficiency)

@@ -406,7 +406,6 @@ def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray) -> None
                 warnings.warn(
                     f"{name} is a torsion over the atoms {', '.join(map(str, four))}, counted from 0, and {said}; give "
                     "the atoms in the order in which they are bonded, unless this is what you mean",
-                    UserWarning,
                     stacklevel=4,
                 )
 

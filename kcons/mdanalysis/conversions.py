@@ -330,7 +330,6 @@ def _warn_of_cut(snapshot: Snapshot) -> None:
             f"{int(cut.sum())} bonds are as long as half of the system, that of atoms {bonds[k, 0]} and {bonds[k, 1]} "
             f"{length[k] / snapshot.angstrom:.1f} angstrom: molecules seem to be cut at the edge of a box, and there "
             "is none to make them whole. Give it (universe.dimensions = [a, b, c, 90, 90, 90]), or unwrap the file",
-            UserWarning,
             stacklevel=4,
         )
 

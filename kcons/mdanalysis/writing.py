@@ -306,7 +306,9 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     from kcons.ase.binding import applied_forces
     from kcons.ase.topology import velocities_of
 
-    atoms = dynamics.atoms
+    atoms = getattr(dynamics, "atoms", None)
+    if atoms is None:
+        raise InputError(f"dynamics is {dynamics!r:.80}; give what makes the steps, not the atoms", item="dynamics")
     whole_number(interval, "interval")
 
     def box() -> FloatArray | None:

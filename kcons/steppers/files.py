@@ -183,7 +183,6 @@ def _locked(folder: Path) -> Iterator[None]:
         except OSError as error:  # a file system without locks
             warnings.warn(
                 f"{folder} cannot be locked ({error}): see to it that one run at a time writes there",
-                UserWarning,
                 stacklevel=5,
             )
         yield

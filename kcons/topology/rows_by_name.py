@@ -358,9 +358,8 @@ def rows_of(snapshot: Snapshot, holding: Holding, numbers: Callable[[Any], IntAr
     )
     if guessed and holding.guess_bonds == "missing":
         warnings.warn(
-            f"{guessed} bonds were guessed from distances and covalent radii, since "
-            f"the {snapshot.host or 'topology'} does not have them; {remedy}, or pass guess_bonds=False to refuse",
-            UserWarning,
+            f"{guessed} bonds were guessed from distances and covalent radii, since the {snapshot.host or 'topology'} "
+            f"does not have them; {remedy}, or pass guess_bonds=True to accept them, guess_bonds=False to refuse",
             stacklevel=3,
         )
     loose = _loose_hydrogens(snapshot.topology, holding, selected)
@@ -369,7 +368,6 @@ def rows_of(snapshot: Snapshot, holding: Holding, numbers: Callable[[Any], IntAr
         warnings.warn(
             f"no bond was guessed for {len(loose)} hydrogens, the first of which is "
             f"{snapshot.topology.atom_name(int(loose[0]))}: nothing holds them; {cell}{remedy}",
-            UserWarning,
             stacklevel=3,
         )
     return HeldRows(held, snapshot, waters.sites, guessed, loose)

@@ -106,6 +106,7 @@ def test_what_is_wrong_with_a_method_is_said(registry):
     assert "wrong" not in registry
     for names, words in (
         (["ratle"], r"there is no method 'ratle' \(did you mean 'rattle'"),
+        ("rattle", r"give a list, such as \['rattle'\]"),
         ([], "no method is named"),
     ):
         with pytest.raises(InputError, match=words):

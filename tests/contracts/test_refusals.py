@@ -17,6 +17,7 @@ from ase.build import molecule
 from ase.calculators.emt import EMT
 
 import kcons.ase
+import kcons.comparison
 import kcons.constraints.projection
 import kcons.mdanalysis
 import kcons.motion
@@ -335,6 +336,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("ConstrainedLangevin(ATOMS.copy(), 0.1, 300, 0.01, barostat=MonteCarloBarostat(0.0))", "cell"),
     ("ConstrainedLangevin(SLAB.copy(), 0.1, 300, 0.01, barostat=MonteCarloBarostat(0.0))", "kind"),
     ('ConstrainedLangevin(FLAT.copy(), 0.1, 300, 0.01, barostat=MonteCarloBarostat(0.0, kind="lateral"))', "cell"),
+    ("ConstrainedCalculator(?, Distance([0, 1]))", "inner", "None", "3"),
     ("rigid_water(3)", "atoms"),
     ("rigid_water(?)", "constrain", "ATOMS[:2]", 'molecule("CH4")', 'molecule("CH3OH")'),
     ("rigid_water(ATOMS, ?)", "water_geometry", '"tip9p"', "(1.0, 200.0)", "1.0"),
@@ -359,6 +361,8 @@ REFUSED: list[tuple[str, ...]] = [
     ("ProjectedIntegrator(0.001, parts=[3])", "parts"),
     ("ProjectedIntegrator(0.001, check_every=-1)", "check_every"),
     ("ProjectedIntegrator(0.001, ensemble=3)", "ensemble"),
+    ("ProjectedIntegrator(300, 1.0, 0.002)", "scheme"),
+    ("ProjectedIntegrator(0.001, device=False).setRandomNumberSeed(?)", "seed", "1.5", '"1"', "2**31"),
     ("kcons.openmm.Langevin(-300, 1.0)", "temperature"),
     ("kcons.openmm.Langevin(300, -1.0)", "friction"),
     ("kcons.openmm.Isokinetic(0)", "temperature"),
@@ -517,6 +521,8 @@ REFUSED: list[tuple[str, ...]] = [
     # Before the folder is looked for: nothing would be written.
     ('kcons.mdanalysis.TrajectoryWriter("nowhere/a.trr", -1)', "n_atoms"),
     ('kcons.mdanalysis.OpenMMReporter("nowhere/a.trr", 0)', "interval"),
+    ('kcons.mdanalysis.write_ase(ATOMS, "nowhere/a.trr")', "dynamics"),
+    ('kcons.comparison.compare("chain")', "system"),
 ]
 #: Errors of other types.
 OTHERS: list[tuple[str, type[KconsError], str | None]] = [

@@ -122,7 +122,7 @@ def plan(
             error.args = (f"{path}: {error}",)
             raise
     told = ("were guessed from distances", "no bond was guessed")
-    said = (str(w.message).replace(", or pass guess_bonds=False to refuse", "") for w in caught)
+    said = (str(w.message).partition(", or pass guess_bonds=")[0] for w in caught)
     notes = tuple(line for line in said if any(words in line for words in told))
     return _planned(path.name, rows, constrain, notes)
 

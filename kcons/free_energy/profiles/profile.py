@@ -205,7 +205,6 @@ def integrate(
             warnings.warn(
                 f"the mean force has the integral {closure.value:.4g} ± {closure.error:.2g} over the period, which "
                 "should be 0: a window has not forgotten where it started from, or its error is too small",
-                UserWarning,
                 stacklevel=2,
             )
         process = process.closed()
@@ -363,7 +362,6 @@ def fit_surface(
                 f"the mean forces are no gradient: a field beside it of {_ROTATIONS[best]:.0%} of its size is more "
                 f"likely (p = {chance:.1e}). Windows are in different states of what is not held, or their errors are "
                 "too small",
-                UserWarning,
                 stacklevel=2,
             )
     if zero is None:

@@ -98,7 +98,6 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike, *, thermal_energy:
         warnings.warn(
             f"forward and backward pulls have an overlap of {overlap:.1%}; below {_OVERLAP:.0%} errors are not to be "
             "relied on: pull more slowly, or over a shorter way",
-            UserWarning,
             stacklevel=2,
         )
     off = math.sqrt(ahead.var(ddof=1) / len(ahead) + back.var(ddof=1) / len(back))
@@ -106,7 +105,6 @@ def pull_free_energy(forward: ArrayLike, backward: ArrayLike, *, thermal_energy:
         warnings.warn(
             f"forward and backward pulls together gain {-kT * lost:.3g} where some work must be lost: give the work "
             "done on the system, of backward pulls too, not by it",
-            UserWarning,
             stacklevel=2,
         )
     return Pulled(Estimate(kT * difference, kT * error), overlap)

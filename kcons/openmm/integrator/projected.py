@@ -113,6 +113,9 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
     def __new__(cls, *args: Any, device: bool | None = None, **kwargs: Any) -> ProjectedIntegrator:
         """Of this class, or of the one that runs on the device."""
         kind, why = cls, ""
+        if len(args) > 2:
+            right = "ProjectedIntegrator(0.002, ensemble=Langevin(300, 1.0))"
+            raise InputError(f"{len(args)} numbers without names; give the thermostat as {right}", item="scheme")
         if "_on_device" in vars(cls) and device is not False:
             kind, why = cls._on_device(device, *args, **kwargs)
         made = object.__new__(kind)
@@ -712,7 +715,10 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
                 "act; leave them out",
                 item="groups",
             )
-        super().setIntegrationForceGroups(wanted)
+        super().setIntegrationForceGroups(sum(1 << group for group in wanted))
+
+    def setRandomNumberSeed(self, seed: int) -> None:
+        super().setRandomNumberSeed(whole_number(seed, "seed", -(2**31), 2**31 - 1))
 
     # -- copies ---------------------------------------------------------------------------------
 
