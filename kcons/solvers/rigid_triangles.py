@@ -1,9 +1,8 @@
 """Rigid triangles: three held distances between three atoms, eight at a time.
 
-The displacements that hold a triangle lie in the plane of its reference
-shape, spanned by ``s01`` and ``s02``. Two bond vectors describe the triangle
-(the third is their difference), so a Newton step is four scalar products, a
-3-by-3 solve and four updates.
+The displacements that hold a triangle lie in the plane of its reference shape, spanned by ``s01`` and ``s02``. Two bond
+vectors describe the triangle (the third is their difference), so a Newton step is four scalar products, a 3-by-3 solve
+and four updates.
 """
 
 import numpy as np
@@ -35,6 +34,8 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 """Order of the three rows of a triangle, in local atoms."""
 #: Of the pieces of the tables, those that are named.
 _SIDES, _UNDO = 3, 4
+#: Not literal, since a function is compiled for each of its literal arguments.
+_NONE, _CORNERS = np.int64(0), np.int64(3)
 
 
 # Spliced into the loop as they stand: what is compiled apart is rounded otherwise, and takes longer.
@@ -133,7 +134,7 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
     w01, w02, w12 = w0 + w1, w0 + w2, w1 + w2
     errors, sizes, worst, worst_at, most = np.empty(3 * WIDTH), np.empty(3 * WIDTH), 0.0, -1, 0
     # Points kept of a triangle, what residuals are counted in, and the sign of multipliers.
-    kept_points, unit, sign = (6, 2.0, 1.0) if tangent is None else (3, 1.0, -1.0)
+    kept_points, unit, sign = (2 * _CORNERS, 2.0, 1.0) if tangent is None else (_CORNERS, 1.0, -1.0)
     for group in range(n_groups):
         at, saved = group * 3 * WIDTH, kept_points * group * SAVED
         # Reference bonds s, t; present bonds p, q; from atom 0 to 1 and to 2.
@@ -205,9 +206,9 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
                 store_triple(sizes, 0, splat(1.0), splat(1.0), splat(1.0))
             worst, worst_at = worst_row(errors, sizes, 3, slots, group * WIDTH)
             if not (ok and kept):
-                restore_points(points, atoms, undo, group, 3, kept_points, 0)
+                restore_points(points, atoms, undo, group, _CORNERS, kept_points, _NONE)
                 if move:
-                    restore_points(velocities, atoms, undo, group, 3, kept_points, 3)
+                    restore_points(velocities, atoms, undo, group, _CORNERS, kept_points, _CORNERS)
                 return False, worst if tangent is None else np.sqrt(worst), most, worst_at
         f0, g0, f1, g1, f2, g2 = w0 * m0, w0 * m1, -w1 * (m0 + m2), w1 * m2, w2 * m2, -w2 * (m1 + m2)
         _move(changed, moving, inverse_dt, table, at, 0, ax, ay, az, f0, g0, sx, sy, sz, tx, ty, tz, move, room, saved)
@@ -234,7 +235,7 @@ def _tangents(alone, y, x, v, inv_dt, wanted, lattice, kind, tables, numbers):
 def _undo(points, tangents, velocities, tables):
     h, u = integers(tables), halves(tables)
     groups, kept, first = table_array(u, h, 1).size // WIDTH, 3 if tangents else 6, 3 if velocities else 0
-    restore_points(points, table_array(u, h, 0), table_array(tables, h, _UNDO), groups, 3, kept, first)
+    restore_points(points, table_array(u, h, 0), table_array(tables, h, _UNDO), groups, _CORNERS, kept, first)
 
 
 class RigidTriangles(AddressableSolver):
