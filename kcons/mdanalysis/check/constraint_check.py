@@ -124,8 +124,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
         names = self._path or "memory", str(getattr(universe, "filename", None) or "topology")
-        remarks = [reason] if reason else []
-        self.asked = Asked(names, topology, mode, text, whole_number(worst, "worst"), remarks + _remarks_on(reader))
+        remarks = [*filter(None, [reason]), *_remarks_on(reader, self._masses)]
+        self.asked = Asked(names, topology, mode, text, whole_number(worst, "worst"), remarks)
         self._given, self._tolerance, self._wants_rank = given, not_negative(tolerance, "tolerance"), rank
         #: Rounding of given targets that were measured in another file, in angstrom a coordinate, by atom.
         self.target_error: FloatArray = np.zeros(n_atoms)
@@ -362,9 +362,13 @@ def _masses(
     return None, f"no temperature: {reason}"
 
 
-def _remarks_on(reader: Any) -> list[str]:
-    """What a reader of MDAnalysis does not know, or was told to do."""
+def _remarks_on(reader: Any, masses: FloatArray | None) -> list[str]:
+    """What a reader of MDAnalysis does not know, or was told to do; atoms that have masses and do not move."""
     remarks, name = [], format_of(reader)
+    if masses is not None and reader.ts.has_velocities:
+        still = int(np.count_nonzero(masses[~reader.ts.velocities.any(axis=1)]))
+        if 0 < still < np.count_nonzero(masses):
+            remarks.append(f"{still} atoms have no velocity: if the run fixed them, the temperature is too low")
     if getattr(reader, "transformations", ()):
         remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
     if reader.ts.has_velocities and not velocities_known(reader):

@@ -86,6 +86,17 @@ def test_masses_that_were_guessed_are_told_of_where_there_are_velocities(tmp_pat
     assert not any("masses" in remark for remark in files.checked(tmp_path / "t.trr", N).remarks)
 
 
+def test_atoms_that_do_not_move_are_told_of(tmp_path):
+    """Their degrees of freedom are counted. A run may begin at rest as a whole."""
+    x = files.water(N, 3)
+    v = np.random.default_rng(1).normal(size=x.shape)
+    for still, said in ((30, True), (3 * N, False)):
+        v[:, :still] = 0
+        result = files.checked(files.write(tmp_path / "t.trr", x, velocities=v), N)
+        words = "30 atoms have no velocity: if the run fixed them, the temperature is too low"
+        assert (words in result.remarks) == any("velocity" in remark for remark in result.remarks) == said
+
+
 def test_velocities_of_later_frames_alone_have_a_temperature(tmp_path):
     x = files.water(N, 4)
     v = np.random.default_rng(1).normal(size=x.shape)
