@@ -18,7 +18,8 @@ from kcons.ase.binding import FORCES_ONLY
 from kcons.errors import InputError, KconsError, UnsupportedError, did_you_mean
 
 #: Endings of files that say what a calculator computes, not what it writes.
-WEIGHTS = [".model", ".pt", ".pth", ".ckpt", ".pb", ".safetensors", ".h5", ".npz", ".xml", ".eam", ".alloy", ".yace"]
+WEIGHTS = [".model", ".pt", ".pth", ".ckpt", ".pb", ".safetensors", ".h5", ".npz", ".xml", ".yace"]
+WEIGHTS += [".eam", ".alloy", ".fs", ".adp"]
 #: Calculators of ASE that take any setting, and know those alone that they list.
 _FULLY_LISTED = ("emt", "lj", "morse")
 #: Calculators that compute in this process, whatever their settings: others start programs that settings name.
@@ -129,8 +130,7 @@ def described(calculator: Any, atoms: Atoms) -> list[Any]:
     there are any, and constraints of ASE that add forces. Plain data, the same in each process; of parameters that are
     files of weights, the contents. What a calculator does not give as parameters is not in it.
     """
-    given = {name: atoms.arrays.get(name, np.zeros(0)) for name in ("initial_charges", "initial_magmoms")}
-    initial = {name: values for name, values in given.items() if values.any()}
+    initial = {k: atoms.arrays[k] for k in ("initial_charges", "initial_magmoms") if np.any(atoms.arrays.get(k, 0))}
     added = [item.todict() for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
     return [_plain(part) for part in (*_kind(calculator), *([initial] if initial else []), *added)]
 

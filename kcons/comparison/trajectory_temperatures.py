@@ -41,12 +41,13 @@ def along(
         raise InputError(f"{len(frames)} frames are too few for temperatures; give {MIN_FRAMES} or more", item="frames")
     from kcons.mdanalysis import open_universe
 
+    where: dict[str, Any] = {"coordinates": trajectory, "frame": frames[0]}  # whose box the forces have
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)  # the check says so
-        test_system = test_systems.from_file(topology, coordinates=trajectory, forces=forces, **options)
+        test_system = test_systems.from_file(topology, forces=forces, **where, **options)
     motion, potential, lattice = test_system.motion, test_system.potential, test_system.constraint_set.lattice
     given = {name: value for name, value in options.items() if name not in ("force_field", "platform")}
-    described = test_systems.plan(topology, coordinates=trajectory, angles="distances", **given).rows.snapshot.topology
+    described = test_systems.plan(topology, angles="distances", **where, **given).rows.snapshot.topology
     bonds = described.bonds
     joins = test_system.constraint_set.incidence.astype(int)
     cluster = connected_components(joins.T @ joins, directed=False)[1]
@@ -58,9 +59,8 @@ def along(
     first = None
     for number in frames:
         ts = universe.trajectory[number]
-        box = None if ts.dimensions is None else np.array(ts.dimensions)
-        first = box if first is None else first
-        if box is not None and first is not None and not np.allclose(box, first, rtol=CHANGED):
+        first = ts._unitcell.copy() if first is None else first  # zeros where there is none
+        if not np.allclose(ts._unitcell, first, rtol=CHANGED):
             raise UnsupportedError(
                 f"the box of frame {number} is another one than that of the first frame: its forces are not those of "
                 "this system. Temperatures of configurations need a run at constant volume"
@@ -74,16 +74,14 @@ def along(
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
         found = split.result()
-    found = replace(found, left_out=(*found.left_out, *dict.fromkeys(str(doubt.message) for doubt in doubts)))
-    if not len(stiff):
-        return found
-    i, j = stiff[0].tolist()
-    held = (
-        f"{len(stiff)} bonds that nothing was said to hold keep their length within {STIFF:.1%}, the first of them "
-        f"from {described.atom_name(i)} to {described.atom_name(j)}: if the run held them, these temperatures are too "
-        "low; name all that it held (--constrain)"
-    )
-    return replace(found, left_out=(*found.left_out, held))
+    told = [*found.left_out, *dict.fromkeys(str(doubt.message) for doubt in doubts)]
+    for i, j in stiff[:1].tolist():
+        told.append(
+            f"{len(stiff)} bonds that nothing was said to hold keep their length within {STIFF:.1%}, the first of them "
+            f"from {described.atom_name(i)} to {described.atom_name(j)}: if the run held them, these temperatures are "
+            "too low; name all that it held (--constrain)"
+        )
+    return replace(found, left_out=tuple(told))
 
 
 def sentences(found: SplitTemperatures, asked: float | None = None) -> list[str]:

@@ -116,14 +116,12 @@ def load_trajectory(
     topology : path
         What to call the topology.
     format : str, optional
-        Of the trajectory, as MDAnalysis names it; by default what its name tells.
+        As for `open_universe`.
 
     Raises
     ------
-    InputError
-        A file that is missing; a format that MDAnalysis does not have, or needs a package for; atom counts that differ.
-    UnreadableError
-        A trajectory that is empty, or cannot be read.
+    InputError, UnreadableError
+        As `open_universe`.
     """
     _look_at(Path(trajectory), "trajectory")
     named = _format(trajectory, format, "format")

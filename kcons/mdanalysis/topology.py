@@ -248,8 +248,7 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
 
 def dimensions_of(cell: FloatArray) -> NDArray[np.float32]:
     """Lengths and angles of a cell, with a positive diagonal: those of others would be of its mirror image."""
-    box: NDArray[np.float32] = triclinic_box(*(cell * np.where(np.diag(cell) < 0, -1.0, 1.0)[:, None]))
-    return box
+    return np.asarray(triclinic_box(*(cell * np.where(np.diag(cell) < 0, -1.0, 1.0)[:, None])))
 
 
 def cell_of(state: State, motion: Motion | None) -> FloatArray | None:

@@ -55,8 +55,9 @@ def test_what_tells_calculators_from_each_other():
     assert described(by_pair[0], Atoms()) != described(by_pair[1], Atoms())
 
 
-def test_weights_in_a_file_belong_to_a_calculator(tmp_path):
-    calculator, model, log = LennardJones(), tmp_path / "net.model", tmp_path / "out.txt"
+@pytest.mark.parametrize("name", ["net.model", "FeH.eam.fs", "Cu.adp"])
+def test_weights_in_a_file_belong_to_a_calculator(name, tmp_path):
+    calculator, model, log = LennardJones(), tmp_path / name, tmp_path / "out.txt"
     model.write_bytes(b"weights")
     log.write_text("one")
     calculator.parameters.update(model=str(model), log=log)

@@ -85,6 +85,18 @@ def test_a_box_that_changes(folder, named, tmp_path):
         trajectory_temperatures.along(tmp_path / "other.trr", folder / "t.gro", "lj", range(FRAMES), constrain="none")
 
 
+def test_lengths_and_box_are_those_of_the_first_frame_that_is_looked_at(folder, named, tmp_path):
+    """As after an equilibration at constant pressure, or in a file whose first frame was not on the constraints yet."""
+    frames = [ts.copy() for ts in files.mda.Universe(folder / "t.gro", folder / "good.trr").trajectory]
+    x, (side, *_) = np.array([ts.positions for ts in frames]), frames[0].dimensions.tolist()
+    cells = [[factor * side] * 3 + [90, 90, 90] for factor in [1.1, *[1.0] * FRAMES]]
+    files.write(tmp_path / "t.trr", np.concatenate([1.1 * x[:1], x]), cells)
+    how = folder / "t.gro", "lj"
+    expected = trajectory_temperatures.along(folder / "good.trr", *how, range(FRAMES), constrain="none")
+    found = trajectory_temperatures.along(tmp_path / "t.trr", *how, range(1, FRAMES + 1), constrain="none")
+    np.testing.assert_allclose([found.shift, found.turn], [expected.shift, expected.turn], rtol=1e-4)
+
+
 def test_bonds_that_the_run_held_are_to_be_named(tmp_path, recwarn):
     """Ethanol with stiff bonds: those to hydrogen are held and named, C-C and C-O are held and not named."""
     ethanol, rng = molecule("CH3CH2OH"), np.random.default_rng(1)

@@ -77,6 +77,7 @@ def plan(
     select: str = "all",
     angles: str = "angles",
     hydrogens: Any = None,
+    frame: int = 0,
 ) -> Plan:
     """Constraints of a file.
 
@@ -85,7 +86,7 @@ def plan(
     path : path
         A topology, or a file with both.
     coordinates : path, optional
-        Coordinates or a trajectory, of which the first frame counts.
+        Coordinates or a trajectory, of which one `frame` counts.
     constrain, select, angles
         As for `kcons.mdanalysis.constraints_of`.
     hydrogens : openmm.app.ForceField, optional
@@ -111,20 +112,20 @@ def plan(
         warnings.simplefilter("always")
         try:
             if by_openmm:
-                text = path.read_text(encoding="utf-8", errors="replace")
-                rows = _by_openmm(text, path, constrain, angles, hydrogens)
+                rows = _by_openmm(path.read_text("utf-8", "replace"), path, constrain, angles, hydrogens)
             else:
                 from kcons.mdanalysis import constraints_of, open_universe
 
                 universe = open_universe(path, coordinates)
+                if coordinates is not None:
+                    _ = universe.trajectory[frame]
                 rows = constraints_of(universe, constrain, select=select, angles=angles)  # type: ignore[arg-type]
         except KconsError as error:
             error.args = (f"{path}: {error}",)
             raise
     told = ("were guessed from distances", "no bond was guessed")
     said = (str(w.message).partition(", or pass guess_bonds=")[0] for w in caught)
-    notes = tuple(line for line in said if any(words in line for words in told))
-    return _planned(path.name, rows, constrain, notes)
+    return _planned(path.name, rows, constrain, tuple(line for line in said if any(words in line for words in told)))
 
 
 def _planned(name: str, rows: HeldRows, constrain: str, notes: tuple[str, ...] = ()) -> Plan:
@@ -168,6 +169,7 @@ def from_file(
     *,
     quick: bool = False,
     coordinates: Path | str | None = None,
+    frame: int = 0,
     constrain: str = "hbonds",
     select: str = "all",
     forces: str = "openmm",
@@ -182,7 +184,7 @@ def from_file(
 
     Parameters
     ----------
-    path, coordinates, constrain, select
+    path, coordinates, frame, constrain, select
         See `plan`.
     rng : int, numpy.random.Generator or None
         Of the velocities.
@@ -208,7 +210,7 @@ def from_file(
         raise InputError(f"forces are {forces!r} already; leave --forcefield out", item="force_field")
     fields = named or force_field or FORCE_FIELD
     hydrogens = force_field_of(fields) if add_hydrogens else None
-    how: dict[str, Any] = {"coordinates": coordinates, "constrain": constrain, "select": select}
+    how: dict[str, Any] = {"coordinates": coordinates, "frame": frame, "constrain": constrain, "select": select}
     found = plan(path, **how, angles="distances", hydrogens=hydrogens)
     for note in found.notes:
         warnings.warn(note, UserWarning, stacklevel=2)

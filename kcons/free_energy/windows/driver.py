@@ -409,13 +409,12 @@ class FreeEnergy:
         made = Table(*(Column(title, justify="right") for title in titles))
         made.title = f"mean force (kJ/mol per {' or '.join(dict.fromkeys(_PER[angle] for angle in self.angles))})"
         for window in self.windows:
-            mark = "!" if window.p_value < UNLIKELY else ""
             made.add_row(
                 *self._shown(window),
                 *map(with_error, window.force, window.error),
                 ", ".join(f"{raw:.2f}" for raw in window.raw),
                 f"{window.n_effective:.0f}",
-                "" if np.isnan(window.p_value) else f"{window.p_value:.2g}{mark}",
+                "" if np.isnan(window.p_value) else f"{window.p_value:.2g}{'!' * bool(window.p_value < UNLIKELY)}",
             )
         return made
 
@@ -466,6 +465,8 @@ class FreeEnergy:
             figure = plot_profile(profile, coordinate=f"{name} / {_PER[angle]}", energy="(kJ/mol)")
             figure.savefig(picture, dpi=150, format="png")
             contents |= {"profile.csv": table.getvalue(), "profile.png": picture.getvalue()}
+        for left in {"profile.csv", "profile.png"} - contents.keys():  # of other windows
+            (folder / left).unlink(missing_ok=True)
         return write_files(folder, contents)
 
 
@@ -490,8 +491,7 @@ def combine_sides(target: FloatArray, sides: dict[str, MeanForce], sampler: Samp
             half = (forces[0] - forces[1]) / 2
             covariance = covariance + np.outer(half, half)
     means = (forces.mean(axis=0), covariance, per * raws.mean(axis=0), int(n.sum()), float(effective.sum()))
-    names = next(iter(sides.values())).names
-    return WindowResult(names, target, *means, sides=sides, p_value=chance)
+    return WindowResult(next(iter(sides.values())).names, target, *means, sides=sides, p_value=chance)
 
 
 class Windows:

@@ -124,8 +124,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
         names = self._path or "memory", str(getattr(universe, "filename", None) or "topology")
-        remarks = [f"no temperature: {reason}"] if reason else []
-        self.asked = Asked(names, topology, mode, text, whole_number(worst, "worst"), remarks + _remarks_on(reader))
+        remarks = [*filter(None, [reason]), *_remarks_on(reader, self._masses)]
+        self.asked = Asked(names, topology, mode, text, whole_number(worst, "worst"), remarks)
         self._given, self._tolerance, self._wants_rank = given, not_negative(tolerance, "tolerance"), rank
         #: Rounding of given targets that were measured in another file, in angstrom a coordinate, by atom.
         self.target_error: FloatArray = np.zeros(n_atoms)
@@ -170,8 +170,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         remarks = self._look_for_grid(numbers) if self._may_be_on_grid else []
         remarks += self._bind(int(numbers[0]))
         damaged = None if _in_place(self._trajectory) else first_break(self._trajectory, damage)
-        masses = self._masses if self._trajectory.ts.has_velocities else None
-        self._compute = _Frames(self._trajectory, self._rows, masses, self._velocities, damaged, self._precision)
+        how = self._masses, self._velocities, damaged, self._precision
+        self._compute = _Frames(self._trajectory, self._rows, *how)
         super().run(**chosen, **options)
         if self.asked.mode == "mean":
             self._rows.take_means(self.results.found)
@@ -291,7 +291,7 @@ class _Frames:
 
     trajectory: Any
     rows: RowTable
-    #: None where there are no velocities, or no masses.
+    #: None where there are none.
     masses: FloatArray | None
     velocities: bool
     #: In files of which not each worker looks itself.
@@ -341,27 +341,34 @@ class _Frames:
 def _masses(
     universe: Any, topology: Topology, given: Sequence[Constraint], used: NDArray[np.int64]
 ) -> tuple[FloatArray | None, str]:
-    """Masses; or None where they cannot be used, and why."""
+    """Masses, or None where they cannot be used; and what to say of them."""
     masses = topology.masses
     if used[-1] >= len(masses):
         said = f"there is no atom {used[-1]}; the topology has atoms 0 to {len(masses) - 1}"
         raise InputError(said, item="constraints", atoms=[int(used[-1])])
     bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
+    remedy = "give a topology with masses, such as PSF, PRMTOP or TPR"
     if not len(bad):
-        return masses, ""
+        own = [a for a in universe._topology.attrs if a.attrname == "masses" and not a.is_guessed]
+        said = f"masses are those of the elements: temperatures are wrong if the run had others (heavy H); {remedy}"
+        return masses, said if universe.trajectory.ts.has_velocities and not own else ""
     reason = f"{label(topology, bad[:1].tolist())} has mass {masses[bad[0]]:g}"
     if not hasattr(universe.atoms, "masses"):
         reason = "the topology has no masses"
-    reason += "; give a topology with masses, such as PSF, PRMTOP or TPR"
+    reason += f"; {remedy}"
     needing = next((item for item in given if item.uses_masses), None)
     if needing is not None:
         raise InputError(f"{needing!r} needs masses, but {reason}", item="masses")
-    return None, reason
+    return None, f"no temperature: {reason}"
 
 
-def _remarks_on(reader: Any) -> list[str]:
-    """What a reader of MDAnalysis does not know, or was told to do."""
+def _remarks_on(reader: Any, masses: FloatArray | None) -> list[str]:
+    """What a reader of MDAnalysis does not know, or was told to do; atoms that have masses and do not move."""
     remarks, name = [], format_of(reader)
+    if masses is not None and reader.ts.has_velocities:
+        still = int(np.count_nonzero(masses[~reader.ts.velocities.any(axis=1)]))
+        if 0 < still < np.count_nonzero(masses):
+            remarks.append(f"{still} atoms have no velocity: if the run fixed them, the temperature is too low")
     if getattr(reader, "transformations", ()):
         remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
     if reader.ts.has_velocities and not velocities_known(reader):
@@ -439,13 +446,15 @@ def check_trajectory(
         # Bonds are looked for in the first frame that is looked at; one that is not there is for the check to refuse.
         with quiet(), suppress(*READ_ERRORS):
             _ = universe.trajectory[chosen.get("start") or 0]
-    held = _held(universe, constrain, {name: options.pop(name) for name in Options.__annotations__ if name in options})
+    given = {name: options.pop(name) for name in Options.__annotations__ if name in options}
+    held = _held(universe, constrain, given)
     if of_topology:
         load_trajectory(universe, trajectory, topology, format=format)
     check = ConstraintCheck(universe, held, targets="given" if of_topology else targets, **options)
     check.asked.names = str(trajectory), str(topology)
     if errors is not None:
         check.asked.targets, check.target_error = f"coordinates of {topology}", errors
+    check.asked.part = str(given.get("select", "all")) != "all"
     if guessed := held.bonds_guessed:
         check.asked.remarks.append(
             f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "
@@ -465,8 +474,7 @@ def check_trajectory(
 
 def _held(universe: Any, constrain: str | None, held: dict[str, Any]) -> HeldRows:
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)
-        warnings.filterwarnings("ignore", message="no bond was guessed", category=UserWarning)  # a gap
+        warnings.filterwarnings("ignore", message=".*bonds? (was|were) guessed", category=UserWarning)  # said above
         try:
             return constraints_of(universe, constrain, **held)
         except InputError as error:

@@ -101,14 +101,12 @@ class Found:
 
     def mean(self, name: str) -> FloatArray:
         """Means by row of 'total' or 'rounded'; 0 where no frame counted."""
-        result: FloatArray = self.rows[name] / np.maximum(self.rows["counted"], 1)
-        return result
+        return np.asarray(self.rows[name] / np.maximum(self.rows["counted"], 1))
 
     @property
     def rms(self) -> FloatArray:
         """Root mean square over the rows, shape (n_frames, 2)."""
-        result: FloatArray = np.sqrt(self.units["squares"] / np.maximum(self.units["seen"], 1))
-        return result
+        return np.asarray(np.sqrt(self.units["squares"] / np.maximum(self.units["seen"], 1)))
 
 
 class RowTable:

@@ -85,8 +85,7 @@ class FilePrecision:
         with np.errstate(all="ignore"):
             below = np.where(size > 0, np.ldexp(1.0, np.frexp(size)[1] - 1), 0.0)
             below = np.where(below < reach, 0.0, below)
-        result: FloatArray = np.where(np.isfinite(size), base + factor * below, np.inf)
-        return result
+        return np.where(np.isfinite(size), base + factor * below, np.inf)
 
 
 def precision_of(path: str | Path, file_format: str, step: float | None = None) -> FilePrecision:

@@ -32,7 +32,8 @@ def page(result: CheckResult) -> tuple[str, Table, Table, Text]:
         f"{result.precision}; targets: {result.targets}; tolerance {result.tolerance:g}",
     ]
     if result.rank is not None:
-        lines.append(f"rank {result.rank}, {result.degrees_of_freedom} degrees of freedom")
+        g = result.degrees_of_freedom
+        lines.append(f"rank {result.rank}" + ("" if g is None else f", {g} degrees of freedom"))
     if result.temperature is not None:
         t = result.temperature
         lines[-1] += f", {t['mean']:.2f} ± {t['deviation']:.2f} K (mean and standard deviation of frames)"
@@ -94,7 +95,6 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
     grid = figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
     timed = len(set(result.times)) == len(result.times)
     x = result.times if timed else [float(frame) for frame in result.frames]
-    marker = "." if len(x) < 60 else ""
     for axes, unit in zip(grid, result.units, strict=False):
         largest, rms, rounding = (np.array(result.series[f"{k} {unit.unit}"]) for k in ("largest", "rms", "rounding"))
         if (largest > 0).any():
@@ -102,7 +102,7 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
         # The frame that gives targets is off by 0, or by the rounding of this program: no point of such a line.
         for color, label, values in (("#D55E00", "largest", largest), ("#0072B2", "rms", rms)):
             shown = np.where(values > _NOTHING * largest.max(), values, np.nan)
-            axes.plot(x, shown, color=color, linewidth=1.0, marker=marker, label=label)
+            axes.plot(x, shown, color=color, linewidth=1.0, marker="." * (len(x) < 60), label=label)
         # Rounding of the targets comes to that of each frame.
         allowed = rounding + unit.bound - rounding.max()
         lines = [("black", ":", allowed, "rounding of the file, at most")]

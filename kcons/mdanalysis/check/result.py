@@ -98,10 +98,10 @@ class CheckResult:
     violated_rows: int
     violated_frames: int
     first_violated_frame: int | None
-    #: None where the rank could not be found; see `remarks`.
+    #: None where the rank could not be found; degrees of freedom also where a selection was looked at; see `remarks`.
     rank: int | None
     degrees_of_freedom: int | None
-    #: Mean, standard deviation and drift in K; None without velocities or masses.
+    #: Mean, standard deviation and drift in K; None without velocities, masses or degrees of freedom.
     temperature: dict[str, float] | None
     #: Where the file ends too early, or is no longer numbers.
     broken: Break | None
@@ -150,6 +150,8 @@ class Asked:
     #: What there is to say besides, and what is known beforehand to be missing.
     remarks: list[str]
     gaps: list[str] = field(default_factory=list)
+    #: Whether rows were looked for within a selection only.
+    part: bool = False
 
 
 def result_of(
@@ -180,7 +182,9 @@ def result_of(
     of_unit = [(unit.unit, UNITS.index(unit.unit)) for unit in units]
     series = {f"{name} {unit}": values[:, k].tolist() for unit, k in of_unit for name, values in columns}
     freedom, temperature = None, None
-    if rank is not None:
+    if asked.part:
+        remarks.append("no temperature: what holds atoms outside of the selection was not looked for")
+    elif rank is not None:
         freedom, kelvin = _temperatures(found, rank, held.masses, remarks)
         if kelvin is not None:
             series["temperature K"] = kelvin.tolist()
@@ -297,8 +301,7 @@ def _gaps(found: Found, table: RowTable, untold: NDArray[np.bool_], targets: str
             "parameter file"
         )
     unseen = n_rows - found.units["seen"].sum(axis=1)
-    frames = np.flatnonzero(unseen > 0)
-    if len(frames):
+    if len(frames := np.flatnonzero(unseen > 0)):
         gaps.append(
             f"nothing can be told of up to {unseen.max():.0f} of {n_rows} rows in {len(frames)} of {n_frames} "
             f"frames, from frame {found.frames['frame'][frames[0]]}: coordinates are so large that their rounding "
@@ -316,8 +319,7 @@ def _temperatures(found: Found, rank: int, masses: FloatArray, remarks: list[str
         return max(freedom, 0), None
     center = (found.frames["momentum"][has] ** 2).sum(axis=1) / masses.sum()
     still = float(center.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean()) and freedom > 3
-    what = "at rest: 3 degrees of freedom less" if still else "not at rest: it counts"
-    remarks.append(f"the center of mass is {what}")
+    remarks.append("the center of mass is " + ("not at rest: it counts", "at rest: 3 degrees of freedom less")[still])
     freedom -= 3 * still
     if freedom <= 0:
         remarks.append("no temperature: the constraints leave no degree of freedom")

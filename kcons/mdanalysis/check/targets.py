@@ -9,10 +9,6 @@ A TOML file lists lengths by elements or atom names; the first entry that fits a
     residue = "SOL"              # optional
     value = 1.0
 
-    [[length]]
-    elements = ["C", "H"]
-    value = 1.09
-
     [[angle]]
     elements = ["H", "O", "H"]   # the vertex in the middle
     value = 104.52               # degrees

@@ -31,8 +31,16 @@ MUTANTS = {
         "«Timestep.from_timestep(trajectory.ts)→trajectory.ts», converts": (
             "deviations::rows_that_were_made_for_a_part_are_refused"
         ),
+        '«str(given.get("select", "all")) != "all"→False»': (
+            "mdanalysis/check/results::of_a_selection_there_is_no_temperature"
+        ),
         ".half_step(universe.atoms.positions)«→.max()»": (
             "mdanalysis/check/precision::a_wild_molecule_of_the_topology_excuses_no_other"
+        ),
+    },
+    "comparison/trajectory_temperatures.py": {
+        '"frame": «frames[0]→0»}': (
+            "trajectory_temperatures::lengths_and_box_are_those_of_the_first_frame_that_is_looked_at"
         ),
     },
     "mdanalysis/check/endings.py": {

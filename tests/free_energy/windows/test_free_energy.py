@@ -120,6 +120,13 @@ def test_a_profile_or_why_there_is_none(places, tmp_path):
     assert ("no profile: 2 different windows are too few for a profile; give 3 or more" in said) == (not profile)
 
 
+def test_no_profile_of_other_windows_is_left(tmp_path):
+    """A file of fewer windows, in the folder of more."""
+    assert len(run(tmp_path, [0.1, 0.5, 0.9]).write(tmp_path)) == 3
+    assert run(tmp_path, [0.1, 0.5]).write(tmp_path) == [tmp_path / "free_energy.json"]
+    assert not sorted(tmp_path.glob("profile.*"))
+
+
 def test_a_formula_has_its_own_unit(sampled, tmp_path):
     """Of OpenMM it is in nm, and nobody knows whether it is a length."""
     sampled.angles = (None,)

@@ -5,12 +5,14 @@ import json
 import numpy as np
 import pytest
 import water_files as files
+from MDAnalysis.lib.formats.libmdaxdr import TRRFile
 
 from kcons.constraints import CenterOfMass, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.mdanalysis import ConstraintCheck, to_ase
 from kcons.mdanalysis.check import report
+from kcons.mdanalysis.check.constraint_check import check_trajectory
 from kcons.mdanalysis.check.result import fitted
 from kcons.motion import Motion
 
@@ -59,6 +61,53 @@ def test_a_moving_center_of_mass_counts_and_without_masses_there_is_a_rank_but_n
     assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)
     with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*give a topology with masses"):
         files.checked(path, N, CenterOfMass([0, 1, 2]), masses=False)
+
+
+def test_of_a_selection_there_is_no_temperature(tmp_path):
+    """What holds the other atoms is not looked for: their motions would be counted with too many degrees of freedom."""
+    x = files.water(N, 3)
+    v = np.random.default_rng(1).normal(size=x.shape)
+    files.topology(tmp_path / "t.gro", N, x[0])
+    where = files.write(tmp_path / "t.trr", x, velocities=v), tmp_path / "t.gro"
+    part, whole = check_trajectory(*where, select="resid 1:10"), check_trajectory(*where)
+    assert (part.rank, part.degrees_of_freedom, part.temperature) == (30, None, None)
+    assert "temperature K" not in part.series and "degrees of freedom" not in report.page(part)[0]
+    said = "no temperature: what holds atoms outside of the selection was not looked for"
+    assert said in part.remarks and said not in whole.remarks and whole.temperature is not None
+    assert report.page(whole)[0].splitlines()[2].startswith(f"rank {3 * N}, {6 * N} degrees of freedom, ")
+
+
+def test_masses_that_were_guessed_are_told_of_where_there_are_velocities(tmp_path):
+    x = files.water(N, 3)
+    for ending, warned in (("trr", True), ("dcd", False)):
+        path = files.write(tmp_path / f"t.{ending}", x, velocities=np.ones_like(x) if warned else None)
+        result = check_trajectory(path, files.topology(tmp_path / "t.gro", N, x[0]))
+        assert any("masses are those of the elements" in remark for remark in result.remarks) == warned
+    assert not any("masses" in remark for remark in files.checked(tmp_path / "t.trr", N).remarks)
+
+
+def test_atoms_that_do_not_move_are_told_of(tmp_path):
+    """Their degrees of freedom are counted. A run may begin at rest as a whole."""
+    x = files.water(N, 3)
+    v = np.random.default_rng(1).normal(size=x.shape)
+    for still, said in ((30, True), (3 * N, False)):
+        v[:, :still] = 0
+        result = files.checked(files.write(tmp_path / "t.trr", x, velocities=v), N)
+        words = "30 atoms have no velocity: if the run fixed them, the temperature is too low"
+        assert (words in result.remarks) == any("velocity" in remark for remark in result.remarks) == said
+
+
+def test_velocities_of_later_frames_alone_have_a_temperature(tmp_path):
+    x = files.water(N, 4)
+    v = np.random.default_rng(1).normal(size=x.shape)
+    with TRRFile(str(tmp_path / "t.trr"), "w") as file:
+        for k in range(4):
+            speeds = np.float32(v[k] / 10) if k % 2 else None
+            file.write(np.float32(x[k] / 10), speeds, None, 1.2 * np.eye(3, dtype="f4"), k, float(k), 0.0, 3 * N)
+    result = files.checked(tmp_path / "t.trr", N)
+    kelvin = np.einsum("i,kij->k", np.tile([15.999, 1.008, 1.008], N), v**2) / (0.831446261815324 * 6 * N)
+    assert result.degrees_of_freedom == 6 * N
+    np.testing.assert_allclose(result.series["temperature K"], [np.nan, kelvin[1], np.nan, kelvin[3]], rtol=1e-6)
 
 
 def test_velocities_without_a_unit_are_no_temperature(tmp_path):
