@@ -224,6 +224,7 @@ APART = {
         lambda x, t: np.outer(x[:, 0], [0.7, 0, 0]) - [0, 0, 2],
     ),
     "dumbbells": ([PAIRS], PAIRS_FAR, quartic),
+    "dumbbells without forces": ([PAIRS], PAIRS_FAR, None),
     "on a fixed atom": ([Distance([[0, 1], [0, 2]]), FixedAtoms([0])], SCATTERED[:3], quartic),
     "oscillators": ([], SCATTERED, lambda x, t: -np.arange(1.0, 13.0)[:, None] * x),
     "triangle and atoms": ([Distance([[0, 1], [1, 2], [0, 2]])], SCATTERED[:5], lambda x, t: np.cos(x)),
