@@ -233,11 +233,11 @@ def _conserved(system: System, state: State, forces: FloatArray) -> tuple[FloatA
     turns.keep_rows(system.motion, state.positions, state.time)
     for attempt, (x, f) in enumerate(places):
         turns.see(x, f)
+        if not attempt and len(directions):
+            continue  # where the atoms are, all may cancel by symmetry but for rounding
         total = directions @ f.sum(axis=0)
         if np.abs(total).max(initial=0.0) <= BALANCED * np.abs(f).sum():
-            # At one place they may cancel by symmetry.
-            if attempt or not len(directions):
-                break
+            break
         elif len(directions) == 1:
             directions = np.zeros((0, 3))
             break
