@@ -411,10 +411,10 @@ def _apart(system: System, state: State) -> bool:
     """
     x, forces = state.positions, state.forces
     label = bodies(system.motion, system.inverse_masses[:, 0] > 0)
-    count = int(label.max(initial=-1)) + 1
-    if count < 2 or system.force is None:
-        return count > 1
     assert forces is not None
+    count = int(label.max(initial=-1)) + 1
+    if count < 2:
+        return False
     body, half = np.arange(count), count // 2
     sums = np.stack([np.bincount(label + 1, column, count + 1)[1:] for column in x.T], axis=1)
     centers = np.asarray(sums / np.bincount(label + 1, minlength=count + 1)[1:, None], dtype=np.float64)
