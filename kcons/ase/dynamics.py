@@ -321,6 +321,8 @@ class ConstrainedDynamics(MolecularDynamics):
     def _systems(self) -> System:
         """The system for the atoms as they are; built anew if masses, constraints or periodicity changed."""
         atoms = self.atoms
+        for name in ("positions", "momenta"):  # kernels write to them
+            atoms.arrays[name] = np.ascontiguousarray(atoms.arrays[name], np.float64)
         present, bound = company(atoms.constraints), self._bound
         if bound is None or present != self._present or not bound.fits(atoms):
             gone = 0 if bound is None else bound.motion.n_atoms - len(atoms)

@@ -233,11 +233,11 @@ def _conserved(system: System, state: State, forces: FloatArray) -> tuple[FloatA
     turns.keep_rows(system.motion, state.positions, state.time)
     for attempt, (x, f) in enumerate(places):
         turns.see(x, f)
+        if not attempt and len(directions):
+            continue  # where the atoms are, all may cancel by symmetry but for rounding
         total = directions @ f.sum(axis=0)
         if np.abs(total).max(initial=0.0) <= BALANCED * np.abs(f).sum():
-            # At one place they may cancel by symmetry.
-            if attempt or not len(directions):
-                break
+            break
         elif len(directions) == 1:
             directions = np.zeros((0, 3))
             break
@@ -409,8 +409,6 @@ def _apart(system: System, state: State) -> bool:
     Every second one is moved a little, and the forces on the others are looked at. Where nothing changes, bodies may be
     out of reach: pairs are brought to half their distance again and again.
     """
-    if system.force is None:
-        return False
     x, forces = state.positions, state.forces
     label = bodies(system.motion, system.inverse_masses[:, 0] > 0)
     assert forces is not None

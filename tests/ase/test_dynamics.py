@@ -135,6 +135,18 @@ def test_masses_of_free_atoms_changed_between_steps_are_taken(name, value):
     assert equal(state(atoms), state(again))
 
 
+@pytest.mark.parametrize(("kept", "size"), [(np.asfortranarray, 1.0), (lambda p: p.astype(int), 0.0)])
+def test_momenta_in_arrays_of_another_order_or_kind_are_taken(kept, size):
+    """As ``atoms.arrays["momenta"] = (masses * v.T).T`` leaves them: what is written to these would be lost."""
+    atoms, _ = water()
+    atoms.arrays["momenta"] *= size
+    again = atoms.copy()
+    again.calc, again.arrays["momenta"] = Field(), kept(again.arrays["momenta"])
+    for each in (atoms, again):
+        ConstrainedDynamics(each, FS).run(3)
+    assert equal(state(atoms), state(again))
+
+
 # -- time steps -------------------------------------------------------------------------------------
 
 

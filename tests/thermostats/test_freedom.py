@@ -64,6 +64,9 @@ def twelve(force=None, *rows, x=SCATTERED):
     return system(list(rows), x, WEIGHTS[: len(x)], force), x
 
 
+#: A perfect crystal, in which all forces are rounding.
+CRYSTAL = 1.5 * np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), 1) + 0.1
+
 # (system and positions, g by hand, directions in which momentum is conserved)
 COUNTED = {
     "free atoms, own forces": (twelve(swirling), 36 - 3, 3),
@@ -71,6 +74,7 @@ COUNTED = {
     "two atoms, balanced by symmetry": ((system([], OPPOSITE, [1.0, 1.0], quartic), OPPOSITE), 6, 0),
     "free atoms in a field": (twelve(waves), 36, 0),
     "ideal gas": (twelve(), 36 - 3, 3),
+    "crystal": ((system([], CRYSTAL, np.ones(27), LennardJones(range(27), 4.5).force), CRYSTAL), 81 - 3, 3),
     "gravity": (twelve(gravity), 36 - 2, 2),
     "a trap": (twelve(quartic), 36, 0),
     "one methane": ((system([Distance(TEN)], METHANE, np.ones(5), swirling), METHANE), 15 - 9 - 3, 3),
@@ -224,6 +228,7 @@ APART = {
         lambda x, t: np.outer(x[:, 0], [0.7, 0, 0]) - [0, 0, 2],
     ),
     "dumbbells": ([PAIRS], PAIRS_FAR, quartic),
+    "dumbbells without forces": ([PAIRS], PAIRS_FAR, None),
     "on a fixed atom": ([Distance([[0, 1], [0, 2]]), FixedAtoms([0])], SCATTERED[:3], quartic),
     "oscillators": ([], SCATTERED, lambda x, t: -np.arange(1.0, 13.0)[:, None] * x),
     "triangle and atoms": ([Distance([[0, 1], [1, 2], [0, 2]])], SCATTERED[:5], lambda x, t: np.cos(x)),

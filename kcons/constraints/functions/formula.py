@@ -303,7 +303,7 @@ class Formula(Constraint):
     Notes
     -----
     Where the formula depends on differences of positions alone, which is found out, minimum images apply in periodic
-    cells. The code is kept in files.
+    cells. The code is kept in files. An atom that crosses a corner, as of abs, loses speed: sqrt(q**2 + a**2) is round.
 
     Raises
     ------

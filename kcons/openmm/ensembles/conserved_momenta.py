@@ -134,13 +134,13 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
 def _totals(
     given: openmm.Context, force: openmm.Force, x: FloatArray, fixed: list[int], turns: RigidMotions
 ) -> FloatArray:
-    """Sum of one force over the particles, at a few places and as shares of its size; `turns` sees them, too."""
+    """Sum of one force, as shares of its size, nearby: in place it may be rounding alone; `turns` sees them, too."""
     context = forces_alone(given.getSystem(), [force], box_of(given), given.getParameters())
     rng = np.random.default_rng(0)
     size = extent(x) or 1.0
     found: list[FloatArray] = []
     while len(found) < _PLACES or turns.open:
-        there = x + (SHIFT * size * rng.standard_normal(3) + SHAKE * size * rng.standard_normal(x.shape)) * bool(found)
+        there = x + SHIFT * size * rng.standard_normal(3) + SHAKE * size * rng.standard_normal(x.shape)
         there[fixed] = x[fixed]
         context.setPositions(there)
         f = forces_at(context, -1)

@@ -31,6 +31,19 @@ def test_momenta_that_are_conserved_are_found():
     del context
 
 
+def springs(state):
+    """Of all pairs, at rest in PLACES, where rounding is left of them."""
+    x = state.getPositions(asNumpy=True)._value
+    return 0.0, 7.3 * x.mean(axis=0) - 7.3 * x - 7.3 * (np.mean(PLACES, axis=0) - PLACES)
+
+
+def test_forces_that_are_rounding_where_the_particles_are_break_no_momentum():
+    system = particles([20.0] * 4, openmm.PythonForce(springs))
+    context = started(system, integrator := ProjectedIntegrator(1e-4, ensemble=(bath := Isokinetic(300.0))), PLACES)
+    assert bath.count(integrator) == 9
+    del context
+
+
 def test_forces_are_looked_at_with_the_parameters_of_the_context():
     system, x, v = dumbbell(stiffness=0.0)
     context = started(system, integrator := ProjectedIntegrator(1e-4, ensemble=(bath := Isokinetic(300.0))), x, v)
