@@ -28,7 +28,7 @@ dynamics = ConstrainedLangevin(atoms, 2 * units.fs, 300, 0.01 / units.fs, rng=2,
 print("time/fs   density/(g/cm3)   temperature/K   trials accepted")
 gram = units.kg / 1000 / (1e8 * units.Angstrom) ** 3  # 1 g/cm3 in ASE's units
 densities = []
-for _ in range(8):
+for _ in range(4):
     dynamics.run(50)
     densities.append(atoms.get_masses().sum() / atoms.get_volume() / gram)
     accepted = barostat.acceptance(dynamics.state)[0]

@@ -24,8 +24,8 @@ simulation.minimizeEnergy(maxIterations=100)
 integrator.setVelocitiesToTemperature(simulation.context, 300 * unit.kelvin, 1)
 
 log = {"time": True, "potentialEnergy": True, "temperature": True}
-simulation.reporters.append(app.StateDataReporter(sys.stdout, 50, **log, separator="  "))
-simulation.step(250)
+simulation.reporters.append(app.StateDataReporter(sys.stdout, 20, **log, separator="  "))
+simulation.step(100)
 
 name, off = worst_length(simulation.context)
 print(f"{system.getNumConstraints()} lengths held; {name} is off by most, {off:.0e} of its length")

@@ -24,7 +24,7 @@ def water_box(side: int = 3, spacing: float = 3.1) -> Atoms:
     return box
 
 
-def main(steps: int = 200) -> None:
+def main(steps: int = 100) -> None:
     atoms = water_box()
     atoms.calc = TIP3P(rc=4.5)
 

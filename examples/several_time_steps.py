@@ -15,8 +15,8 @@ from kcons.openmm import Langevin, LangevinRespa, ProjectedIntegrator, worst_len
 
 field = app.ForceField("tip3p.xml")
 box = app.Modeller(app.Topology(), [])
-box.addSolvent(field, boxSize=openmm.Vec3(2.2, 2.2, 2.2))
-system = field.createSystem(box.topology, nonbondedMethod=app.PME, nonbondedCutoff=1.0 * unit.nanometer)
+box.addSolvent(field, boxSize=openmm.Vec3(1.9, 1.9, 1.9))
+system = field.createSystem(box.topology, nonbondedMethod=app.PME, nonbondedCutoff=0.9 * unit.nanometer)
 whole = next(force for force in system.getForces() if isinstance(force, openmm.NonbondedForce))
 
 
@@ -38,11 +38,11 @@ def divided(system):
 
 respa = LangevinRespa(300, 5.0, {0: 1, 1: 4}, slow_kicks="middle")  # K, 1/ps, steps of each group
 runs = {
-    "one step, 2 fs": (system, ProjectedIntegrator(0.002, ensemble=Langevin(300, 5.0)), 200),
-    "8 fs outside, 2 fs inside": (divided(system), ProjectedIntegrator(0.008, ensemble=respa), 50),
+    "one step, 2 fs": (system, ProjectedIntegrator(0.002, ensemble=Langevin(300, 5.0)), 100),
+    "8 fs outside, 2 fs inside": (divided(system), ProjectedIntegrator(0.008, ensemble=respa), 25),
 }
 x = box.positions
-print("steps                        whole sums in 0.4 ps  potential energy/(kJ/mol)   temperature/K   off   seconds")
+print("steps                        whole sums in 0.2 ps  potential energy/(kJ/mol)   temperature/K   off   seconds")
 for name, (given, integrator, steps) in runs.items():
     simulation = app.Simulation(box.topology, given, integrator, openmm.Platform.getPlatformByName("CPU"))
     simulation.context.setPositions(x)

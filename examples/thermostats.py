@@ -28,7 +28,7 @@ for place in np.ndindex(3, 3, 3):  # waters on a grid, each turned at random
 box.calc = TIP3P(rc=4.5)
 held = constrain(box, rigid_water(box, "tip3p"), project=True)
 draw_velocities(box, 300, rng=2)
-ConstrainedLangevin(box, 2 * units.fs, 300, 0.1 / units.fs, rng=3).run(200)
+ConstrainedLangevin(box, 2 * units.fs, 300, 0.1 / units.fs, rng=3).run(100)
 
 step = 2 * units.fs
 baths = {
@@ -45,7 +45,7 @@ for name, bath in baths.items():
     dynamics.run(20)
     found, before = [], dynamics.get_conserved_energy()
     dynamics.attach(lambda dynamics=dynamics, found=found: found.append(dynamics.get_temperature()))
-    dynamics.run(300)
+    dynamics.run(100)
     drift = dynamics.get_conserved_energy() - before
     off = np.abs(held.engine(atoms).constraint_set.value(atoms.positions)).max()
     print(f"{name:12s} {np.mean(found):18.1f} {np.std(found):19.1f} {drift:26.4f} {off:22.0e}")

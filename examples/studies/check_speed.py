@@ -1,6 +1,6 @@
 """How fast `kcons check` reads a long trajectory, beside the reader alone, and how much memory it takes.
 
-    python examples/studies/check_speed.py --quick --out DIR     files of 2 MB, seconds
+    python examples/studies/check_speed.py --quick --out DIR     files of 0.2 MB, seconds
     python examples/studies/check_speed.py --out DIR             files of 0.2 GB, some minutes
 
 The files are made in a temporary folder and deleted: rigid water that tumbles and wanders through a periodic cell, all
@@ -129,7 +129,7 @@ def main() -> None:
         print(json.dumps(measured(sys.argv[2], int(sys.argv[3]), sys.argv[4])))
         return
     chosen = harness.options(__doc__, "trajectory_check").parse_args()
-    size, turns = (2e6, 1) if chosen.quick else (2e8, 3)
+    size, turns = (2e5, 1) if chosen.quick else (2e8, 3)
     pieces = {
         f"{ending}-{n}": partial(case, ending, n, size, turns) for ending, n in (SMALL if chosen.quick else CASES)
     }

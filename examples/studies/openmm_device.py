@@ -65,7 +65,7 @@ def integrators() -> dict[str, openmm.Integrator]:
 
 def without_forces(place: str, full: bool) -> Iterator[dict[str, Any]]:
     """Rigid water whose forces cost nothing: what is beside the forces in a step, here of order 4 as well."""
-    system, positions = water(2.4)
+    system, positions = water(2.4 if full else 1.3)
     start = start_of(system, positions, place, 20)
     while system.getNumForces():
         system.removeForce(0)
@@ -144,7 +144,7 @@ def bonds_and_angles(place: str, full: bool) -> Iterator[dict[str, Any]]:
 
 def pieces(chosen: argparse.Namespace) -> dict[str, Callable[[], Iterator[dict[str, Any]]]]:
     full = not chosen.quick
-    systems: dict[str, Callable[[], Any]] = {"rigid water": partial(water, 4.3 if full else 1.9)}
+    systems: dict[str, Callable[[], Any]] = {"rigid water": partial(water, 4.3 if full else 1.3)}
     for name in ("HBonds", "AllBonds"):
         systems[f"Villin, {name}"] = partial(protein, VILLIN, getattr(app, name))
     found: dict[str, Callable[[], Iterator[dict[str, Any]]]] = {}

@@ -166,7 +166,7 @@ def sample(system: openmm.System, start: openmm.State, name: str, step: float, p
     masses = masses_of(system)
     freedom = 3 * len(masses) - system.getNumConstraints()
     found = []
-    for _ in range(max(40, round(picoseconds / APART))):
+    for _ in range(max(20, round(picoseconds / APART))):
         integrator.step(round(APART / step))
         both, kinetic = energy(context)
         half = kinetic
@@ -208,7 +208,7 @@ def drift(
 
 def rows(constraints: str, full: bool) -> Iterator[dict[str, Any]]:
     """Averages of runs from one start, and drifts of the integrators that conserve energy."""
-    warm_up = 5000 if full else 200
+    warm_up = 5000 if full else 50
     system, x = alanine(constraints)
     start = start_of(system, x, 1, warm_up)
     omega = harmonic(system, x)
@@ -219,11 +219,11 @@ def rows(constraints: str, full: bool) -> Iterator[dict[str, Any]]:
         "expected_K": float(TEMPERATURE * (1 - np.mean((omega * 0.004) ** 2) / 4)),
     }
     for name, fs in RUNS[constraints] if full else [run for run in RUNS[constraints] if run[1] == 4][:2]:
-        found = sample(system, start, name, 1e-3 * fs, 1000.0 if full else 4.0)
+        found = sample(system, start, name, 1e-3 * fs, 1000.0 if full else 0.1)
         flat = {f"{key}{'_error' if what == 'error' else ''}": v for key, m in found.items() for what, v in m.items()}
         yield {"part": "runs", "constraints": constraints, "integrator": name, "fs": fs, **flat}
     for name, make in CONSERVING.items():
-        found = drift(system, x, make, warm_up, *((250.0, 4) if full else (2.0, 2)))
+        found = drift(system, x, make, warm_up, *((250.0, 4) if full else (0.5, 2)))
         yield {"part": "drift", "constraints": constraints, "integrator": name, **found}
 
 

@@ -105,7 +105,7 @@ def main() -> None:
     harness.main(
         "thermostat_cost",
         harness.options(__doc__, "thermostat-cost"),
-        lambda chosen: {name: partial(cost, name, 15 if chosen.quick else 301) for name in SYSTEMS},
+        lambda chosen: {name: partial(cost, name, 3 if chosen.quick else 301) for name in SYSTEMS},
         tables,
     )
 

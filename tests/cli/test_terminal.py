@@ -22,7 +22,7 @@ def said(line, where="", **variables):
 
 
 def test_into_a_pipe_that_nobody_reads(tmp_path):
-    said("plan chain --size 3")  # what has to be compiled is compiled now: that is announced on the stream of errors
+    main(["plan", "chain", "--size", "3"])  # compiles what has to be: that is announced on the stream of errors
     status, out, errors = said("plan chain --size 3", "| head -1", PYTHONUNBUFFERED="1")
     assert status == 0 and errors == b"" and out.count(b"\n") == 1
     # A comparison is written though nobody reads it.

@@ -25,7 +25,10 @@ OWN = {*("harness", "bare_solvers", "bare_systems", "hard_cases", "stability", "
 OWN |= {"batched", "water_model_by_gradients"}
 PLAIN = {"constraint_figures", "own_constraints"}
 STUDIES = [path for path in sorted((ROOT / "examples" / "studies").glob("*.py")) if path.stem not in OWN]
-EXAMPLES = [*(path for path in sorted((ROOT / "examples").glob("*.py")) if path.stem not in OWN), *STUDIES]
+#: An example that runs in a process of its own.
+BY_ITSELF = ROOT / "examples" / "rigid_water_ase.py"
+EXAMPLES = [path for path in sorted((ROOT / "examples").glob("*.py")) if path.stem not in OWN and path != BY_ITSELF]
+EXAMPLES += STUDIES
 #: Pages on a program that `all` does not install; `.ci/run` has torch for some of these.
 NEEDS = {"batched.md": "torch_sim"} | {
     f"tutorials/{name}.md": package for name, package in runpy.run_path(ROOT / "docs/notebooks.py")["NEEDS"].items()
@@ -103,7 +106,7 @@ def test_examples_are_short_and_listed_under_the_tutorials():
 def test_an_example_runs_by_itself(tmp_path):
     """Nothing but what it imports, and no warning of anybody."""
     result = subprocess.run(
-        [sys.executable, "-W", "error", str(ROOT / "examples" / "rigid_water_ase.py")],
+        [sys.executable, "-W", "error", str(BY_ITSELF)],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
