@@ -170,12 +170,16 @@ class TrajectoryWriter:
         Raises
         ------
         InputError
-            A wrong shape; numbers that the file cannot hold; a cell that MDAnalysis cannot; the writer is closed.
+            A wrong shape; numbers that the file cannot hold; a cell that MDAnalysis cannot; no velocities for a file that
+            has them; the writer is closed.
         NonFiniteError
             A NaN or infinity; nothing was written.
         """
         if self._writer is None:
             raise InputError(f"{self.path} is closed", item="path")
+        if velocities is None and "velocities" in self._kept:
+            remedy = "give them, or make the writer with velocities=False"
+            raise InputError(f"{self.path.name} has velocities, and none are given; {remedy}", item="velocities")
         length, energy = self.units.length, self.units.energy
         units = {"positions": length, "velocities": length / self.units.time, "forces": energy / length}
         given = {"positions": positions, "velocities": velocities, "forces": forces}
@@ -191,8 +195,7 @@ class TrajectoryWriter:
         extras = self._extras(arrays, time)
         ts = self._universe.trajectory.ts
         for name in ("positions", *self._kept):
-            missing = np.full_like(arrays["positions"], np.nan if name == "forces" else 0.0)
-            setattr(ts, name, arrays.get(name, missing) * units[name])
+            setattr(ts, name, arrays.get(name, np.full_like(arrays["positions"], np.nan)) * units[name])
         ts.time, ts.frame, ts.dimensions = time * self.units.time, self.n_frames, box
         ts.data["step"] = self.n_frames if step is None else step
         ts.data.update(extras)

@@ -199,8 +199,12 @@ def test_a_file_has_one_writer(tmp_path, ending):
     with TrajectoryWriter(path, 3) as writer:
         with pytest.raises(InputError, match="open in another TrajectoryWriter"):
             TrajectoryWriter(tmp_path / "." / path.name, 3)
-        writer.write(np.zeros((3, 3)))
-    with TrajectoryWriter(path, 3) as again:
+        if ending == "h5md":
+            with pytest.raises(InputError, match="has velocities, and none are given.*velocities=False"):
+                writer.write(np.zeros((3, 3)))
+            assert writer.n_frames == 0
+        writer.write(np.zeros((3, 3)), np.zeros((3, 3)))
+    with TrajectoryWriter(path, 3, velocities=False) as again:
         again.write(np.ones((3, 3)))
 
 
@@ -265,7 +269,7 @@ def test_cells_that_boxes_of_mdanalysis_are_not(tmp_path):
     with pytest.raises(InputError, match=r"MDAnalysis wants the first cell vector along x.*standard_form\(\)"):
         write_ase(ConstrainedDynamics(turned, 0.1), tmp_path / "a.trr")
     assert not list(tmp_path.iterdir())
-    with TrajectoryWriter(tmp_path / "b.trr", 2) as writer:
+    with TrajectoryWriter(tmp_path / "b.trr", 2, velocities=False) as writer:
         for cell, kind, what in (
             (turned.cell.array, InputError, "standard_form"),
             (np.diag([9.0, np.nan, 9.0]), NonFiniteError, "not finite"),
