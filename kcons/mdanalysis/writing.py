@@ -170,8 +170,8 @@ class TrajectoryWriter:
         Raises
         ------
         InputError
-            A wrong shape; numbers that the file cannot hold; a cell that MDAnalysis cannot; no velocities for a file that
-            has them; the writer is closed.
+            A wrong shape; no velocities for a file that has them; numbers that the file cannot hold; a cell that
+            MDAnalysis cannot; the writer is closed.
         NonFiniteError
             A NaN or infinity; nothing was written.
         """

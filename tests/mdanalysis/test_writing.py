@@ -200,7 +200,7 @@ def test_a_file_has_one_writer(tmp_path, ending):
         with pytest.raises(InputError, match="open in another TrajectoryWriter"):
             TrajectoryWriter(tmp_path / "." / path.name, 3)
         if ending == "h5md":
-            with pytest.raises(InputError, match="has velocities, and none are given.*velocities=False"):
+            with pytest.raises(InputError, match=r"has velocities, and none are given.*velocities=False"):
                 writer.write(np.zeros((3, 3)))
             assert writer.n_frames == 0
         writer.write(np.zeros((3, 3)), np.zeros((3, 3)))
