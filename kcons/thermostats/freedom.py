@@ -124,8 +124,9 @@ EXACT = 1e-12
 AT_REST = 1e-16
 #: How far the system is shifted, relative to its size, to see whether forces depend on its place.
 SHIFT = 1e-2
-#: How far each atom is moved besides, so that nothing cancels by symmetry.
-SHAKE = 1e-4
+#: How far each atom is moved besides, of the way to the nearest: nothing cancels by symmetry, and forces are far above
+#: rounding, also those of a calculator in single precision on a perfect crystal.
+SHAKE = 0.01
 #: Steps after which it is looked whether bodies feel each other; shorter runs have no averages.
 LOOK_AT = 20_000
 #: How often bodies that do not feel each other are brought to half their distance, to see whether they do so there.
@@ -255,9 +256,17 @@ def _places(system: System, state: State, forces: FloatArray) -> Iterator[tuple[
     moving = system.inverse_masses > 0
     yield state.positions, forces
     while True:
-        shift = SHIFT * size * rng.standard_normal(3)
-        x = state.positions + moving * (shift + SHAKE * size * rng.standard_normal(state.positions.shape))
+        x = state.positions + moving * (SHIFT * size * rng.standard_normal(3) + shaking(state.positions, rng))
         yield x, system.forces(x, state.velocities, state.time, state.step)
+
+
+def shaking(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Random displacements, small beside the distances between atoms, shape (n_atoms, 3)."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(x).query(x, k=2)[0][:, 1]  # infinite for one atom alone; 0 where two are at one place
+    known = np.where(np.isfinite(near) & (near > 0), near, SHIFT * (extent(x) or 1.0))
+    return SHAKE * known[:, None] * rng.standard_normal(x.shape)
 
 
 class RigidMotions:
@@ -428,7 +437,7 @@ def _apart(system: System, state: State) -> bool:
             return True
         return not np.abs(f - forces)[~goes].max(initial=0.0) <= least
 
-    small = SHAKE * (extent(x) or 1.0) * np.random.default_rng(0).standard_normal((count, 3))
+    small = NEARBY * (extent(x) or 1.0) * np.random.default_rng(0).standard_normal((count, 3))
     if felt(small, body % 2 == 1):
         return False
     for moved, towards in ((body % 2 == 1, body - 1), (body >= count - half, body - (count - half))):

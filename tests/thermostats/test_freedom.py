@@ -66,6 +66,13 @@ def twelve(force=None, *rows, x=SCATTERED):
 
 #: A perfect crystal, in which all forces are rounding.
 CRYSTAL = 1.5 * np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), 1) + 0.1
+ATTRACTED = LennardJones(range(27), 4.5).force
+
+
+def noisy(x, time):
+    """What a calculator in single precision gives."""
+    return ATTRACTED(x, time) + 2e-6 * np.sin(1e5 * x)
+
 
 # (system and positions, g by hand, directions in which momentum is conserved)
 COUNTED = {
@@ -74,7 +81,8 @@ COUNTED = {
     "two atoms, balanced by symmetry": ((system([], OPPOSITE, [1.0, 1.0], quartic), OPPOSITE), 6, 0),
     "free atoms in a field": (twelve(waves), 36, 0),
     "ideal gas": (twelve(), 36 - 3, 3),
-    "crystal": ((system([], CRYSTAL, np.ones(27), LennardJones(range(27), 4.5).force), CRYSTAL), 81 - 3, 3),
+    "crystal": ((system([], CRYSTAL, np.ones(27), ATTRACTED), CRYSTAL), 81 - 3, 3),
+    "crystal, single precision": ((system([], CRYSTAL, np.ones(27), noisy), CRYSTAL), 81 - 3, 3),
     "gravity": (twelve(gravity), 36 - 2, 2),
     "a trap": (twelve(quartic), 36, 0),
     "one methane": ((system([Distance(TEN)], METHANE, np.ones(5), swirling), METHANE), 15 - 9 - 3, 3),

@@ -20,7 +20,7 @@ from kcons.openmm.integrator.guard import (
 )
 from kcons.openmm.integrator.program import Ensemble, Integrator
 from kcons.openmm.quantities import box_of, forces_at, held_without_mass, masses_of, positions_of, velocities_of
-from kcons.thermostats.freedom import BALANCED, SHAKE, SHIFT, RigidMotions, open_directions, warn_of_conserved_momenta
+from kcons.thermostats.freedom import BALANCED, SHIFT, RigidMotions, open_directions, shaking, warn_of_conserved_momenta
 
 Momentum = Literal["auto", "conserved", "free"]
 
@@ -140,7 +140,7 @@ def _totals(
     size = extent(x) or 1.0
     found: list[FloatArray] = []
     while len(found) < _PLACES or turns.open:
-        there = x + SHIFT * size * rng.standard_normal(3) + SHAKE * size * rng.standard_normal(x.shape)
+        there = x + SHIFT * size * rng.standard_normal(3) + shaking(x, rng)
         there[fixed] = x[fixed]
         context.setPositions(there)
         f = forces_at(context, -1)
