@@ -71,7 +71,7 @@ ATTRACTED = LennardJones(range(27), 4.5).force
 
 def noisy(x, time):
     """What a calculator in single precision gives."""
-    return ATTRACTED(x, time) + 2e-6 * np.sin(1e5 * x)
+    return ATTRACTED(x, time) + 2e-7 * np.sin(1e5 * x)
 
 
 # (system and positions, g by hand, directions in which momentum is conserved)
