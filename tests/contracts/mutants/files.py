@@ -3,7 +3,8 @@
 MUTANTS = {
     "mdanalysis/writing.py": {
         "«other._writer is not None→False» and other.path.resolve()": "mdanalysis/writing::a_file_has_one_writer",
-        "«np.nan→0.0» if name == ": "mdanalysis/writing::forces_that_a_state_does_not_know_are_not_zero",
+        '«velocities is None→False» and "velocities" in self._kept': "mdanalysis/writing::a_file_has_one_writer",
+        'arrays["positions"], «np.nan→0.0»)': "mdanalysis/writing::forces_that_a_state_does_not_know_are_not_zero",
     },
     "mdanalysis/check/deviations.py": {
         "«of_targets + →»self.tolerance * self.sizes": "mdanalysis/check/precision::two_roundings_make_more_than_one",

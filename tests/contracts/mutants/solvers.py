@@ -36,7 +36,9 @@ MUTANTS = {
     "solvers/rigid_triangles.py": {
         "(TINY, qt)« and all_within(TINY, us)→»": "distance_solvers::a_third_side_that_turned_round_is_no_solution",
         "c10, c11, c12 = -(a12 * a20 «+→-» a10 * a22)": "distance_solvers::newton_and_a_chord_step_gain_together",
-        "3, kept_points, «3→0»)": "distance_solvers::failure_changes_nothing_and_names_the_cluster[far-triangles-29]",
+        "_CORNERS, kept_points, «_CORNERS→_NONE»)": (
+            "distance_solvers::failure_changes_nothing_and_names_the_cluster[far-triangles-29]"
+        ),
     },
     "solvers/chains.py": {
         "vy - dy * inverse_dt, vz - dz« * inverse_dt→»": "distance_solvers::matches_dense_newton[chains-short-free]",
