@@ -57,8 +57,9 @@ MUTANTS = {
         "if «not attempt and→False and» len(directions):": "freedom::the_thermostats_hold_what_is_counted_by_hand",
         "«turns.see(*next(places))→break»": "freedom::angular_momentum_about_the_axes_of_what_is_held_is_said",
         "share = BALANCED« if len(self._motions) == 6 else EXACT→»": (
-            "freedom::a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster"
+            "freedom::the_thermostats_hold_what_is_counted_by_hand"
         ),
+        "«SHAKE→1e-9» * known": "freedom::a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster",
     },
     "steppers/state.py": {
         "if state.remainder is None« or self._free_of_origin is None→»:": (
