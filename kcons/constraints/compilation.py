@@ -196,7 +196,7 @@ def njit(function: Any = None, /, *, cache: bool = False, **options: Any) -> Any
     """
 
     def made(function: Any) -> Any:
-        kernel = numba.njit(pipeline_class=_Compiler, no_cfunc_wrapper=True, **options)(function)
+        kernel = numba.njit(pipeline_class=_Compiler, **(options | {"no_cfunc_wrapper": True}))(function)
         if cache:
             kernel._cache = _KernelCache(function)
         return kernel
