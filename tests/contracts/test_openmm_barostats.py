@@ -172,8 +172,7 @@ PRESSURE = (N + 1) * KT / SIDE**3
 @pytest.mark.parametrize(
     ("ensemble", "barostat", "sites"),
     [
-        pytest.param("Langevin", "isotropic", False, marks=pytest.mark.validation),
-        ("Langevin", "isotropic", True),
+        *(("Langevin", "isotropic", sites) for sites in (False, True)),
         *(("NoseHoover", "one axis", False), ("Isokinetic", "membrane", False)),
     ],
 )

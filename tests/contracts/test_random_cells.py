@@ -31,7 +31,7 @@ def test_molecules_that_nobody_has_seen(seed, periodic):
 
 
 def test_long_steps_and_strong_forces_end_on_the_rows_or_in_a_typed_error():
-    for seed in range(60):
+    for seed in range(120):
         if not {"winding", "fixed pair"} & set(world(seed).kinds):
             by = cell_judge.Judge(world(seed), seed, periodic=False)
             by.build()
