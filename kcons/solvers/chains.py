@@ -139,7 +139,7 @@ def _next_bond(points, atoms, at, ax, ay, az, cell, kind, wrapped):
     bx, by, bz = gather_points(points, atoms, at)
     nx, ny, nz = ax - bx, ay - by, az - bz
     if kind != OPEN and wrapped:
-        nx, ny, nz = minimum_image(nx, ny, nz, cell, kind)
+        nx, ny, nz = minimum_image((nx, ny, nz), cell, kind)
     return nx, ny, nz, bx, by, bz
 
 
@@ -150,7 +150,7 @@ def _seam_bond(points, atoms, first, end, real, cell, kind, wrapped):
     bx, by, bz = gather_points(points, atoms, end)
     zx, zy, zz = (bx - from_next(ax)) * real, (by - from_next(ay)) * real, (bz - from_next(az)) * real
     if kind != OPEN and wrapped:
-        zx, zy, zz = minimum_image(zx, zy, zz, cell, kind)
+        zx, zy, zz = minimum_image((zx, zy, zz), cell, kind)
     return zx, zy, zz, ax, ay, az
 
 
@@ -195,7 +195,7 @@ def _opened(work, slot, rx, ry, rz, sx, sy, sz, target, scale, tangent):
     """Keep the bond of a row and what is wanted of it; returns this, and squares added up."""
     scale = scale + (dot(rx, ry, rz, rx, ry, rz) + target * target)
     target = target * (square_root(dot(sx, sy, sz, sx, sy, sz)) if tangent is not None else target)
-    store_triple(work, slot + _S, sx, sy, sz)
+    store_triple(work, slot + _S, (sx, sy, sz))
     store(work, slot + _TARGET, target)
     return target, scale
 
@@ -203,7 +203,7 @@ def _opened(work, slot, rx, ry, rz, sx, sy, sz, target, scale, tangent):
 @njit(fastmath=FASTMATH, inline="always")
 def _measured(work, slot, rx, ry, rz, sx, sy, sz, target, real, tangent):
     """Keep r; its errors, and the gradient along it."""
-    store_triple(work, slot + _R, rx, ry, rz)
+    store_triple(work, slot + _R, (rx, ry, rz))
     if tangent is not None:
         error, inner, positive, ratio = _rate_error(rx, ry, rz, sx, sy, sz, target, real)
         rx, ry, rz = sx, sy, sz
@@ -219,7 +219,7 @@ def _eliminated(work, slot, masses, lower, inner, error, leave, onward, right, a
     right = (error + lower * right) * pivot
     aside = flushed(lower * aside * pivot)
     ahead = -leave * onward * pivot
-    store_triple(work, slot + _RIGHT, right, ahead, aside)
+    store_triple(work, slot + _RIGHT, (right, ahead, aside))
     return right, ahead, aside
 
 
@@ -299,7 +299,7 @@ def _solve(
     ux, uy, uz, bx, by, bz = _next_bond(origins, table, first + WIDTH, ax, ay, az, cell, kind, True)
     cx, cy, cz, ax, ay, az = _seam_bond(changed, table, first, end, real, cell, kind, tangent is None)
     vx, vy, vz, dx, dy, dz = _next_bond(changed, table, first + WIDTH, ax, ay, az, cell, kind, tangent is None)
-    store_triple(work, seam + _R, cx, cy, cz)
+    store_triple(work, seam + _R, (cx, cy, cz))
     count, seam_target = real, gather(given, rows, end, 0) * real if driven else zero
     seam_target, scale = _opened(room, seam, cx, cy, cz, zx, zy, zz, seam_target, zero, tangent)
 
@@ -364,8 +364,8 @@ def _solve(
         tail = -weight * dot(gx, gy, gz, px, py, pz)
         store(small, 0, where_zero(masses, 1.0, masses * inner))
         store(small, WIDTH, error)
-        store_triple(small, 2 * WIDTH, -head * head_diagonal, -head * head_right, head * to_head)
-        store_triple(small, 5 * WIDTH, -tail * ahead, -tail * right, -tail * aside)
+        store_triple(small, 2 * WIDTH, (-head * head_diagonal, -head * head_right, head * to_head))
+        store_triple(small, 5 * WIDTH, (-tail * ahead, -tail * right, -tail * aside))
         _reduce(small.reshape(8, WIDTH), upward)
         pulls = load(small, WIDTH)
     store(small, 0, peak)
@@ -412,18 +412,18 @@ def _shift(points, velocities, inverse_dt, atoms, owned, full, weights, work, fi
         if move:
             vx, vy, vz = gather_points(velocities, atoms, at)
         if keep:
-            store_triple(undo, 6 * at, x, y, z)
-            store_triple(undo, 6 * at + 3 * WIDTH, vx, vy, vz)
+            store_triple(undo, 6 * at, (x, y, z))
+            store_triple(undo, 6 * at + 3 * WIDTH, (vx, vy, vz))
         x, y, z = x - dx, y - dy, z - dz
         vx, vy, vz = vx - dx * inverse_dt, vy - dy * inverse_dt, vz - dz * inverse_dt
         if full[at // WIDTH]:
-            scatter_points(points, atoms, at, x, y, z)
+            scatter_points(points, atoms, at, (x, y, z))
             if move:
-                scatter_points(velocities, atoms, at, vx, vy, vz)
+                scatter_points(velocities, atoms, at, (vx, vy, vz))
         else:
             # Slots beyond a chain's end repeat its last atom; only its own slot writes it.
-            store_triple(work, slot + _R, x, y, z)
-            store_triple(work, slot + _RIGHT, vx, vy, vz)
+            store_triple(work, slot + _R, (x, y, z))
+            store_triple(work, slot + _RIGHT, (vx, vy, vz))
             for lane in range(WIDTH):
                 if owned[at + lane]:
                     target = atoms[at + lane] // 3
@@ -439,7 +439,7 @@ def _restore(points, atoms, undo, end, first):
     # Backwards: a slot that repeats an atom kept it as it was after its own slot.
     for at in range(end - WIDTH, -WIDTH, -WIDTH):
         x, y, z = load_triple(undo, 6 * at + first)
-        scatter_points(points, atoms, at, x, y, z)
+        scatter_points(points, atoms, at, (x, y, z))
 
 
 @njit(fastmath=FASTMATH)
@@ -490,10 +490,10 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
         elif strip < last:
             for at in range(first, starts[strip + 1], WIDTH):
                 x, y, z = gather_points(points, atoms, at)
-                store_triple(undo, 6 * at, x, y, z)
+                store_triple(undo, 6 * at, (x, y, z))
                 if move:
                     x, y, z = gather_points(velocities, atoms, at)
-                store_triple(undo, 6 * at + 3 * WIDTH, x, y, z)
+                store_triple(undo, 6 * at + 3 * WIDTH, (x, y, z))
         if multipliers.shape[0] > 0:
             _report(multipliers, rows, present, work, first, n_slots, solves, -1.0 if tangent is not None else 1.0)
     return True, worst, most, worst_row

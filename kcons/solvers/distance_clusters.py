@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.kernels.eight_wide import FASTMATH, WIDTH, load_triple, scatter_points
+from kcons.solvers.kernels.any_width import arithmetic
+from kcons.solvers.kernels.eight_wide import FASTMATH, WIDTH, lanes_type, load_triple, scatter_points
 from kcons.solvers.kernels.lattices import OPEN, TRICLINIC, lattice_numbers, minimum_image
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.tolerances import EPS, ROUNDING
@@ -23,7 +24,7 @@ def resolved(x, pairs, lengths, lattice, kind):
         i, j = pairs[2 * k], pairs[2 * k + 1]
         ax, ay, az = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
         if kind != OPEN:
-            ax, ay, az = minimum_image(ax, ay, az, cell, TRICLINIC)
+            ax, ay, az = minimum_image((ax, ay, az), cell, TRICLINIC)
         d = lengths[k]
         miss = abs(ax * ax + ay * ay + az * az - d * d) / (2.0 * d)
         if not (miss <= ROUNDING * d):
@@ -34,7 +35,7 @@ def resolved(x, pairs, lengths, lattice, kind):
     return True
 
 
-@njit(fastmath=FASTMATH, forceinline=True)
+@arithmetic(lanes_type)
 def dot(ax, ay, az, bx, by, bz):
     """Scalar product of two triples."""
     return ax * bx + ay * by + az * bz
@@ -50,8 +51,7 @@ def restore_points(points, table, undo, groups, n_local, stride, first):
     for group in range(groups):
         for k in range(n_local):
             saved = (group * stride + first + k) * SAVED
-            x, y, z = load_triple(undo, saved)
-            scatter_points(points, table, (group * n_local + k) * WIDTH, x, y, z)
+            scatter_points(points, table, (group * n_local + k) * WIDTH, load_triple(undo, saved))
 
 
 def lane_tables(atoms: NDArray[np.int64], n_rows: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:

@@ -6,25 +6,27 @@ and four updates.
 """
 
 import numpy as np
+from numba import types
 from numpy.typing import ArrayLike
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
-from kcons.solvers.distance_clusters import SAVED, dot, lane_tables, restore_points, worst_row
+from kcons.solvers.distance_clusters import SAVED, lane_tables, restore_points, worst_row
 from kcons.solvers.kernels.aligned_memory import in_one_array, room
+from kcons.solvers.kernels.any_width import arithmetic
 from kcons.solvers.kernels.array_views import at_first, halves, integers, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
+    TRIPLE,
     WIDTH,
-    absolute,
     all_within,
     gather_differences,
     gather_points,
     keep_points,
+    lanes_type,
     not_positive,
     scatter_points,
     splat,
-    square_root,
     store_triple,
 )
 from kcons.solvers.kernels.lattices import OPEN, lattice_numbers, minimum_image
@@ -38,184 +40,194 @@ _SIDES, _UNDO = 3, 4
 _NONE, _CORNERS = np.int64(0), np.int64(3)
 
 
-# Spliced into the loop as they stand: what is compiled apart is rounded otherwise, and takes longer.
+#: Rows of an adjugate, and what scales it.
+_FACTOR = types.UniTuple(lanes_type, 10)
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _small(e0, e1, e2, l0, l1, l2, factor):
-    return all_within(e0, l0 * factor) and all_within(e1, l1 * factor) and all_within(e2, l2 * factor)
+# Of a triangle: p, q are the bonds from atom 0 to 1 and to 2, s, t their references, w inverse masses; of its
+# three rows e are errors, d and m multipliers, l squares of lengths.
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _length_errors(l0, l1, l2, px, py, pz, qx, qy, qz):
-    ux, uy, uz = qx - px, qy - py, qz - pz
-    e0, e1 = l0 - dot(px, py, pz, px, py, pz), l1 - dot(qx, qy, qz, qx, qy, qz)
-    return e0, e1, l2 - dot(ux, uy, uz, ux, uy, uz)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _products(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz):
+def _minus(a, b):
+    return tuple(x - y for x, y in zip(a, b, strict=True))
+
+
+_difference = arithmetic(TRIPLE)(_minus)
+_times = arithmetic(TRIPLE)(lambda e, factor: tuple(x * factor for x in e))
+_plus = arithmetic(TRIPLE)(lambda a, shift, factor: tuple(x + y * factor for x, y in zip(a, shift, strict=True)))
+_squared = arithmetic(TRIPLE)(lambda e: tuple(x * x for x in e))
+_absolute = arithmetic(TRIPLE)(lambda e: tuple(x.unary("fabs") for x in e))
+_roots = arithmetic(TRIPLE)(lambda l, r: tuple(y * x.unary("sqrt") for x, y in zip(l, r, strict=True)))
+_square = arithmetic(lanes_type)(lambda r: _dot(r, r))
+
+
+@arithmetic(TRIPLE)
+def _products(p, q, s, t):
     """Of the three bonds with their references."""
-    us = dot(qx - px, qy - py, qz - pz, tx - sx, ty - sy, tz - sz)
-    return dot(px, py, pz, sx, sy, sz), dot(qx, qy, qz, tx, ty, tz), us
+    return _dot(p, s), _dot(q, t), _dot(_minus(q, p), _minus(t, s))
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _tangent_factor(l0, l1, l2, st, w0, w1, w2, w01, w02, w12):
+@arithmetic(TRIPLE)
+def _length_errors(l, p, q):
+    u = _minus(q, p)
+    return l[0] - _dot(p, p), l[1] - _dot(q, q), l[2] - _dot(u, u)
+
+
+@arithmetic(_FACTOR)
+def _tangent_factor(l, s, t, w):
     """Rows of the adjugate of the matrix for velocities, and what scales it."""
-    a00, a01, a02 = w01 * l0, w0 * st, w1 * (l0 - st)
-    a11, a12, a22 = w02 * l1, w2 * (l1 - st), w12 * l2
+    (l0, l1, l2), (w0, w1, w2), st = l, w, _dot(s, t)
+    a00, a01, a02 = (w0 + w1) * l0, w0 * st, w1 * (l0 - st)
+    a11, a12, a22 = (w0 + w2) * l1, w2 * (l1 - st), (w1 + w2) * l2
     c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
     c11, c12, c22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
     return c00, c01, c02, c01, c11, c12, c02, c12, c22, 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _position_factor(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz, w0, w1, w2, w01, w02, w12):
+@arithmetic(_FACTOR)
+def _position_factor(p, q, s, t, w):
     """The same of Newton's matrix for positions."""
-    ps, pt = dot(px, py, pz, sx, sy, sz), dot(px, py, pz, tx, ty, tz)
-    qs, qt = dot(qx, qy, qz, sx, sy, sz), dot(qx, qy, qz, tx, ty, tz)
+    ps, pt, qs, qt, (w0, w1, w2) = _dot(p, s), _dot(p, t), _dot(q, s), _dot(q, t), w
     us, ut = qs - ps, qt - pt
-    a00, a01, a02 = w01 * ps, w0 * pt, w1 * (ps - pt)
-    a10, a11, a12 = w0 * qs, w02 * qt, w2 * (qt - qs)
-    a20, a21, a22 = w1 * us, w2 * ut, w12 * (ut - us)
+    a00, a01, a02 = (w0 + w1) * ps, w0 * pt, w1 * (ps - pt)
+    a10, a11, a12 = w0 * qs, (w0 + w2) * qt, w2 * (qt - qs)
+    a20, a21, a22 = w1 * us, w2 * ut, (w1 + w2) * (ut - us)
     c00, c01, c02 = a11 * a22 - a12 * a21, a02 * a21 - a01 * a22, a01 * a12 - a02 * a11
     c10, c11, c12 = -(a12 * a20 + a10 * a22), a00 * a22 + a02 * a20, a02 * a10 - a00 * a12
     c20, c21, c22 = a10 * a21 + a11 * a20, -(a01 * a20 + a00 * a21), a00 * a11 - a01 * a10
     return c00, c01, c02, c10, c11, c12, c20, c21, c22, 0.5 / (a00 * c00 + a01 * c10 + a02 * c20)
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _product(c00, c01, c02, c10, c11, c12, c20, c21, c22, f0, f1, f2):
-    d0 = c00 * f0 + c01 * f1 + c02 * f2
-    d1 = c10 * f0 + c11 * f1 + c12 * f2
-    d2 = c20 * f0 + c21 * f1 + c22 * f2
-    return d0, d1, d2
+@arithmetic(TRIPLE)
+def _solved(factor, e):
+    scaled = tuple(x * factor[9] for x in e)
+    return tuple(_dot(factor[k : k + 3], scaled) for k in (0, 3, 6))
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _pulled(px, py, pz, f, g, sx, sy, sz, tx, ty, tz):
-    return px + f * sx + g * tx, py + f * sy + g * ty, pz + f * sz + g * tz
+@arithmetic(types.UniTuple(TRIPLE, 3))
+def _stepped(p, q, m, d, w, s, t):
+    """Bonds and multipliers after a step d."""
+    (w0, w1, w2), (d0, d1, d2) = w, d
+    pulls = (p, (w0 + w1) * d0 + w1 * d2, w0 * d1 - w1 * d2), (q, w0 * d0 - w2 * d2, (w0 + w2) * d1 + w2 * d2)
+    p, q = (tuple(x + f * y + g * z for x, y, z in zip(bond, s, t, strict=True)) for bond, f, g in pulls)
+    return p, q, tuple(x + y for x, y in zip(m, d, strict=True))
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _move(points, velocities, inverse_dt, atoms, at, k, ax, ay, az, f, g, sx, sy, sz, tx, ty, tz, move, undo, saved):
-    """Move corner k of each triangle from a by f s + g t, and change its velocity."""
-    corner = at + k * WIDTH
-    x, y, z = f * sx + g * tx, f * sy + g * ty, f * sz + g * tz
-    scatter_points(points, atoms, corner, ax + x, ay + y, az + z)
-    if move:
-        ax, ay, az = keep_points(velocities, atoms, corner, undo, saved + (3 + k) * SAVED)
-        x, y, z = ax + x * inverse_dt, ay + y * inverse_dt, az + z * inverse_dt
-        scatter_points(velocities, atoms, corner, x, y, z)
+@arithmetic(types.UniTuple(TRIPLE, 3))
+def _shifts(m, w, s, t):
+    """How far the corners move."""
+    (m0, m1, m2), (w0, w1, w2) = m, w
+    factors = (w0 * m0, w0 * m1), (-w1 * (m0 + m2), w1 * m2), (w2 * m2, -w2 * (m1 + m2))
+    return tuple(tuple(f * x + g * y for x, y in zip(s, t, strict=True)) for f, g in factors)
 
 
-@njit(fastmath=FASTMATH, inline="always")
-def _report(multipliers, slots, place, sign, m0, m1, m2, sx, sy, sz, tx, ty, tz):
+@arithmetic(TRIPLE)
+def _unit_multipliers(sign, m, s, t):
     """Multipliers of unit gradients."""
-    ux, uy, uz = tx - sx, ty - sy, tz - sz
-    m0 = sign * m0 * square_root(dot(sx, sy, sz, sx, sy, sz))
-    m1 = sign * m1 * square_root(dot(tx, ty, tz, tx, ty, tz))
-    m2 = sign * m2 * square_root(dot(ux, uy, uz, ux, uy, uz))
-    scatter_points(multipliers, slots, place, m0, m1, m2)
+    return tuple(sign * x * _dot(b, b).unary("sqrt") for x, b in zip(m, (s, t, _minus(t, s)), strict=True))
+
+
+# Spliced into the loop as they stand: what is compiled apart is rounded otherwise, and takes longer.
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _small(e, l, factor):
+    limits = _times(l, factor)
+    return all_within(e[0], limits[0]) and all_within(e[1], limits[1]) and all_within(e[2], limits[2])
+
+
+@njit(fastmath=FASTMATH, inline="always")
+def _move(points, velocities, inverse_dt, atoms, corner, point, shift, move, undo, saved):
+    """Move a corner of each triangle, and change its velocity."""
+    scatter_points(points, atoms, corner, _plus(point, shift, 1.0))
+    if move:
+        velocity = keep_points(velocities, atoms, corner, undo, saved + 3 * SAVED)
+        scatter_points(velocities, atoms, corner, _plus(velocity, shift, inverse_dt))
 
 
 @njit(cache=True, fastmath=FASTMATH)
 def _project(tangent, points, references, velocities, inverse_dt, given, lattice, kind, tables, multipliers):
     """Project one group of eight triangles after another; `distance_clusters` says what the arguments are."""
-    t, h, u = tables, integers(tables), halves(tables)
-    atoms, slots = table_array(u, h, 0), table_array(u, h, 1)
-    inv_mass, undo = table_array(t, h, 2), table_array(t, h, _UNDO)
+    header, words = integers(tables), halves(tables)
+    atoms, slots = table_array(words, header, 0), table_array(words, header, 1)
+    inv_mass, undo = table_array(tables, header, 2), table_array(tables, header, _UNDO)
     move, report, driven = tangent is None and inverse_dt != 0.0, multipliers.shape[0] > 0, given.shape[0] > 0
     n_groups, cell = slots.shape[0] // WIDTH, lattice_numbers(lattice)
     # Arrays that are handed on inside the loop would cost reference counting.
     changed, moving, table, room = at_first(points), at_first(velocities), at_first(atoms), at_first(undo)
-    w0, w1, w2 = inv_mass[0], inv_mass[1], inv_mass[2]
-    w01, w02, w12 = w0 + w1, w0 + w2, w1 + w2
+    w, zero = (inv_mass[0], inv_mass[1], inv_mass[2]), splat(0.0)
     errors, sizes, worst, worst_at, most = np.empty(3 * WIDTH), np.empty(3 * WIDTH), 0.0, -1, 0
     # Points kept of a triangle, what residuals are counted in, and the sign of multipliers.
     kept_points, unit, sign = (2 * _CORNERS, 2.0, 1.0) if tangent is None else (_CORNERS, 1.0, -1.0)
     for group in range(n_groups):
         at, saved = group * 3 * WIDTH, kept_points * group * SAVED
-        # Reference bonds s, t; present bonds p, q; from atom 0 to 1 and to 2.
-        sx, sy, sz = gather_differences(references, atoms, at, at + WIDTH)
-        tx, ty, tz = gather_differences(references, atoms, at, at + 2 * WIDTH)
-        ax, ay, az = keep_points(points, atoms, at, undo, saved)
-        bx, by, bz = keep_points(points, atoms, at + WIDTH, undo, saved + SAVED)
-        cx, cy, cz = keep_points(points, atoms, at + 2 * WIDTH, undo, saved + 2 * SAVED)
-        px, py, pz = ax - bx, ay - by, az - bz
-        qx, qy, qz = ax - cx, ay - cy, az - cz
+        s = gather_differences(references, atoms, at, at + WIDTH)
+        t = gather_differences(references, atoms, at, at + 2 * WIDTH)
+        a = keep_points(points, atoms, at, undo, saved)
+        b = keep_points(points, atoms, at + WIDTH, undo, saved + SAVED)
+        c = keep_points(points, atoms, at + 2 * WIDTH, undo, saved + 2 * SAVED)
+        p, q = _difference(a, b), _difference(a, c)
         if kind != OPEN:
-            sx, sy, sz = minimum_image(sx, sy, sz, cell, kind)
-            tx, ty, tz = minimum_image(tx, ty, tz, cell, kind)
+            s, t = minimum_image(s, cell, kind), minimum_image(t, cell, kind)
             if tangent is None:
-                px, py, pz = minimum_image(px, py, pz, cell, kind)
-                qx, qy, qz = minimum_image(qx, qy, qz, cell, kind)
-        m0 = m1 = m2 = r0 = r1 = r2 = c00 = c01 = c02 = c10 = c11 = c12 = c20 = c21 = c22 = scale = splat(0.0)
-        # l: what the errors of the three rows are compared with.
+                p, q = minimum_image(p, cell, kind), minimum_image(q, cell, kind)
+        m = r = (zero, zero, zero)
+        factor, size = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero), zero
+        # What the errors of the three rows are compared with.
         if tangent is None:
-            l0, l1, l2 = gather_points(given, slots, group * WIDTH)
-            l0, l1, l2 = l0 * l0, l1 * l1, l2 * l2
+            l = _squared(gather_points(given, slots, group * WIDTH))
         else:
-            l0, l1, l2 = _products(sx, sy, sz, tx, ty, tz, sx, sy, sz, tx, ty, tz)
-            st = dot(sx, sy, sz, tx, ty, tz)
-            size = dot(px, py, pz, px, py, pz) + dot(qx, qy, qz, qx, qy, qz)
+            l, size = _products(s, t, s, t), _square(p) + _square(q)
             if driven:
-                r0, r1, r2 = gather_points(given, slots, group * WIDTH)
-                size = size + (r0 * r0 + r1 * r1 + r2 * r2)
-                r0, r1, r2 = r0 * square_root(l0), r1 * square_root(l1), r2 * square_root(l2)
+                r = gather_points(given, slots, group * WIDTH)
+                size, r = size + _square(r), _roots(l, r)
             size = size * (SPEED_TOLERANCE * SPEED_TOLERANCE)
-            factor = _tangent_factor(l0, l1, l2, st, w0, w1, w2, w01, w02, w12)
-            c00, c01, c02, c10, c11, c12, c20, c21, c22, scale = factor
+            factor = _tangent_factor(l, s, t, w)
         iteration, ok = 0, False
         while True:
             if tangent is None:
-                e0, e1, e2 = _length_errors(l0, l1, l2, px, py, pz, qx, qy, qz)
+                e = _length_errors(l, p, q)
                 if iteration >= 3:
-                    ok = _small(absolute(e0), absolute(e1), absolute(e2), l0, l1, l2, 2.0 * NEWTON_TOLERANCE)
+                    ok = _small(_absolute(e), l, 2.0 * NEWTON_TOLERANCE)
                     if ok or iteration == MAX_ITERATIONS:
                         break
                 # A factor serves two steps: Newton, then chord; order three for both.
                 if iteration % 2 == 0:
-                    factor = _position_factor(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz, w0, w1, w2, w01, w02, w12)
-                    c00, c01, c02, c10, c11, c12, c20, c21, c22, scale = factor
+                    factor = _position_factor(p, q, s, t, w)
             else:
-                ps, qt, us = _products(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz)
-                e0, e1, e2 = r0 - ps, r1 - qt, r2 - us
+                e = _difference(r, _products(p, q, s, t))
                 if iteration > 0:
-                    ok = _small(e0 * e0, e1 * e1, e2 * e2, l0, l1, l2, size)
+                    ok = _small(_squared(e), l, size)
                     if ok or iteration == MAX_ITERATIONS:
                         break
-            d0, d1, d2 = _product(c00, c01, c02, c10, c11, c12, c20, c21, c22, e0 * scale, e1 * scale, e2 * scale)
-            m0, m1, m2 = m0 + d0, m1 + d1, m2 + d2
-            px, py, pz = _pulled(px, py, pz, w01 * d0 + w1 * d2, w0 * d1 - w1 * d2, sx, sy, sz, tx, ty, tz)
-            qx, qy, qz = _pulled(qx, qy, qz, w0 * d0 - w2 * d2, w02 * d1 + w2 * d2, sx, sy, sz, tx, ty, tz)
+            p, q, m = _stepped(p, q, m, _solved(factor, e), w, s, t)
             iteration += 1
-        if tangent is None:
-            # A bond that turned round has found the wrong root.
-            ps, qt, us = _products(px, py, pz, qx, qy, qz, sx, sy, sz, tx, ty, tz)
-            e0, e1, e2 = absolute(e0), absolute(e1), absolute(e2)
-        else:
-            ps, qt, us, e0, e1, e2 = l0, l1, l2, e0 * e0, e1 * e1, e2 * e2
-        most, kept = max(most, iteration), all_within(TINY, ps) and all_within(TINY, qt) and all_within(TINY, us)
-        if not (ok and kept and _small(e0, e1, e2, l0, l1, l2, unit * worst)):
-            store_triple(errors, 0, e0, e1, e2)
-            store_triple(sizes, 0, unit * l0, unit * l1, unit * l2)
+        # A bond that turned round has found the wrong root.
+        inner, e = (_products(p, q, s, t), _absolute(e)) if tangent is None else (l, _squared(e))
+        most = iteration if iteration > most else most
+        kept = all_within(TINY, inner[0]) and all_within(TINY, inner[1]) and all_within(TINY, inner[2])
+        if not (ok and kept and _small(e, l, unit * worst)):
+            store_triple(errors, 0, e)
+            store_triple(sizes, 0, _times(l, unit))
             if ok and not kept:
-                store_triple(errors, 0, not_positive(ps), not_positive(qt), not_positive(us))
-                store_triple(sizes, 0, splat(1.0), splat(1.0), splat(1.0))
+                store_triple(errors, 0, (not_positive(inner[0]), not_positive(inner[1]), not_positive(inner[2])))
+                store_triple(sizes, 0, (splat(1.0), splat(1.0), splat(1.0)))
             worst, worst_at = worst_row(errors, sizes, 3, slots, group * WIDTH)
             if not (ok and kept):
                 restore_points(points, atoms, undo, group, _CORNERS, kept_points, _NONE)
                 if move:
                     restore_points(velocities, atoms, undo, group, _CORNERS, kept_points, _CORNERS)
                 return False, worst if tangent is None else np.sqrt(worst), most, worst_at
-        f0, g0, f1, g1, f2, g2 = w0 * m0, w0 * m1, -w1 * (m0 + m2), w1 * m2, w2 * m2, -w2 * (m1 + m2)
-        _move(changed, moving, inverse_dt, table, at, 0, ax, ay, az, f0, g0, sx, sy, sz, tx, ty, tz, move, room, saved)
-        _move(changed, moving, inverse_dt, table, at, 1, bx, by, bz, f1, g1, sx, sy, sz, tx, ty, tz, move, room, saved)
-        _move(changed, moving, inverse_dt, table, at, 2, cx, cy, cz, f2, g2, sx, sy, sz, tx, ty, tz, move, room, saved)
+        shifts = _shifts(m, w, s, t)
+        _move(changed, moving, inverse_dt, table, at, a, shifts[0], move, room, saved)
+        _move(changed, moving, inverse_dt, table, at + WIDTH, b, shifts[1], move, room, saved + SAVED)
+        _move(changed, moving, inverse_dt, table, at + 2 * WIDTH, c, shifts[2], move, room, saved + 2 * SAVED)
         if report:
-            _report(at_first(multipliers), at_first(slots), group * WIDTH, sign, m0, m1, m2, sx, sy, sz, tx, ty, tz)
+            scatter_points(at_first(multipliers), at_first(slots), group * WIDTH, _unit_multipliers(sign, m, s, t))
     return True, worst if tangent is None else np.sqrt(worst), most, worst_at
 
 

@@ -129,11 +129,11 @@ def _move_points(points, velocities, inverse_dt, atoms, at, weights, shifts, n_l
         dx, dy, dz = _point(shifts, a)
         dx, dy, dz = w * dx, w * dy, w * dz
         x, y, z = keep_points(points, atoms, i, undo, saved + a * SAVED)
-        scatter_points(points, atoms, i, x + dx, y + dy, z + dz)
+        scatter_points(points, atoms, i, (x + dx, y + dy, z + dz))
         if move:
             x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * SAVED)
             x, y, z = x + dx * inverse_dt, y + dy * inverse_dt, z + dz * inverse_dt
-            scatter_points(velocities, atoms, i, x, y, z)
+            scatter_points(velocities, atoms, i, (x, y, z))
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
@@ -159,9 +159,9 @@ def _begin(
         x, y, z = gather_differences(references, atoms, i, j)
         a, b, c = gather_differences(points, atoms, i, j)
         if kind != OPEN:
-            x, y, z = minimum_image(x, y, z, cell, kind)
+            x, y, z = minimum_image((x, y, z), cell, kind)
             if tangent is None:
-                a, b, c = minimum_image(a, b, c, cell, kind)
+                a, b, c = minimum_image((a, b, c), cell, kind)
         _set_point(s, k, x, y, z)
         _set_point(r, k, a, b, c)
         poke(sums, k, splat(0.0))

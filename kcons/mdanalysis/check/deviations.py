@@ -335,7 +335,7 @@ def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untype
                 dx, dy, dz, power = gather_ends(quads, offsets, 2 * r, 2 * r + WIDTH)
                 square = dx * dx + dy * dy + dz * dz
                 if not all_within(square, limit):
-                    dx, dy, dz = minimum_image(dx, dy, dz, cell, TRICLINIC)
+                    dx, dy, dz = minimum_image((dx, dy, dz), cell, TRICLINIC)
                     square = dx * dx + dy * dy + dz * dz
                 off = square_root(square) - load(targets, r)
                 rounding = power * (_ROOT_THREE * factor) + 2.0 * _ROOT_THREE * base

@@ -53,9 +53,7 @@ def instruction(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]
 
             def codegen(context, builder, sig, values):
                 found = emit(builder, *map(functools.partial(first_of, context, builder), sig.args, values))
-                if isinstance(found, list):
-                    return context.make_tuple(builder, sig.return_type, found)
-                return context.get_dummy_value() if found is None else found
+                return context.get_dummy_value() if found is None else _packed(context, builder, sig.return_type, found)
 
             return result(*taken), codegen
 
@@ -66,6 +64,78 @@ def instruction(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]
         return intrinsic(functools.wraps(emit, ("__module__", "__name__", "__qualname__", "__doc__"), ())(function))
 
     return made
+
+
+def arithmetic(result: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Make a Numba intrinsic of a function that only computes with numbers and tuples of them.
+
+    LLVM's instructions are written as the function runs once: Numba would take each operation for itself, which takes
+    ten times as long. `result` is the type of what it returns, or what gives the signature for kinds of arguments.
+    """
+
+    def made(function: Callable[..., Any]) -> Any:
+        def emit(builder, *values):
+            found = function(*(_terms(builder, value) for value in values))
+            return _values(found)
+
+        names = list(inspect.signature(function).parameters.values())
+        emit.__signature__ = inspect.Signature([names[0].replace(name="builder"), *names])  # type: ignore[attr-defined]
+        functools.update_wrapper(emit, function, updated=()).__dict__.pop("__wrapped__")
+        return instruction(lambda *kinds: result(*kinds), *(None,) * len(names))(emit)
+
+    return made
+
+
+def _terms(builder: Any, value: Any) -> Any:
+    """A value of LLVM, or the values in it, to compute with."""
+    if isinstance(value.type, ir.ArrayType):
+        return tuple(_terms(builder, each) for each in unpacked(builder, value))
+    return _Term(builder, value)
+
+
+def _values(found: Any) -> Any:
+    return [_values(each) for each in found] if isinstance(found, tuple) else found.value
+
+
+def unpacked(builder: Any, value: Any) -> list[Any]:
+    """What is in a tuple of equal kinds."""
+    return [builder.extract_value(value, k) for k in range(value.type.count)]
+
+
+def _packed(context: Any, builder: Any, kind: Any, found: Any) -> Any:
+    if not isinstance(found, list):
+        return found
+    entries = [_packed(context, builder, *each) for each in zip(kind.types, found, strict=True)]
+    return context.make_tuple(builder, kind, entries)
+
+
+class _Term:
+    """A double or a vector of LLVM; + - * / with another, or with a number, make the next."""
+
+    def __init__(self, builder: Any, value: Any) -> None:
+        self.builder, self.value = builder, value
+
+    def _with(self, other: Any, name: str, swap: bool = False) -> _Term:
+        pair = [self.value, other.value if isinstance(other, _Term) else DOUBLE(float(other))]
+        width = next((value.type.count for value in pair if value.type != DOUBLE), 0)
+        first, last = [vectors(width).splat(self.builder, value) for value in pair] if width else pair
+        return _Term(
+            self.builder, getattr(self.builder, name)(*((last, first) if swap else (first, last)), flags=FLAGS)
+        )
+
+    def unary(self, name: str) -> _Term:
+        """The function that LLVM calls `name`, such as 'sqrt'."""
+        width = f"v{self.value.type.count}" if self.value.type != DOUBLE else ""
+        return _Term(self.builder, call(self.builder, f"llvm.{name}.{width}f64", self.value.type, [self.value]))
+
+    def __neg__(self) -> _Term:
+        return _Term(self.builder, self.builder.fneg(self.value, flags=FLAGS))
+
+
+for _operator, _name in _INSTRUCTIONS:
+    for _prefix in ("__", "__r"):
+        _method = functools.partialmethod(_Term._with, name=_name, swap=_prefix == "__r")
+        setattr(_Term, f"{_prefix}{_operator.__name__}__", _method)
 
 
 def first_of(context: Any, builder: Any, kind: Any, value: Any) -> Any:
@@ -172,13 +242,6 @@ def call(builder: Any, name: str, result: Any, args: Any) -> Any:
     """Call an LLVM intrinsic."""
     function_type = ir.FunctionType(result, [a.type for a in args])
     return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), args)
-
-
-@instruction(lambda value: value(value), None)
-def nearest(builder, value):
-    """The nearest whole number: of a double, or of each of some."""
-    width = f"v{value.type.count}" if isinstance(value.type, ir.VectorType) else ""
-    return call(builder, f"llvm.rint.{width}f64", value.type, [value])
 
 
 def masked_point(builder: Any, at: Any) -> Any:

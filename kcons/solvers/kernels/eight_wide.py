@@ -20,6 +20,7 @@ from kcons.solvers.kernels.any_width import (
     masked_point,
     place,
     shuffle,
+    unpacked,
     vectors,
 )
 
@@ -31,7 +32,7 @@ FASTMATH = set(FLAGS)
 _EIGHT = vectors(WIDTH)
 lanes_type = _EIGHT.kind
 _VECTOR = _EIGHT.llvm
-_TRIPLE = types.UniTuple(lanes_type, 3)
+TRIPLE = types.UniTuple(lanes_type, 3)
 load, store = _EIGHT.load, _EIGHT.store
 _ZERO = ir.Constant(_VECTOR, [0.0] * WIDTH)
 
@@ -42,7 +43,7 @@ def splat(builder, value):
     return _EIGHT.splat(builder, value)
 
 
-@instruction(_TRIPLE, None, types.int64)
+@instruction(TRIPLE, None, types.int64)
 def load_triple(builder, array, start):
     """Three vectors one after another in a flat float64 array."""
     base = place(builder, array, start, _VECTOR)
@@ -55,10 +56,10 @@ def _store_triple(builder: Any, array: Any, start: Any, triple: Any) -> None:
         builder.store(vector, builder.gep(base, [INT64(k)]), align=8)
 
 
-@instruction(types.void, None, types.int64, *(lanes_type,) * 3)
-def store_triple(builder, array, start, x, y, z):
+@instruction(types.void, None, types.int64, TRIPLE)
+def store_triple(builder, array, start, triple):
     """Inverse of `load_triple`."""
-    _store_triple(builder, array, start, (x, y, z))
+    _store_triple(builder, array, start, unpacked(builder, triple))
 
 
 def _places(builder: Any, array: Any, table: Any, start: Any, shift: Any = None) -> list[Any]:
@@ -108,13 +109,13 @@ def scatter(builder, array, table, start, shift, value):
         builder.store(builder.extract_element(value, INT32(lane)), at, align=8)
 
 
-@instruction(_TRIPLE, None, None, types.int64)
+@instruction(TRIPLE, None, None, types.int64)
 def gather_points(builder, points, table, start):
     """Coordinates (x, y, z) of the points at the offsets ``table[start + lane]``."""
     return _columns(builder, _load_rows(builder, points, table, start))
 
 
-@instruction(_TRIPLE, None, None, types.int64, None, types.int64)
+@instruction(TRIPLE, None, None, types.int64, None, types.int64)
 def keep_points(builder, points, table, start, undo, saved):
     """`gather_points`, with a copy of the three vectors from ``undo[saved]`` on."""
     columns = _columns(builder, _load_rows(builder, points, table, start))
@@ -122,7 +123,7 @@ def keep_points(builder, points, table, start, undo, saved):
     return columns
 
 
-@instruction(_TRIPLE, None, None, types.int64, types.int64)
+@instruction(TRIPLE, None, None, types.int64, types.int64)
 def gather_differences(builder, points, table, start, other):
     """Coordinates of the points at `start` minus those at `other`."""
     left, right = (_load_rows(builder, points, table, at) for at in (start, other))
@@ -145,10 +146,10 @@ def gather_ends(builder, quads, table, start, other):
     return _columns(builder, rows, (2, 3))
 
 
-@instruction(types.void, None, None, types.int64, *(lanes_type,) * 3)
-def scatter_points(builder, points, table, start, x, y, z):
+@instruction(types.void, None, None, types.int64, TRIPLE)
+def scatter_points(builder, points, table, start, found):
     """Inverse of `gather_points`; lanes that repeat a point must agree."""
-    rows = _rows(builder, x, y, z)
+    rows = _rows(builder, *unpacked(builder, found))
     for at, row in zip(_places(builder, points, table, start), rows, strict=True):
         front = shuffle(builder, row, row, [0, 1])
         builder.store(front, builder.bitcast(at, ir.PointerType(front.type)), align=8)

@@ -4,10 +4,11 @@ A lattice is the cell (rows) and its inverse, shape (2, 3, 3).
 """
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit
-from kcons.solvers.kernels.any_width import nearest
+from kcons.solvers.kernels.any_width import INT64, arithmetic, instruction, place
 from kcons.solvers.kernels.eight_wide import FASTMATH
 
 #: Stands for 'no periodicity' where a kernel needs an array of the right type.
@@ -26,36 +27,29 @@ def lattice_kind(lattice: NDArray[np.float64] | None) -> tuple[NDArray[np.float6
     return lattice, ORTHORHOMBIC if diagonal else TRICLINIC
 
 
+@instruction(types.UniTuple(types.float64, 18), None)
+def lattice_numbers(builder, lattice):
+    """Cell and inverse as plain numbers: an array handed to a function in a loop costs reference counting."""
+    return [builder.load(place(builder, lattice, INT64(k))) for k in range(18)]
+
+
+@arithmetic(lambda r, numbers: r(r, numbers))
+def _orthorhombic(r, numbers):
+    return tuple(x - (x * numbers[k + 9]).unary("rint") * numbers[k] for x, k in zip(r, (0, 4, 8), strict=True))
+
+
+@arithmetic(lambda r, numbers: r(r, numbers))
+def _triclinic(r, numbers):
+    (x, y, z), (a, b, c, p, q, s) = r, (numbers[k : k + 3] for k in range(0, 18, 3))
+    i, j, k = ((x * p[n] + y * q[n] + z * s[n]).unary("rint") for n in range(3))
+    return tuple(r[n] - (i * a[n] + j * b[n] + k * c[n]) for n in range(3))
+
+
 @njit(fastmath=FASTMATH, forceinline=True)
-def lattice_numbers(lattice):
-    """Cell and inverse as plain numbers.
-
-    An array handed to a function inside a loop costs reference counting,
-    and a call there makes every vector register spill.
-    """
-    return (
-        (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
-        (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
-        (lattice[0, 2, 0], lattice[0, 2, 1], lattice[0, 2, 2]),
-        (lattice[1, 0, 0], lattice[1, 0, 1], lattice[1, 0, 2]),
-        (lattice[1, 1, 0], lattice[1, 1, 1], lattice[1, 1, 2]),
-        (lattice[1, 2, 0], lattice[1, 2, 1], lattice[1, 2, 2]),
-    )
-
-
-@njit(fastmath=FASTMATH, forceinline=True)
-def minimum_image(x, y, z, cell, kind):
-    """Shortest periodic copy of a bond shorter than half the cell."""
-    a, b, c, p, q, r = cell
+def minimum_image(r, numbers, kind):
+    """Shortest periodic copy of a bond (x, y, z) shorter than half the cell."""
     if kind == ORTHORHOMBIC:
-        x = x - nearest(x * p[0]) * a[0]
-        y = y - nearest(y * q[1]) * b[1]
-        z = z - nearest(z * r[2]) * c[2]
+        r = _orthorhombic(r, numbers)
     elif kind == TRICLINIC:
-        i = nearest(x * p[0] + y * q[0] + z * r[0])
-        j = nearest(x * p[1] + y * q[1] + z * r[1])
-        k = nearest(x * p[2] + y * q[2] + z * r[2])
-        x = x - (i * a[0] + j * b[0] + k * c[0])
-        y = y - (i * a[1] + j * b[1] + k * c[1])
-        z = z - (i * a[2] + j * b[2] + k * c[2])
-    return x, y, z
+        r = _triclinic(r, numbers)
+    return r

@@ -240,7 +240,7 @@ def _couplings(start, columns, ends, w):
 
 @njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _image(vector, cell):
-    x, y, z = minimum_image(extract(vector, 0), extract(vector, 1), extract(vector, 2), cell, TRICLINIC)
+    x, y, z = minimum_image((extract(vector, 0), extract(vector, 1), extract(vector, 2)), cell, TRICLINIC)
     return quad(x, y, z, 0.0)
 
 

@@ -180,7 +180,7 @@ def near(whole, change, cell, periodic):
     # No arrays come here: one that passes a branch costs reference counting.
     x, y, z = extract(whole, 0), extract(whole, 1), extract(whole, 2)
     if periodic:
-        x, y, z = minimum_image(x, y, z, cell, TRICLINIC)
+        x, y, z = minimum_image((x, y, z), cell, TRICLINIC)
     return x + extract(change, 0), y + extract(change, 1), z + extract(change, 2)
 
 
