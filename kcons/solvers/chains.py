@@ -15,11 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
-from kcons.solvers.distance_clusters import dot, resolved
+from kcons.solvers.distance_clusters import dot, minus, resolved, times
 from kcons.solvers.kernels.aligned_memory import aligned, in_one_array, room
+from kcons.solvers.kernels.any_width import arithmetic
 from kcons.solvers.kernels.array_views import at_first, halves, integers, octets, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
+    TRIPLE,
     WIDTH,
     absolute,
     all_within,
@@ -93,20 +95,30 @@ def _reduce(small, upward):
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
-def _length_error(rx, ry, rz, sx, sy, sz, square, real):
+def _length_error(r, s, square, real):
     """Right-hand side, gradient product, the same where there is a bond, relative residual."""
-    error = 0.5 * (square - dot(rx, ry, rz, rx, ry, rz) * real)
-    inner = dot(rx, ry, rz, sx, sy, sz)
+    error = 0.5 * (square - dot(r, r) * real)
+    inner = dot(r, s)
     return error, inner, where_zero(real, 1.0, inner), absolute(error) / where_zero(real, 1.0, square)
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
-def _rate_error(rx, ry, rz, sx, sy, sz, rate, real):
+def _rate_error(r, s, rate, real):
     """The same for relative velocities r; the residual is that along the unit bond."""
-    error = rate - dot(rx, ry, rz, sx, sy, sz)
-    inner = dot(sx, sy, sz, sx, sy, sz)
+    error = rate - dot(r, s)
+    inner = dot(s, s)
     positive = where_zero(real, 1.0, inner)
     return error, inner, positive, absolute(error) / square_root(positive)
+
+
+@arithmetic(TRIPLE)
+def _less(d, w, s, pull, p, before):
+    return tuple(x - w * (y * pull - z * before) for x, y, z in zip(d, s, p, strict=True))
+
+
+@arithmetic(TRIPLE)
+def _added(r, factor, a, b):
+    return tuple(x + factor * (y - z) for x, y, z in zip(r, a, b, strict=True))
 
 
 @njit(fastmath=FASTMATH)
@@ -134,24 +146,23 @@ def _first_bad(work, present, first, n_slots, tangent):
 
 
 @njit(fastmath=FASTMATH, inline="always")
-def _next_bond(points, atoms, at, ax, ay, az, cell, kind, wrapped):
+def _next_bond(points, atoms, at, a, cell, kind, wrapped):
     """The bond from the atoms a to those at `at`, and these."""
-    bx, by, bz = gather_points(points, atoms, at)
-    nx, ny, nz = ax - bx, ay - by, az - bz
+    b = gather_points(points, atoms, at)
+    n = minus(a, b)
     if kind != OPEN and wrapped:
-        nx, ny, nz = minimum_image((nx, ny, nz), cell, kind)
-    return nx, ny, nz, bx, by, bz
+        n = minimum_image(n, cell, kind)
+    return n, b
 
 
 @njit(fastmath=FASTMATH, inline="always")
 def _seam_bond(points, atoms, first, end, real, cell, kind, wrapped):
     """The separators, from the last atoms of the lanes to the first ones of the next, and the first atoms."""
-    ax, ay, az = gather_points(points, atoms, first)
-    bx, by, bz = gather_points(points, atoms, end)
-    zx, zy, zz = (bx - from_next(ax)) * real, (by - from_next(ay)) * real, (bz - from_next(az)) * real
+    a = gather_points(points, atoms, first)
+    z = times(minus(gather_points(points, atoms, end), from_next(a)), real)
     if kind != OPEN and wrapped:
-        zx, zy, zz = minimum_image((zx, zy, zz), cell, kind)
-    return zx, zy, zz, ax, ay, az
+        z = minimum_image(z, cell, kind)
+    return z, a
 
 
 @njit(fastmath=FASTMATH, inline="always")
@@ -172,15 +183,6 @@ def _add_up(work, slot, iteration, pull):
 
 
 @njit(fastmath=FASTMATH, inline="always")
-def _displacement(weight, nx, ny, nz, next_pull, sx, sy, sz, pull):
-    """Of the atom between two rows."""
-    ox = weight * product_difference(nx, next_pull, sx, pull)
-    oy = weight * product_difference(ny, next_pull, sy, pull)
-    oz = weight * product_difference(nz, next_pull, sz, pull)
-    return ox, oy, oz
-
-
-@njit(fastmath=FASTMATH, inline="always")
 def _judged(least, total, peak, peak_slot, positive, ratio, slot):
     """What is known of all rows of a sweep, with one row more."""
     least = where_greater(least, positive, positive, least)
@@ -191,25 +193,25 @@ def _judged(least, total, peak, peak_slot, positive, ratio, slot):
 
 
 @njit(fastmath=FASTMATH, inline="always")
-def _opened(work, slot, rx, ry, rz, sx, sy, sz, target, scale, tangent):
+def _opened(work, slot, r, s, target, scale, tangent):
     """Keep the bond of a row and what is wanted of it; returns this, and squares added up."""
-    scale = scale + (dot(rx, ry, rz, rx, ry, rz) + target * target)
-    target = target * (square_root(dot(sx, sy, sz, sx, sy, sz)) if tangent is not None else target)
-    store_triple(work, slot + _S, (sx, sy, sz))
+    scale = scale + (dot(r, r) + target * target)
+    target = target * (square_root(dot(s, s)) if tangent is not None else target)
+    store_triple(work, slot + _S, s)
     store(work, slot + _TARGET, target)
     return target, scale
 
 
 @njit(fastmath=FASTMATH, inline="always")
-def _measured(work, slot, rx, ry, rz, sx, sy, sz, target, real, tangent):
+def _measured(work, slot, r, s, target, real, tangent):
     """Keep r; its errors, and the gradient along it."""
-    store_triple(work, slot + _R, (rx, ry, rz))
+    store_triple(work, slot + _R, r)
     if tangent is not None:
-        error, inner, positive, ratio = _rate_error(rx, ry, rz, sx, sy, sz, target, real)
-        rx, ry, rz = sx, sy, sz
+        error, inner, positive, ratio = _rate_error(r, s, target, real)
+        r = s
     else:
-        error, inner, positive, ratio = _length_error(rx, ry, rz, sx, sy, sz, target, real)
-    return error, inner, positive, ratio, rx, ry, rz
+        error, inner, positive, ratio = _length_error(r, s, target, real)
+    return error, inner, positive, ratio, r
 
 
 @njit(fastmath=FASTMATH, inline="always")
@@ -226,55 +228,55 @@ def _eliminated(work, slot, masses, lower, inner, error, leave, onward, right, a
 @njit(fastmath=FASTMATH, inline="always")
 def _sweep(
     origins, changed, table, rows, present, weights, given, room, cell, kind, tangent, driven, n_rows, whole, iteration,
-    way, p, behind, q, final, s, pull, e, weight, b, d, v, count, scale,
+    way, p, q, final, s, pull, e, weight, b, d, v, count, scale,
 ):  # fmt: skip
     """One row after another, from one separator to the next; what they add to these, and what is known of them."""
     slot, stride, atom, step, onward = way
-    (px, py, pz), (qx, qy, qz), (sx, sy, sz), (ex, ey, ez) = p, q, s, e
-    (bx, by, bz), (dx, dy, dz), (vx, vy, vz) = b, d, v
     opening, zero, one = iteration == 0, splat(0.0), splat(1.0)
     right, ahead, aside = zero, zero, splat(-1.0)
     to_head, head_diagonal, head_right = one, zero, zero
     least, total, peak, peak_slot = one, zero, splat(-1.0), zero
     for row in range(n_rows):
-        nx, ny, nz, next_pull = qx, qy, qz, final
+        n, next_pull = q, final
         if opening:
-            rx, ry, rz = vx, vy, vz
+            r = v
             real = load(present, atom)
             target = gather(given, rows, atom, 0) * real if driven else zero
             count = count + real
-            target, scale = _opened(room, slot, rx, ry, rz, sx, sy, sz, target, scale, tangent)
+            target, scale = _opened(room, slot, r, s, target, scale, tangent)
             if row + 1 < n_rows:
-                at, wrapped = atom + 2 * WIDTH, tangent is None
-                nx, ny, nz, bx, by, bz = _next_bond(origins, table, at, bx, by, bz, cell, kind, True)
-                vx, vy, vz, dx, dy, dz = _next_bond(changed, table, at, dx, dy, dz, cell, kind, wrapped)
+                n, b = _next_bond(origins, table, atom + 2 * WIDTH, b, cell, kind, True)
+                v, d = _next_bond(changed, table, atom + 2 * WIDTH, d, cell, kind, tangent is None)
         else:
-            rx, ry, rz = load_triple(room, slot + _R)
+            r = load_triple(room, slot + _R)
             target = load(room, slot + _TARGET)
             _add_up(room, slot, iteration, pull)
             real = one if atom < whole else load(present, atom)
             if row + 1 < n_rows:
-                nx, ny, nz = load_triple(room, slot + stride + _S)
+                n = load_triple(room, slot + stride + _S)
                 next_pull = _pull_of(room, slot + stride, pull, final)
         leave = load(weights, atom + onward)
-        ox, oy, oz = _displacement(leave, nx, ny, nz, next_pull, sx, sy, sz, pull)
-        error, inner, positive, ratio, rx, ry, rz = _measured(
-            room, slot, rx + (ex - ox), ry + (ey - oy), rz + (ez - oz), sx, sy, sz, target, real, tangent
-        )
+        o = times(product_difference(n, next_pull, s, pull), leave)
+        error, inner, positive, ratio, r = _measured(room, slot, _added(r, 1.0, e, o), s, target, real, tangent)
         least, total, peak, peak_slot = _judged(least, total, peak, peak_slot, positive, ratio, slot)
         right, ahead, aside = _eliminated(
-            room, slot, (weight + leave) * real, weight * dot(rx, ry, rz, px, py, pz), inner, error,
-            leave, dot(rx, ry, rz, nx, ny, nz), right, ahead, aside,
-        )  # fmt: skip
+            room, slot, (weight + leave) * real, weight * dot(r, p), inner, error, leave, dot(r, n), right, ahead, aside
+        )
         head_diagonal = head_diagonal + to_head * aside
         head_right = head_right + to_head * right
         to_head = flushed(-to_head * ahead)
-        px, py, pz, sx, sy, sz, pull = sx, sy, sz, nx, ny, nz, next_pull
-        ex, ey, ez, weight = ox, oy, oz, leave
+        p, s, pull, e, weight = s, n, next_pull, o, leave
         slot += stride
         atom += step
-    added = head_diagonal, head_right, to_head, ahead, right, aside
-    return added, (px, py, pz, ex, ey, ez, weight), (least, total, peak, peak_slot), count, scale
+    return (
+        (head_diagonal, head_right, to_head, ahead, right, aside),
+        p,
+        e,
+        weight,
+        (least, total, peak, peak_slot),
+        count,
+        scale,
+    )
 
 
 @njit(fastmath=FASTMATH, error_model="numpy")
@@ -295,56 +297,43 @@ def _solve(
     numbers, exists, heavy, goals = at_first(rows), at_first(present), at_first(weights), at_first(given)
     # The separators, and the bond that the first sweep begins with.
     real = load(present, end)
-    zx, zy, zz, ax, ay, az = _seam_bond(origins, table, first, end, real, cell, kind, True)
-    ux, uy, uz, bx, by, bz = _next_bond(origins, table, first + WIDTH, ax, ay, az, cell, kind, True)
-    cx, cy, cz, ax, ay, az = _seam_bond(changed, table, first, end, real, cell, kind, tangent is None)
-    vx, vy, vz, dx, dy, dz = _next_bond(changed, table, first + WIDTH, ax, ay, az, cell, kind, tangent is None)
-    store_triple(work, seam + _R, (cx, cy, cz))
+    z, a = _seam_bond(origins, table, first, end, real, cell, kind, True)
+    u, b = _next_bond(origins, table, first + WIDTH, a, cell, kind, True)
+    c, a = _seam_bond(changed, table, first, end, real, cell, kind, tangent is None)
+    v, d = _next_bond(changed, table, first + WIDTH, a, cell, kind, tangent is None)
+    store_triple(work, seam + _R, c)
     count, seam_target = real, gather(given, rows, end, 0) * real if driven else zero
-    seam_target, scale = _opened(room, seam, cx, cy, cz, zx, zy, zz, seam_target, zero, tangent)
+    seam_target, scale = _opened(room, seam, c, z, seam_target, zero, tangent)
 
     pulls, ok, finite, iteration, least, peak, peak_slot = zero, False, False, 0, zero, zero, zero
     for iteration in range(MAX_ITERATIONS + 1):
         opening, upward = iteration == 0, iteration % 2 == 0
         # At first, what lies before a row is a separator; after the last row there is one again.
-        px, py, pz, behind = from_previous(zx), from_previous(zy), from_previous(zz), from_previous(pulls)
-        qx, qy, qz, final = zx, zy, zz, pulls
+        p, behind, q, final = from_previous(z), from_previous(pulls), z, pulls
         slot, stride, atom, step, onward = 0, SLOT, first, WIDTH, WIDTH
         if not upward:
-            px, py, pz, behind, qx, qy, qz, final = qx, qy, qz, final, px, py, pz, behind
+            p, behind, q, final = q, final, p, behind
             slot, stride, atom, step, onward = seam - SLOT, -SLOT, end - WIDTH, -WIDTH, 0
         sign = 1.0 if upward else -1.0
         if opening:
-            sx, sy, sz, pull = ux, uy, uz, zero
+            s, pull = u, zero
         else:
-            sx, sy, sz = load_triple(work, slot + _S)
+            s = load_triple(work, slot + _S)
             pull = _pull_of(room, slot, behind, final)
-        weight = load(weights, atom + WIDTH - onward)
-        head_weight, hx, hy, hz = weight, sx, sy, sz
+        head_weight = load(weights, atom + WIDTH - onward)
         # Displacement, times sign, of the atom between two rows.
-        ex, ey, ez = _displacement(weight, sx, sy, sz, pull, px, py, pz, behind)
-        fx, fy, fz = ex, ey, ez
-        (
-            (head_diagonal, head_right, to_head, ahead, right, aside), (px, py, pz, ex, ey, ez, weight),
-            (least, total, peak, peak_slot), count, scale,
-        ) = _sweep(
+        h, f = s, times(product_difference(s, pull, p, behind), head_weight)
+        added, p, e, weight, (least, total, peak, peak_slot), count, scale = _sweep(
             origins, changed, table, numbers, exists, heavy, goals, room, cell, kind, tangent, driven, n_rows, whole,
-            iteration, (slot, stride, atom, step, onward), (px, py, pz), behind, (qx, qy, qz), final, (sx, sy, sz),
-            pull, (ex, ey, ez), weight, (bx, by, bz), (dx, dy, dz), (vx, vy, vz), count, scale,
+            iteration, (slot, stride, atom, step, onward), p, q, final, s, pull, f, head_weight, b, d, v, count, scale,
         )  # fmt: skip
+        head_diagonal, head_right, to_head, ahead, right, aside = added
         # The separators: move, measure, and add what the pieces pass on.
-        real = load(present, end) * sign
-        rx, ry, rz = load_triple(work, seam + _R)
-        if upward:
-            gx, gy, gz, fx, fy, fz = ex, ey, ez, from_next(fx), from_next(fy), from_next(fz)
-        else:
-            gx, gy, gz, fx, fy, fz = fx, fy, fz, from_next(ex), from_next(ey), from_next(ez)
-        rx, ry, rz = rx + real * (gx - fx), ry + real * (gy - fy), rz + real * (gz - fz)
+        g, f = (e, from_next(f)) if upward else (f, from_next(e))
+        r = _added(load_triple(work, seam + _R), load(present, end) * sign, g, f)
         _add_up(room, seam, iteration, pulls)
         real = load(present, end)
-        error, inner, positive, ratio, rx, ry, rz = _measured(
-            room, seam, rx, ry, rz, zx, zy, zz, seam_target, real, tangent
-        )
+        error, inner, positive, ratio, r = _measured(room, seam, r, z, seam_target, real, tangent)
         least, total, peak, peak_slot = _judged(least, total, peak, peak_slot, positive, ratio, seam)
         if tangent is not None and opening:
             limit = limit * np.sqrt(lane_sum(scale, small) / lane_sum(count, small))
@@ -357,11 +346,8 @@ def _solve(
             break
         masses = (load(weights, end) + from_next(load(weights, first))) * real
         # Couplings of the rows at both ends of a lane: A(head, first), A(tail, last).
-        gx, gy, gz = from_previous(rx), from_previous(ry), from_previous(rz)
-        if upward:
-            rx, ry, rz, gx, gy, gz = gx, gy, gz, rx, ry, rz
-        head = -head_weight * dot(rx, ry, rz, hx, hy, hz)
-        tail = -weight * dot(gx, gy, gz, px, py, pz)
+        g, r = (r, from_previous(r)) if upward else (from_previous(r), r)
+        head, tail = -head_weight * dot(r, h), -weight * dot(g, p)
         store(small, 0, where_zero(masses, 1.0, masses * inner))
         store(small, WIDTH, error)
         store_triple(small, 2 * WIDTH, (-head * head_diagonal, -head * head_right, head * to_head))
@@ -388,42 +374,34 @@ def _shift(points, velocities, inverse_dt, atoms, owned, full, weights, work, fi
     much larger than displacements, and the later solves corrected just this rounding.
     """
     seam = (n_slots - 1) * SLOT
-    px, py, pz = load_triple(work, seam + _S)
-    px, py, pz = from_previous(px), from_previous(py), from_previous(pz)
-    p, later_p = from_previous(load(work, seam + _FIRST)), splat(0.0)
+    p = from_previous(load_triple(work, seam + _S))
+    before, later_before = from_previous(load(work, seam + _FIRST)), splat(0.0)
     if solves > 1:
-        later_p = from_previous(load(work, seam + _LATER))
+        later_before = from_previous(load(work, seam + _LATER))
     later = splat(0.0)
     for t in range(n_slots):
         at, slot = first + t * WIDTH, t * SLOT
-        sx, sy, sz = load_triple(work, slot + _S)
+        s = load_triple(work, slot + _S)
         now, w = load(work, slot + _FIRST), load(weights, at)
-        dx = w * product_difference(px, p, sx, now)
-        dy = w * product_difference(py, p, sy, now)
-        dz = w * product_difference(pz, p, sz, now)
+        d = times(product_difference(p, before, s, now), w)
         if solves > 1:
             later = load(work, slot + _LATER)
-            dx = dx - w * (sx * later - px * later_p)
-            dy = dy - w * (sy * later - py * later_p)
-            dz = dz - w * (sz * later - pz * later_p)
-        px, py, pz, p, later_p = sx, sy, sz, now, later
-        x, y, z = gather_points(points, atoms, at)
-        vx, vy, vz = x, y, z
-        if move:
-            vx, vy, vz = gather_points(velocities, atoms, at)
+            d = _less(d, w, s, later, p, later_before)
+        p, before, later_before = s, now, later
+        x = gather_points(points, atoms, at)
+        v = gather_points(velocities, atoms, at) if move else x
         if keep:
-            store_triple(undo, 6 * at, (x, y, z))
-            store_triple(undo, 6 * at + 3 * WIDTH, (vx, vy, vz))
-        x, y, z = x - dx, y - dy, z - dz
-        vx, vy, vz = vx - dx * inverse_dt, vy - dy * inverse_dt, vz - dz * inverse_dt
+            store_triple(undo, 6 * at, x)
+            store_triple(undo, 6 * at + 3 * WIDTH, v)
+        x, v = minus(x, d), minus(v, times(d, inverse_dt))
         if full[at // WIDTH]:
-            scatter_points(points, atoms, at, (x, y, z))
+            scatter_points(points, atoms, at, x)
             if move:
-                scatter_points(velocities, atoms, at, (vx, vy, vz))
+                scatter_points(velocities, atoms, at, v)
         else:
             # Slots beyond a chain's end repeat its last atom; only its own slot writes it.
-            store_triple(work, slot + _R, (x, y, z))
-            store_triple(work, slot + _RIGHT, (vx, vy, vz))
+            store_triple(work, slot + _R, x)
+            store_triple(work, slot + _RIGHT, v)
             for lane in range(WIDTH):
                 if owned[at + lane]:
                     target = atoms[at + lane] // 3
@@ -438,8 +416,7 @@ def _restore(points, atoms, undo, end, first):
     """Write back what `_shift` kept of the slots before `end`."""
     # Backwards: a slot that repeats an atom kept it as it was after its own slot.
     for at in range(end - WIDTH, -WIDTH, -WIDTH):
-        x, y, z = load_triple(undo, 6 * at + first)
-        scatter_points(points, atoms, at, (x, y, z))
+        scatter_points(points, atoms, at, load_triple(undo, 6 * at + first))
 
 
 @njit(fastmath=FASTMATH)
@@ -489,11 +466,9 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
             )  # fmt: skip
         elif strip < last:
             for at in range(first, starts[strip + 1], WIDTH):
-                x, y, z = gather_points(points, atoms, at)
-                store_triple(undo, 6 * at, (x, y, z))
+                store_triple(undo, 6 * at, gather_points(points, atoms, at))
                 if move:
-                    x, y, z = gather_points(velocities, atoms, at)
-                store_triple(undo, 6 * at + 3 * WIDTH, (x, y, z))
+                    store_triple(undo, 6 * at + 3 * WIDTH, gather_points(velocities, atoms, at))
         if multipliers.shape[0] > 0:
             _report(multipliers, rows, present, work, first, n_slots, solves, -1.0 if tangent is not None else 1.0)
     return True, worst, most, worst_row

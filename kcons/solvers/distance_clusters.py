@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.kernels.any_width import arithmetic
-from kcons.solvers.kernels.eight_wide import FASTMATH, WIDTH, lanes_type, load_triple, scatter_points
+from kcons.solvers.kernels.eight_wide import FASTMATH, TRIPLE, WIDTH, lanes_type, load_triple, scatter_points
 from kcons.solvers.kernels.lattices import OPEN, TRICLINIC, lattice_numbers, minimum_image
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.tolerances import EPS, ROUNDING
@@ -35,10 +35,20 @@ def resolved(x, pairs, lengths, lattice, kind):
     return True
 
 
-@arithmetic(lanes_type)
-def dot(ax, ay, az, bx, by, bz):
+def product(a, b):
     """Scalar product of two triples."""
-    return ax * bx + ay * by + az * bz
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def difference(a, b):
+    """Of two triples."""
+    return tuple(x - y for x, y in zip(a, b, strict=True))
+
+
+# Compiled into kernels; within formulas their functions are called.
+dot, minus = arithmetic(lanes_type)(product), arithmetic(TRIPLE)(difference)
+plus = arithmetic(TRIPLE)(lambda a, b, factor: tuple(x + y * factor for x, y in zip(a, b, strict=True)))
+times = arithmetic(TRIPLE)(lambda a, factor: tuple(x * factor for x in a))
 
 
 SAVED = 3 * WIDTH

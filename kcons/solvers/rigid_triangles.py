@@ -11,7 +11,18 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
-from kcons.solvers.distance_clusters import SAVED, lane_tables, restore_points, worst_row
+from kcons.solvers.distance_clusters import (
+    SAVED,
+    difference,
+    dot,
+    lane_tables,
+    minus,
+    plus,
+    product,
+    restore_points,
+    times,
+    worst_row,
+)
 from kcons.solvers.kernels.aligned_memory import in_one_array, room
 from kcons.solvers.kernels.any_width import arithmetic
 from kcons.solvers.kernels.array_views import at_first, halves, integers, table_array
@@ -48,39 +59,27 @@ _FACTOR = types.UniTuple(lanes_type, 10)
 # three rows e are errors, d and m multipliers, l squares of lengths.
 
 
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _minus(a, b):
-    return tuple(x - y for x, y in zip(a, b, strict=True))
-
-
-_difference = arithmetic(TRIPLE)(_minus)
-_times = arithmetic(TRIPLE)(lambda e, factor: tuple(x * factor for x in e))
-_plus = arithmetic(TRIPLE)(lambda a, shift, factor: tuple(x + y * factor for x, y in zip(a, shift, strict=True)))
 _squared = arithmetic(TRIPLE)(lambda e: tuple(x * x for x in e))
 _absolute = arithmetic(TRIPLE)(lambda e: tuple(x.unary("fabs") for x in e))
 _roots = arithmetic(TRIPLE)(lambda l, r: tuple(y * x.unary("sqrt") for x, y in zip(l, r, strict=True)))
-_square = arithmetic(lanes_type)(lambda r: _dot(r, r))
 
 
 @arithmetic(TRIPLE)
 def _products(p, q, s, t):
     """Of the three bonds with their references."""
-    return _dot(p, s), _dot(q, t), _dot(_minus(q, p), _minus(t, s))
+    return product(p, s), product(q, t), product(difference(q, p), difference(t, s))
 
 
 @arithmetic(TRIPLE)
 def _length_errors(l, p, q):
-    u = _minus(q, p)
-    return l[0] - _dot(p, p), l[1] - _dot(q, q), l[2] - _dot(u, u)
+    u = difference(q, p)
+    return l[0] - product(p, p), l[1] - product(q, q), l[2] - product(u, u)
 
 
 @arithmetic(_FACTOR)
 def _tangent_factor(l, s, t, w):
     """Rows of the adjugate of the matrix for velocities, and what scales it."""
-    (l0, l1, l2), (w0, w1, w2), st = l, w, _dot(s, t)
+    (l0, l1, l2), (w0, w1, w2), st = l, w, product(s, t)
     a00, a01, a02 = (w0 + w1) * l0, w0 * st, w1 * (l0 - st)
     a11, a12, a22 = (w0 + w2) * l1, w2 * (l1 - st), (w1 + w2) * l2
     c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
@@ -91,7 +90,7 @@ def _tangent_factor(l, s, t, w):
 @arithmetic(_FACTOR)
 def _position_factor(p, q, s, t, w):
     """The same of Newton's matrix for positions."""
-    ps, pt, qs, qt, (w0, w1, w2) = _dot(p, s), _dot(p, t), _dot(q, s), _dot(q, t), w
+    ps, pt, qs, qt, (w0, w1, w2) = product(p, s), product(p, t), product(q, s), product(q, t), w
     us, ut = qs - ps, qt - pt
     a00, a01, a02 = (w0 + w1) * ps, w0 * pt, w1 * (ps - pt)
     a10, a11, a12 = w0 * qs, (w0 + w2) * qt, w2 * (qt - qs)
@@ -105,7 +104,7 @@ def _position_factor(p, q, s, t, w):
 @arithmetic(TRIPLE)
 def _solved(factor, e):
     scaled = tuple(x * factor[9] for x in e)
-    return tuple(_dot(factor[k : k + 3], scaled) for k in (0, 3, 6))
+    return tuple(product(factor[k : k + 3], scaled) for k in (0, 3, 6))
 
 
 @arithmetic(types.UniTuple(TRIPLE, 3))
@@ -128,7 +127,7 @@ def _shifts(m, w, s, t):
 @arithmetic(TRIPLE)
 def _unit_multipliers(sign, m, s, t):
     """Multipliers of unit gradients."""
-    return tuple(sign * x * _dot(b, b).unary("sqrt") for x, b in zip(m, (s, t, _minus(t, s)), strict=True))
+    return tuple(sign * x * product(b, b).unary("sqrt") for x, b in zip(m, (s, t, difference(t, s)), strict=True))
 
 
 # Spliced into the loop as they stand: what is compiled apart is rounded otherwise, and takes longer.
@@ -136,17 +135,17 @@ def _unit_multipliers(sign, m, s, t):
 
 @njit(fastmath=FASTMATH, inline="always")
 def _small(e, l, factor):
-    limits = _times(l, factor)
+    limits = times(l, factor)
     return all_within(e[0], limits[0]) and all_within(e[1], limits[1]) and all_within(e[2], limits[2])
 
 
 @njit(fastmath=FASTMATH, inline="always")
 def _move(points, velocities, inverse_dt, atoms, corner, point, shift, move, undo, saved):
     """Move a corner of each triangle, and change its velocity."""
-    scatter_points(points, atoms, corner, _plus(point, shift, 1.0))
+    scatter_points(points, atoms, corner, plus(point, shift, 1.0))
     if move:
         velocity = keep_points(velocities, atoms, corner, undo, saved + 3 * SAVED)
-        scatter_points(velocities, atoms, corner, _plus(velocity, shift, inverse_dt))
+        scatter_points(velocities, atoms, corner, plus(velocity, shift, inverse_dt))
 
 
 @njit(cache=True, fastmath=FASTMATH)
@@ -170,7 +169,7 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
         a = keep_points(points, atoms, at, undo, saved)
         b = keep_points(points, atoms, at + WIDTH, undo, saved + SAVED)
         c = keep_points(points, atoms, at + 2 * WIDTH, undo, saved + 2 * SAVED)
-        p, q = _difference(a, b), _difference(a, c)
+        p, q = minus(a, b), minus(a, c)
         if kind != OPEN:
             s, t = minimum_image(s, cell, kind), minimum_image(t, cell, kind)
             if tangent is None:
@@ -181,10 +180,10 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
         if tangent is None:
             l = _squared(gather_points(given, slots, group * WIDTH))
         else:
-            l, size = _products(s, t, s, t), _square(p) + _square(q)
+            l, size = _products(s, t, s, t), dot(p, p) + dot(q, q)
             if driven:
                 r = gather_points(given, slots, group * WIDTH)
-                size, r = size + _square(r), _roots(l, r)
+                size, r = size + dot(r, r), _roots(l, r)
             size = size * (SPEED_TOLERANCE * SPEED_TOLERANCE)
             factor = _tangent_factor(l, s, t, w)
         iteration, ok = 0, False
@@ -199,7 +198,7 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
                 if iteration % 2 == 0:
                     factor = _position_factor(p, q, s, t, w)
             else:
-                e = _difference(r, _products(p, q, s, t))
+                e = minus(r, _products(p, q, s, t))
                 if iteration > 0:
                     ok = _small(_squared(e), l, size)
                     if ok or iteration == MAX_ITERATIONS:
@@ -212,7 +211,7 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
         kept = all_within(TINY, inner[0]) and all_within(TINY, inner[1]) and all_within(TINY, inner[2])
         if not (ok and kept and _small(e, l, unit * worst)):
             store_triple(errors, 0, e)
-            store_triple(sizes, 0, _times(l, unit))
+            store_triple(sizes, 0, times(l, unit))
             if ok and not kept:
                 store_triple(errors, 0, (not_positive(inner[0]), not_positive(inner[1]), not_positive(inner[2])))
                 store_triple(sizes, 0, (splat(1.0), splat(1.0), splat(1.0)))

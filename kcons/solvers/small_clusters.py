@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
-from kcons.solvers.distance_clusters import SAVED, dot, lane_tables, restore_points, worst_row
+from kcons.solvers.distance_clusters import SAVED, dot, lane_tables, minus, plus, restore_points, times, worst_row
 from kcons.solvers.kernels.aligned_memory import in_one_array, room
 from kcons.solvers.kernels.array_views import at_first, halves, integers, table_array
 from kcons.solvers.kernels.eight_wide import (
@@ -76,20 +76,18 @@ def _point(room, k):
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
-def _set_point(room, k, x, y, z):
-    poke(room, 3 * k, x)
-    poke(room, 3 * k + 1, y)
-    poke(room, 3 * k + 2, z)
+def _set_point(room, k, point):
+    poke(room, 3 * k, point[0])
+    poke(room, 3 * k + 1, point[1])
+    poke(room, 3 * k + 2, point[2])
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
 def _gram(matrix, left, right, coupling, n):
     """``coupling[k, l] * (left_k · right_l)``, factored."""
     for k in range(n):
-        x, y, z = _point(left, k)
         for j in range(n):
-            a, b, c = _point(right, j)
-            poke(matrix, k * n + j, dot(x, y, z, a, b, c) * peek(coupling, k * n + j))
+            poke(matrix, k * n + j, dot(_point(left, k), _point(right, j)) * peek(coupling, k * n + j))
     _factor(matrix, n)
 
 
@@ -97,52 +95,41 @@ def _gram(matrix, left, right, coupling, n):
 def _move(bonds, directions, step, coupling, n):
     """Change of the bonds by the multipliers `step`."""
     for k in range(n):
-        x, y, z = _point(bonds, k)
+        bond = _point(bonds, k)
         for j in range(n):
-            a, b, c = _point(directions, j)
-            f = peek(step, j) * peek(coupling, k * n + j)
-            x, y, z = x + f * a, y + f * b, z + f * c
-        _set_point(bonds, k, x, y, z)
+            bond = plus(bond, _point(directions, j), peek(step, j) * peek(coupling, k * n + j))
+        _set_point(bonds, k, bond)
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
 def _spread(shifts, ends, bonds, total, n, n_local):
     """What the multipliers `total` along the bonds do to each point, over its inverse mass."""
     for a in range(n_local):
-        _set_point(shifts, a, splat(0.0), splat(0.0), splat(0.0))
+        _set_point(shifts, a, (splat(0.0), splat(0.0), splat(0.0)))
     for k in range(n):
-        x, y, z = _point(bonds, k)
-        f = peek(total, k)
-        x, y, z = f * x, f * y, f * z
-        i, j = ends[2 * k], ends[2 * k + 1]
-        a, b, c = _point(shifts, i)
-        _set_point(shifts, i, a + x, b + y, c + z)
-        a, b, c = _point(shifts, j)
-        _set_point(shifts, j, a - x, b - y, c - z)
+        i, j, pull = ends[2 * k], ends[2 * k + 1], times(_point(bonds, k), peek(total, k))
+        _set_point(shifts, i, plus(_point(shifts, i), pull, 1.0))
+        _set_point(shifts, j, minus(_point(shifts, j), pull))
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
 def _move_points(points, velocities, inverse_dt, atoms, at, weights, shifts, n_local, move, undo, saved):
     """Move the points of eight clusters, and change their velocities; what was there is kept."""
     for a in range(n_local):
-        w, i = weights[a], at + a * WIDTH
-        dx, dy, dz = _point(shifts, a)
-        dx, dy, dz = w * dx, w * dy, w * dz
-        x, y, z = keep_points(points, atoms, i, undo, saved + a * SAVED)
-        scatter_points(points, atoms, i, (x + dx, y + dy, z + dz))
+        i, shift = at + a * WIDTH, times(_point(shifts, a), weights[a])
+        point = keep_points(points, atoms, i, undo, saved + a * SAVED)
+        scatter_points(points, atoms, i, plus(point, shift, 1.0))
         if move:
-            x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * SAVED)
-            x, y, z = x + dx * inverse_dt, y + dy * inverse_dt, z + dz * inverse_dt
-            scatter_points(velocities, atoms, i, (x, y, z))
+            velocity = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * SAVED)
+            scatter_points(velocities, atoms, i, plus(velocity, shift, inverse_dt))
 
 
 @njit(fastmath=FASTMATH, forceinline=True)
 def _report(multipliers, slots, place, sign, bonds, total, n):
     """Multipliers of unit gradients."""
     for k in range(n):
-        x, y, z = _point(bonds, k)
-        f = peek(total, k) * square_root(dot(x, y, z, x, y, z))
-        scatter(multipliers, slots, place, k, sign * f)
+        bond = _point(bonds, k)
+        scatter(multipliers, slots, place, k, sign * (peek(total, k) * square_root(dot(bond, bond))))
 
 
 # These two are spliced into the loop as they stand: compiled apart, they are rounded otherwise, or slower.
@@ -156,22 +143,21 @@ def _begin(
     size = splat(0.0)
     for k in range(n):
         i, j = at + ends[2 * k] * WIDTH, at + ends[2 * k + 1] * WIDTH
-        x, y, z = gather_differences(references, atoms, i, j)
-        a, b, c = gather_differences(points, atoms, i, j)
+        reference, bond = gather_differences(references, atoms, i, j), gather_differences(points, atoms, i, j)
         if kind != OPEN:
-            x, y, z = minimum_image((x, y, z), cell, kind)
+            reference = minimum_image(reference, cell, kind)
             if tangent is None:
-                a, b, c = minimum_image((a, b, c), cell, kind)
-        _set_point(s, k, x, y, z)
-        _set_point(r, k, a, b, c)
+                bond = minimum_image(bond, cell, kind)
+        _set_point(s, k, reference)
+        _set_point(r, k, bond)
         poke(sums, k, splat(0.0))
         if tangent is None:
             length = gather(goal, slots, place, k)
             poke(squares, k, length * length)
         else:
-            square = dot(x, y, z, x, y, z)
+            square = dot(reference, reference)
             poke(squares, k, square)
-            size = size + dot(a, b, c, a, b, c)
+            size = size + dot(bond, bond)
             rate = splat(0.0)
             if driven:
                 rate = gather(goal, slots, place, k)
@@ -189,9 +175,7 @@ def _judge(error, step, squares, bonds, references, tangent, limit, n):
         e, inner = peek(error, k), peek(squares, k)
         if tangent is None:
             # A bond that turned round has found the wrong root.
-            x, y, z = _point(bonds, k)
-            a, b, c = _point(references, k)
-            e, inner = absolute(e), dot(x, y, z, a, b, c)
+            e, inner = absolute(e), dot(_point(bonds, k), _point(references, k))
         else:
             e = e * e
         poke(error, k, e)
@@ -248,14 +232,13 @@ def _kernel(n_rows: int, tangent: tuple[()] | None) -> Any:
                 # An infinite speed would make every error look small.
                 ok = all_within(size, 1e300)
                 for k in range(n):
-                    x, y, z = _point(r, k)
+                    bond = _point(r, k)
                     if tangent is None:
-                        e = peek(squares, k) - dot(x, y, z, x, y, z)
+                        e = peek(squares, k) - dot(bond, bond)
                         limit = peek(squares, k) * (2.0 * NEWTON_TOLERANCE)
                         ok = ok and all_within(absolute(e), limit)
                     else:
-                        a, b, c = _point(s, k)
-                        e = peek(goal, k) - dot(x, y, z, a, b, c)
+                        e = peek(goal, k) - dot(bond, _point(s, k))
                         ok = ok and all_within(e * e, size * peek(squares, k))
                     poke(error, k, e)
                 if ok or iteration == MAX_ITERATIONS:

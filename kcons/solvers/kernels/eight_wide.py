@@ -186,8 +186,10 @@ def where_greater(builder, left, right, value, otherwise):
 
 
 def _shifted(mask: list[int]) -> Callable[..., Any]:
-    @instruction(lanes_type, lanes_type)
+    @instruction(lambda value: value(value), None)
     def function(builder, value):
+        if isinstance(value.type, ir.ArrayType):
+            return [shuffle(builder, each, _ZERO, mask) for each in unpacked(builder, value)]
         return shuffle(builder, value, _ZERO, mask)
 
     return function
@@ -197,13 +199,15 @@ def _shifted(mask: list[int]) -> Callable[..., Any]:
 from_previous, from_next = _shifted([WIDTH, *range(WIDTH - 1)]), _shifted([*range(1, WIDTH + 1)])
 
 
-@instruction(lanes_type, *(lanes_type,) * 4)
+@instruction(TRIPLE, TRIPLE, lanes_type, TRIPLE, lanes_type)
 def product_difference(builder, a, b, c, d):
-    """``a * b - c * d`` with the second product rounded, the first not.
+    """``a * b - c * d`` for each of a and c, with the second product rounded, the first not.
 
     Spelt out, so that it gives the same number wherever it is repeated.
     """
-    return call(builder, f"llvm.fma.v{WIDTH}f64", _VECTOR, [a, b, builder.fneg(builder.fmul(c, d))])
+    pairs = zip(unpacked(builder, a), unpacked(builder, c), strict=True)
+    negative = [(x, builder.fneg(builder.fmul(y, d))) for x, y in pairs]
+    return [call(builder, f"llvm.fma.v{WIDTH}f64", _VECTOR, [x, b, y]) for x, y in negative]
 
 
 @intrinsic
