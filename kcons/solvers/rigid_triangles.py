@@ -159,7 +159,8 @@ def _project(tangent, points, references, velocities, inverse_dt, given, lattice
     # Arrays that are handed on inside the loop would cost reference counting.
     changed, moving, table, room = at_first(points), at_first(velocities), at_first(atoms), at_first(undo)
     w, zero = (inv_mass[0], inv_mass[1], inv_mass[2]), splat(0.0)
-    errors, sizes, worst, worst_at, most = np.empty(3 * WIDTH), np.empty(3 * WIDTH), 0.0, -1, 0
+    errors, sizes = table_array(tables, header, 5), table_array(tables, header, 6)
+    worst, worst_at, most = 0.0, -1, 0
     # Points kept of a triangle, what residuals are counted in, and the sign of multipliers.
     kept_points, unit, sign = (2 * _CORNERS, 2.0, 1.0) if tangent is None else (_CORNERS, 1.0, -1.0)
     for group in range(n_groups):
@@ -272,4 +273,6 @@ class RigidTriangles(AddressableSolver):
         self.rows = np.array(rows, dtype=np.int64).reshape(-1)
         slots, corners = lane_tables(np.asarray(atoms).reshape(-1, 3), 3)
         given = np.array(inv_mass, dtype=np.float64), np.array(lengths, dtype=np.float64).reshape(-1)
-        self.tables = in_one_array((corners, slots, *given, room(6 * len(corners))))
+        self.tables = in_one_array(
+            (corners, slots, *given, room(6 * len(corners)), *(room(3 * WIDTH) for _ in range(2)))
+        )

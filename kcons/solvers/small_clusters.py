@@ -208,7 +208,7 @@ def _kernel(n_rows: int, tangent: tuple[()] | None) -> Any:
         # Points kept of a cluster, what residuals are counted in, and the sign of multipliers.
         kept_points, unit, sign = (2 * n_local, 2.0, 1.0) if tangent is None else (n_local, 1.0, -1.0)
         cell = lattice_numbers(lattice)
-        errors, sizes = np.empty(n * WIDTH), np.empty(n * WIDTH)
+        errors, sizes = table_array(t, h, 7), table_array(t, h, 8)
         # Reference bonds s, present bonds r; what is wanted of these, and what errors are compared with.
         s, r, shifts = stack(n_coordinates), stack(n_coordinates), stack(n_shifts)
         matrix, coupling = stack(n_square), stack(n_square)
@@ -317,4 +317,5 @@ class SmallClusters(AddressableSolver):
         weights = np.array(inv_mass, dtype=np.float64)
         slots, points = lane_tables(members, len(local))
         given = points, slots, local.reshape(-1), weights, _couplings(local, weights)
-        self.tables = in_one_array((*given, room(6 * len(points)), np.array(lengths, dtype=np.float64).reshape(-1)))
+        sides, work = np.array(lengths, dtype=np.float64).reshape(-1), (room(len(local) * WIDTH) for _ in range(2))
+        self.tables = in_one_array((*given, room(6 * len(points)), sides, *work))
