@@ -15,13 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.compilation import njit
 from kcons.solvers.addressable_solvers import AddressableSolver, Kernels
-from kcons.solvers.distance_clusters import dot, minus, resolved, times
+from kcons.solvers.distance_clusters import dot, minus, plus, resolved, times
 from kcons.solvers.kernels.aligned_memory import aligned, in_one_array, room
-from kcons.solvers.kernels.any_width import arithmetic
 from kcons.solvers.kernels.array_views import at_first, halves, integers, octets, table_array
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
-    TRIPLE,
     WIDTH,
     absolute,
     all_within,
@@ -109,16 +107,6 @@ def _rate_error(r, s, rate, real):
     inner = dot(s, s)
     positive = where_zero(real, 1.0, inner)
     return error, inner, positive, absolute(error) / square_root(positive)
-
-
-@arithmetic(TRIPLE)
-def _less(d, w, s, pull, p, before):
-    return tuple(x - w * (y * pull - z * before) for x, y, z in zip(d, s, p, strict=True))
-
-
-@arithmetic(TRIPLE)
-def _added(r, factor, a, b):
-    return tuple(x + factor * (y - z) for x, y, z in zip(r, a, b, strict=True))
 
 
 @njit(fastmath=FASTMATH)
@@ -257,7 +245,7 @@ def _sweep(
                 next_pull = _pull_of(room, slot + stride, pull, final)
         leave = load(weights, atom + onward)
         o = times(product_difference(n, next_pull, s, pull), leave)
-        error, inner, positive, ratio, r = _measured(room, slot, _added(r, 1.0, e, o), s, target, real, tangent)
+        error, inner, positive, ratio, r = _measured(room, slot, plus(r, minus(e, o), 1.0), s, target, real, tangent)
         least, total, peak, peak_slot = _judged(least, total, peak, peak_slot, positive, ratio, slot)
         right, ahead, aside = _eliminated(
             room, slot, (weight + leave) * real, weight * dot(r, p), inner, error, leave, dot(r, n), right, ahead, aside
@@ -330,7 +318,7 @@ def _solve(
         head_diagonal, head_right, to_head, ahead, right, aside = added
         # The separators: move, measure, and add what the pieces pass on.
         g, f = (e, from_next(f)) if upward else (f, from_next(e))
-        r = _added(load_triple(work, seam + _R), load(present, end) * sign, g, f)
+        r = plus(load_triple(work, seam + _R), minus(g, f), load(present, end) * sign)
         _add_up(room, seam, iteration, pulls)
         real = load(present, end)
         error, inner, positive, ratio, r = _measured(room, seam, r, z, seam_target, real, tangent)
@@ -386,7 +374,7 @@ def _shift(points, velocities, inverse_dt, atoms, owned, full, weights, work, fi
         d = times(product_difference(p, before, s, now), w)
         if solves > 1:
             later = load(work, slot + _LATER)
-            d = _less(d, w, s, later, p, later_before)
+            d = minus(d, times(minus(times(s, later), times(p, later_before)), w))
         p, before, later_before = s, now, later
         x = gather_points(points, atoms, at)
         v = gather_points(velocities, atoms, at) if move else x

@@ -74,14 +74,13 @@ def arithmetic(result: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def made(function: Callable[..., Any]) -> Any:
+        @functools.wraps(function)
         def emit(builder, *values):
-            found = function(*(_terms(builder, value) for value in values))
-            return _values(found)
+            return _values(function(*(_terms(builder, value) for value in values)))
 
         names = list(inspect.signature(function).parameters.values())
         emit.__signature__ = inspect.Signature([names[0].replace(name="builder"), *names])  # type: ignore[attr-defined]
-        functools.update_wrapper(emit, function, updated=()).__dict__.pop("__wrapped__")
-        return instruction(lambda *kinds: result(*kinds), *(None,) * len(names))(emit)
+        return instruction(result, *(None,) * len(names))(emit)
 
     return made
 
@@ -118,10 +117,8 @@ class _Term:
     def _with(self, other: Any, name: str, swap: bool = False) -> _Term:
         pair = [self.value, other.value if isinstance(other, _Term) else DOUBLE(float(other))]
         width = next((value.type.count for value in pair if value.type != DOUBLE), 0)
-        first, last = [vectors(width).splat(self.builder, value) for value in pair] if width else pair
-        return _Term(
-            self.builder, getattr(self.builder, name)(*((last, first) if swap else (first, last)), flags=FLAGS)
-        )
+        pair = [vectors(width).splat(self.builder, value) for value in pair] if width else pair
+        return _Term(self.builder, getattr(self.builder, name)(*(pair[::-1] if swap else pair), flags=FLAGS))
 
     def unary(self, name: str) -> _Term:
         """The function that LLVM calls `name`, such as 'sqrt'."""

@@ -34,16 +34,21 @@ MUTANTS = {
         "rate = rate * square«_root(square)→»": "distance_solvers::tangents_match_dense_solve[True-small-bond]",
     },
     "solvers/rigid_triangles.py": {
-        "(TINY, qt)« and all_within(TINY, us)→»": "distance_solvers::a_third_side_that_turned_round_is_no_solution",
+        "(TINY, inner[1])« and all_within(TINY, inner[2])→»": (
+            "distance_solvers::a_third_side_that_turned_round_is_no_solution"
+        ),
         "c10, c11, c12 = -(a12 * a20 «+→-» a10 * a22)": "distance_solvers::newton_and_a_chord_step_gain_together",
+        "(w2 * m2, «-→»w2 * (m1 + m2))": "distance_solvers::matches_dense_newton[triangles-8]",
         "_CORNERS, kept_points, «_CORNERS→_NONE»)": (
             "distance_solvers::failure_changes_nothing_and_names_the_cluster[far-triangles-29]"
         ),
     },
     "solvers/chains.py": {
-        "vy - dy * inverse_dt, vz - dz« * inverse_dt→»": "distance_solvers::matches_dense_newton[chains-short-free]",
-        "dx = dx - w * (sx * later« - px * later_p→»)": "distance_solvers::ten_thousand_bonds[straight]",
-        "rx + real * (gx «-→+» fx)": "distance_solvers::ten_thousand_bonds[free]",
+        "minus(v, «times(d, inverse_dt)→d»)": "distance_solvers::matches_dense_newton[chains-short-free]",
+        "times(«minus(times(s, later), times(p, later_before))→times(s, later)», w)": (
+            "distance_solvers::ten_thousand_bonds[straight]"
+        ),
+        "minus(«g, f→f, g»), load(present, end)": "distance_solvers::ten_thousand_bonds[free]",
     },
     "solvers/sparse/mixed_rows.py": {
         "if abs(d) > «PIVOT_TOLERANCE * abs(whole)→0.0» else 0.0": "row_functions::dependent_rows_are_dropped",
@@ -53,8 +58,11 @@ MUTANTS = {
             "row_functions::rows_with_a_period_miss_by_the_shorter_way"
         ),
     },
+    "solvers/kernels/any_width.py": {
+        "(pair«[::-1]→» if swap": "distance_solvers::matches_dense_newton[triangles-8]",
+    },
     "solvers/kernels/lattices.py": {
-        "y = y - (i * a[1] + j * b[1]« + k * c[1]→»)": "distance_solvers::periodic_equals_unwrapped",
+        "(i * a[n] + j * b[n]« + k * c[n]→»)": "distance_solvers::periodic_equals_unwrapped",
     },
     "motion/restoring/nearest_point.py": {
         "        «self._descend(start, here)→pass»\n": (
