@@ -49,15 +49,11 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 _SIDES, _UNDO = 3, 4
 #: Not literal, since a function is compiled for each of its literal arguments.
 _NONE, _CORNERS = np.int64(0), np.int64(3)
-
-
 #: Rows of an adjugate, and what scales it.
 _FACTOR = types.UniTuple(lanes_type, 10)
 
-
 # Of a triangle: p, q are the bonds from atom 0 to 1 and to 2, s, t their references, w inverse masses; of its
 # three rows e are errors, d and m multipliers, l squares of lengths.
-
 
 _squared = arithmetic(TRIPLE)(lambda e: tuple(x * x for x in e))
 _absolute = arithmetic(TRIPLE)(lambda e: tuple(x.unary("fabs") for x in e))
