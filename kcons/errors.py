@@ -7,8 +7,9 @@ the built-in that fits (`ValueError`, `RuntimeError`, ...), and carries its data
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
+from importlib import import_module
 from typing import Any
 
 __all__ = [
@@ -171,6 +172,21 @@ def with_extra(error: ModuleNotFoundError, what: str) -> ModuleNotFoundError:
         f"python -m pip install --upgrade 'kcons[{EXTRAS[package]}]'",
         name=error.name,
     )
+
+
+def imported_late(package: str, names: Mapping[str, Iterable[str]]) -> Callable[[str], Any]:
+    """`__getattr__` of a package: imports the module of a name, of those by module, when the name is asked for."""
+    modules = {name: module for module, own in names.items() for name in own}
+
+    def attribute(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        try:
+            return getattr(import_module(f"{package}.{modules[name]}"), name)
+        except ModuleNotFoundError as error:
+            raise with_extra(error, f"{package}.{name}") from error
+
+    return attribute
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -34,7 +34,7 @@ from kcons.ase.binding import (
     touched_atoms,
     unchanged_on_failure,
 )
-from kcons.ase.topology import bonds_of, constraints_of, require_atoms, velocities_of
+from kcons.ase.topology import REMEDY, bonds_of, require_atoms, snapshot_of, velocities_of
 from kcons.ase.translation import ase_forms, translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import as_float_array
@@ -46,6 +46,7 @@ from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.steppers.state import KICK_ROUNDING
 from kcons.thermostats.cells import constraint_virial
+from kcons.topology.rows_by_name import Holding, rows_of
 
 #: Name in ASE's registry and in files.
 REGISTERED_NAME = "KconsConstraints"
@@ -494,7 +495,9 @@ def constrain(
         Another ASE constraint acts on the same atoms.
     """
     require_atoms(atoms)
-    held = Constraints(constraints_of(atoms, constraints) if isinstance(constraints, str) else constraints)
+    if isinstance(constraints, str):  # not by `constraints_of`, since its caller is where warnings point
+        constraints = rows_of(snapshot_of(atoms), Holding(constraints), np.array, REMEDY)
+    held = Constraints(constraints)
     with unchanged_on_failure(atoms):
         atoms.set_constraint([*atoms.constraints, held])
         if project:

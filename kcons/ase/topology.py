@@ -34,7 +34,7 @@ BONDS = "bonds"
 #: ASE's unit of time in ps, to the power that velocities need.
 PS = 1000 * units.fs
 _ITEM = f"atoms.info[{BONDS!r}]"
-_REMEDY = f"put pairs of atoms into {_ITEM}"
+REMEDY = f"put pairs of atoms into {_ITEM}"
 
 
 @with_options
@@ -52,7 +52,7 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
     """
     snapshot = snapshot_of(atoms)
     numbers = partial(selected_numbers, n=len(atoms))
-    return rows_of(snapshot, Holding(constrain, **options), numbers, _REMEDY)
+    return rows_of(snapshot, Holding(constrain, **options), numbers, REMEDY)
 
 
 def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None) -> Distance:

@@ -11,10 +11,7 @@
 - `trajectory_temperatures`: temperatures of configurations along a trajectory of any engine
 """
 
-from importlib import import_module
-from typing import Any
-
-from kcons.errors import with_extra
+from kcons.errors import imported_late
 
 #: Names by the module that has them; imported when they are asked for.
 _NAMES = {
@@ -32,17 +29,7 @@ _NAMES = {
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)
-
-
-def __getattr__(name: str) -> Any:
-    for module, names in _NAMES.items():
-        if name in names:
-            try:
-                found = import_module(f"{__name__}.{module}")
-            except ModuleNotFoundError as error:
-                raise with_extra(error, f"{__name__}.{name}") from error
-            return getattr(found, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = imported_late(__name__, _NAMES)
 
 
 def __dir__() -> list[str]:

@@ -93,7 +93,8 @@ def sentence(table: pd.DataFrame, found: Ranking | None) -> str:
     """Which method, at which step."""
     about = table.attrs
     if found is None:
-        left = ", ".join(f"{title} ({note})" for title, note in _notes(table).items())
+        bad = table[table.status.isin(["failed", "partial", "not run"])].drop_duplicates("title")
+        left = ", ".join(f"{title} ({note})" for title, note in zip(bad.title, bad.note, strict=True))
         if "what" in about:
             return f"No run can tell the {about['what']}: {left}. Give a larger --budget."
         return f"No method reached the horizon of {about['horizon']:g} {about['time']}: {left}."
@@ -149,12 +150,6 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
 
 def _per(about: dict[str, Any]) -> str:
     return str(about.get("per") or f"per {about['long_time']}")
-
-
-def _notes(table: pd.DataFrame) -> dict[str, str]:
-    """Why methods have no error, by title."""
-    bad = table[table.status.isin(["failed", "partial", "not run"])].drop_duplicates("title")
-    return dict(zip(bad.title, bad.note, strict=True))
 
 
 def _spent(cost: float, kind: str) -> str:

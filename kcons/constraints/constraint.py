@@ -18,7 +18,7 @@ import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
-from typing import Any, ClassVar, Self, TypeAlias
+from typing import Any, ClassVar, NoReturn, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -449,6 +449,12 @@ class Constraint:
                     raise InputError(f"{cls.family} cannot be read: {name} has vectors not of length 1", item=name)
         Constraint.__init__(item, data["atoms"], data["target"], **{name: data[name] for name in cls.per_row})
         return item
+
+    def adjust_positions(self, *_: Any) -> NoReturn:
+        """What ASE calls, by this name or another, where the object itself was given to ``atoms.set_constraint``."""
+        raise UnsupportedError(f"{self!r} is on Atoms by itself; take it off, and kcons.ase.constrain(atoms, [...])")
+
+    adjust_forces = adjust_momenta = get_removed_dof = adjust_positions
 
     def __repr__(self) -> str:
         what = self.row_name(0) if self.n_rows == 1 else f"{self.family}({self.n_rows} rows)"

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.constraints.arguments import LARGEST, as_float_array, check_call, check_range, positive, read_only
 from kcons.constraints.arguments import FloatArray as FloatArray
-from kcons.constraints.arguments import as_float_array, check_call, check_range, positive, read_only
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -111,6 +111,8 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
 
 
 def _per_row(target: Any, rows: int, when: str = "") -> FloatArray:
+    if isinstance(target, float) and abs(target) <= LARGEST:
+        return np.full(rows, target)
     array = as_float_array(target, "target")
     if array.ndim > 1 and array.size == rows:
         array = array.ravel()  # for example (n, 3) for three rows an atom

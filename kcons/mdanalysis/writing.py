@@ -71,7 +71,7 @@ class TrajectoryWriter:
         The constraints of the run, in its units: for the cell of its states. Into H5MD residuals are written, and
         multipliers where forces are given; both in the units of the run, as `natural_units` says.
     interval : float, optional
-        Time between frames in the run's unit; DCD stores this and no times.
+        Time between frames in the run's unit; DCD stores this and no times, and so needs it.
     velocities : bool, optional
         Write velocities; by default where the format has them.
     forces : bool
@@ -128,6 +128,8 @@ class TrajectoryWriter:
             dt = self._universe.trajectory.ts.dt = abs(finite_number(interval, "interval")) * self.units.time
             if self._format == "DCD":
                 options.setdefault("dt", dt)
+        elif self._format == "DCD" and "dt" not in options:
+            raise InputError(f"{self.path.name} has no times but the interval; give interval=", item="interval")
         try:
             with quiet():
                 self._writer = MDAnalysis.Writer(str(self.path), n_atoms, multiframe=True, **options)

@@ -539,6 +539,11 @@ OTHERS: list[tuple[str, type[KconsError], str | None]] = [
     ("Motion(ConstraintSet([FixedAtoms([0, 1]), Distance([0, 1], 9.0)], X, M), X)", ContradictionError, None),
     ("ConstraintSet(Angle([0, 1, 2]), X * 0, M)", SingularGeometryError, None),
     ("constrain(ATOMS.copy(), VelocityFormula('vx1', 0))", UnsupportedError, None),
+    *(
+        (f"type(ATOMS)('H2', constraint=Distance([0, 1])).{asked}", UnsupportedError, None)
+        for asked in ("set_positions(X[:2])", "set_momenta(X[:2])", "get_number_of_degrees_of_freedom()")
+    ),
+    ("type(ATOMS)(ATOMS, constraint=Distance([0, 1]), calculator=ATOMS.calc).get_forces()", UnsupportedError, None),
     ("constrain(ATOMS.copy(), Distance([0, 1], lambda t: 1.0 + t))", UnsupportedError, None),
     ("TemperatureSplit(SYSTEM).add(X, X * nan)", NonFiniteError, "force"),
     ("CellSystem(CELL, lambda x, t, h: x, lambda x, t, h: 0.0).stress(X, 0.0)", UnsupportedError, None),

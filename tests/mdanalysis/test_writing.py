@@ -218,7 +218,9 @@ def test_bad_input(tmp_path):
     assert caught.value.item == "interval" and not list(tmp_path.iterdir())
     with pytest.raises(UnsupportedError, match="XTC has no velocities; write TRR"):
         TrajectoryWriter(tmp_path / "r.xtc", 3 * N, velocities=True)
-    writer = TrajectoryWriter(tmp_path / "r.dcd", 3 * N)
+    with pytest.raises(InputError, match=r"r\.dcd has no times but the interval; give interval="):
+        TrajectoryWriter(tmp_path / "r.dcd", 3 * N)
+    writer = TrajectoryWriter(tmp_path / "r.dcd", 3 * N, interval=0.002)
     with pytest.raises(InputError, match="positions must have shape"):
         writer.write(x[:-1])
     bad = x.copy()
@@ -304,7 +306,10 @@ def test_what_a_file_cannot_hold_is_not_written(tmp_path, away):
     np.testing.assert_allclose(universe.trajectory[1].positions, x + 150.0, atol=0.006)
     with TrajectoryWriter(tmp_path / "9.xtc", 9) as writer:
         writer.write(np.full((9, 3), 10 * away))  # so few atoms have no grid
-    with TrajectoryWriter(tmp_path / "b.dcd", 10) as writer, pytest.raises(InputError, match="beyond single precision"):
+    with (
+        TrajectoryWriter(tmp_path / "b.trr", 10, velocities=False) as writer,
+        pytest.raises(InputError, match="beyond single precision"),
+    ):
         writer.write(x * 1e38)
     # Of wide frames: beyond 2^23 steps it depends on the distances of neighbors whether the packing is right.
     x = np.random.default_rng(1).uniform(0, 60, size=(200, 3))

@@ -506,11 +506,9 @@ class Scan:
             raise InputError(f"there is no structure at {point}: {why}", item="point")
         found = self.atoms.copy()
         found.positions[:] = self.best[point].positions
-        found.info |= {"energy": self.best[point].energy, **self._values(point)}
+        shown = dict(zip(self.grid.keys, self.grid.shown(point), strict=True))
+        found.info |= {"energy": self.best[point].energy, **shown}
         return found
-
-    def _values(self, point: Point) -> dict[str, float]:
-        return dict(zip(self.grid.keys, self.grid.shown(point), strict=True))
 
     # -- shown ----------------------------------------------------------------------------------
 

@@ -628,7 +628,10 @@ class Windows:
     def _jobs(self, place: tuple[float, ...]) -> list[Window]:
         """The runs of a window; without a pull they begin where they end."""
         target = np.array(place)
-        approach = self.approach if self.settings.pull else 0.0
+        # Angles end at 0 and 180 degrees: half the way there at most.
+        ends = np.array([angle is True for angle in self.sampler.angles]) & (self.sampler.periods == 0)
+        room = np.where(ends, np.minimum(target, np.pi - target) / 2, np.inf)
+        approach = np.clip(self.approach if self.settings.pull else 0.0, -room, room)
         ways = zip(SIDES[: 1 + self.both_sides], (-1, 1), strict=False)
         return [self._job(side, target + sign * approach, target) for side, sign in ways]
 

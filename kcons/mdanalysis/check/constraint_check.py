@@ -352,10 +352,9 @@ def _masses(
         own = [a for a in universe._topology.attrs if a.attrname == "masses" and not a.is_guessed]
         said = f"masses are those of the elements: temperatures are wrong if the run had others (heavy H); {remedy}"
         return masses, said if universe.trajectory.ts.has_velocities and not own else ""
-    reason = f"{label(topology, bad[:1].tolist())} has mass {masses[bad[0]]:g}"
+    reason = f"{label(topology, bad[:1].tolist())} has mass {masses[bad[0]]:g}; {remedy}"
     if not hasattr(universe.atoms, "masses"):
-        reason = "the topology has no masses"
-    reason += f"; {remedy}"
+        reason = f"the topology has no masses; {remedy}"
     needing = next((item for item in given if item.uses_masses), None)
     if needing is not None:
         raise InputError(f"{needing!r} needs masses, but {reason}", item="masses")
@@ -378,6 +377,9 @@ def _remarks_on(reader: Any, masses: FloatArray | None) -> list[str]:
     if not timed and (name == "LAMMPSDUMP" or "time" not in reader.ts.data) and reader.n_frames > 1:
         apart = "steps" if name == "LAMMPSDUMP" else "frames"
         remarks.append(f"{name} files have no times: {apart} are taken to be 1 ps apart, in drifts too")
+    # The defaults of MDAnalysis, and of VMD and MDTraj: 1 ps and the unit of time of the format.
+    if name == "DCD" and reader.skip_timestep == 1 and round(reader.dt, 4) in (1.0, 0.0489) and reader.n_frames > 1:
+        remarks.append(f"DCD says frames are {reader.dt:.3g} ps apart, as files do by default: drifts may be wrong")
     return remarks
 
 

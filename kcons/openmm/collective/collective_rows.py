@@ -255,11 +255,6 @@ class CollectiveRows(Part):
         """An entry of the inverse, which Broyden's updates make unsymmetric."""
         return f"inverse{self.code}_{i}_{j}"
 
-    def _target(self, row: int) -> str:
-        """Expression of the target now."""
-        moved = f"+{self._rate(row)}*(clock{self.code}+flown{self.code})" if self._rates[row] != 0.0 else ""
-        return self._of("target", row) + moved
-
     def _rate(self, row: int) -> str:
         return self._of("rate", row)
 
@@ -440,7 +435,8 @@ class CollectiveRows(Part):
         c = self.code
         for k, group in enumerate(self._groups):
             now = self._of("now", k)
-            p.let(now, f"energy{group}-({self._target(k)})", f"{self.names[k]} less its target")
+            moved = f"+{self._rate(k)}*(clock{c}+flown{c})" if self._rates[k] != 0.0 else ""
+            p.let(now, f"energy{group}-({self._of('target', k)}{moved})", f"{self.names[k]} less its target")
             if self.periods[k]:
                 period = repr(self.periods[k])
                 p.let(now, f"{now}-{period}*floor({now}/{period}+0.5)", "nearest image")

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -218,13 +220,13 @@ class DeviceRows:
             tables: list[Any] = [[time, start, 1 / spacing, count]]
             for item in self.set.constraints:
                 if isinstance(of := item.target, MovingTarget):
-                    values = np.array([item.target_at(t) for t in times])
+                    # Rates and accelerations ask for the values at the same times.
+                    of = replace(of, value=cache(of.value))
+                    values = np.array([item.with_target(of).target_at(t) for t in times])
                     if item.period is not None:
                         values = np.unwrap(values, axis=0, period=item.period)
-                    rates, turns = (
-                        np.array([f(t, item.n_rows, item.period) for t in times])
-                        for f in (of.rate_at, of.acceleration_at)
-                    )
+                    about = item.n_rows, item.period
+                    rates, turns = (np.array([f(t, *about) for t in times]) for f in (of.rate_at, of.acceleration_at))
                     known = np.stack([values, spacing * rates, spacing**2 * turns], axis=2)
                     tables.append(known.swapaxes(0, 1).ravel())
             found["rows_knots"] = np.zeros(self._n_knots)

@@ -29,6 +29,7 @@ MUTANTS = {
         ),
     },
     "mdanalysis/check/constraint_check.py": {
+        "«reader.skip_timestep == 1→True» and": "mdanalysis/check/targets::times_that_files_do_not_have_are_said",
         "«Timestep.from_timestep(trajectory.ts)→trajectory.ts», converts": (
             "deviations::rows_that_were_made_for_a_part_are_refused"
         ),

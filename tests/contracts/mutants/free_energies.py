@@ -23,6 +23,7 @@ MUTANTS = {
     "free_energy/windows/driver.py": {
         ".«pop(job.name, None→clear(»)": "driver::windows_that_failed_before_others_are_added_are_still_told_of",
         "«os._exit(1)→pass»": "driver::workers_end_with_what_waits_for_them",
+        "np.minimum(target, «np.pi - target→np.pi»)": "driver::runs_of_an_angle_begin_at_angles",
         "«(folder / left).unlink(missing_ok=True)→pass»": (
             "free_energy/windows/free_energy::no_profile_of_other_windows_is_left"
         ),

@@ -97,6 +97,16 @@ def test_windows_are_known_by_their_places(tmp_path):
     assert len(same.windows) == 2 and len(diary(tmp_path)) == 13
 
 
+def test_runs_of_an_angle_begin_at_angles(tmp_path):
+    """Beyond 180 degrees there are none: one of the two runs failed, and nobody saw whether both agree."""
+    windows = made(tmp_path, periods=np.zeros(1))
+    for angle in (0.01, 3.12):
+        up, down = (job.start[0] for job in windows._jobs((angle,)))
+        assert 0 < up < angle < down < np.pi
+        assert [angle - up, down - angle] == pytest.approx([min(angle, np.pi - angle) / 2] * 2)
+    assert [job.start[0] for job in windows._jobs((1.0,))] == pytest.approx([0.9, 1.1])
+
+
 def test_windows_are_added_where_they_help(tmp_path):
     windows, first = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1])
     better = windows.improve(0.5, 20, at_once=2)

@@ -62,13 +62,20 @@ def test_bonds_are_looked_for_in_the_first_frame_that_is_looked_at(tmp_path, x):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
-    [("w.dcd", None), ("w.xyz", "frames are taken to be 1 ps apart"), ("w.lammpsdump", "steps are taken to be 1 ps")],
+    ("name", "said", "options"),
+    [
+        ("w.dcd", None, {}),
+        ("w.xyz", "frames are taken to be 1 ps apart", {}),
+        ("w.lammpsdump", "steps are taken to be 1 ps", {}),
+        ("w.dcd", "DCD says frames are 1 ps apart", {"dt": 1.0}),  # the default of MDAnalysis, 1 AKMA that of VMD
+        ("w.dcd", "DCD says frames are 0.0489 ps apart", {"dt": 0.04888821}),
+        ("w.dcd", None, {"dt": 1.0, "nsavc": 500}),
+    ],
 )
 @pytest.mark.filterwarnings("ignore:DCDReader currently")
-def test_times_that_files_do_not_have_are_said(tmp_path, x, name, said):
+def test_times_that_files_do_not_have_are_said(tmp_path, x, name, said, options):
     """A drift a ns means nothing without them."""
-    path = files.write(tmp_path / name, files.whole(x)[:3])
+    path = files.write(tmp_path / name, files.whole(x)[:3], **options)
     remarks = files.checked(path, N).remarks
     assert [said in remark for remark in remarks] == [True] if said else remarks == []
     made = files.loaded(path, N)

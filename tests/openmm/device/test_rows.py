@@ -127,6 +127,16 @@ def test_targets_move_between_their_knots():
     assert plain.failed  # nothing is known there
 
 
+def test_a_function_is_asked_once_for_a_time():
+    """Its rates and accelerations are differences of the same values."""
+    asked = []
+    bond = Distance([[0, 1]], lambda t: asked.append(t) or 1.5 + 0.1 * np.sin(t))
+    rows = DeviceRows(np.ones(2), NONE, [bond], positions=np.array([[0.0, 0, 0], [1.5, 0, 0]]), time=0.0)
+    asked.clear()
+    rows.renew(0.0, STEP, 10)
+    assert len(asked) == len(set(asked)) > 25
+
+
 # -- clusters ---------------------------------------------------------------------------------------
 
 
