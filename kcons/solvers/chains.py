@@ -256,15 +256,8 @@ def _sweep(
         p, s, pull, e, weight = s, n, next_pull, o, leave
         slot += stride
         atom += step
-    return (
-        (head_diagonal, head_right, to_head, ahead, right, aside),
-        p,
-        e,
-        weight,
-        (least, total, peak, peak_slot),
-        count,
-        scale,
-    )
+    added, judged = (head_diagonal, head_right, to_head, ahead, right, aside), (least, total, peak, peak_slot)
+    return added, p, e, weight, judged, count, scale
 
 
 @njit(fastmath=FASTMATH, error_model="numpy")
