@@ -204,12 +204,7 @@ class Vectors:
 
     def unary(self, name: str) -> Callable[..., Any]:
         """The function of each that LLVM calls `name`, such as 'sqrt'."""
-
-        @instruction(self.kind, self.kind)
-        def function(builder, value):
-            return call(builder, f"llvm.{name}.v{self.llvm.count}f64", self.llvm, [value])
-
-        return function
+        return arithmetic(self.kind)(lambda value: value.unary(name))  # type: ignore[no-any-return]
 
     def _define(self, function: Any, instruction: str, cases: list[Any]) -> None:
         infer_global(function)(type(f"_{instruction}_{self.kind.name}", (ConcreteTemplate,), {"cases": cases}))
