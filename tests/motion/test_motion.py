@@ -240,6 +240,17 @@ def test_nothing_held() -> None:
         assert report.condition == 1.0 and report.iterations == 0 and "rows 0" in str(report)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_accelerations_of_a_light_atom_are_on_the_rows_to_their_own_rounding(seed: int) -> None:
+    # Its force over its mass is a hundred thousand times what the rows leave of it.
+    rng = np.random.default_rng(seed)
+    x, masses = rng.standard_normal((4, 3)), np.array([800.0, 400.0, 1e-4, 150.0])
+    rows = ConstraintSet(held.Distance(list(combinations(range(4), 2))), x, masses)
+    a = Motion(rows, x).acceleration(x, np.zeros((4, 3)), rng.standard_normal((4, 3)))
+    off = rows.jacobian(x) @ a.ravel()
+    assert np.abs(off).max() < 50 * np.finfo(float).eps * np.abs(a).max()
+
+
 @pytest.mark.parametrize("fixed", [False, True], ids=["solvers", "fixed atoms"])
 def test_velocities_are_put_back_when_a_later_solver_fails(fixed):
     """One cluster has been solved, the next has no solution: positions, velocities and all are as they were."""
