@@ -473,7 +473,8 @@ def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
     """
     for holder in gc.get_referrers(integrator):
         # Attributes are a dictionary of their own where somebody has asked for it.
-        for owner in gc.get_referrers(holder) if type(holder) is dict else [holder]:
+        kept = type(holder) is dict and holder.get("_integrator") is integrator
+        for owner in gc.get_referrers(holder) if kept else [holder]:
             if issubclass(type(owner), openmm.Context) and owner.getIntegrator() is integrator:
                 return owner
     return None
