@@ -26,7 +26,7 @@ from kcons.comparison.progress import Watcher
 from kcons.comparison.runs import Run
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.test_systems.potential import Potential
-from kcons.constraints.arguments import Positive, checked
+from kcons.constraints.arguments import FromZero, Positive, checked
 from kcons.constraints.compilation import announcer, clock
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.thermostats.correlated_series import slope
@@ -83,7 +83,7 @@ def compare(
     methods: Iterable[str] | None = None,
     *,
     budget: Positive = 20.0,
-    rounds: int = ROUNDS,
+    rounds: FromZero = ROUNDS,
     reference: Reference | None = None,
     done: pd.DataFrame | None = None,
     keep: Callable[[pd.DataFrame], None] | None = None,

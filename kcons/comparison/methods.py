@@ -579,7 +579,7 @@ def code(system: TestSystem, name: str, setting: float, made_by: str) -> str:
         ``test_systems.build("chain", 10)``.
     """
     method = choose([name])[0]
-    internal = setting if method.adaptive else setting * system.units.time_unit
+    internal = float(setting if method.adaptive else setting * system.units.time_unit)
     lines = method.code or ""
     if callable(lines):
         lines = lines(system)

@@ -123,6 +123,13 @@ class Splitting(Interpreted):
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
 
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` for velocity-dependent forces where they take the order, as they do above 2."""
+        if system.velocity_dependent and self.order > 2 and self.kicks != _rattle_kicks(self.drifts):
+            raise UnsupportedError(
+                f"{self!r} loses its order with forces that depend on the velocities; use Suzuki4 or KahanLi6"
+            )
+
     def program(self, system: System | None) -> Program:
         # Whether drifts are along great circles, and whether velocities are iterated because forces depend on them.
         exact = self.exact_flight and system is not None and system.great_circles is not None
@@ -288,13 +295,6 @@ class RungeKuttaNystrom(Splitting):
     ----------
     Blanes and Moan, J. Comput. Appl. Math. 142, 313 (2002), Tables 2 and 3.
     """
-
-    def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for velocity-dependent forces."""
-        if system.velocity_dependent:
-            raise UnsupportedError(
-                f"{self!r} loses its order with forces that depend on the velocities; use Suzuki4 or KahanLi6"
-            )
 
 
 class BlanesMoan4(RungeKuttaNystrom):

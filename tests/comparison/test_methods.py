@@ -314,7 +314,7 @@ def test_refusals(monkeypatch):
     [
         *(("rotor", name) for name in ("blanes-moan6", "dop853", "ase-kcons", "ase-bonds")),
         *(("rotor", name) for name in ("openmm-verlet", "openmm-kcons-suzuki4", "openmm-held-rattle")),
-        *(("chain", name) for name in ("rattle", "openmm-middle")),
+        *(("chain", name) for name in ("rattle", "projected-rk4", "openmm-middle")),
     ],
 )
 def test_lines_of_python_end_where_the_run_ends(system, method):
@@ -322,7 +322,7 @@ def test_lines_of_python_end_where_the_run_ends(system, method):
     made = test_systems.build(system, size, quick=True)
     chosen = METHODS[method]
     setting = 1e-6 if chosen.adaptive else chosen.settings(made)[-1] / made.units.time_unit
-    lines = code(made, method, setting, f"test_systems.build({system!r}, {size}, quick=True)")
+    lines = code(made, method, np.float64(setting), f"test_systems.build({system!r}, {size}, quick=True)")
     space = {"__name__": "pasted"}
     exec(compile(lines, "pasted", "exec"), space)
     run = chosen.start(made, setting * (1.0 if chosen.adaptive else made.units.time_unit))

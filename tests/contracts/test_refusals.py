@@ -38,7 +38,7 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.models import flows, growth
-from kcons.steppers.splitting import KAHAN_LI_6, SRKN_6B, SUZUKI_4
+from kcons.steppers.splitting import KAHAN_LI_6, SRKN_6B, SUZUKI_4, Splitting
 
 X = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0], [0.3, 1.0, 1.0]])
 MASSES = [1.0, 2.0, 3.0, 4.0]
@@ -101,6 +101,7 @@ def names() -> dict[str, Any]:
         "MOTION": motion,
         "SYSTEM": system,
         "DRAG": kcons.System(motion, lambda x, v, t: -v, velocity_dependent=True),
+        "FOURTH": type("Own", (Splitting,), {"order": 4})([1 / 6, 2 / 3, 1 / 6], [0.5, 0.5], SUZUKI_4),
         "NO_ENERGY": kcons.System(motion, force, potential=lambda x, t: nan),
         "CELL": cell,
         "TRIALS": bath.ConstantPressure(bath.Langevin(1.0, 1.0, 1), bath.MonteCarloBarostat(1.0)),
@@ -523,6 +524,7 @@ REFUSED: list[tuple[str, ...]] = [
     ('kcons.mdanalysis.OpenMMReporter("nowhere/a.trr", 0)', "interval"),
     ('kcons.mdanalysis.write_ase(ATOMS, "nowhere/a.trr")', "dynamics"),
     ('kcons.comparison.compare("chain")', "system"),
+    ("kcons.comparison.compare(None, rounds=-1)", "rounds"),
 ]
 #: Errors of other types.
 OTHERS: list[tuple[str, type[KconsError], str | None]] = [
@@ -559,6 +561,7 @@ OTHERS: list[tuple[str, type[KconsError], str | None]] = [
     ("MultipleTimeSteps(CRYSTAL, 0.1, **TWO, **CALCS, barostat=MonteCarloBarostat(0.0))", UnsupportedError, None),
     ("run(DRAG, STATE, 0.1, 0, stepper=BlanesMoan4(), observers=[lambda s: 1 / 0])", UnsupportedError, None),
     *((f"BlanesMoan{order}().step(DRAG, STATE, 0.1)", UnsupportedError, None) for order in ("4", "6", "6a")),
+    ("FOURTH.step(DRAG, STATE, 0.1)", UnsupportedError, None),
     *(
         (f"solve(ConstrainedGrowth(Hypercycle(2), VelocityRow({row})), (0, 1), [0.5, 0.5])", NonFiniteError, "rows")
         for row in ("lambda t, x: [nan, 1]", "lambda t, x: [1, 1], lambda t, x: nan", "lambda t, x: [1, inf]")

@@ -72,6 +72,7 @@ from kcons.openmm.quantities import (
     with_massless_atoms,
 )
 from kcons.openmm.topology import bonds_of
+from kcons.solvers.tolerances import PIVOT_TOLERANCE
 
 #: Relative tolerance of rows in double precision.
 TOLERANCE = 1e-13
@@ -79,8 +80,6 @@ TOLERANCE = 1e-13
 START_TOLERANCE = 1e-9
 #: Two values of one coordinate, by OpenMM and by kcons, differ by less.
 SAME = 1e-5
-#: A pivot below this fraction of the row's own norm means that the row depends on others, in double precision.
-PIVOT = 1e-10
 #: A push that is not measured leaves this part of sigma at most; what it leaves more, the next step takes away.
 _LEFT = 0.01
 #: Bound of the iteration.
@@ -288,7 +287,7 @@ class CollectiveRows(Part):
             p.number(f"clock{c}", "time of the targets where the step began")
             p.number(f"flown{c}", "time of its drifts")
             p.number(f"began{c}", "good_steps when it began")
-        p.setting(f"small{c}", "a pivot below this fraction of the row's own norm means dependence", PIVOT)
+        p.setting(f"small{c}", "a pivot below this fraction of the row's own norm means dependence", PIVOT_TOLERANCE)
         p.setting(f"tolerance{c}", "what the residual may be", self.tolerance)
         if p.lean:
             p.number(f"renew{c}", "1 if G is to be computed", 1.0)
@@ -298,7 +297,7 @@ class CollectiveRows(Part):
 
     def take_precision(self, program: Program, precision: Precision) -> None:
         """What counts as small is what Forces of the platform can tell."""
-        program.set(f"small{self.code}", max(PIVOT, 10 * precision.forces))
+        program.set(f"small{self.code}", max(PIVOT_TOLERANCE, 10 * precision.forces))
 
     # -- gradients ------------------------------------------------------------------------------
 

@@ -40,6 +40,7 @@ from kcons.openmm.integrator.part import SINGLE, Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.quantities import masses_of, positions_of
 from kcons.plan.clusters import alike
+from kcons.solvers.tolerances import PIVOT_TOLERANCE
 
 #: Newton iterations at most; those after which a large cluster is factored again.
 TURNS, CHORD = 30, 4
@@ -48,15 +49,15 @@ KNOTS, BLOCK, BEYOND = 2, 500, 2
 #: Arrays of impulses, and of what rounding has taken from their sums.
 SUMS = ("rows_sums", "rows_lost")
 _NONE = np.zeros(0, np.int64)
-#: A pivot of a dependent row below this part of its diagonal is none.
-PIVOT, PIVOT_SINGLE = 1e-10, 1e-4
+#: A pivot of a dependent row below this part of its diagonal is none in single precision.
+PIVOT_SINGLE = 1e-4
 
 _COMMON = f"""
 #define ROWS_TURNS {TURNS}
 #define ROWS_CHORD {CHORD}
 #define ROWS_FAR ((mixed) 1e30)
 #if defined(USE_DOUBLE_PRECISION) || defined(USE_MIXED_PRECISION)
-#define ROWS_PIVOT ((mixed) {PIVOT})
+#define ROWS_PIVOT ((mixed) {PIVOT_TOLERANCE})
 #define ROWS_ROUNDING ((mixed) 4e-16)
 #define ROWS_ADD(row, impulse) rows_sums[row] -= impulse;
 #else

@@ -15,7 +15,7 @@ MUTANTS = {
     "openmm/device/rows.py": {
         "if «not item.n_rows→False»:": "rows::constraints_of_no_rows_hold_nothing",
         "np.isin(pairs, fixed).all(axis=1) «& rounded→»": "kernel_rows::fixed_atoms_of_rigid_water_in_single_precision",
-        "#define ROWS_PIVOT ((mixed) {«PIVOT_SINGLE→PIVOT»})": "kernel_rows::multipliers_in_single_precision",
+        "#define ROWS_PIVOT ((mixed) {«PIVOT_SINGLE→PIVOT_TOLERANCE»})": "kernel_rows::multipliers_in_single_precision",
         "{volatile mixed y_ = -(impulse)«-rows_lost[row]→», t_": "kernel_rows::multipliers_in_single_precision",
         "part._engine._integrator = «weakref.ref(integrator)→other»": (
             "kernel_rows::states_with_energies_of_rows_of_hold_that_move"
