@@ -126,13 +126,13 @@ def _refuse_unknown(name: str, kind: Any, given: Mapping[str, Any]) -> None:
 def described(calculator: Any, atoms: Atoms) -> list[Any]:
     """What tells a calculator from others: its kind, its parameters, and the calculators that it is made of.
 
-    Initial charges and magnetic moments of the atoms, which it may take for the charge and the spin, are in it where
-    there are any, and constraints of ASE that add forces. Plain data, the same in each process; of parameters that are
-    files of weights, the contents. What a calculator does not give as parameters is not in it.
+    What it may take for the charge and the spin, initial charges and magnetic moments of the atoms and ``atoms.info``,
+    is in it where there is any, and constraints of ASE that add forces. Plain data, the same in each process; of files
+    of weights, the contents. What a calculator does not give as parameters is not in it.
     """
     initial = {k: atoms.arrays[k] for k in ("initial_charges", "initial_magmoms") if np.any(atoms.arrays.get(k, 0))}
     added = [item.todict() for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
-    return [_plain(part) for part in (*_kind(calculator), *([initial] if initial else []), *added)]
+    return [_plain(part) for part in (*_kind(calculator), *filter(None, (initial, atoms.info)), *added)]
 
 
 def _kind(calculator: Any) -> list[Any]:

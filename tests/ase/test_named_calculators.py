@@ -40,7 +40,8 @@ def test_what_tells_calculators_from_each_other():
     made = [(each, Atoms()) for each in (*lj, EMT(), *(SumCalculator([EMT(), each]) for each in lj))]
     adding = (ExternalForce(0, 1, 0.5), ExternalForce(0, 1, 0.6), Hookean(0, 1, 2.0, 1.0))
     made += [(EMT(), Atoms("H2", constraint=[FixAtoms([0]), item])) for item in adding]
-    made += [(EMT(), Atoms("H2", magmoms=[1.0, 0.0])), (EMT(), Atoms("H2", charges=[1.0, 0.0]))]
+    made += [(EMT(), Atoms("H2", **{name: [1.0, 0.0]})) for name in ("magmoms", "charges")]
+    made += [(EMT(), Atoms("H2", info={"charge": charge})) for charge in (0, 1)]
     assert len({json.dumps(described(*each)) for each in made}) == len(made)
     for plain in (Atoms("H2", charges=[0.0, 0.0]), Atoms("H2", constraint=FixAtoms([0]))):
         assert described(EMT(), plain) == described(EMT(), Atoms())

@@ -32,6 +32,7 @@ MUTANTS = {
         "if «module not in modules→False»:": (
             "named_calculators::files_name_calculators_of_a_list_or_of_modules_that_their_reader_names"
         ),
+        "(initial, «atoms.info→None»)": "named_calculators::what_tells_calculators_from_each_other",
     },
     "free_energy/held_coordinates.py": {
         "if «dependent→False»:": "free_energy/refusals::refusals",
