@@ -119,7 +119,7 @@ class Ensemble:
         Whether what `close` does may be left to the next step if the state is not read between.
     noisy : bool
         Whether it has noise, of size `spread` in the program: the kinetic energy that is reported is then that of
-        `v_middle`, since velocities have the temperature of the bath in the middle of a step only.
+        the middle, since velocities have the temperature of the bath in the middle of a step only.
     """
 
     stays_tangent = adds_up = owes = noisy = False
@@ -323,6 +323,8 @@ class Program:
         self.lean = plain and bool(self.parts) and verlet and not self.sited
         #: Without parts: whether the kick that ends a step is made with that which begins the next.
         self.joined = ensemble.adds_up and not self.parts and verlet
+        #: Where velocities in the middle and at the end of a step are noted: of joined steps in what is idle there.
+        self.noted = ("xu", "x_start") if self.joined else ("v_middle", "v_end")
         #: Whether `between` is of use.
         self.lazy = self.lean or self.joined or (not self.parts and ensemble.owes)
         #: Whether drifts change v by impulses without the rounding errors of positions.
@@ -491,12 +493,12 @@ class Program:
     def note_middle(self, velocities: str) -> None:
         """The velocities between the last drift of a step and the kick that ends it."""
         if self.ensemble.noisy:
-            self.each("v_middle", velocities, "its kinetic energy is reported")
+            self.each(self.noted[0], velocities, "its kinetic energy is reported")
 
     def note_end(self) -> None:
-        """The step that has this `v_middle` ends."""
+        """The step that has this middle ends."""
         if self.ensemble.noisy:
-            self.each("v_end", "v", "to see whether others change v")
+            self.each(self.noted[1], "v", "to see whether others change v")
 
     # -- the integrator -------------------------------------------------------------------------
 
@@ -590,7 +592,7 @@ def write_step(p: Program) -> None:
     p.ensemble.declare(p)
     if p.ensemble.noisy:
         # Where others have set v since, it is theirs that counts.
-        p.kinetic_energy = "m*u*u/2; u=select(spread*delta(v-v_end), v_middle, v)"
+        p.kinetic_energy = "m*u*u/2; u=select(spread*delta(v-{1}), {0}, v)".format(*p.noted)
     p.ensemble.write(p)
     p.use("ending")
     with p.when("ending != 0", "a call ends"):

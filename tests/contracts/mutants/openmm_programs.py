@@ -39,7 +39,7 @@ MUTANTS = {
         "        if «→not rows and »_scales_atoms(force):": "hold::agents_that_break_rows_are_refused",
     },
     "openmm/integrator/program.py": {
-        "«*delta(v-v_end)→», v_middle, v": "reported_kinetic_energy::of_velocities_that_others_have_set_it_is_theirs",
+        "«*delta(v-{1})→», {0}, v": "reported_kinetic_energy::of_velocities_that_others_have_set_it_is_theirs",
         "v+per_h*(x-xu)«→+0.5*dt*f/m»": "reported_kinetic_energy::with_noise_it_is_that_half_a_kick_before_the_end",
         '«exact+→»1-between != 0", "kicks need it")': "every_ensemble::calls_of_any_length_make_the_same_motion",
         '", "good_steps+«delta(failed)→1»", "count it")': "steps::a_failed_step_is_taken_back_and_not_counted",
