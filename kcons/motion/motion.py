@@ -28,6 +28,7 @@ from kcons.motion.solver_sequence import SolverSequence
 from kcons.plan.clusters import fixed_atoms
 from kcons.plan.plan import Plan, make_plan
 from kcons.plan.second_order import MISFIT, FlatBody, without_second_order_rows
+from kcons.solvers.tolerances import UNEVEN
 
 
 class Motion:
@@ -95,6 +96,8 @@ class Motion:
         self._flat: IntArray = (3 * touched[:, None] + np.arange(3)).ravel() if self._atoms is not None else touched
         self._lattice = self._local.lattice
         self._solve = SolverSequence(self._local, self.plan, self._atoms)
+        free = self.plan.inverse_masses[self.plan.inverse_masses > 0]
+        self._uneven = bool(free.max(initial=0.0) > UNEVEN * free.min(initial=np.inf))
 
     @property
     def rank(self) -> int:
@@ -437,11 +440,11 @@ class Motion:
         if not np.all(np.isfinite(b)):
             raise self._solve.failures.undefined(int(np.argmin(np.isfinite(b))), velocity=local_v, position=local_x)
         self._solve.tangents(local_x, local_a, b, time, mu, "force")
-        # Again, for what rounding leaves where a light atom's force over its mass is many times its acceleration.
-        more = None if mu is None else np.empty_like(mu)
-        self._solve.tangents(local_x, local_a, b, time, more, "force")
-        if mu is not None and more is not None:
-            mu += more
+        if self._uneven:  # again, for what rounding leaves
+            more = None if mu is None else np.empty_like(mu)
+            self._solve.tangents(local_x, local_a, b, time, more, "force")
+            if mu is not None and more is not None:
+                mu += more
         if self._atoms is not None:
             a[self._atoms] = local_a
         return a

@@ -47,6 +47,9 @@ CHAIN_SPEED_TOLERANCE = 2e-15
 SPEED_ROUNDINGS = 1e3
 #: The same with dense algebra, whose rows are combined by singular vectors.
 DENSE_SPEED_TOLERANCE = 1e-11
+#: Where masses differ more, the force over the mass of a light atom is so many times its acceleration on the rows that
+#: accelerations are refined.
+UNEVEN = 1e3
 #: Smallest scalar product taken for positive: of a bond with its reference, or with itself.
 TINY = 1e-300
 
