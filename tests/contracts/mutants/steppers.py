@@ -128,10 +128,15 @@ MUTANTS = {
     "motion/certificate.py": {
         "SPEED = 1«0.→e1»0": "certificate::a_solver_that_is_wrong_without_knowing_is_found_in_the_first_step",
     },
+    "steppers/splitting.py": {
+        "if «system.velocity_dependent and self.order > 2 and→False and»": "contracts/refusals::refused",
+        "« and self.kicks != _rattle_kicks(self.drifts)→»:": "schemes::forces_that_depend_on_velocities_are_taken_back",
+    },
     "motion/motion.py": {
         "            «certify(self._given, here, speed, time, slack=10 * MISFIT, still=still, moved=moved)→pass»": (
             "certificate::rows_that_were_converted_are_looked_at_as_they_were_given"
         ),
+        "if «self._uneven→False»:": "motion::accelerations_of_a_light_atom_are_on_the_rows_to_their_own_rounding",
     },
     "constraints/constraint_set.py": {
         "_HALF = 0.«5 - 1e-9→6»": "images::atoms_that_nothing_ties_raise_before_their_image_flips",
