@@ -37,7 +37,7 @@ from kcons.constraints.arguments import Rng, as_array, as_float_array, generator
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import spanning_tree
 from kcons.constraints.target import FloatArray
-from kcons.constraints.vectors import extent
+from kcons.constraints.vectors import cross, extent
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.steppers import System
@@ -161,7 +161,7 @@ class Clusters(Bodies):
             p = self.arms(x)
             reach = math.sqrt(float((p * p).sum(axis=1).max(initial=0.0))) or 1.0
             moves = [np.where(inside, axis, 0.0) for axis in np.eye(3)]
-            return np.stack([m.ravel() for m in (*moves, *(np.cross(axis, p) / reach for axis in np.eye(3)))], axis=1)
+            return np.stack([m.ravel() for m in (*moves, *(cross(axis, p) / reach for axis in np.eye(3)))], axis=1)
 
         for change in row_changes(motion, whole, fields, 0.0, size):
             kept: NDArray[np.bool_] = np.asarray(np.abs(change) <= UNCHANGED)  # not NaN: a surface that ends there
@@ -296,8 +296,8 @@ class TemperatureSplit:
         clusters, masses = self._clusters, self._system.masses[:, None]
         v = thermal_velocities(self._system, x, 1.0, self._rng)
         pace = clusters.centers(v) * clusters.shifts[:, None]
-        spins = np.einsum("cik,cjk,cj->ci", turns, turns, clusters.sums(masses * np.cross(arms, v)))
-        return np.asarray(v - clusters.spread(pace) - np.cross(clusters.spread(spins), arms))
+        spins = np.einsum("cik,cjk,cj->ci", turns, turns, clusters.sums(masses * cross(arms, v)))
+        return np.asarray(v - clusters.spread(pace) - cross(clusters.spread(spins), arms))
 
     def _squares(self, x: FloatArray, f: FloatArray, arms: FloatArray, turns: FloatArray) -> FloatArray:
         """Squares of the slopes by shifts, by turns, and of all, of each cluster; shape (3, clusters)."""
@@ -305,7 +305,7 @@ class TemperatureSplit:
         sizes = np.sqrt((f * f).sum(axis=1))
         force = _unbalanced(clusters.sums(f), clusters.sums(sizes))
         reach = np.sqrt((arms * arms).sum(axis=1))
-        torque = _unbalanced(clusters.sums(np.cross(arms, f)), clusters.sums(reach * sizes))
+        torque = _unbalanced(clusters.sums(cross(arms, f)), clusters.sums(reach * sizes))
         shift = np.where(clusters.shifts, (force * force).sum(axis=1) / clusters.mass, 0.0)
         turn = (np.einsum("cik,ci->ck", turns, torque) ** 2).sum(axis=1)
         whole = np.zeros_like(shift)
@@ -325,14 +325,14 @@ class TemperatureSplit:
         spin = clusters.spread(np.einsum("cik,ck->ci", turns, signs[1]))
         v = pushed
         if self._rest.any():
-            v = self._rest_of(x, arms, turns) + pushed + np.cross(spin, arms)
+            v = self._rest_of(x, arms, turns) + pushed + cross(spin, arms)
         found = np.zeros((3, len(clusters)))
         for way in (h, -h):
             if clusters.shifts.any():
                 found[0] -= self._slopes(x + way * pushed, pushed) / (2 * way)
             if self._axes.any():
                 turned = _turned(arms, spin, way)
-                found[1] -= self._slopes(x + (turned - arms), np.cross(spin, turned)) / (2 * way)
+                found[1] -= self._slopes(x + (turned - arms), cross(spin, turned)) / (2 * way)
             if self._rest.any():
                 there, speed = self._system.flown(x, v, way)
                 end = self._system.motion.project_velocities(there, speed)
@@ -389,8 +389,8 @@ def _turned(arms: FloatArray, spin: FloatArray, h: float) -> FloatArray:
     angle = h * np.sqrt((spin * spin).sum(axis=1))[:, None]
     sine = h * np.sinc(angle / np.pi)
     versed = 0.5 * (h * np.sinc(0.5 * angle / np.pi)) ** 2
-    across = np.cross(spin, arms)
-    return np.asarray(arms + sine * across + versed * np.cross(spin, across))
+    across = cross(spin, arms)
+    return np.asarray(arms + sine * across + versed * cross(spin, across))
 
 
 def flight_of(system: System, x: FloatArray, displacement: float | None, share: float) -> float:

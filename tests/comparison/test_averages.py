@@ -83,7 +83,7 @@ def test_the_notes_convention_is_found_to_be_hot():
         potential=Potential(fluid.forces.evaluate, "Lennard-Jones"),
         thermal_energy=fluid.thermal_energy,
     )
-    found = {n: sample(box, SAMPLERS[n], 0.01, 1.0, length=400.0) for n in ("isokinetic", "isokinetic-notes")}
+    found = {n: sample(box, SAMPLERS[n], 0.01, 1.0, length=160.0) for n in ("isokinetic", "isokinetic-notes")}
     for name, expected in (("isokinetic", 0.0), ("isokinetic-notes", 1 / 3)):
         for kind in ("shift", "turn"):
             assert abs(found[name][kind] - expected) <= 4 * found[name][f"{kind}_error"] < 0.3

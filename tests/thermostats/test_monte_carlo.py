@@ -95,7 +95,7 @@ def test_a_free_angle_has_the_average_of_its_metric():
     held, state = trimer(masses=(10.0, 1.0, 10.0))
     sampler = HamiltonianMonteCarlo(1.0, (3, 8), 21)
     frames: list = []
-    counts = Counts.of(run(held, state, 0.15, 4500, stepper=sampler, observers=[frames.append], check_every=0))
+    counts = Counts.of(run(held, state, 0.15, 2100, stepper=sampler, observers=[frames.append], check_every=0))
     assert counts.energy > 5 and counts.unsolved > 5
     squares = cosines(frames[1:]) ** 2
     error = squares.reshape(30, -1).mean(axis=1).std(ddof=1) / math.sqrt(30)
