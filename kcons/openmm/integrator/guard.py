@@ -664,6 +664,7 @@ class Guard:
         if self.started:
             integrator.refresh()
         else:
+            self._read_again()  # `Context.reinitialize` may have come since this Context was seen first
             # OpenMM keeps the forces of a CustomIntegrator whatever has happened to the box.
             context.setVelocities(v)
         try:

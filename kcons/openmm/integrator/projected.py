@@ -794,8 +794,7 @@ def _descend(integrator: ProjectedIntegrator, context: openmm.Context, tolerance
     ----------
     Bitzek et al., Phys. Rev. Lett. 97, 170201 (2006).
     """
-    system = context.getSystem()
-    masses = masses_of(system)[:, None]
+    masses = masses_of(context.getSystem())[:, None]
     inverse = np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0)
     groups = integrator.getIntegrationForceGroups()
     kept = velocities_of(context)
