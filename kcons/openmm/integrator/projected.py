@@ -458,7 +458,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         Raises
         ------
         KconsError
-            A part cannot do it; velocities are unchanged.
+            A part, or the solver of OpenMM, cannot do it; velocities are unchanged.
         """
         guard = self._watch(context)
         context = guard.context
@@ -467,6 +467,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             context.applyVelocityConstraints(tolerance)
             for part in self.parts:
                 part.apply_velocities(context)
+            check_finite(*motion_of(context), context.getStepCount(), guard.rows.n_rows > 0)
         except KconsError:
             context.setVelocities(velocities)
             raise
