@@ -322,6 +322,7 @@ class CallbackEngine(Engine):
 
     def follow(self, p: Program) -> None:
         """Take times and step sizes from the integrator of this program."""
+        self.refuse_other_threads()
         self.exact, self.served = p.exact, True
         self._integrator = weakref.ref(p.integrator)
         self.carries_rest = not p.integrator.thermostatted
@@ -333,12 +334,16 @@ class CallbackEngine(Engine):
         if precision.name != "double":
             self.carries_rest = False
 
-    def begin_run(self) -> None:
-        """Whatever was asked between steps, the next call belongs to the beginning of one."""
+    def refuse_other_threads(self) -> None:
+        """Raise while another thread makes steps: nothing may change what they go by."""
         if self._thread not in (0, get_ident()):
             raise UnsupportedError(
                 "a Context in another thread is making steps with these rows; call hold for a System of each thread"
             )
+
+    def begin_run(self) -> None:
+        """Whatever was asked between steps, the next call belongs to the beginning of one."""
+        self.refuse_other_threads()
         self._thread = get_ident()
         self._between_steps, self._rest_to_come, self._ran = True, False, None
 
@@ -639,8 +644,7 @@ class CarriedConstraints(Part):
 
     def solver_at(self, context: openmm.Context) -> Solver:
         """The engine at the time of the context."""
-        time = self._state(context)[2]
-        return Solver(self.motion, time=time)
+        return Solver(self.motion, time=self._state(context)[2])
 
     @property
     def atoms(self) -> IntArray:
@@ -674,8 +678,7 @@ class CarriedConstraints(Part):
             cut = (np.ptp(held.gather(item, x) - x[item.atoms], axis=1) > NEAR).any(axis=1)
             rows.append((item.atoms, lambda k, start=start: held.row_name(start + k), cut))
         refuse_agents(system, bound, rows, context.getMolecules)
-        miss = self.worst_violation(context)
-        if miss is not None:
+        if (miss := self.worst_violation(context)) is not None:
             raise InputError(
                 f"{miss}; bring them onto the rows by apply_{miss.what}(context), or correct them. OpenMM's minimizer "
                 "does not know the rows: take integrator.minimizeEnergy()",
@@ -751,9 +754,8 @@ class CarriedConstraints(Part):
         InfeasibleError, InputError
             As `Motion.restore_positions`; nothing was changed.
         """
-        solver = self.solver_at(context)
         bonds = bonds_of(context.getSystem(), positions_of(context))
-        self.restore_by(solver, context, bonds if len(bonds) else None)
+        self.restore_by(self.solver_at(context), context, bonds if len(bonds) else None)
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
         require_context(context)
