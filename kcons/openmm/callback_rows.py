@@ -532,8 +532,7 @@ class CallbackEngine(Engine):
     # -- afterwards -----------------------------------------------------------------------------
 
     def explained_error(self, step: int) -> KconsError:
-        error = self._error
-        self._error = None
+        error, self._error = self._error, None
         if error is None:
             return ConvergenceError(f"step {step}: the carried rows failed without saying why", step=step)
         finite = np.isfinite(self._read).all(axis=1)
@@ -644,7 +643,8 @@ class CarriedConstraints(Part):
 
     def solver_at(self, context: openmm.Context) -> Solver:
         """The engine at the time of the context."""
-        return Solver(self.motion, time=self._state(context)[2])
+        time = self._state(context)[2]
+        return Solver(self.motion, time=time)
 
     @property
     def atoms(self) -> IntArray:
