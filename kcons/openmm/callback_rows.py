@@ -653,8 +653,7 @@ class CarriedConstraints(Part):
 
     def rank(self, context: openmm.Context | None = None) -> int:
         """Degrees of freedom that the rows take; particles without mass never had any."""
-        fixed = int(np.count_nonzero(self.motion.masses[self.atoms] == 0))
-        return self.motion.rank - 3 * fixed
+        return self.motion.rank - 3 * int(np.count_nonzero(self.motion.masses[self.atoms] == 0))
 
     # -- in a context ---------------------------------------------------------------------------
 
@@ -754,8 +753,9 @@ class CarriedConstraints(Part):
         InfeasibleError, InputError
             As `Motion.restore_positions`; nothing was changed.
         """
+        solver = self.solver_at(context)
         bonds = bonds_of(context.getSystem(), positions_of(context))
-        self.restore_by(self.solver_at(context), context, bonds if len(bonds) else None)
+        self.restore_by(solver, context, bonds if len(bonds) else None)
 
     def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
         require_context(context)
