@@ -135,6 +135,6 @@ MUTANTS = {
         ),
         "u * np.cos(w) - d * (w * np.sin(w))« - way→»": "surface_integrator::great_circles_at_any_time_step",
         '"ij,ij->i", d, way)[:, None] / radius«**2→»)': "surface_integrator::the_steps_are_those_of_the_core",
-        "self.motion.rank« - 3 * fixed→»": "hold::particles_without_mass_take_no_degree_of_freedom",
+        "self.motion.rank - «3→0» * int": "hold::particles_without_mass_take_no_degree_of_freedom",
     },
 }
