@@ -322,6 +322,7 @@ class CallbackEngine(Engine):
 
     def follow(self, p: Program) -> None:
         """Take times and step sizes from the integrator of this program."""
+        self.refuse_other_threads()
         self.exact, self.served = p.exact, True
         self._integrator = weakref.ref(p.integrator)
         self.carries_rest = not p.integrator.thermostatted
@@ -333,12 +334,16 @@ class CallbackEngine(Engine):
         if precision.name != "double":
             self.carries_rest = False
 
-    def begin_run(self) -> None:
-        """Whatever was asked between steps, the next call belongs to the beginning of one."""
+    def refuse_other_threads(self) -> None:
+        """Raise while another thread makes steps: nothing may change what they go by."""
         if self._thread not in (0, get_ident()):
             raise UnsupportedError(
                 "a Context in another thread is making steps with these rows; call hold for a System of each thread"
             )
+
+    def begin_run(self) -> None:
+        """Whatever was asked between steps, the next call belongs to the beginning of one."""
+        self.refuse_other_threads()
         self._thread = get_ident()
         self._between_steps, self._rest_to_come, self._ran = True, False, None
 
@@ -527,8 +532,7 @@ class CallbackEngine(Engine):
     # -- afterwards -----------------------------------------------------------------------------
 
     def explained_error(self, step: int) -> KconsError:
-        error = self._error
-        self._error = None
+        error, self._error = self._error, None
         if error is None:
             return ConvergenceError(f"step {step}: the carried rows failed without saying why", step=step)
         finite = np.isfinite(self._read).all(axis=1)
@@ -649,8 +653,7 @@ class CarriedConstraints(Part):
 
     def rank(self, context: openmm.Context | None = None) -> int:
         """Degrees of freedom that the rows take; particles without mass never had any."""
-        fixed = int(np.count_nonzero(self.motion.masses[self.atoms] == 0))
-        return self.motion.rank - 3 * fixed
+        return self.motion.rank - 3 * int(np.count_nonzero(self.motion.masses[self.atoms] == 0))
 
     # -- in a context ---------------------------------------------------------------------------
 
@@ -674,8 +677,7 @@ class CarriedConstraints(Part):
             cut = (np.ptp(held.gather(item, x) - x[item.atoms], axis=1) > NEAR).any(axis=1)
             rows.append((item.atoms, lambda k, start=start: held.row_name(start + k), cut))
         refuse_agents(system, bound, rows, context.getMolecules)
-        miss = self.worst_violation(context)
-        if miss is not None:
+        if (miss := self.worst_violation(context)) is not None:
             raise InputError(
                 f"{miss}; bring them onto the rows by apply_{miss.what}(context), or correct them. OpenMM's minimizer "
                 "does not know the rows: take integrator.minimizeEnergy()",

@@ -104,7 +104,8 @@ class DeviceProgram(Program):
         self.push()
 
     def write(self, name: str, value: float) -> None:
-        """Change a variable that is no setting; settings go over at the next call of `step`."""
+        """Change a variable that is no setting; settings go over to the plugin and into its text."""
+        self.push()
         if self.known(name) in self.kept and self.integrator.shared.bound:
             values = self.integrator.read("memory")
             values[self.kept.index(name)] = value
@@ -119,7 +120,7 @@ class DeviceProgram(Program):
     def push(self) -> None:
         """Settings, where they are others than the plugin has."""
         integrator = self.integrator
-        if integrator.describe() and integrator.shared.bound:
+        if integrator.describe() and integrator.shared.planned:
             integrator.write("parameters", np.array([*self.settings.values(), 0.0]))
 
     def remembered(self) -> dict[str, Any]:
@@ -278,7 +279,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     def record(self, atoms: IntArray) -> None:
         """Choose particles of which `records` tells; before the first step of a Context."""
         self._recorded = np.unique(atoms).tolist()
-        self.describe()
+        self.program.push()
 
     def records(self, steps: int, every: int) -> Iterator[tuple[FloatArray, FloatArray, FloatArray, float]]:
         """Make steps, and give what was recorded on the device after each `every` of them.
@@ -343,7 +344,7 @@ class DeviceIntegrator(ProjectedIntegrator):
     def setRandomNumberSeed(self, seed: int) -> None:
         """The seed of noise, before the Context is made; 0 for one that nobody knows."""
         self._seed = whole_number(seed, "seed", -(2**31), 2**31 - 1)
-        self.describe()
+        self.program.push()
 
     def getRandomNumberSeed(self) -> int:
         return self._seed

@@ -257,7 +257,7 @@ class DeviceRows:
         off = f"is off by {abs(residual):.3g}" if np.isfinite(residual) else "is not finite"
         return ConvergenceError(
             f"step {step}: row {self.set.row_name(number)} {off} after {TURNS} iterations on the device. Use a "
-            "smaller time step, or start nearer to the constraints",
+            "smaller time step, start nearer to the constraints, or leave out tolerance=, which may be below rounding",
             residual=abs(residual),
             iterations=TURNS,
             row=number,

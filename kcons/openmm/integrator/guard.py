@@ -28,6 +28,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.certificate import MOST, SHARE
+from kcons.motion.motion import Motion
 from kcons.openmm.integrator.part import NEAR, SINGLE, Part, Precision, Violation
 from kcons.openmm.integrator.program import Integrator, forces_at_old_positions
 from kcons.openmm.quantities import (
@@ -40,7 +41,6 @@ from kcons.openmm.quantities import (
     velocities_of,
     width_of,
 )
-from kcons.plan.plan import make_plan
 
 logger = logging.getLogger("kcons.openmm")
 
@@ -176,15 +176,12 @@ class SystemRows:
         return f"constraint {self.numbers[row]} of the System (particles {i} and {j}, {self.lengths[row]:.6g} nm)"
 
     def rank(self, x: FloatArray) -> int:
-        """Independent rows at positions x. Isolated triangles have rank 3."""
-        rest = ~self.settled
-        count = int(np.sum(self.settled))
-        if not rest.any():
-            return count
-        atoms, pairs = np.unique(self.pairs[rest], return_inverse=True)
-        distances = Distance(pairs.reshape(-1, 2), self.lengths[rest])
-        rows = ConstraintSet([distances], x[atoms], self.masses[atoms])
-        return count + make_plan(rows, np.ascontiguousarray(x[atoms]), 0.0).rank
+        """Independent rows at positions x; of straight and flat groups all that hold them so, as `Motion` counts."""
+        if not self.n_rows:
+            return 0
+        atoms, pairs = np.unique(self.pairs, return_inverse=True)
+        rows = ConstraintSet([Distance(pairs.reshape(-1, 2), self.lengths)], x[atoms], self.masses[atoms])
+        return Motion(rows, x[atoms]).rank
 
 
 def components(n: int, pairs: ArrayLike) -> IntArray:
@@ -660,10 +657,11 @@ class Guard:
         """
         context, integrator = self.context, self.integrator
         x, v = motion_of(context)
-        check_finite(x, v, context.getStepCount(), False)
+        check_finite(x, v, context.getStepCount(), self.rows.n_rows > 0)
         if self.started:
             integrator.refresh()
         else:
+            self._read_again()  # `Context.reinitialize` may have come since this Context was seen first
             # OpenMM keeps the forces of a CustomIntegrator whatever has happened to the box.
             context.setVelocities(v)
         try:

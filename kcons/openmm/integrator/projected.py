@@ -458,7 +458,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         Raises
         ------
         KconsError
-            A part cannot do it; velocities are unchanged.
+            A part, or the solver of OpenMM, cannot do it; velocities are unchanged.
         """
         guard = self._watch(context)
         context = guard.context
@@ -467,6 +467,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             context.applyVelocityConstraints(tolerance)
             for part in self.parts:
                 part.apply_velocities(context)
+            check_finite(*motion_of(context), context.getStepCount(), guard.rows.n_rows > 0)
         except KconsError:
             context.setVelocities(velocities)
             raise
@@ -794,8 +795,7 @@ def _descend(integrator: ProjectedIntegrator, context: openmm.Context, tolerance
     ----------
     Bitzek et al., Phys. Rev. Lett. 97, 170201 (2006).
     """
-    system = context.getSystem()
-    masses = masses_of(system)[:, None]
+    masses = masses_of(context.getSystem())[:, None]
     inverse = np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0)
     groups = integrator.getIntegrationForceGroups()
     kept = velocities_of(context)

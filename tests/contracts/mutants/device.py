@@ -25,6 +25,7 @@ MUTANTS = {
         "numbers.time = «→(float) »c.getTime()-shared.origin;": "kernel_rows::targets_move_late_in_a_long_run",
     },
     "openmm/device/plugin/program_integrator.cpp": {
+        "«steps->valid = false;→»   ": "device_integrator::others_move_positions_and_velocities",
         'array.name != «"memory"→""»;': "device_integrator::states_of_other_rows_are_refused",
     },
     "plan/clusters.py": {

@@ -5,6 +5,7 @@ MUTANTS = {
         "if «cut.any()→False»:": (
             "hold::a_barostat_in_place_of_another_force_refuses_rows_through_the_faces_of_the_box"
         ),
+        "«self._read_again()→»  # `Context": "openmm/integrator/edits::particles_that_lose_their_mass_take_no_heat",
         "            if «self._read_again()→False»:\n": (
             "openmm/integrator/edits::masses_and_lengths_after_reinitialize"
         ),
@@ -123,6 +124,7 @@ MUTANTS = {
     },
     "openmm/callback_rows.py": {
         "if «self._thread not in (0, get_ident())→False»:": "hold::rows_serve_one_thread_at_a_time",
+        "«self.refuse_other_threads()→»\n        self.exact": "hold::rows_serve_one_thread_at_a_time",
         "if self._count == count + «1 > 0→2 > 0»:": "callbacks::an_integrator_that_does_not_hold_the_rows_is_refused",
         "elif self.timed and «self._integrator() is None→False»:": (
             "callbacks::rows_that_need_the_time_are_not_held_without_their_integrator"
@@ -133,6 +135,6 @@ MUTANTS = {
         ),
         "u * np.cos(w) - d * (w * np.sin(w))« - way→»": "surface_integrator::great_circles_at_any_time_step",
         '"ij,ij->i", d, way)[:, None] / radius«**2→»)': "surface_integrator::the_steps_are_those_of_the_core",
-        "self.motion.rank« - 3 * fixed→»": "hold::particles_without_mass_take_no_degree_of_freedom",
+        "self.motion.rank - «3→0» * int": "hold::particles_without_mass_take_no_degree_of_freedom",
     },
 }

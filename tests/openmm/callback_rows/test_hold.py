@@ -233,12 +233,13 @@ def test_rows_serve_one_thread_at_a_time():
         return r[0, 2]
 
     system = particles([1.0])
-    rows = hold(system, Custom([0], height, lambda r: np.array([[0, 0, 1.0]])), [[0, 0, 0]])
-    for _ in range(2):
-        contexts.append(started(system, ProjectedIntegrator(0.001, parts=rows), [[0, 0, 0]], [[1.0, 0, 0]]))
+    rows = hold(system, Custom([0], height, lambda r: np.array([[0, 0, 1.0]]), lambda t: 0.5 * t), [[0, 0, 0]])
+    for dt in (0.001, 0.002):
+        contexts.append(started(system, ProjectedIntegrator(dt, parts=rows), [[0, 0, 0]], [[1.0, 0, 0.5]]))
     for context in contexts:
         context.getIntegrator().step(4)
     assert told == ["asked", "refused"]
+    assert state_of(contexts[0])[0][0, 2] == pytest.approx(0.5 * 0.004, abs=1e-12)  # as if nobody had asked
 
 
 @pytest.mark.usefixtures("without_device")

@@ -21,7 +21,7 @@ from openmm_systems import (
     state_of,
 )
 
-from kcons.errors import InputError, KconsError
+from kcons.errors import InputError, KconsError, NonFiniteError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 
@@ -76,6 +76,17 @@ def test_degrees_of_freedom_are_counted_by_rank():
         system, integrator = particles([12.0] * 5, *removers, held=every, x=x), ProjectedIntegrator(0.001)
         context = started(system, integrator, x)
         assert integrator.degrees_of_freedom(context) == count and integrator.independent_momenta(context) == 6
+
+
+def test_flat_and_straight_groups_move_like_bodies():
+    """By all distances, which are singular at second order there; SETTLE gives a straight triangle no velocities."""
+    for x, count in ([[0, 0, 0], [3, 0, 0], [3, 3, 0], [0, 3, 0]], 6), ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], 5):
+        system = particles([12.0] * len(x), held=[(i, j) for i in range(len(x)) for j in range(i)], x=x)
+        context = started(system, integrator := ProjectedIntegrator(0.001), x)
+        assert integrator.degrees_of_freedom(context) == count
+    with pytest.raises(NonFiniteError, match="let kcons hold"):
+        integrator.setVelocitiesToTemperature(context, 300, 1)
+    assert not state_of(context)[1].any()
 
 
 def test_minimizer_keeps_parts():

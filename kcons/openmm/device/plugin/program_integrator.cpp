@@ -159,10 +159,9 @@ protected:
     }
     double computeKineticEnergy() override {
         const double middle = shared.told[1], end = shared.told[6];
-        if (middle >= 0) {
-            steps->launch("look");
-            if (fabs(steps->read("looked")[6]-end) <= 1e-7*end) return middle/2;   // others leave other velocities
-        }
+        steps->valid = false;                      // forces of other groups may be there than energies were asked of last
+        if (middle >= 0) steps->launch("look");
+        if (middle >= 0 && fabs(steps->read("looked")[6]-end) <= 1e-7*end) return middle/2;   // else others left other velocities
         vector<Vec3> v;
         double sum = 0;
         context->getVelocities(v);
