@@ -568,8 +568,7 @@ def attach(atoms: Atoms) -> Constraints:
     """
     require_atoms(atoms)
     others = [item for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
-    rows = translated(atoms, [item for item in atoms.constraints if not isinstance(item, FORCES_ONLY)])
-    held = Constraints(rows)
+    held = Constraints(translated(atoms, [item for item in atoms.constraints if not isinstance(item, FORCES_ONLY)]))
     atoms.set_constraint([held, *others])
     return held
 
