@@ -152,7 +152,7 @@ def test_angular_momentum_of_a_free_cluster_is_said():
         ([CenterOfMass([0, 1]), Plane([3], [0, 0, 1.0], 0.0)], 1),
         ([Line([2], [0.1, 0.2, 0.3], [0, 0.6, 0.8])], 1),
     ],
-    ids="sphere plane cylinder fixed-atom ellipsoid formula three-fixed-atoms center center-and-plane line".split(),
+    ids=["sphere", "plane", "cylinder", "fixed", "ellipsoid", "formula", "three fixed", "center", "and plane", "line"],
 )
 def test_angular_momentum_about_the_axes_of_what_is_held_is_said(rows, axes):
     """Pairs that repel exert no torque, and rows none about some axis; a field across it does."""
