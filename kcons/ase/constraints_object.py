@@ -370,6 +370,7 @@ class Constraints(FixConstraint):
         x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept)
         self._move(atoms, bound.motion, x)
         accepted.between_steps = True
+        self._binding = None  # which rows are independent is seen there anew
 
     def _move(self, atoms: Atoms, motion: Motion, x: FloatArray) -> None:
         """Put atoms where they are on the constraints, and project momenta that they have."""
