@@ -370,6 +370,7 @@ class Constraints(FixConstraint):
         x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept)
         self._move(atoms, bound.motion, x)
         accepted.between_steps = True
+        self._binding = None  # which rows are independent is seen there anew
 
     def _move(self, atoms: Atoms, motion: Motion, x: FloatArray) -> None:
         """Put atoms where they are on the constraints, and project momenta that they have."""
@@ -568,8 +569,7 @@ def attach(atoms: Atoms) -> Constraints:
     """
     require_atoms(atoms)
     others = [item for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
-    rows = translated(atoms, [item for item in atoms.constraints if not isinstance(item, FORCES_ONLY)])
-    held = Constraints(rows)
+    held = Constraints(translated(atoms, [item for item in atoms.constraints if not isinstance(item, FORCES_ONLY)]))
     atoms.set_constraint([held, *others])
     return held
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kcons.constraints import Distance
 from kcons.constraints.arguments import check_pairs, positive
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.periodic.one_piece import connected
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.rows_by_name import HeldRows, Holding, Options, rows_of, with_options
@@ -50,9 +51,7 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
     atoms : ase.Atoms
     **options
     """
-    snapshot = snapshot_of(atoms)
-    numbers = partial(selected_numbers, n=len(atoms))
-    return rows_of(snapshot, Holding(constrain, **options), numbers, REMEDY)
+    return rows_of(snapshot_of(atoms), Holding(constrain, **options), partial(selected_numbers, n=len(atoms)), REMEDY)
 
 
 def rigid_water(atoms: Atoms, geometry: str | tuple[float, float] | None = None) -> Distance:
@@ -141,17 +140,19 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
 
 
 def bonds_of(atoms: Atoms) -> IntArray:
-    """Bonds of `atoms`: the pairs in ``atoms.info['bonds']``, otherwise guessed, shape (n, 2).
+    """Bonds of `atoms`: the pairs in ``atoms.info['bonds']``; those of molecules without any there are guessed.
 
-    Atoms of elements that form no covalent bonds, and those whose position is not finite, have none.
+    Atoms of elements that form no covalent bonds, and those whose position is not finite, have none. Shape (n, 2).
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         snapshot = snapshot_of(atoms)
-    given = snapshot.topology.bonds
-    if len(given) or not atoms.numbers.any():
+    given, lacking = snapshot.topology.bonds, atoms.numbers > 0
+    lacking[given] = False
+    if not lacking.any():
         return given
-    return guess_bonds(snapshot, among=np.isfinite(atoms.positions).all(axis=1))
+    found = guess_bonds(snapshot, lacking, np.isfinite(atoms.positions).all(axis=1))
+    molecule, _ = connected(np.concatenate([given, found]), len(atoms))
+    return np.concatenate([given, found[~np.isin(molecule[found[:, 0]], molecule[given])]])
 
 
 def repair_elements(atoms: Atoms) -> int:

@@ -91,15 +91,15 @@ def row_changes(
 ) -> Iterator[FloatArray]:
     """Changes of all rows by motions, relative to their gradients, here and at two places nearby, shape (n_rows, k).
 
-    At a single place they may cancel by symmetry. Fixed atoms stay. Not finite where a surface is not defined. `fields`
-    gets positions and gives the velocities of k motions as columns, shape (3 n_atoms, k); `size` is that of the system.
+    At a single place they may cancel by symmetry; both are along the rows. Not finite where a surface is not defined.
+    `fields` gets positions and gives velocities of k motions as columns, shape (3 n_atoms, k); `size`: of the system.
     """
     held, rng = motion.constraint_set, np.random.default_rng(0)
     size = size or extent(positions) or 1.0
     for spread in (0.0, NEARBY * size, NEARBY * size):
         shake = spread * rng.standard_normal(positions.shape)
-        shake[motion.fixed_atoms] = 0.0
-        x = positions + shake
+        ways = [motion.project_velocities(positions, way, time=time) for way in (shake, np.zeros_like(shake))]
+        x = positions + ways[0] - ways[1]  # off the rows, turns about a center that is held change it
         with np.errstate(all="ignore"):
             rows = held.jacobian(x, time)
             lengths = row_norms(rows)

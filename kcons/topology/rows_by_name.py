@@ -22,7 +22,7 @@ from kcons.constraints import Angle, Constraint, Dihedral, Distance, LinearRelat
 from kcons.constraints.arguments import checked
 from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.periodic.one_piece import lined_up
+from kcons.constraints.periodic.one_piece import connected, lined_up
 from kcons.errors import InputError, did_you_mean
 from kcons.topology.angle_rows import STRAIGHT, angle_rows
 from kcons.topology.rigid_groups import (
@@ -324,17 +324,14 @@ def rows_of(snapshot: Snapshot, holding: Holding, numbers: Callable[[Any], IntAr
     """
     kind, topology = holding.kind, snapshot.topology
     geometry, _ = holding.geometry()
-    selected = None
-    if not (isinstance(holding.select, str) and holding.select == "all"):
-        selected = np.zeros(topology.n_atoms, dtype=bool)
+    selected = np.full(topology.n_atoms, isinstance(holding.select, str) and holding.select == "all")
+    if not selected.all():
         selected[numbers(holding.select)] = True
     # Words, and AtomGroups.
     bodies = [numbers(b) if isinstance(b, str) or hasattr(b, "atoms") else b for b in holding.bodies]
     snapshot, waters, guessed = _with_waters(snapshot, holding, remedy)
-    groups = residue_bodies(snapshot, holding.residues)
-    if selected is not None:
-        waters = waters.among(selected)
-        groups = [g[selected[g].all(axis=1)] for g in groups]
+    waters = waters.among(selected)
+    groups = [g[selected[g].all(axis=1)] for g in residue_bodies(snapshot, holding.residues)]
     # Rigid residues that are rigid water are held as water.
     groups = [g[~np.isin(g, waters.triples[:, 0]).any(axis=1)] for g in groups]
     groups = [g for g in groups if len(g)] + listed_bodies(snapshot, bodies)
@@ -428,11 +425,11 @@ def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: Boo
     return replace(snapshot, topology=replace(topology, bonds=both)), len(both) - len(known)
 
 
-def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray | None) -> IntArray:
+def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray) -> IntArray:
     """Hydrogens that were looked for bonds, and have none; ions of their own residue are not."""
     if holding.kind == "none" and (topology.residues_known or not holding.rigid_water):
         return np.zeros(0, np.int64)
-    loose = topology.hydrogen if selected is None else topology.hydrogen & selected
+    loose = topology.hydrogen & selected
     loose[topology.bonds] = False
     if topology.residues_known:
         loose &= np.bincount(topology.residues, minlength=topology.n_residues)[topology.residues] > 1
@@ -443,15 +440,14 @@ def _loose_hydrogens(topology: Topology, holding: Holding, selected: BoolArray |
 
 
 def _internal(
-    snapshot: Snapshot, kind: str, bonds: IntArray, rigid: Sequence[IntArray], selected: BoolArray | None, angles: str
+    snapshot: Snapshot, kind: str, bonds: IntArray, rigid: Sequence[IntArray], selected: BoolArray, angles: str
 ) -> list[Constraint]:
     """Bonds, angles, and linear rows for straight angles, outside of rigid groups."""
     topology, hydrogen = snapshot.topology, snapshot.topology.hydrogen
     massless = (topology.masses == 0) & (topology.elements == "")
     bonds = bonds[~massless[bonds].any(axis=1)]
     held = bonds[hydrogen[bonds].any(axis=1)] if kind == "hbonds" else bonds
-    if selected is not None:
-        held = held[selected[held].all(axis=1)]
+    held = held[selected[held].all(axis=1)]
     held = held[~inside_bodies(topology.n_atoms, held, rigid)]
     _refuse_torn(snapshot, held)
     rows: list[Constraint] = [Distance(held)]
@@ -462,12 +458,9 @@ def _internal(
         triples = bond_angles(bonds, topology.n_atoms)
         ends = hydrogen[triples[:, 0]].astype(int) + hydrogen[triples[:, 2]]
         triples = triples[(ends == 2) | ((ends == 1) & (topology.elements[triples[:, 1]] == "O"))]
-        if selected is not None:
-            triples = triples[selected[triples].all(axis=1)]
+        triples = triples[selected[triples].all(axis=1)]
     else:
-        if selected is not None:
-            bonds = bonds[selected[bonds].all(axis=1)]
-        triples, quads = angle_rows(snapshot, bonds, rigid)
+        triples, quads = angle_rows(snapshot, bonds[selected[bonds].all(axis=1)], rigid)
         quads = quads[~inside_bodies(topology.n_atoms, quads, rigid)]
     triples = triples[~inside_bodies(topology.n_atoms, triples, rigid)]
     if angles == "distances":
@@ -482,6 +475,12 @@ def _internal(
         weights = arms[:, ::-1] / arms.sum(axis=1, keepdims=True)
         i, j, k = triples[straight].T
         rows.append(LinearRelation(j, np.stack([i, k], axis=1), weights))
+        # One length of a line gives all others: that of an arm in a rigid group, or of the first arm.
+        code = [topology.n_atoms, 1]
+        arms, number = np.unique(np.sort(triples[straight][:, [[0, 1], [1, 2]]], axis=2) @ code, return_inverse=True)
+        line, order = connected(number.reshape(-1, 2), len(arms))[0], np.argsort(np.isin(arms, held @ code))
+        one = order[np.unique(line[order], return_index=True)[1]]
+        rows[0] = Distance(held[~np.isin(held @ code, np.delete(arms, one))])
     return [*rows, Dihedral(quads)]
 
 
@@ -527,8 +526,8 @@ def _check_masses(topology: Topology, rows: Sequence[Constraint]) -> None:
         )
 
 
-def _nothing(topology: Topology, kind: str, selected: BoolArray | None) -> str:
-    if selected is not None:
+def _nothing(topology: Topology, kind: str, selected: BoolArray) -> str:
+    if not selected.all():
         return f"nothing to hold within the selection of {int(selected.sum())} atoms ({CONSTRAIN[kind]}); widen it"
     if kind == "hbonds" and not topology.hydrogen.any():
         return "nothing to hold: there are no hydrogens; add them to the file, or hold all bonds (allbonds)"

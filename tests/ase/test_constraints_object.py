@@ -14,7 +14,7 @@ from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, Free, copper, off, rigid, slip
 
 from kcons.ase import ConstrainedCalculator, Constraints, constrain
-from kcons.constraints import Angle, CenterDistance, Dihedral, Distance
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, LinearRelation
 from kcons.errors import InfeasibleError, InputError
 
 # -- dynamics and optimization ----------------------------------------------------------------------
@@ -131,13 +131,17 @@ def test_what_is_known_of_one_image_says_nothing_of_another():
 # -- `constrain(project=True)` and `Constraints.restore` with far targets: whole groups move, bonds stay --
 
 
-def test_momenta_go_along() -> None:
+def test_momenta_go_along_and_the_rank_is_that_of_the_end() -> None:
     atoms = molecule("CH3CH2OH")
     atoms.set_momenta(np.random.default_rng(0).normal(size=(9, 3)))
     held = Constraints([Dihedral([[3, 2, 1, 0]], 0.3), Distance([[0, 1]])])
     atoms.set_constraint(held)
     held.restore(atoms)
     assert slip(atoms, held) < 1e-13
+    bent = molecule("CO2")
+    bent.positions[1, 0] += 0.02
+    constrain(bent, [Distance([[0, 1], [0, 2]], 1.18), LinearRelation(0, [1, 2], [0.5, 0.5])], project=True)
+    assert bent.get_number_of_degrees_of_freedom() == 5  # where it is straight, one of five rows depends on others
 
 
 def test_a_target_that_bonds_stand_against_is_reached_without_them():

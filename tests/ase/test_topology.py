@@ -12,6 +12,7 @@ from ase.build import bulk, molecule
 
 from kcons.ase import constrain, constraints_of, repartition_hydrogen_mass, rigid_water
 from kcons.ase.topology import atoms_of, bonds_of, repair_elements, snapshot_of, velocities_of
+from kcons.constraints import Dihedral
 from kcons.errors import InputError
 
 
@@ -30,6 +31,11 @@ def test_bonds_are_guessed_where_none_are_given():
     atoms.info["bonds"] = [[0, 2]]
     assert bonds_of(atoms).tolist() == [[0, 2]]
     assert bonds_of(Atoms("X2", positions=[[0, 0, 0], [1, 0, 0]])).shape == (0, 2)
+    both = atoms + molecule("CH3OH")  # info of a sum is that of the first
+    both.positions[3:] += 8.0
+    assert bonds_of(both).tolist() == [[0, 2], [3, 4], [3, 5], [3, 7], [3, 8], [4, 6]]
+    constrain(both, Dihedral([[5, 3, 4, 6]], 1.0), project=True)
+    assert both.get_distance(4, 6) == pytest.approx(molecule("CH3OH").get_distance(1, 3), abs=1e-9)
     atoms.info["bonds"] = [[0, 3]]
     for asked in (bonds_of, constraints_of):
         with pytest.raises(InputError, match=r"atoms\.info\['bonds'\].* atom 3"):

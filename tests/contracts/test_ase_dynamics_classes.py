@@ -25,8 +25,6 @@ CANONICAL = {
     "Langevin": lambda a: Langevin(a, 2 * FS, temperature_K=TEMPERATURE, friction=0.05 / FS, fixcm=False, rng=random()),
     "Bussi": lambda a: Bussi(a, 2 * FS, TEMPERATURE, 10 * FS, rng=random()),
     "NVTBerendsen": lambda a: NVTBerendsen(a, 2 * FS, TEMPERATURE, 50 * FS, fixcm=False),
-    # All velocities are drawn anew at each step: with fewer, projections take energy (docs/ase.md).
-    "Andersen": lambda a: Andersen(a, 1 * FS, TEMPERATURE, 1.0, fixcm=False, rng=random()),
 }
 #: Classes that do not go through the constraints: `tests/ase/test_binding.py` has what is said of them.
 REFUSED = {"LangevinBAOAB", "NoseHooverChainNVT", "MelchionnaNPT", "NPT"}
@@ -38,7 +36,7 @@ BY_NAME = {"VelocityVerlet", "NPTBerendsen", "Inhomogeneous_NPTBerendsen", "Swit
 
 def test_no_dynamics_class_is_forgotten():
     found = set(classes_in(ase.md, MolecularDynamics, Dynamics)) - {"MolecularDynamics"}
-    assert found == set(CANONICAL) | REFUSED | set(REFUSE_THEMSELVES) | BY_NAME
+    assert found == set(CANONICAL) | REFUSED | set(REFUSE_THEMSELVES) | BY_NAME | {"Andersen"}
 
 
 def test_velocity_verlet_has_no_energy_slope():
@@ -67,6 +65,15 @@ def test_temperature(name):
     assert error < 6
     assert abs(mean - TEMPERATURE) <= 3 * error + (0.01 * TEMPERATURE if name == "NVTBerendsen" else 0)
     assert off(atoms, held) <= 1e-12 and slip(atoms, held) <= 1e-12
+
+
+def test_andersen_that_draws_all_velocities_moves_no_atom_by_a_force():
+    """Half a kick goes with the velocities that are drawn anew, the other half with those of the next step."""
+    (free, held), (pulled, _) = dumbbells(2), dumbbells(2)
+    pulled.calc = EMT()
+    for atoms in (free, pulled):
+        Andersen(atoms, 1 * FS, TEMPERATURE, 1.0, fixcm=False, rng=random()).run(20)
+    assert np.abs(free.positions - pulled.positions).max() <= 1e-12 >= off(free, held)
 
 
 def test_contour_exploration_keeps_lengths():

@@ -11,15 +11,7 @@ import pytest
 from fluids import LennardJones
 from thermostat_systems import METHANE, TEN, quartic, repelling, swirling, system, waves
 
-from kcons.constraints import (
-    CenterOfMass,
-    Distance,
-    Ellipsoid,
-    FixedAtoms,
-    Formula,
-    Plane,
-    Sphere,
-)
+from kcons.constraints import CenterOfMass, Distance, Ellipsoid, FixedAtoms, Formula, Line, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import UnsupportedError
 from kcons.motion import Motion
@@ -156,13 +148,16 @@ def test_angular_momentum_of_a_free_cluster_is_said():
         ([Ellipsoid([0, 1, 2, 3], [0, 0, 0], [1.0, 1.2, 1.5])], 0),
         ([Distance([[0, 1]]), Formula("x1**2 + y1**2 + z1**2 - 1", [[3]])], 3),
         ([FixedAtoms([0, 1, 2])], 0),
+        ([CenterOfMass([0, 1, 2, 3])], 3),
+        ([CenterOfMass([0, 1]), Plane([3], [0, 0, 1.0], 0.0)], 1),
+        ([Line([2], [0.1, 0.2, 0.3], [0, 0.6, 0.8])], 1),
     ],
-    ids=["sphere", "plane", "cylinder", "fixed atom", "ellipsoid", "formula", "three fixed atoms"],
+    ids=["sphere", "plane", "cylinder", "fixed", "ellipsoid", "formula", "three fixed", "center", "and plane", "line"],
 )
 def test_angular_momentum_about_the_axes_of_what_is_held_is_said(rows, axes):
     """Pairs that repel exert no torque, and rows none about some axis; a field across it does."""
     x = np.random.default_rng(3).standard_normal((4, 3))
-    motion = Motion(ConstraintSet(rows, x, np.ones(4)), x)
+    motion = Motion(ConstraintSet(rows, x, np.arange(1.0, 5.0)), x)
     x = motion.restore_positions(x, bonds=[])
     calls = []
 
@@ -195,7 +190,7 @@ def test_a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster():
 
 def test_a_surface_that_ends_nearby_has_a_place():
     x = np.array([[0.5, 0.0, 0.0], [3.0, 0.2, 0.1]])
-    edge = Formula("sqrt(0.5 - x1)", [0])
+    edge = Formula("z1 + (0.5 - x1)**1.5", [0], target=None)
     near = ConstraintSet([edge], x - np.array([0.01, 0, 0]), [1.0, 1.0])
     motion = Motion(near, x - np.array([0.01, 0, 0]))
     assert open_directions(motion, x - np.array([0.0001, 0, 0])).shape == (0, 3)

@@ -110,7 +110,7 @@ STARS = {
     "tetrahedron": [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]],
     "five": [[1, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [0, 0.1, 1], [0.1, 0, -1]],
     "four in a plane at no right angle: two impropers": [[1, 0, 0], [0.2, 1, 0], [-1, 0.3, 0], [0, -1, 0]],
-    # Straight angles hold an end by a linear row; these hold bonds once more, and are counted.
+    # Straight angles hold an end by a linear row, from which the length of its bond follows.
     "square": [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]],
     "T": [[1, 0, 0], [0, 1, 0], [-1, 0, 0]],
     "octahedron": [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]],
@@ -122,9 +122,22 @@ def test_centers_have_two_n_minus_three_rows(name):
     made = star(STARS[name])
     held, n = held_rows(made, "allangles").constraint_set, len(STARS[name])
     largest, rank = condition(held, made.positions)
-    assert rank == 3 * n - 3 and Motion(held, made.positions).degrees_of_freedom == 6
-    if name in list(STARS)[:3]:
-        assert rank == held.n_rows and largest < 15
+    assert rank == held.n_rows == 3 * n - 3 and Motion(held, made.positions).degrees_of_freedom == 6
+    assert largest < 15
+
+
+@pytest.mark.parametrize(("name", "left"), {"CO2": 5, "NCCN": 5, "2-butyne": 7, "C3H4_D2d": 7, "H2CCHCN": 7}.items())
+def test_rows_of_straight_molecules_are_independent_wherever_they_point(name, left):
+    made = of_ase(name)
+    held = held_rows(made, "allangles").constraint_set
+    x = Motion(held, made.positions).restore_positions(made.positions, bonds=[])
+    motion = Motion(held, x)
+    assert motion.rank == held.n_rows == x.size - left
+    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
+        v = motion.project_velocities(x[:, axes], np.random.default_rng(0).normal(size=x.shape))
+        assert np.abs(held.jacobian(x[:, axes]) @ v.ravel()).max() < 1e-13
+    beside = held_rows(made, "allangles", rigid_bodies=[[0, 1]]).constraint_set
+    assert condition(beside, x)[1] == beside.n_rows == x.size - left
 
 
 def test_of_six_angles_the_one_between_the_lightest_is_none_of_the_rows():
