@@ -190,6 +190,16 @@ def test_agents_that_break_rows_are_refused(rows, force, words):
     np.testing.assert_array_equal(state_of(context)[0], x)
 
 
+def test_a_barostat_of_frequency_0_is_off():
+    system, x = waters(2, openmm.MonteCarloBarostat(1.0, 300.0, 0))
+    parts = hold(system, [Plane([6], [0, 0, 1]), Distance([[0, 3]])], x)
+    context = started(system, integrator := ProjectedIntegrator(0.001, parts=parts), x)
+    integrator.step(1)
+    next(force for force in system.getForces() if type(force) is openmm.MonteCarloBarostat).setFrequency(5)
+    with pytest.raises(UnsupportedError, match="MonteCarloBarostat moves molecules"):
+        integrator.step(1)
+
+
 @pytest.mark.parametrize("kind", ["hold", "collective"])
 def test_a_barostat_in_place_of_another_force_refuses_rows_through_the_faces_of_the_box(kind):
     system, x = waters(2, field("0", 1))
