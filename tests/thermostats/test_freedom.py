@@ -11,15 +11,7 @@ import pytest
 from fluids import LennardJones
 from thermostat_systems import METHANE, TEN, quartic, repelling, swirling, system, waves
 
-from kcons.constraints import (
-    CenterOfMass,
-    Distance,
-    Ellipsoid,
-    FixedAtoms,
-    Formula,
-    Plane,
-    Sphere,
-)
+from kcons.constraints import CenterOfMass, Distance, Ellipsoid, FixedAtoms, Formula, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import UnsupportedError
 from kcons.motion import Motion
