@@ -89,7 +89,7 @@ MUTANTS = {
         "<= «_SMOOTH * →»squares.sum()": "correlated_series::errors_are_as_large_as_they_say[smooth]",
         "for turn in (0.0,« *_OSCILLATORS→»):": "correlated_series::errors_are_as_large_as_they_say[underdamped]",
         "max(«2 * len(values) // 3→len(values)»,": "correlated_series::errors_are_as_large_as_they_say[up-and-down]",
-        "if «carriers < FEW_INDEPENDENT→False» else": "correlated_series::heavy_tails_are_said",
+        "if «carriers < _FEW_BLOCKS→False» else": "correlated_series::heavy_tails_are_said",
     },
     "thermostats/freedom.py": {
         "for k in range(1, «NEARER + 1→2»)": "freedom::bodies_that_feel_no_other_are_warned_of_once[gas]",
