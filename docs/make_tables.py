@@ -3,8 +3,8 @@
     python docs/make_tables.py [FILE ...]
 
 A page has a table between `<!-- table: FILE NAME -->` and `<!-- end -->`. FILE.csv is the result of a study in
-examples/studies, and NAME one of the tables that the study makes of it; tables of FILE.json are made by result_tables.py,
-and `steppers all` of the steppers themselves. Figures go to docs/figures; with FILEs only their tables are made.
+examples/studies, and NAME one of the tables that the study makes of it; tables of FILE.json are made by
+result_tables.py, and `steppers all` of the steppers. Figures go to docs/figures; with FILEs only their tables are made.
 """
 
 from __future__ import annotations
