@@ -1,10 +1,10 @@
 """Tables and figures of the pages, from the result files in docs/results.
 
-    python docs/make_tables.py
+    python docs/make_tables.py [FILE ...]
 
 A page has a table between `<!-- table: FILE NAME -->` and `<!-- end -->`. FILE.csv is the result of a study in
 examples/studies, and NAME one of the tables that the study makes of it; tables of FILE.json are made by
-result_tables.py, and `steppers all` of the steppers themselves. Figures go to docs/figures.
+result_tables.py, and `steppers all` of the steppers. Figures go to docs/figures; with FILEs only their tables are made.
 """
 
 from __future__ import annotations
@@ -112,8 +112,8 @@ def results(name: str) -> tuple[str, dict[str, pd.DataFrame]]:
     return made, result_tables.TABLES[name](data)
 
 
-def renewed(text: str, folder: Path = DOCS) -> str:
-    """A page with its tables made again, each above the line that says of which run it is."""
+def renewed(text: str, folder: Path = DOCS, *files: str) -> str:
+    """A page with its tables, or those of some files, made again, each above the line that says of which run it is."""
 
     def block(match: re.Match[str]) -> str:
         result, name = match.groups()
@@ -121,7 +121,7 @@ def renewed(text: str, folder: Path = DOCS) -> str:
         made = made and f"\n{made}\n".replace("RESULTS", os.path.relpath(harness.RESULTS, folder))
         return f"<!-- table: {result} {name} -->\n{markdown(tables[name])}\n{made}<!-- end -->"
 
-    return BLOCK.sub(block, text)
+    return BLOCK.sub(lambda match: block(match) if match[1] in (files or match.groups()) else match[0], text)
 
 
 #: The picture of the front page: what is said, part of the whole comparison, engine, title of the other method, of
@@ -177,12 +177,14 @@ def front() -> Figure:
     return drawn
 
 
-def main() -> None:
+def main(*files: str) -> None:
     for page in DOCS.rglob("*.md"):
         text = page.read_text(encoding="utf-8")
-        if (new := renewed(text, page.parent)) != text:
+        if (new := renewed(text, page.parent, *files)) != text:
             page.write_text(new, encoding="utf-8")
             print(page.relative_to(DOCS))
+    if [results(file) for file in files]:  # an unknown one raises
+        return
     front().savefig(DOCS / "figures" / "front.png", dpi=110)
     for name, picture in {**result_pictures.PICTURES, **drawn_pictures.PICTURES}.items():
         picture().savefig(DOCS / "figures" / f"{name}.png", dpi=110)
@@ -197,4 +199,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

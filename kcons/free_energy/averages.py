@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from kcons.constraints.arguments import FloatArray, as_float_array
 from kcons.errors import InputError
-from kcons.thermostats.correlated_series import FEW_INDEPENDENT, spread
+from kcons.thermostats.correlated_series import few, spread
 
 #: Fewest values that an error is taken from.
 MIN_SAMPLES = 16
@@ -77,7 +77,7 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
     Warns
     -----
     UserWarning
-        Fewer than 10 independent samples; a quantity that never changes, whose error is then 0.
+        Fewer than 15 independent samples; a quantity that never changes, whose error is then 0.
     """
     series = finite(values, "values")
     series = series[:, None] if series.ndim == 1 else series
@@ -92,10 +92,8 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
         raise InputError(f"weights must have shape {(n,)}, not be negative, and one be positive", item="weights")
     factors = factors / factors.max()
     if factors.sum() <= 1 + 1e-12:
-        raise InputError(
-            f"sample {int(np.argmax(factors))} has all of the weight, and one sample has no error; sample longer",
-            item="weights",
-        )
+        said = f"sample {int(np.argmax(factors))} has all of the weight, and one sample has no error; sample longer"
+        raise InputError(said, item="weights")
     factors /= factors.mean()
     value = factors @ series / n
     # What the ratio sum w f/sum w fluctuates by, sample by sample: its mean is 0.
@@ -119,14 +117,10 @@ def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> Mean:
     covariance *= np.outer(widening, widening)
     alike = float(factors.sum() ** 2 / (factors**2).sum())
     effective = max(min(alike / max(float(inefficiency.max()), 1.0), *(each.independent for each in found)), 1.0)
-    if effective < FEW_INDEPENDENT:
-        heaviest = float(factors.max() / factors.sum())
-        warnings.warn(
-            f"{n} samples are worth {effective:.1f} independent ones, or a few of them make up the spread (the "
-            f"heaviest has {heaviest:.0%} of the weight, memory lasts for {inefficiency.max():.0f} samples): the error "
-            "is not to be relied on. Sample longer",
-            stacklevel=2,
-        )
+    if doubt := few(n, effective):
+        heaviest, memory = factors.max() / factors.sum(), inefficiency.max()
+        why = f"the heaviest has {heaviest:.0%} of the weight, memory lasts for {memory:.0f}"
+        warnings.warn(f"{doubt} ({why})", stacklevel=2)
     return Mean(value, covariance, np.sqrt(np.diag(covariance)), n, effective, inefficiency)
 
 

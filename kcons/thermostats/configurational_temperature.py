@@ -251,12 +251,11 @@ class TemperatureSplit:
         Warns
         -----
         UserWarning
-            Fewer than 10 independent samples; a temperature that has no error, which is given as infinite.
+            Fewer than 15 independent samples; a temperature that has no error, which is given as infinite.
         """
         if len(self._series) < MIN_SAMPLES:
-            raise InputError(
-                f"{len(self._series)} samples are too few for an error; add {MIN_SAMPLES} or more", item="samples"
-            )
+            said = f"{len(self._series)} samples are too few for an error; add {MIN_SAMPLES} or more"
+            raise InputError(said, item="samples")
         series, notes = np.array(self._series), self._left_out()
         found: list[Estimate | None] = [None, None, None]
         exists = self._clusters.shifts, self._axes, self._rest

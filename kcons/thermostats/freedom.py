@@ -322,22 +322,19 @@ class RigidMotions:
 
 
 def warn_of_conserved_momenta(
-    masses: FloatArray, velocities: FloatArray, directions: FloatArray, turns: bool, stacklevel: int
+    masses: FloatArray, velocities: FloatArray, directions: FloatArray, turns: bool, stacklevel: int, few: bool = False
 ) -> None:
-    """Say so where conserved momenta, see `Freedom`, keep a deterministic thermostat from sampling a temperature."""
-    if momentum_share(masses, velocities, directions) > AT_REST:
-        warnings.warn(
-            "total momentum is not zero, and a thermostat that scales velocities scales it too instead of forgetting "
-            "it: no temperature is sampled. Take it out of the velocities first, or use Langevin",
-            stacklevel=stacklevel,
-        )
-    elif turns:
-        warnings.warn(
-            "the forces exert no torque about an axis that the rows leave (a free cluster, particles on a sphere), so "
-            "that angular momentum is only scaled by the thermostat and never forgotten: configurations are not "
-            "canonical. Use Langevin",
-            stacklevel=stacklevel,
-        )
+    """Say so where conserved momenta, see `Freedom`, or `few` of them, keep a thermostat from sampling."""
+    share = momentum_share(masses, velocities, directions)
+    reasons = {
+        "total momentum is not zero, and a thermostat that scales velocities scales it too instead of forgetting it: "
+        "no temperature is sampled. Take it out of the velocities first, or use Langevin": share > AT_REST,
+        "the forces exert no torque about an axis that the rows leave (a free cluster, particles on a sphere): angular "
+        "momentum is only scaled, never forgotten, and configurations are not canonical. Use Langevin": turns,
+        "isokinetic dynamics of two degrees of freedom does not visit all configurations. Use Langevin": few,
+    }
+    if told := [words for words, holds in reasons.items() if holds]:
+        warnings.warn(told[0], stacklevel=stacklevel)
 
 
 def momentum_share(masses: FloatArray, velocities: FloatArray, directions: FloatArray) -> float:

@@ -271,7 +271,7 @@ class Isokinetic(Splitting):
     -----
     UserWarning
         At the start of a run: total momentum is conserved but for a factor exp(U/2K), and not zero; or a temperature is
-        asked for and forces exert no torque, so that the same holds of angular momentum. Neither samples a temperature.
+        asked for and forces exert no torque, so that the same holds of angular momentum, or g is 2. None samples it.
         After 20,000 steps: a temperature is asked for, and no body, which rows tie together, feels another.
 
     Notes
@@ -366,8 +366,8 @@ class Isokinetic(Splitting):
             )
         free = freedom(system, state, state.forces, self.momentum)
         twice = self._twice_kinetic(system, free.count, found)
-        turns = free.turns and self.thermal_energy is not None
-        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8)
+        turns, few = (self.thermal_energy is not None and each for each in (free.turns, free.count == 2))
+        warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8, few=few)
         off = float(np.abs(velocities - state.velocities).max())
         if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:
             velocities = state.velocities

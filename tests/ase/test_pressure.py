@@ -17,13 +17,7 @@ from ase.filters import ExpCellFilter, FrechetCellFilter, StrainFilter, UnitCell
 from ase.optimize import BFGS
 from ase_systems import FS, TEMPERATURE, Field, Free, copper, dumbbells, follow, state
 
-from kcons.ase import (
-    ConstrainedCalculator,
-    ConstrainedDynamics,
-    ConstrainedLangevin,
-    PressureReporter,
-    constrain,
-)
+from kcons.ase import ConstrainedCalculator, ConstrainedDynamics, ConstrainedLangevin, PressureReporter, constrain
 from kcons.constraints import Distance, Plane
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.thermostats import CellRescaling, MonteCarloBarostat

@@ -120,6 +120,14 @@ def test_the_conserved_energies(kind):
     assert np.ptp(energies) >= 50 * np.ptp(values)
 
 
+def test_two_degrees_of_freedom_at_constant_kinetic_energy_are_said():
+    held = Constraints([Distance([0, 1]), FixedAtoms([0])])
+    atoms = Atoms("HCl", [[0, 0, 0], [1.3, 0.2, 0]], constraint=held, calculator=Waves())
+    draw_velocities(atoms, 300.0, 1)
+    with pytest.warns(UserWarning, match="two degrees of freedom.*Use Langevin"):
+        made("isokinetic", atoms).run(1)
+
+
 def test_the_chain_has_the_constants_of_ase():
     moving = made("nose-hoover", waters(), tchain=4)
     np.testing.assert_allclose(moving.stepper._masses(18)[:2], [18 * KT * (50 * FS) ** 2, KT * (50 * FS) ** 2])

@@ -21,15 +21,7 @@ from stepper_systems import (
     system_of,
 )
 
-from kcons.constraints import (
-    Distance,
-    FixedAtoms,
-    Formula,
-    MovingTarget,
-    Plane,
-    Sphere,
-    VelocityFormula,
-)
+from kcons.constraints import Distance, FixedAtoms, Formula, MovingTarget, Plane, Sphere, VelocityFormula
 from kcons.errors import ConvergenceError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, State, Stepper, run
 from kcons.steppers import compiled_operations as compiled

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from kcons.free_energy import weighted_mean
 from kcons.thermostats import mean
 from kcons.thermostats.configurational_temperature import temperature
-from kcons.thermostats.correlated_series import slope, spread
+from kcons.thermostats.correlated_series import FEW_INDEPENDENT, slope, spread
 
 
 def fading(rng, n, memory, d=1):
@@ -115,7 +115,11 @@ def test_few_independent_values_are_said():
     rng = np.random.default_rng(6)
     with pytest.warns(UserWarning, match="400 values are worth .* independent ones"):
         mean(fading(rng, 400, 100.0)[:, 0])
-    assert np.mean([spread(rng.standard_normal(64)).independent < 10 for _ in range(200)]) == 0
+    assert np.mean([spread(rng.standard_normal(64)).independent < FEW_INDEPENDENT for _ in range(200)]) == 0
+    # Runs of 5 independent values seem worth more, and errors of those that seem worth 10 are half of what they are.
+    for worth, least, most in ((5, 0.9, 1.0), (30, 0.0, 0.05)):
+        runs = [spread(fading(rng, 600, 300 / worth)[:, 0]).independent < FEW_INDEPENDENT for _ in range(400)]
+        assert least <= np.mean(runs) <= most
 
 
 def test_heavy_tails_are_said():

@@ -169,7 +169,7 @@ def integrate(
     Warns
     -----
     UserWarning
-        The integral over the period is more than 4 standard errors from 0: some mean force is wrong, or its error.
+        The integral over the period is more than 4 standard errors from 0; windows around it miss a threefold barrier.
     """
     arrays = [finite(values, name, "window") for values, name in ((x, "x"), (f, "f"), (e, "e"))]
     for array, name in zip(arrays, "xfe", strict=True):
@@ -180,10 +180,8 @@ def integrate(
         raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
     if period is not None and place.size:
         if np.ptp(place) > period * (1 + _SAME):
-            raise InputError(
-                f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
-                item="period",
-            )
+            said = f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units"
+            raise InputError(said, item="period")
         place = place.min() + (place - place.min()) % period
         place = np.where(place - place.min() > period * (1 - _SAME), place.min(), place)
     order = np.argsort(place, kind="stable")
@@ -200,6 +198,7 @@ def integrate(
     axis = Axis(low, high - low, period is not None, _COEFFICIENTS if different >= _MANY else 1)
     process, closure = learn(places[:, None], forces[:, None], errors[:, None, None] ** 2, [axis], [True]), None
     if period is not None:
+        _tell_of_waves(places, period)
         closure = process.difference(np.array([low]), np.array([high]))
         if abs(closure.value) > _CLOSES * closure.error and abs(closure.value) > 1e-9 * period * np.abs(forces).max():
             warnings.warn(
@@ -214,6 +213,15 @@ def integrate(
     F, covariance = process.differences(grid[:, None], inside([[zero]], grid[:1], grid[-1:], [period], "zero")[0])
     band = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Profile(grid, F, band, covariance, zero, places, forces, errors, period, closure, process)
+
+
+def _tell_of_waves(places: FloatArray, period: float) -> None:
+    """Warn where windows tell less of some sum of the waves of most torsions than one in the right place does."""
+    waves = 2 * np.pi / period * np.outer(places, [1, 2, 3])
+    sizes = np.linalg.svd(np.hstack([np.sin(waves), np.cos(waves)]), compute_uv=False)
+    if len(places) < 6 or sizes[-1] < 1.0:
+        said = f"a barrier that comes three times in the period {period:.4g} may have no slope at any of the windows"
+        warnings.warn(f"{said}, and no error tells of it: give seven or more, about equally far apart", stacklevel=3)
 
 
 def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "energy") -> Figure:
@@ -232,8 +240,7 @@ def plot_profile(profile: Profile, *, coordinate: str = "x", energy: str = "ener
     above.plot(profile.x, profile.F, color=_BLUE, label="F")
     above.set_ylabel(f"F / {energy}")
     above.legend(fontsize=8)
-    slope = np.gradient(profile.F, profile.x)
-    below.plot(profile.x, slope, color=_BLUE, linewidth=1.0, label="slope of F")
+    below.plot(profile.x, np.gradient(profile.F, profile.x), color=_BLUE, linewidth=1.0, label="slope of F")
     how: dict[str, Any] = {"color": _RED, "fmt": "o", "markersize": 4, "capsize": 2, "label": "windows"}
     below.errorbar(profile.windows, profile.mean_forces, _BAND * profile.mean_force_errors, **how)
     below.axhline(0.0, color=_GREY, linewidth=0.8)
@@ -322,7 +329,7 @@ def fit_surface(
     Warns
     -----
     UserWarning
-        The mean forces are not the gradient of any free energy.
+        The mean forces are not the gradient of any free energy; windows around a period miss a threefold barrier.
     """
     places, forces, given = (finite(a, name, "window") for a, name in ((x, "x"), (f, "f"), (errors, "errors")))
     if places.ndim != 2 or not places.shape[1] or len(places) < places.shape[1] + 2:
@@ -347,6 +354,8 @@ def fit_surface(
         if spread == 0 or (period is not None and spread > period * (1 + 1e-9)):
             reason = "windows are further apart than the period in" if spread else "all windows are at one value of"
             raise InputError(f"{reason} coordinate {j}; check the units, or leave it out", item="x")
+        if period is not None:
+            _tell_of_waves(places[:, j], period)
     low = places.min(axis=0)
     lengths = np.array([spread if p is None else p for spread, p in zip(np.ptp(places, axis=0), turns, strict=True)])
     axes = [Axis(float(a), float(b), p is not None) for a, b, p in zip(low, lengths, turns, strict=True)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 import openmm
@@ -46,14 +46,14 @@ class CountsMomenta(Ensemble):
 
     momentum: Momentum
     temperature: float | None
+    few = 0  # momenta that are too few for averages
 
     def momenta(self, integrator: Integrator) -> Momenta:
         """Which momenta are conserved."""
         guard = integrator._watch()
         if guard.momenta is None:
             guard.momenta = conserved_momenta(integrator, guard.context, self.momentum)
-        found: Momenta = guard.momenta
-        return found
+        return cast(Momenta, guard.momenta)
 
     def count(self, integrator: Integrator) -> int:
         """g: the momenta that are independent, less those that are conserved; `OverdeterminedError` for none."""
@@ -80,9 +80,9 @@ class CountsMomenta(Ensemble):
         if removes_center_of_mass_motion(context.getSystem()):
             v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
         self.ready(integrator, context, masses, v)
-        momenta = self.momenta(integrator)
-        turns = momenta.turns and self.temperature is not None
-        warn_of_conserved_momenta(masses, v, momenta.directions, turns, stacklevel=7)
+        directions, turns = self.momenta(integrator)
+        asked, few = self.temperature is not None, self.count(integrator) <= self.few
+        warn_of_conserved_momenta(masses, v, directions, turns and asked, stacklevel=7, few=few and asked)
 
     def ready(self, integrator: Integrator, context: openmm.Context, masses: FloatArray, v: FloatArray) -> None:
         """Before the first step: settings that depend on g, and on the velocities v of particles with these masses."""

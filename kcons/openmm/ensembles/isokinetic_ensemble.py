@@ -51,8 +51,8 @@ class Isokinetic(CountsMomenta):
     Warns
     -----
     UserWarning
-        At the first step: total momentum is conserved and not zero, or the System is a free cluster, on which no
-        torque acts. Neither samples a temperature.
+        At the first step: total momentum is conserved and not zero, the System is a free cluster, on which no torque
+        acts, or g is 2. None of these samples a temperature.
 
     Notes
     -----
@@ -65,6 +65,7 @@ class Isokinetic(CountsMomenta):
 
     stays_tangent = True
     adds_up = True
+    few = 2
     temperature: float | None
     convention: Literal["exact", "notes"]
     momentum: Momentum

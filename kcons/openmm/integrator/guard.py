@@ -414,8 +414,8 @@ def refuse_agents(
     """
     for force in forces_of(system):
         name = type(force).__name__
-        moves = isinstance(force, openmm.CMMotionRemover)
-        if bound is not None and (moves or name in BAROSTATS):
+        moves, scales = isinstance(force, openmm.CMMotionRemover), name in BAROSTATS and force.getFrequency() > 0
+        if bound is not None and (moves or scales):
             what = "shifts all velocities" if moves else "moves molecules"
             raise UnsupportedError(
                 f"{name} {what}, and {bound} holds particles in space, so that momentum is not conserved: take it out "
@@ -423,7 +423,7 @@ def refuse_agents(
             )
         if isinstance(force, openmm.AndersenThermostat):
             raise UnsupportedError(f"{name} draws velocities of single atoms, which makes rows cold; use Langevin")
-        if name not in BAROSTATS:
+        if not scales:
             continue
         if _scales_atoms(force):
             raise UnsupportedError(f"rows are held, and {_ATOM_BY_ATOM}")
@@ -881,8 +881,9 @@ class Guard:
         return self.independent_momenta() - (3 if removes_center_of_mass_motion(self.system) else 0)
 
 
-def _size(system: openmm.System) -> tuple[int, int, list[type]]:
-    return system.getNumParticles(), system.getNumConstraints(), [type(force) for force in forces_of(system)]
+def _size(system: openmm.System) -> tuple[int, int, list[Any]]:
+    acting = [(type(force), getattr(force, "getFrequency", bool)()) for force in forces_of(system)]
+    return system.getNumParticles(), system.getNumConstraints(), acting
 
 
 def _misses(parts: Iterable[Part], context: openmm.Context) -> list[Violation]:

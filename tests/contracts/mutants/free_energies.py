@@ -46,6 +46,8 @@ MUTANTS = {
     },
     "openmm/integrator/guard.py": {
         "force.getForceGroup() not in «row_groups→range(32)»": "openmm/integrator/edits::forgotten_parts_are_refused",
+        "name in BAROSTATS« and force.getFrequency() > 0→»": "hold::a_barostat_of_frequency_0_is_off",
+        '(type(force), «getattr(force, "getFrequency", bool)()→0»)': "hold::a_barostat_of_frequency_0_is_off",
     },
     "free_energy/averages.py": {
         "covariance *= «np.outer(widening, widening)→1.0»": "correlated_series::errors_are_as_large_as_they_say",
@@ -60,6 +62,7 @@ MUTANTS = {
     },
     "free_energy/profiles/profile.py": {
         "process = process«.closed()→»": "profile::a_period_closes",
+        "sizes[-1] < «1.0→0.0»": "profile::waves_without_a_slope_at_any_window_are_said",
         "if chance < «_CHANCE→0.0»:": "mean_force_surface::vectors_that_are_no_gradient_are_warned_of",
     },
     "free_energy/profiles/pulls.py": {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -85,6 +86,16 @@ def test_a_period_closes():
     assert profile.F[0] == pytest.approx(profile.F[-1], abs=1e-6)
     with pytest.warns(UserWarning, match="which should be 0"):
         integrate(x, case.f(x) + 3.0, np.full(16, 0.1), period=case.period)
+
+
+def test_waves_without_a_slope_at_any_window_are_said():
+    """Windows 60 degrees apart do not see cos 3t, nor does the error; seven do."""
+    case = Case(lambda t: 3 * np.cos(t) - 0.35 * np.cos(2 * t) + 3.3 * np.cos(3 * t), 0.0, 2 * math.pi, 2 * math.pi)
+    for n in (6, 7):
+        with pytest.warns(UserWarning, match="give seven or more") if n == 6 else nullcontext():
+            profile = integrate(case.grid(n), case.f(case.grid(n)), np.full(n, 3e-3), period=case.period, zero=0.0)
+        away = np.abs(profile.F - (case.F(profile.x) - case.F(0.0))).max()
+        assert (away > 3 * profile.error.max()) == (n == 6)
 
 
 def test_windows_of_a_circle_may_be_given_in_any_turn_and_order():

@@ -107,6 +107,7 @@ def test_runs_of_an_angle_begin_at_angles(tmp_path):
     assert [job.start[0] for job in windows._jobs((1.0,))] == pytest.approx([0.9, 1.1])
 
 
+@pytest.mark.filterwarnings("ignore:a barrier that comes three times")
 def test_windows_are_added_where_they_help(tmp_path):
     windows, first = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1])
     better = windows.improve(0.5, 20, at_once=2)
@@ -122,6 +123,7 @@ def test_windows_are_added_where_they_help(tmp_path):
     assert errors.max() <= 0.5 < found.profile.error.max() and len(found.windows) == 5
 
 
+@pytest.mark.filterwarnings("ignore:a barrier that comes three times")
 def test_windows_that_failed_before_others_are_added_are_still_told_of(tmp_path):
     windows, first = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1], fails=("window--1.88495559-up",))
     better = windows.improve(0.5, 20)

@@ -65,6 +65,7 @@ def test_windows_across_the_end_of_a_turn_are_a_part_of_it(there):
     assert max(np.degrees(part.profile.next_windows(3))) <= np.degrees(part.profile.x[-1]) + 1e-9
 
 
+@pytest.mark.filterwarnings("ignore:a barrier that comes three times")
 def test_a_turn_with_gaps_of_any_width_is_closed():
     for there in ([0, 90, 135, 180, 202, 225, 270, 292, 315], [0, 120, 240], np.arange(-180, 181, 30)):
         assert found(there).profile.closure is not None

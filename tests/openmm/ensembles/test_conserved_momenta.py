@@ -10,7 +10,7 @@ from collective_cases import bond
 from ensemble_runs import run, tied
 from openmm_systems import dumbbell, field, masses_of, particles, started
 
-from kcons.constraints import Ellipsoid, Formula, Sphere
+from kcons.constraints import Ellipsoid, Formula, Plane, Sphere
 from kcons.openmm import CollectiveRows, Isokinetic, NoseHoover, NoseHooverMiddle, ProjectedIntegrator, Row, hold
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -116,8 +116,15 @@ def test_thermostats_without_noise_say_so_where_a_temperature_is_asked_for():
     assert not said(system, x, Isokinetic(300.0, momentum="free"), parts)
 
 
-def said(system, x, bath, parts=()):
-    """Whether the first step warns of angular momentum."""
+def test_two_degrees_of_freedom_at_constant_kinetic_energy_are_said():
+    system, x = particles([20.0] * 2, field(LOPSIDED, 2)), np.array([[0.0, 0.6, 0.0], [0.6, 0.0, 0.0]])
+    parts = [hold(system, [Sphere([0, 1], [0, 0, 0], 0.6), Plane([0, 1], [0, 0, 1], 0.0)], x)]
+    assert said(system, x, Isokinetic(300.0), parts, "two degrees of freedom")
+    assert not said(system, x, Isokinetic(), parts) and not said(system, x, NoseHoover(300.0, 5.0), parts)
+
+
+def said(system, x, bath, parts=(), words="exert no torque about an axis"):
+    """Whether the first step warns with these words."""
     integrator = ProjectedIntegrator(1e-4, parts=parts, ensemble=bath)
     context = started(system, integrator, x)
     integrator.applyConstraints(context)
@@ -128,7 +135,7 @@ def said(system, x, bath, parts=()):
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         integrator.step(1)
-    told = [one for one in heard if "exert no torque about an axis" in str(one.message)]
+    told = [one for one in heard if words in str(one.message)]
     assert all(one.filename == __file__ for one in told)
     assert all(one in told or "total momentum is not zero" in str(one.message) for one in heard)
     return bool(told)

@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 from collective_cases import bond
 from openmm import unit
-from openmm_systems import (
-    DEVICE,
-    PLATFORMS,
-    field,
-    on_gpus,
-    particles,
-    started,
-    state_of,
-    with_and_without_device,
-)
+from openmm_systems import DEVICE, PLATFORMS, field, on_gpus, particles, started, state_of, with_and_without_device
 
 from kcons.constraints import Distance
 from kcons.openmm import (
