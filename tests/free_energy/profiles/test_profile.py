@@ -53,7 +53,7 @@ def off(profile, case):
 )
 @pytest.mark.parametrize(
     ("seeds", "low", "high", "covered"),
-    [(6, 0.4, 1.6, 0.85), pytest.param(100, 0.81, 1.32, 0.9, marks=pytest.mark.validation)],
+    [(6, 0.4, 1.6, 0.85), pytest.param(300, 0.81, 1.32, 0.9, marks=pytest.mark.validation)],
     ids=["few", "many"],
 )
 def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error, seeds, low, high, covered):
