@@ -14,9 +14,7 @@ from kcons.errors import InputError, KconsError, UnreadableError
 #: The exit status of each result; 2 is wrong use.
 EXIT = {"kept": 0, "tolerated": 0, "violated": 1, "incomplete": 3}
 #: Options that are arguments of `check_trajectory`, by the same names.
-AS_GIVEN = (
-    *("constrain", "select", "targets", "tolerance", "precision", "frames", "format", "topology_format", "workers"),
-)
+AS_GIVEN = "constrain", "select", "targets", "tolerance", "precision", "frames", "format", "topology_format", "workers"
 
 
 def _check(chosen: argparse.Namespace) -> int:
@@ -37,9 +35,8 @@ def _check(chosen: argparse.Namespace) -> int:
     try:
         result = check_trajectory(path, chosen.topology, rigid_water=not chosen.no_rigid_water, **given)
     except UnreadableError as error:
-        said = str(error)
-        print(f"kcons: {said}", file=sys.stderr)
-        found = {"trajectory": str(path), "status": "incomplete", "verdict": said}
+        print(f"kcons: {error}", file=sys.stderr)
+        found = {"trajectory": str(path), "status": "incomplete", "verdict": str(error)}
         say_written(report.write(folder, path, found))
         return EXIT["incomplete"]
     failed = ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from hashlib import sha256
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -114,6 +115,9 @@ def _compare(chosen: argparse.Namespace) -> int:
     settings |= {"averages": True, "slow": chosen.slow, "fast": chosen.fast} if averages else {}
     system = str(Path(chosen.system).resolve()) if Path(chosen.system).is_file() else chosen.system
     asked = {"system": system, **settings, "budget": budget, **molecules(chosen)}
+    forces = (part for name in ("forces", "slow", "fast") for part in str(getattr(chosen, name)).split(","))
+    paths = map(Path, (system, *(chosen.force_field or ()), chosen.coordinates or "", *forces))
+    asked["contents"] = {str(path): sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()}
     files = [f"compare.{kind}" for kind in ("csv", "png", "txt")]
     results = ResultFolder(folder, files[0], {"asked": {"system": system}}, files, "a comparison")
     results.refuse_others()

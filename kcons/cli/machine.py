@@ -114,9 +114,8 @@ def _warmup(chosen: argparse.Namespace) -> int:
     from kcons.constraints import compilation
 
     wanted = [name for given in chosen.what for name in names(given)] or USUAL
-    for name in wanted:
-        if name != "device":
-            check_name(argparse.Namespace(system=name, size=None))
+    for name in (name for name in wanted if name != "device"):
+        check_name(argparse.Namespace(system=name, size=None))
     announcer, compilation.SMALL = compilation.announcer, 0
     announcer.announced = True  # it is said here
     for name in wanted:

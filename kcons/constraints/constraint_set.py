@@ -487,9 +487,7 @@ class ConstraintSet:
 
         `x` itself where all rows are plain.
         """
-        if self.lattice is None or self.images is None:
-            return x
-        return self.images.make_whole(x, self.lattice)
+        return x if self.lattice is None or self.images is None else self.images.make_whole(x, self.lattice)
 
     @cached_property
     def placed(self) -> IntArray | None:

@@ -17,7 +17,7 @@ import MDAnalysis
 import numpy as np
 from MDAnalysis.converters.base import ConverterBase
 
-from kcons.constraints import Constraint, Distance
+from kcons.constraints import Constraint, Distance, FixedAtoms
 from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.vectors import extent
@@ -215,7 +215,7 @@ def _of_openmm(
     topology: Any, positions: unit.Quantity, system: openmm.System | None, velocities: unit.Quantity | None, part: Any
 ) -> tuple[Snapshot, list[Constraint]]:
     """A snapshot, and what a System and a part hold, in angstrom."""
-    from kcons.openmm.quantities import held_pairs
+    from kcons.openmm.quantities import held_pairs, held_without_mass
     from kcons.openmm.topology import snapshot_of as snapshot_of_topology
 
     rows: list[Constraint] = []
@@ -223,6 +223,9 @@ def _of_openmm(
         rows.append(Distance(*held_pairs(system)))
     if part is not None:
         rows += part.motion.constraint_set.constraints
+    fixed = [item.atoms.ravel() for item in rows if item.fixes_atoms]
+    still = np.setdiff1d([] if system is None else held_without_mass(system), np.concatenate([[], *fixed]))
+    rows += [FixedAtoms(still.astype(np.int64))] if len(still) else []
     snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)
     return snapshot, [item.rescaled(1 / NM) for item in rows]
 

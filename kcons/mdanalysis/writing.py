@@ -312,8 +312,8 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
     from kcons.ase.topology import velocities_of
 
     atoms = getattr(dynamics, "atoms", None)
-    if atoms is None:
-        raise InputError(f"dynamics is {dynamics!r:.80}; give what makes the steps, not the atoms", item="dynamics")
+    if atoms is None or not hasattr(dynamics, "dt"):
+        raise InputError(f"dynamics is {dynamics!r:.80}; give what makes the steps in time", item="dynamics")
     whole_number(interval, "interval")
 
     def box() -> FloatArray | None:

@@ -113,9 +113,7 @@ def spheres_of(motion: Motion) -> FloatArray | None:
 def packed_system(motion: Motion, *more: NDArray[Any]) -> PackedSystem | None:
     """All rows, and `more`; None where there are rows that move, that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
-    if held.moving or any(plan.whole):
-        return None
-    if plan.driven and held.target(0.0)[~held.holonomic].any():
+    if held.moving or any(plan.whole) or (plan.driven and held.target(0.0)[~held.holonomic].any()):
         return None
     # Where few atoms are held, the engine works on a copy of these, and counts only them.
     compact = plan.constraint_set is not held

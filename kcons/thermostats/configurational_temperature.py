@@ -322,9 +322,7 @@ class TemperatureSplit:
         signs = self._rng.choice((-1.0, 1.0), size=(2, len(clusters), 3))
         pushed = clusters.spread(signs[0] * (clusters.shifts / np.sqrt(clusters.mass))[:, None])
         spin = clusters.spread(np.einsum("cik,ck->ci", turns, signs[1]))
-        v = pushed
-        if self._rest.any():
-            v = self._rest_of(x, arms, turns) + pushed + cross(spin, arms)
+        v = self._rest_of(x, arms, turns) + pushed + cross(spin, arms) if self._rest.any() else pushed
         found = np.zeros((3, len(clusters)))
         for way in (h, -h):
             if clusters.shifts.any():

@@ -138,3 +138,6 @@ def test_a_topology_with_coordinates(tmp_path, monkeypatch, capsys):
     with pytest.warns(UserWarning, match="were guessed"):
         exec(code, made)  # the lines of Python run as they are
     assert len(made["atoms"]) == 3
+    Path("start.xyz").write_text("\n".join([*lines[:-1], "H -0.24 0.95 0"]) + "\n")
+    assert run("compare", "water.xyz", *words, "--resume") == 2  # rows of the file that it was before
+    assert "of settings" in capsys.readouterr().err

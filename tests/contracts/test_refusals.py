@@ -523,6 +523,7 @@ REFUSED: list[tuple[str, ...]] = [
     ('kcons.mdanalysis.TrajectoryWriter("nowhere/a.trr", -1)', "n_atoms"),
     ('kcons.mdanalysis.OpenMMReporter("nowhere/a.trr", 0)', "interval"),
     ('kcons.mdanalysis.write_ase(ATOMS, "nowhere/a.trr")', "dynamics"),
+    ('kcons.mdanalysis.write_ase(type("BFGS", (), {"atoms": ATOMS}), "nowhere/a.trr")', "dynamics"),
     ('kcons.comparison.compare("chain")', "system"),
     ("kcons.comparison.compare(None, rounds=-1)", "rounds"),
 ]

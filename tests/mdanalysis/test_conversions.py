@@ -291,6 +291,10 @@ def test_converted_atoms_carry_constraints():
         atoms = group.convert_to("ASE", **options)
         (held,) = atoms.constraints
         assert len(atoms) == len(group) and held.get_removed_dof(atoms) == removed
+    made = to_openmm(ethane)
+    made.system.setParticleMass(3, 0.0)  # OpenMM does not move it
+    (held,) = openmm_to_ase(made.topology, made.positions, made.system).constraints
+    assert held.get_indices().tolist() == [3]
     for options, words in (
         ({"constraints": 3}, "constraints has 3"),
         ({"constrain": "hbonds", "constraints": [one]}, "not both"),

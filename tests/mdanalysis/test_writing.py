@@ -153,8 +153,7 @@ def test_ase_dynamics(tmp_path):
         with write_ase(dynamics, path, interval=4, forces=True) as writer:
             dynamics.run(8)
         assert writer.n_frames == 3 and writer.motion is not None
-        made = files.loaded(path, 2)
-        last = made.trajectory[-1]
+        last = files.loaded(path, 2).trajectory[-1]
         assert last.time == pytest.approx(8e-3, rel=1e-5)
         np.testing.assert_allclose(last.positions, atoms.positions, atol=1e-5)
         np.testing.assert_allclose(last.velocities, atoms.get_velocities() * 1000 * ase.units.fs, rtol=1e-5, atol=1e-6)

@@ -67,9 +67,7 @@ def build(size: int, rng: int, *, kind: str = "pendulum") -> TestSystem:
         held.append(Distance([[k, k + 1] for k in range(links - 1)], chosen.lengths[1:]))
 
     def solution(time: float) -> Reference:
-        if links == 1:
-            return _swing(chosen.angles[0], time)
-        return _angles(chosen, time)
+        return _swing(chosen.angles[0], time) if links == 1 else _angles(chosen, time)
 
     return TestSystem(
         name=kind,

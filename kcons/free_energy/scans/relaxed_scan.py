@@ -223,8 +223,7 @@ class _Wavefront:
             found = minimize(
                 motion, lambda y, _: self.evaluate(y)[1], x, tolerance=fmax, longest=FIRST, steps=evaluations
             )
-            energy = self.evaluate(found.positions)[0]
-            return Relaxed(found.positions, energy, found.largest, found.evaluations)
+            return Relaxed(found.positions, self.evaluate(found.positions)[0], found.largest, found.evaluations)
         internals = Internals(self.atoms.numbers, x, motion.lattice)
         memory = internals.remapped(source.memory, source.terms) if source and len(source.memory) else ()
         return Descent(motion, self.evaluate, internals, memory).relaxed(x, fmax, evaluations)

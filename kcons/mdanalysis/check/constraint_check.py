@@ -368,6 +368,9 @@ def _remarks_on(reader: Any, masses: FloatArray | None) -> list[str]:
         still = int(np.count_nonzero(masses[~reader.ts.velocities.any(axis=1)]))
         if 0 < still < np.count_nonzero(masses):
             remarks.append(f"{still} atoms have no velocity: if the run fixed them, the temperature is too low")
+        if light := int(np.count_nonzero((masses > 0) & (masses < 0.9))):
+            said = "are lighter than hydrogen: if they are Drude particles, which are cold, the temperature is too low"
+            remarks.append(f"{light} atoms {said}")
     if getattr(reader, "transformations", ()):
         remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
     if reader.ts.has_velocities and not velocities_known(reader):

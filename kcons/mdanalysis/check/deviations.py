@@ -60,8 +60,8 @@ _BY_ROW = np.dtype([(name, "f8") for name in ("margin", "largest", "frame", "tot
 _BY_UNIT = np.dtype(
     [(name, "f8") for name in ("sum", "squares", "violated", "seen", "rate_squares", "rate", "largest", "rounding")]
 )
-#: By frame: its number and time, twice the kinetic energy, momentum, and whether it has no cell.
-_BY_FRAME = np.dtype([("frame", "i8"), ("time", "f8"), ("kinetic", "f8"), ("momentum", "f8", 3), ("bare", "?")])
+#: By frame: number, time, twice the kinetic energy, and that of a turn of the whole, infinite in a cell; momentum.
+_BY_FRAME = np.dtype([("frame", "i8"), ("time", "f8"), ("kinetic", "f8"), ("turning", "f8"), ("momentum", "f8", 3)])
 
 
 @dataclass
@@ -245,8 +245,7 @@ class RowTable:
         frame = found.frames[k]
         frame["time"] = time = float(ts.time)
         lattice, limit = self._cell_of(ts)
-        if limit == np.inf:
-            frame["bare"] = True
+        frame["turning"] = np.nan if limit == np.inf else np.inf
         planes, speeds = np.ascontiguousarray(ts.positions.T, dtype=np.float32), _NO_SPEEDS
         if v is not None:
             speeds = np.column_stack([v, np.zeros(len(v))])
@@ -256,6 +255,8 @@ class RowTable:
             found.units["rate_squares"][k] = found.units["rate"][k] = 0.0
             if masses is not None:
                 frame["kinetic"], frame["momentum"] = (masses @ (speeds * speeds)).sum(), (masses @ speeds)[:3]
+                if limit == np.inf:
+                    frame["turning"] = _turning(planes.T - masses @ planes.T / masses.sum(), speeds[:, :3], masses)
         if self.others is not None:
             self._look_at_others(planes.T, speeds[:, :3], lattice if limit < np.inf else None, precision, time)
         bad = _look(
@@ -287,6 +288,13 @@ class RowTable:
         given[0] = off
         given[1] = np.where(np.isfinite(off + rounding), np.where(others.holonomic, rounding, 0), np.inf)
         self._given[:, self._places[rows]] = given
+
+
+def _turning(r: FloatArray, v: FloatArray, masses: FloatArray) -> float:
+    """Twice the kinetic energy of the turn of the whole, of positions from the center of mass."""
+    weighted = masses[:, None] * r
+    momentum, inertia = np.cross(weighted, v).sum(axis=0), np.sum(weighted * r) * np.eye(3) - weighted.T @ r
+    return float(momentum @ np.linalg.pinv(inertia, hermitian=True) @ momentum)
 
 
 def _by_row(constraints: Sequence[Constraint], values: Sequence[Any]) -> Any:

@@ -16,6 +16,7 @@ from itertools import islice
 from typing import Any
 
 from MDAnalysis.coordinates.DCD import DCDReader
+from MDAnalysis.exceptions import NoDataError
 from MDAnalysis.lib.util import anyopen
 
 from kcons.errors import NonFiniteError
@@ -54,7 +55,7 @@ def broken_by(error: BaseException, reader: Any, frame: int) -> Break:
     said = str(error).strip().partition("\n")[0].strip() or "the file ends"
     # So it is said of any frame of DCD.
     said = DAMAGED if said.startswith("Reading DCD header failed") else said
-    return Break(frame, said, not isinstance(error, NonFiniteError))
+    return Break(frame, said, not isinstance(error, NonFiniteError | NoDataError))
 
 
 def first_break(reader: Any, look: Callable[[Any, str], Break | None]) -> Break | None:

@@ -11,7 +11,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from kcons.steppers.files import ResultFolder, in_one_piece
+from kcons.steppers.files import ResultFolder, write_files
 from kcons.steppers.files import text as as_json
 
 if TYPE_CHECKING:
@@ -107,8 +107,7 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
         allowed = rounding + unit.bound - rounding.max()
         lines = [("black", ":", allowed, "rounding of the file, at most")]
         if unit.tolerance > 0:
-            label = f"rounding and tolerance of {result.tolerance:g}"
-            lines.append(("#555555", "--", allowed + unit.tolerance, label))
+            lines.append(("#555555", "--", allowed + unit.tolerance, f"rounding and tolerance of {result.tolerance:g}"))
         for color, style, level, label in lines:
             line = axes.axhline(level[0]) if len(x) < 2 else axes.plot(x, level)[0]
             line.set(color=color, linestyle=style, linewidth=1.0, label=label)
@@ -117,9 +116,8 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
     if result.temperature is not None:
         grid[-1].plot(x, result.series["temperature K"], color="#009E73", linewidth=1.0)
         grid[-1].set_ylabel("temperature / K")
-    if result.broken is not None and x:
-        for axes in grid:
-            axes.axvline(x[-1], color="#999999", linestyle="--", linewidth=1.0)
+    for axes in grid if result.broken is not None and x else ():
+        axes.axvline(x[-1], color="#999999", linestyle="--", linewidth=1.0)
     grid[-1].set_xlabel("time / ps" if timed else "frame")
     figure.suptitle(f"{Path(result.trajectory).name}: {result.n_rows} rows, {result.status}", fontsize=11)
     figure.savefig(path, dpi=150, format="png")
@@ -138,13 +136,8 @@ def write(
     # Names of files need not be text; in JSON the replacement is what stands for such a character.
     whole = f"{as_json({**place.owner, **data})}\n".encode(errors="backslashreplace")
     page = f"{text}\n".encode(errors="replace") if text else b""
-    written = []
+    contents = dict(zip(FILES, (whole, picture, page), strict=True))
     with place.taken():
-        for path, content in zip([folder / name for name in FILES], (whole, picture, page), strict=True):
-            if not content:
-                path.unlink(missing_ok=True)
-                continue
-            with in_one_piece(path) as file:
-                file.write(content)
-            written.append(path)
-    return written
+        for name in [name for name in FILES if not contents[name]]:
+            (folder / name).unlink(missing_ok=True)
+        return write_files(folder, {name: content for name, content in contents.items() if content})

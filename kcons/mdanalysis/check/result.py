@@ -18,7 +18,7 @@ from kcons.topology.topology import Topology
 
 #: Boltzmann's constant in amu Å²/(ps² K).
 BOLTZMANN = 0.831446261815324
-#: Part of the kinetic energy that the center of mass may have where its motion is removed.
+#: Part of its thermal energy that a motion of the whole, of its center or a turn, may have where it is removed.
 STILL = 1e-2
 
 
@@ -166,7 +166,7 @@ def result_of(
     untold = table.measured & (table.of_targets > table.sizes)
     gaps = asked.gaps + _gaps(found, table, untold, asked.targets)
     units = [_unit(table, found, unit, untold, asked.mode) for unit in range(len(UNITS)) if (table.units == unit).any()]
-    bare = int(found.frames["bare"].sum())
+    bare = int((found.frames["turning"] != np.inf).sum())
     if bare and (violated & (table.units == 0) & (found.rows["largest"] > table.sizes)).any():
         some = "" if bare == len(numbers) else f"{bare} of {len(numbers)} "
         remarks.append(
@@ -317,10 +317,13 @@ def _temperatures(found: Found, rank: int, masses: FloatArray, remarks: list[str
     has = np.isfinite(twice)
     if not has.any():
         return max(freedom, 0), None
-    center = (found.frames["momentum"][has] ** 2).sum(axis=1) / masses.sum()
-    still = float(center.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean()) and freedom > 3
+    center, least = (found.frames["momentum"][has] ** 2).sum(axis=1) / masses.sum(), STILL * 3 * twice[has].mean()
+    still = bool(center.mean() < least / max(freedom, 1)) and freedom > 3
     remarks.append("the center of mass is " + ("not at rest: it counts", "at rest: 3 degrees of freedom less")[still])
     freedom -= 3 * still
+    if found.frames["turning"][has].mean() < least / max(freedom, 1) and freedom > 3:
+        remarks.append("the system does not turn as a whole: 3 degrees of freedom less")
+        freedom -= 3
     if freedom <= 0:
         remarks.append("no temperature: the constraints leave no degree of freedom")
         return 0, None

@@ -172,9 +172,7 @@ class _Motions:
         with np.errstate(all="ignore"):
             self._sweep(y)
             left = np.abs(held.value(y - self._images, self.time)) / held.scale
-        if not np.all(left[held.holonomic] <= NEAR):
-            return None
-        return y - self._images
+        return y - self._images if np.all(left[held.holonomic] <= NEAR) else None
 
     def _follow_fixed(self, y: FloatArray) -> None:
         """Molecules with fixed atoms that are placed elsewhere go along, in place."""

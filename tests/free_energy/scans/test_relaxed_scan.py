@@ -115,8 +115,7 @@ def test_one_failed_point_does_not_stop_the_others():
         at = np.degrees(phi[0])
         return RuntimeError("no convergence") if 50 < at < 70 else np.nan if -70 < at < -50 else None
 
-    atoms = chain(4, threefold, fails)
-    found = scan(atoms, TURN, RING)
+    found = scan(chain(4, threefold, fails), TURN, RING)
     assert set(found.failed) == {(4,), (8,)}
     assert found.failed[8,].startswith("Dihedral(0, 1, 2, 3) = 60: CalculatorError: the calculator failed")
     assert "RuntimeError: no convergence" in found.failed[8,]

@@ -42,8 +42,7 @@ def test_table_and_summary():
 
 
 def test_what_differs_by_the_way_is_said():
-    atoms = chain(5, two_wells, turns=[np.radians(-150), 0.3])
-    found = scan(atoms, TURN, np.radians(np.arange(-165, 180, 30)))
+    found = scan(chain(5, two_wells, turns=[np.radians(-150), 0.3]), TURN, np.radians(np.arange(-165, 180, 30)))
     assert "from different neighbors the energy differs by up to" in found.summary()
     assert len(found.plot().axes[0].lines) == 2
 

@@ -104,8 +104,7 @@ def test_table_and_sentences(sampled):
 def test_files(sampled, tmp_path):
     paths = sampled.write(tmp_path)
     assert [path.name for path in paths] == ["free_energy.json", "profile.csv", "profile.png"]
-    lines = paths[1].read_text().splitlines()
-    assert lines[0] == "torsion (radian),F (kJ/mol),error (kJ/mol)"
+    assert paths[1].read_text().splitlines()[0] == "torsion (radian),F (kJ/mol),error (kJ/mol)"
     numbers = np.loadtxt(paths[1], delimiter=",", skiprows=1)
     np.testing.assert_allclose(numbers[:, 1], sampled.profile.F, rtol=1e-6, atol=1e-9)
     assert paths[2].read_bytes().startswith(b"\x89PNG")

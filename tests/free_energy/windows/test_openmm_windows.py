@@ -75,8 +75,7 @@ def test_other_coordinates(tmp_path, coordinate, target):
     assert windows.scales.tolist() == ([1.0] if isinstance(coordinate, Angle | Formula) else [10.0])
     settings = Settings(relax=5, pull=20, equilibration=10, production=32, every=1)
     windows.sample(Window("down", (target + 0.02,), (target,), 7), settings, tmp_path / "window.npz")
-    series = Series.load(tmp_path / "window.npz")
-    np.testing.assert_allclose(series.value, target, atol=1e-10)
+    np.testing.assert_allclose(Series.load(tmp_path / "window.npz").value, target, atol=1e-10)
 
 
 def test_structures_that_are_not_of_the_system():

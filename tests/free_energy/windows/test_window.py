@@ -42,8 +42,7 @@ AROUND = [[0, 1], [1, 2], [2, 3], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]]
 
 
 def ring(bonds=AROUND, others=()):
-    pucker = {"pucker": Dihedral([[0, 1, 2, 3]])}
-    return of_atoms(RING, pucker, others, bonds)
+    return of_atoms(RING, {"pucker": Dihedral([[0, 1, 2, 3]])}, others, bonds)
 
 
 def test_a_ring_comes_to_its_window_by_small_steps():

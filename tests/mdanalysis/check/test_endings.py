@@ -94,8 +94,7 @@ def test_a_file_that_ends_early_is_seen_whatever_frames_are_looked_at(tmp_path, 
 def test_a_header_that_announces_more_frames(tmp_path, x):
     """Cut between two frames: nothing but the header of DCD tells."""
     path = files.write(tmp_path / "w.dcd", x)
-    size = 56 + 3 * (8 + 12 * N)
-    result = checked(cut(path, 2 * size))
+    result = checked(cut(path, 2 * (56 + 3 * (8 + 12 * N))))
     assert result.status == "incomplete" and len(result.frames) == 6
     assert "its header announces 8 frames, and it has 6" in result.verdict
     data = bytearray(path.read_bytes())

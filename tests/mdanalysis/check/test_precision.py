@@ -201,8 +201,7 @@ def test_xtc_beyond_the_reach_of_its_grid(tmp_path):
     """Where single precision cannot give back the integers of the file, it is what counts."""
     x = whole()
     x[4, 3 * 7 : 3 * 8] += 2e5
-    path = files.write(tmp_path / "a.xtc", x, side=None)
-    result = checked(path, tolerance=0.0)
+    result = checked(files.write(tmp_path / "a.xtc", x, side=None), tolerance=0.0)
     assert result.status == "kept", result.verdict
     assert result.series["largest Å"][4] > 0.02 > max(np.delete(result.series["largest Å"], 4))
     calm = np.delete(np.array(result.series["rounding Å"]), 4)

@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 import water_files as files
+from ase import Atoms
+from ase.md.velocitydistribution import Stationary, ZeroRotation
 from MDAnalysis.lib.formats.libmdaxdr import TRRFile
 
 from kcons.constraints import CenterOfMass, Distance
@@ -56,6 +58,14 @@ def test_a_moving_center_of_mass_counts_and_without_masses_there_is_a_rank_but_n
     v = np.random.default_rng(1).normal(size=x.shape) + 3.0
     path = files.write(tmp_path / "m.trr", x, velocities=v)
     assert files.checked(path, N).degrees_of_freedom == 6 * N
+    clusters = [Atoms("OHH" * N, r, velocities=u) for r, u in zip(x, v, strict=True)]
+    for atoms in clusters:
+        Stationary(atoms)
+        ZeroRotation(atoms)
+    v = np.array([atoms.get_velocities() for atoms in clusters])
+    for side, less in ((None, 6), (12.0, 3)):  # free to turn, or in a cell
+        files.write(path, x, side, v)
+        assert files.checked(path, N).degrees_of_freedom == 6 * N - less
     result = files.checked(path, N, masses=False)
     assert result.rank == 3 * N and result.temperature is None
     assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)
@@ -95,19 +105,24 @@ def test_atoms_that_do_not_move_are_told_of(tmp_path):
         result = files.checked(files.write(tmp_path / "t.trr", x, velocities=v), N)
         words = "30 atoms have no velocity: if the run fixed them, the temperature is too low"
         assert (words in result.remarks) == any("velocity" in remark for remark in result.remarks) == said
+    universe = files.loaded(tmp_path / "t.trr", N)
+    universe.atoms[:2].masses = 0.4
+    remarks = ConstraintCheck(universe, Distance(files.pairs(N)), targets="first").run().check.remarks
+    assert any("2 atoms are lighter than hydrogen: if they are Drude" in remark for remark in remarks)
 
 
 def test_velocities_of_later_frames_alone_have_a_temperature(tmp_path):
     x = files.water(N, 4)
     v = np.random.default_rng(1).normal(size=x.shape)
     with TRRFile(str(tmp_path / "t.trr"), "w") as file:
-        for k in range(4):
-            speeds = np.float32(v[k] / 10) if k % 2 else None
-            file.write(np.float32(x[k] / 10), speeds, None, 1.2 * np.eye(3, dtype="f4"), k, float(k), 0.0, 3 * N)
+        for k in range(5):
+            speeds, where = np.float32(v[k % 4] / 10) if k % 2 else None, np.float32(x[k] / 10) if k < 4 else None
+            file.write(where, speeds, None, 1.2 * np.eye(3, dtype="f4"), k, float(k), 0.0, 3 * N)
     result = files.checked(tmp_path / "t.trr", N)
     kelvin = np.einsum("i,kij->k", np.tile([15.999, 1.008, 1.008], N), v**2) / (0.831446261815324 * 6 * N)
     assert result.degrees_of_freedom == 6 * N
     np.testing.assert_allclose(result.series["temperature K"], [np.nan, kelvin[1], np.nan, kelvin[3]], rtol=1e-6)
+    assert result.gaps == ["frame 4 cannot be used, nor what follows: This Timestep has no positions"]
 
 
 def test_velocities_without_a_unit_are_no_temperature(tmp_path):
