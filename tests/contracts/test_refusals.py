@@ -508,6 +508,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("Flow(lambda t, X: ?, 2).velocity(0.0, [1.0, 1.0])", "velocity", "[1.0]", "X * 1j"),
     ("Flow(lambda t, X: X, 2, lambda t, X: ?).jacobian(0.0, [1.0, 1.0])", "jacobian", "[1.0]", "1j * np.eye(2)"),
     ("phase_volume(Flow(lambda t, X: X, 2), [1.0, 1.0], [0.0, 1.0, 0.5])", "times"),
+    ("phase_volume(Flow(lambda t, X: -np.sin(t) * X, 1, lambda t, X: [[-t]]), [1.0], [0.0, 1.0])", "jacobian"),
     ("Thermostat([1.0, 1.0], lambda x: ?).friction([1.0, 0.0, 1.0, 0.0])", "force", "1j * x", "[1.0, 2.0, 3.0]"),
     ("Thermostat([1.0, 0.0], abs)", "masses"),
     ("Thermostat([1.0, 1.0], abs).state([0.0, 0.0], [0.0, 0.0])", "v"),
