@@ -34,7 +34,7 @@ from kcons.constraints.arguments import (
     rules_of,
 )
 from kcons.constraints.compilation import has_a_file, njit
-from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target, nearest_image
+from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target, contradiction, nearest_image
 from kcons.errors import ConstraintError, InputError, SingularGeometryError, UnsupportedError
 
 IntArray = NDArray[np.int64]
@@ -311,9 +311,26 @@ class Constraint:
             value, slope = self.value_and_gradient(r, time)
             size = np.sqrt(np.einsum("kai,kai->k", slope, slope))
         yield ~(np.isfinite(value) & np.isfinite(size) & (size > 0)), lambda k: self.undefined(k, r[k], time)
+        if self.holonomic and self.row and not type(self).__module__.startswith("kcons."):
+            yield from self._contradictions(r, time)
         if self.positive and self.target is not None:
             length, remedy = self.target_at(time), "give a length greater than zero, or None to hold the present one"
             yield ~(length > 0), lambda k: f"{self.positive} {length[k]:g} is not positive; {remedy}", self.positive
+
+    def _contradictions(self, r: FloatArray, time: float) -> Iterator[Fault]:
+        """Derivatives of a family of the user that differences contradict: motion would be wrong without a sign."""
+        way = np.random.default_rng(0).normal(size=r.shape)
+
+        def steep(s: float) -> FloatArray:
+            return np.asarray(np.sum(self.gradient(r + s * way, time) * way, axis=(1, 2)))
+
+        with np.errstate(all="ignore"):
+            slope = contradiction(steep, lambda s: self.measure(r + s * way, time), 0.0, 0.01, self.period)
+            moved = contradiction(lambda t: self.time_terms(r, 0 * r, t)[0], lambda t: self.measure(r, t), time, 0.02)
+        for item, found in (("row", slope), ("rate", moved)):
+            if found is not None:
+                said = f"gives {found.given:.6g}, but differences of the value give {found.found:.6g}; correct it"
+                yield np.arange(self.n_rows) == found.number, lambda k, it=f"a derivative of `{item}` {said}": it, item
 
     def undefined(self, k: int, r: FloatArray, time: float) -> str:
         """What is said of row `k`, which has no gradient at `r`, shape (width, 3)."""
@@ -378,9 +395,7 @@ class Constraint:
         """Copy with some of the rows, their targets and their data."""
         rows = np.asarray(rows, dtype=np.int64)
         data = {name: getattr(self, name) for name in (*_BY_ROW, *self.per_row)}
-        own: dict[str, Any] = {
-            name: read_only(array[rows]) for name, array in data.items() if isinstance(array, np.ndarray)
-        }
+        own: dict[str, Any] = {name: read_only(a[rows]) for name, a in data.items() if isinstance(a, np.ndarray)}
         if isinstance(self.target, MovingTarget):
             target, n, period = self.target, self.n_rows, self.period
             own["target"] = MovingTarget(

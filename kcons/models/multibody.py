@@ -197,9 +197,8 @@ class Multibody:
         NonFiniteError
             A function gave a NaN or infinity.
         """
-        solver, (t0, t1), wanted = check_run(
-            t_span, t_eval, method, options | {"rtol": rtol, "atol": atol}, 2 * np.size(q)
-        )
+        options |= {"rtol": rtol, "atol": atol}
+        solver, (t0, t1), wanted = check_run(t_span, t_eval, method, options, 2 * np.size(q))
         q, v = self._state(q, v)
         place = self._start(q, v, t0)
         n, rank = len(q), len(place.rows)
@@ -215,8 +214,7 @@ class Multibody:
             return np.concatenate([v, here.solve(self._called("force", (n,), q, v, t), self._b(q, v))])
 
         start = project(t0, np.concatenate([q, v]))
-        options |= {"t_eval": wanted, "rtol": rtol, "atol": atol}
-        ode = integrate(slope, (t0, t1), start, solver, project, **options)
+        ode = integrate(slope, (t0, t1), start, solver, project, t_eval=wanted, **options)
         if ode.status < 0:
             raise ConvergenceError(
                 f"the run ended at t = {place.t:.8g}: {ode.message} Stiff forces: method='Radau'; forces "
@@ -365,13 +363,15 @@ class Multibody:
             return
         self.m = as_float_array(self.constraints(read_only_view(q)), "constraints").size
         along = self.length * np.random.default_rng(0).normal(size=len(q))
-        bare = copy(self)
-        bare.jacobian = bare.curvature = None
-        own, found = ((body._G(q), -body._b(q, along)) for body in (self, bare))
+        bare, half = copy(self), copy(self)
+        bare.jacobian = bare.curvature = half.jacobian = half.curvature = None
+        half.length = 0.5 * self.length
+        own, found, finer = ((body._G(q), -body._b(q, along)) for body in (self, bare, half))
         bent = WRONG * self.length * _largest(found[0])
         for k, (name, rounding) in enumerate((("jacobian", 0.0), ("curvature", bent))):
-            if getattr(self, name) is not None:
-                check_derivative(name, "the constraints (see `length`)", own[k], found[k], found[k], rounding=rounding)
+            given = getattr(self, name) is not None
+            of, fine = ("the constraints (see `length`)", found) if given else ("what is held (see `length`)", finer)
+            check_derivative(name, of, own[k] if given else None, found[k], fine[k], rounding=rounding)
 
 
 def _factors(A: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:

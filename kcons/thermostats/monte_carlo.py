@@ -212,8 +212,7 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         self._known: tuple[System, ReversedSteps] | None = None
 
     def __repr__(self) -> str:
-        few, most = self.steps
-        steps = few if few == most else self.steps
+        steps = self.steps if self.steps[0] < self.steps[1] else self.steps[0]
         return f"HamiltonianMonteCarlo({self.thermal_energy!r}, {steps!r}, rng={self.seed}, stepper={self.stepper!r})"
 
     @property
@@ -297,12 +296,9 @@ class HamiltonianMonteCarlo(DropsSystemCaches):
         try:
             for _ in range(count):
                 end = steps.step(system, end, dt)
-        except ReversibilityError:
-            return begin, IRREVERSIBLE, math.nan, potential
-        except (ConvergenceError, SingularGeometryError):
-            return begin, UNSOLVED, math.nan, potential
-        except NonFiniteError:
-            return begin, NOT_FINITE, math.nan, potential
+        except (ConvergenceError, SingularGeometryError, NonFiniteError) as error:
+            reason = IRREVERSIBLE if isinstance(error, ReversibilityError) else UNSOLVED
+            return begin, NOT_FINITE if isinstance(error, NonFiniteError) else reason, math.nan, potential
         there = system.potential_energy(end.positions, end.time)
         change = (system.kinetic_energy(end.velocities) - kinetic + (there - potential)) / self.thermal_energy
         if not math.isfinite(change):
@@ -407,8 +403,7 @@ def tune(
         missing += wanted - chances[-1]
         log = begin - math.sqrt(made) / PULL * missing / (made + BEFORE)
         mean += made**-FORGET * (log - mean)
-    second = chances[(proposals + 1) // 2 :]
-    acceptance = sum(second) / len(second)
+    acceptance = float(np.mean(chances[(proposals + 1) // 2 :]))
     if not acceptance > 0:
         raise ConvergenceError(
             f"no proposal succeeded with time steps down to {system.shown_time(math.exp(log))}; is the start sound?"
@@ -458,12 +453,8 @@ def exchange(
         )
     number = whole_number(number, "number", 0, 2**64 - 1)
     for k, state in enumerate(states):
-        if (
-            not isinstance(state, State)
-            or state.thermostat is None
-            or state.thermostat.shape != (SIZE,)
-            or math.isnan(potential_of(state))
-        ):
+        carries = isinstance(state, State) and state.thermostat is not None and state.thermostat.shape == (SIZE,)
+        if not carries or math.isnan(potential_of(state)):
             raise InputError(
                 f"state {k} does not know its potential energy; make a step of HamiltonianMonteCarlo with it first",
                 item="states",

@@ -163,6 +163,16 @@ def test_a_family_of_ones_own_is_compiled_and_kept_in_files():
     assert type(from_dict(Height([[0]], 4.0, factor=1.0).todict())) is Height
 
 
+@pytest.mark.parametrize(("slope", "speed", "item"), [(1.5, -2.0, "row"), (2.0, None, "rate"), (2.0, -1.0, "rate")])
+def test_wrong_derivatives_of_a_family_of_ones_own_are_refused(slope, speed, item):
+    def row(r, p, t, out):
+        out[0], out[1], out[2], out[3] = r[2] * r[2] - 2.0 * t, 0.0 * r[0], 0.0 * r[0], slope * r[2]
+
+    own = {"row": staticmethod(row), "rate": speed and staticmethod(lambda r, p, t, out: out.fill(speed))}
+    with pytest.raises(InputError, match=f"a derivative of `{item}` gives"):
+        ConstraintSet(type("Raised", (Constraint,), own)([[0]]), np.ones((1, 3)), [1.0], time=0.3)
+
+
 # -- in another unit of length ----------------------------------------------------------------------
 
 #: The power with which lengths stand in what is held, of the cases for which it is known.

@@ -70,6 +70,10 @@ class Flow:
         """Jacobians with a step and with half of it."""
         return [jacobian_by_differences(self._velocity, t, self._state(X), step) for step in (STEP, STEP / 2)]
 
+    def _check_jacobian(self, t: float, X: FloatArray) -> None:
+        given = None if self._jacobian is None else self.jacobian(t, X)
+        check_derivative("jacobian", "the velocity", given, *self._differences(t, X))
+
     def divergence(self, t: float, X: ArrayLike) -> float:
         """div V = tr A (notes eqs. 36, 37)."""
         return float(np.trace(self.jacobian(t, X)))
@@ -137,8 +141,7 @@ def phase_volume(
         raise InputError("times are one-dimensional and increase", item="times")
     n = flow.n
     state, total = flow._state(X0), np.eye(n)
-    given = None if flow._jacobian is None else flow.jacobian(wanted[0], state)
-    check_derivative("jacobian", "the velocity", given, *flow._differences(wanted[0], state))
+    flow._check_jacobian(wanted[0], state)
     log_volume = divergence = 0.0
     rows = [(state, total, 0.0, 0.0)]
 
@@ -158,6 +161,7 @@ def phase_volume(
                 f"from t = {a:.6g} to {b:.6g} the volume changes by exp({integral:.6g}), which its propagator no "
                 "longer resolves: give more times"
             )
+        flow._check_jacobian(b, state)
         log_volume, divergence, total = log_volume + change, divergence + integral, J @ total
         rows.append((state, total, log_volume, divergence))
     return PhaseVolume(wanted, *(np.array(column) for column in zip(*rows, strict=True)))

@@ -39,16 +39,10 @@ class DampedOscillator(LinearFlow):
         """T and J in closed form (notes eqs. 17, 24); one block at critical damping, where T of (24) is singular."""
         first, second = self.eigenvalues()
         if first == second:
-            return JordanForm(
-                np.array([[-1.0, -1.0 / self.omega], [1.0, 0.0]], dtype=np.complex128),
-                jordan_block(first, 2).astype(np.complex128),
-                [JordanBlocks(first, (2,))],
-            )
-        return JordanForm(
-            np.array([[second / self.omega, first / self.omega], [1.0, 1.0]]),
-            np.diag([first, second]),
-            [JordanBlocks(first, (1,)), JordanBlocks(second, (1,))],
-        )
+            T, J = np.array([[-1.0, -1.0 / self.omega], [1.0, 0.0]]), jordan_block(first, 2)
+            return JordanForm(T.astype(np.complex128), J.astype(np.complex128), [JordanBlocks(first, (2,))])
+        T = np.array([[second / self.omega, first / self.omega], [1.0, 1.0]])
+        return JordanForm(T, np.diag([first, second]), [JordanBlocks(k, (1,)) for k in (first, second)])
 
     def closed_form(self, t: float) -> FloatArray:
         """exp(At), shape (2, 2), in one formula for all regimes (notes eq. 25, derived anew).

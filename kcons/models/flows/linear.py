@@ -21,6 +21,7 @@ Wilkinson, SIAM Review 18, 578 (1976). Kagstrom and Ruhe, ACM Trans. Math. Softw
 from __future__ import annotations
 
 from enum import Enum
+from functools import partial
 from importlib.util import find_spec
 from itertools import product
 from typing import NamedTuple, TypeAlias
@@ -422,19 +423,14 @@ def find_equilibria(
     spread = generator_of(rng).random((max(starts - len(fixed), 0), n))
     points = low + width * np.array([*fixed, *spread])[:starts]
     found: list[FloatArray] = []
+    velocity, jacobian = partial(flow.velocity, time), partial(flow.jacobian, time)
     with np.errstate(all="ignore"):
-        speeds = [float(np.linalg.norm(flow.velocity(time, p))) for p in points]
+        speeds = [float(np.linalg.norm(velocity(p))) for p in points]
         size = float(np.median([s for s in speeds if np.isfinite(s)] or [1.0])) or 1.0
         for point in points:
             try:
-                result = root(
-                    lambda X: flow.velocity(time, X),
-                    point,
-                    jac=lambda X: flow.jacobian(time, X),
-                    options={"xtol": 1e-13},
-                )
-                X = np.asarray(result.x)
-                place, left = (X - low) / width, float(np.linalg.norm(flow.velocity(time, X)))
+                X = np.asarray(root(velocity, point, jac=jacobian, options={"xtol": 1e-13}).x)
+                place, left = (X - low) / width, float(np.linalg.norm(velocity(X)))
             except InputError:  # the search has left all numbers
                 continue
             inside = np.min(place) >= -SAME and np.max(place) <= 1 + SAME and left <= ZERO * size

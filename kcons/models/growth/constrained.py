@@ -49,7 +49,7 @@ from kcons.errors import (
     InputError,
     NonFiniteError,
 )
-from kcons.models.growth.model import EntropyRow, GrowthModel, Mixture, Populations, Row, TotalPopulation
+from kcons.models.growth.model import EntropyRow, GrowthModel, LinearRow, Mixture, Populations, Row, TotalPopulation
 from kcons.models.integration import called, check_run, integrate
 
 __all__ = ["ConstrainedGrowth", "ConstrainedHypercycle", "Hypercycle", "entropy_balance", "solve"]
@@ -114,7 +114,7 @@ class ConstrainedGrowth:
     Raises
     ------
     ConstraintError
-        If there are more rows than species.
+        If there are more rows than species, or entropy has a law where the sum of populations is not kept.
     """
 
     def __init__(self, model: GrowthModel, rows: Sequence[Row] | Row = ()) -> None:
@@ -129,6 +129,10 @@ class ConstrainedGrowth:
                 f"{len(self.rows)} rows for {model.n} species: give at most as many rows as there are species",
                 rows=range(model.n, len(self.rows)),
             )
+        equal = (row for row in self.rows if isinstance(row, LinearRow) and np.ptp(row.coefficients) == 0)
+        if self.entropy_row is not None and all(row.moving for row in equal):
+            what = "EntropyRow is the law of a closed system, whose sum of populations is kept: add TotalPopulation(n)"
+            raise ConstraintError(f"{what} with a target that rests", rows=[self.rows.index(self.entropy_row)])
 
     #: Least error of ln x that a run asks for, and from when on its motion is the slow one.
     tolerance, settled_time = 1e-9, math.inf
@@ -343,9 +347,8 @@ def solve(
         for row in bound.rows:  # derivatives of what depends on time may be wrong later only
             row.check_derivatives(end)
         found.t, log_sol = np.asarray(found.t), found.sol
-        found.log_y = np.reshape(
-            found.y, (system.model.n, -1)
-        )  # a list where the run ended before the first time wanted
+        # A list where the run ended before the first time wanted.
+        found.log_y = np.reshape(found.y, (system.model.n, -1))
         found.y = np.exp(found.log_y)
         found.y_events = None if found.y_events is None else [np.exp(y) for y in found.y_events]
     found.log_sol, found.sol = log_sol, None if log_sol is None else lambda t: np.exp(log_sol(t))
@@ -448,8 +451,7 @@ class Hypercycle(GrowthModel):
         mu = self.mixture.potentials(p)
         M0, M1, M2 = self.mixture.moments(p)
         reactions = p.x * self.rates(p)
-        eta0 = np.sum(reactions)
-        eta1 = b2 - np.sum(reactions * mu)
+        eta0, eta1 = np.sum(reactions), b2 - np.sum(reactions * mu)
         return np.asarray(((M0 * eta1 + eta0 * M1) * mu - (eta1 * M1 + eta0 * M2)) / (M0 * M2 - M1 * M1))
 
 

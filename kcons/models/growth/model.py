@@ -79,10 +79,9 @@ class Populations(NamedTuple):
             raise InputError(f"populations have shape (n,) or (n, k), not {array.shape}", item="x0")
         bad = np.argwhere(~(np.isfinite(array) & (array > 0)))
         if len(bad):
-            value = array[tuple(bad[0])]
             raise InputError(
-                f"population {bad[0][0]} is {value:.6g}; populations are positive and finite: leave a species that is "
-                "zero out, or start it at a small positive number",
+                f"population {bad[0][0]} is {array[tuple(bad[0])]:.6g}; populations are positive and finite: "
+                "leave a species that is zero out, or start it at a small positive number",
                 item="x0",
             )
         return cls(time, array, np.log(array))
@@ -137,8 +136,7 @@ class GrowthModel:
         return growth if psi is None else growth + psi
 
     def velocity(self, t: float, x: ArrayLike) -> FloatArray:
-        """dx/dt without constraints, for any x (negative ones included), shape (n,) or (n, k): the field of a phase
-        portrait."""
+        """dx/dt without constraints, for any x (also negative), shape (n,) or (n, k): the field of a phase portrait."""
         x = as_float_array(x, "x")
         if x.ndim == 2:
             return np.stack([self.velocity(t, column) for column in x.T], axis=1)
@@ -192,9 +190,8 @@ class LotkaVolterra(GrowthModel):
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
         """dV/dx, shape (2, 2) (notes eq. 75)."""
         x1, x2 = as_float_array(x, "x")
-        return np.array(
-            [[self.alpha1 - self.beta1 * x2, -self.beta1 * x1], [self.alpha2 * x2, self.alpha2 * x1 - self.beta2]]
-        )
+        prey = [self.alpha1 - self.beta1 * x2, -self.beta1 * x1]
+        return np.array([prey, [self.alpha2 * x2, self.alpha2 * x1 - self.beta2]])
 
 
 # -- ideal mixtures -----------------------------------------------------------------------------------
@@ -339,7 +336,7 @@ class HolonomicRow(Row):
             check_call(f"{name}: {what}", given, ("t", "x"))
         self._function, self._gradient, self._time_derivative = function, gradient, time_derivative
         self.target = None if target is None else finite_number(target, "target")
-        self.name = name
+        self.name, self.moving = name, time_derivative is not None
 
     def measure(self, p: Populations) -> float:
         """sigma itself."""
