@@ -118,16 +118,15 @@ def _harmonic(i, j):
     return force
 
 
-def held_chain(rows, scheme="rattle", dt=0.002, platform="Reference", constrained=False, velocities=None, **options):
+def held_chain(rows, scheme="rattle", dt=0.002, platform="Reference", constrained=False, ensemble=None, **options):
     """The chain with rows, restored; (context, integrator, part)."""
     system = chain_system()
     if constrained:
         system.addConstraint(0, 1, float(np.linalg.norm(CHAIN[0] - CHAIN[1])))
         system.addConstraint(2, 3, float(np.linalg.norm(CHAIN[2] - CHAIN[3])))
     part = CollectiveRows(system, rows, positions=CHAIN, **options)
-    integrator = ProjectedIntegrator(dt, scheme, parts=[part], tolerance=1e-13)
-    v = some_velocities() if velocities is None else velocities
-    context = started(system, integrator, CHAIN, v, platform)
+    integrator = ProjectedIntegrator(dt, scheme, parts=[part], tolerance=1e-13, ensemble=ensemble)
+    context = started(system, integrator, CHAIN, some_velocities(), platform)
     part.restore(context)
     return context, integrator, part
 

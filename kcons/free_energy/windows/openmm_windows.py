@@ -86,7 +86,7 @@ class HeldCoordinatesReporter:
         At the first report: rows of `CollectiveRows` that are neither named nor given as `beside`.
         A report of another simulation than the first.
     UnsupportedError
-        At the first report: a coordinate of a virtual site.
+        At the first report: a coordinate of a virtual site; a member of a CompoundIntegrator that may hold rows.
 
     Notes
     -----
@@ -135,9 +135,13 @@ class HeldCoordinatesReporter:
         self._file.flush()
 
     def _begin(self, simulation: Any, x: np.ndarray, time: float) -> None:
-        system, masses = simulation.system, masses_of(simulation.system)
+        system, integrator = simulation.system, simulation.integrator
+        members = [integrator.getIntegrator(k) for k in range(getattr(integrator, "getNumIntegrators", int)())]
+        if not {openmm.Integrator, openmm.CustomIntegrator}.isdisjoint(map(type, members)):
+            raise UnsupportedError("a CompoundIntegrator does not tell what is held; simulate with its member alone")
+        masses = masses_of(system)
         rows = [*self._beside, *self._coordinates.values()]
-        parts = getattr(simulation.integrator, "parts", ())
+        parts = getattr(integrator, "parts", ())
         collective = sum(part.n_rows for part in parts if isinstance(part, CollectiveRows))
         carried = [c for p in parts if isinstance(p, CarriedConstraints) for c in p.motion.sources[0].constraints]
         if collective > (mine := sum(row.n_rows for row in rows)):
@@ -223,8 +227,7 @@ class OpenMMWindows(Sampler):
                 "the System was made for",
                 item="topology",
             )
-        barostats = [type(force).__name__ for force in system.getForces() if "Barostat" in type(force).__name__]
-        if barostats:
+        if barostats := [type(f).__name__ for f in system.getForces() if "Barostat" in type(f).__name__]:
             raise UnsupportedError(f"the System has a {barostats[0]}; windows are sampled in a box at rest: remove it")
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)

@@ -279,6 +279,7 @@ class CollectiveRows(Part):
     def declare(self, p: Program) -> None:
         c = self.code
         self._single = len(p.scheme.drifts) * len(p.scheme.flight) == 1
+        self._counts = "min(stage, 1)*" if p.halves else ""  # what a bath does across the rows is no work
         for k in range(self.n_rows):
             p.setting(self._of("target", k), f"target of row {k}", self._targets[k])
             p.setting(self._of("rate", k), "change of this target in a ps", self._rates[k])
@@ -494,7 +495,8 @@ class CollectiveRows(Part):
         for k in self._driven_rows:
             push, impulse = self._of("push", k), self._of("impulse", k)
             before = "0" if p.lean else f"select(delta(stage), 0, {impulse})"
-            p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
+            share = "*(1+stage)" if p.halves else ""  # the second half also stands for the projection before it
+            p.let(impulse, f"{before}+{push}/{h}{share}", "multiplier times time")
 
     # -- velocities -----------------------------------------------------------------------------
 
@@ -506,9 +508,8 @@ class CollectiveRows(Part):
         else:
             for k, group in enumerate(self._groups):
                 p.sum(self._of("slope", k), f"-f{group}*v", f"rate of {self.names[k]}")
-        for k in rows:
-            if self._rates[k] != 0.0:
-                p.let(self._of("slope", k), f"{self._of('slope', k)}-({self._rate(k)})", "less that of the target")
+        for k in self._driven_rows:
+            p.let(self._of("slope", k), f"{self._of('slope', k)}-({self._rate(k)})", "less that of the target")
         for k in rows:
             p.let(self._of("more", k), f"-({self._solved(k, 'slope')})", "multiplier times time")
         p.let(f"bad_sum{c}", _sum(f"abs({self._of('more', k)})" for k in rows), "to find what is no number")
@@ -520,13 +521,14 @@ class CollectiveRows(Part):
         pushes = _sum(f"{self._of('more', k)}*{self._of('row', k)}" for k in rows)
         p.each("v", f"{v}+{pushes}", "tangent to the rows")
         for k in self._driven_rows:
-            p.let(self._of("impulse", k), f"{self._of('impulse', k)}+{self._of('more', k)}", "all of this step")
+            impulse = self._of("impulse", k)
+            p.let(impulse, f"{impulse}+{self._counts}{self._of('more', k)}", "all of this step")
         self.passed(p)
 
     def passed(self, p: Program) -> None:
         """At the end of a step: the work of targets that move."""
         for k in self._driven_rows:
-            done = f"{self._of('work', k)}+select(failed, 0, {self._rate(k)}*{self._of('impulse', k)})"
+            done = f"{self._of('work', k)}+select(failed, 0, {self._counts}{self._rate(k)}*{self._of('impulse', k)})"
             p.let(self._of("work", k), done, "force times speed of the target")
 
     # -- seen from Python -----------------------------------------------------------------------
@@ -859,10 +861,8 @@ def owner(rows: CollectiveRows, context: openmm.Context) -> Integrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
     require_context(context)
     integrator = context.getIntegrator()
-    if (
-        isinstance(integrator, openmm.CompoundIntegrator) and rows.program is not None
-    ):  # the member that made steps last
-        integrator = rows.program.integrator
+    if isinstance(integrator, openmm.CompoundIntegrator) and rows.program is not None:
+        integrator = rows.program.integrator  # the member that made steps last
     return integrator if rows in getattr(integrator, "parts", ()) else None
 
 

@@ -241,9 +241,8 @@ def found_values(system: openmm.System, forces: Sequence[openmm.Force], position
 
     `InputError` for positions of the wrong shape, or at which a row is not a number.
     """
-    x = nanometers(positions, system.getNumParticles())  # type: ignore[arg-type]
     context = forces_alone(system, forces)
-    context.setPositions(x)
+    context.setPositions(nanometers(positions, system.getNumParticles()))  # type: ignore[arg-type]
     values = np.array([energy_of(context, {group}) for group in range(len(forces))])
     for k, value in enumerate(values):
         if not math.isfinite(value):

@@ -15,7 +15,7 @@ from kcons.errors import CertificateError, ConvergenceError, NonFiniteError, Rev
 from kcons.openmm.integrator.guard import forces_of
 from kcons.openmm.integrator.program import ConstantEnergy, Program
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.quantities import GAS_CONSTANT, energy_of, kelvins, masses_of, positions_of, velocities_of
+from kcons.openmm.quantities import GAS_CONSTANT, energy_of, kelvins, masses_of, motion_of, positions_of, velocities_of
 from kcons.steppers import State
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats import Counts
@@ -168,10 +168,8 @@ class HamiltonianMonteCarlo:
     @property
     def state(self) -> State:
         """Positions (nm), velocities (nm/ps), time (ps), number of proposals, and the variables of the sampler."""
-        context = self.context
-        time = context.getTime().value_in_unit(unit.picosecond)
-        x, v = positions_of(context), velocities_of(context)
-        return State(x, v, time, None, self.number, thermostat=self._held.copy())
+        time = self.context.getTime().value_in_unit(unit.picosecond)
+        return State(*motion_of(self.context), time, None, self.number, thermostat=self._held.copy())
 
     def step(self, proposals: int) -> None:
         """Make so many proposals.

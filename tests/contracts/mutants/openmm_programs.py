@@ -116,6 +116,8 @@ MUTANTS = {
         "weight{c}*({of('more', i)}«-→+»{of('expected', i)})": "row_program::the_iteration_learns_from_each_push",
         'let(f"back{c}_{i}_{j}", f"«-→»({done})*back{c}_{i}_{i}"': "row_program::the_iteration_learns_from_each_push",
         'again = f"select({sure}, «3→1», 1)"': "row_program::many_steps_look_less_often",
+        '"«min(stage, 1)*→»" if p.halves': "row_program::what_a_bath_does_across_a_row_is_no_work",
+        '"«*(1+stage)→»" if p.halves': "row_program::what_a_bath_does_across_a_row_is_no_work",
     },
     "openmm/surface_integrator.py": {
         "«positions is None→False»:": (

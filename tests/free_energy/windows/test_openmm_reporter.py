@@ -157,6 +157,13 @@ def test_bad_input():
     simulation = simulation_of(system, ProjectedIntegrator(0.001, parts=[rows]), HeldCoordinatesReporter(*phi))
     with pytest.raises(InputError, match=r"holds 2 rows, and 1 are named.*beside"):
         simulation.step(1)
+    compound = openmm.CompoundIntegrator()
+    compound.addIntegrator(ProjectedIntegrator(0.001))
+    several = app.Simulation(PDB.topology, peptide(), compound, openmm.Platform.getPlatformByName("Reference"))
+    several.context.setPositions(X)
+    state = several.context.getState(positions=True, velocities=True, forces=True)
+    with pytest.raises(UnsupportedError, match=r"CompoundIntegrator does not tell.*member alone"):
+        HeldCoordinatesReporter(*phi).report(several, state)
     simulation.reporters = [HeldCoordinatesReporter(*phi, beside=[Dihedral([psi])])]
     simulation.step(1)
     assert len(simulation.reporters[0].series) == 1

@@ -66,6 +66,12 @@ def test_work_of_a_drive_is_the_change_of_energy():
     assert errors[1] < 0.5 * errors[0]
 
 
+def test_what_a_bath_does_across_a_row_is_no_work():
+    context, integrator, part = held_chain([Row(bond(0, 3), None, rate=0.5)], dt=0.001, ensemble=Langevin(0, 50))
+    forces = [part.multipliers(context)[0] for _ in map(integrator.step, [0, *50 * [1]])]
+    assert part.work(integrator)[0] == pytest.approx(0.5 * 0.001 * np.trapezoid(forces), rel=0.01)
+
+
 # -- a bath between two halves of the drift -------------------------------------------------------------
 
 
