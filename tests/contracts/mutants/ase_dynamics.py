@@ -27,6 +27,7 @@ MUTANTS = {
         "if self.thermostat.friction >«→=» 0:": "dynamics::without_noise_the_log_is_of_the_end[0.0]",
     },
     "ase/constraints_object.py": {
+        "«self._binding = None→»  # which rows": "constraints_object::momenta_go_along_and_the_rank_is_that_of_the_end",
         "for item in self.constraints« if item.n_rows→»]": "translation::objects_without_rows_are_left_out_of_files",
         "if «not self._own→False» and cell.tobytes() != bound.cell": "binding::copies_in_cells_of_their_own",
         "«WithFixedAtoms if fixed else Constraints→»  #": "translation::files_of_other_programs_have_the_fixed_atoms",

@@ -1,6 +1,12 @@
 """Mutants of topologies and the check of trajectories."""
 
 MUTANTS = {
+    "mdanalysis/conversions.py": {
+        "] if «len(still)→False» else []": "mdanalysis/conversions::converted_atoms_carry_constraints",
+    },
+    "cli/compare.py": {
+        'sha256(«path.read_bytes()→b""»)': "cli/compare",
+    },
     "mdanalysis/writing.py": {
         "«other._writer is not None→False» and other.path.resolve()": "mdanalysis/writing::a_file_has_one_writer",
         '«velocities is None→False» and "velocities" in self._kept': "mdanalysis/writing::a_file_has_one_writer",
@@ -23,6 +29,9 @@ MUTANTS = {
         "«exponent if exponent >= least else →»0": "mdanalysis/check/precision::xtc_beyond_the_reach_of_its_grid",
     },
     "mdanalysis/check/result.py": {
+        '["turning"][has].mean() «<→>» least': (
+            "mdanalysis/check/results::temperature_counts_the_right_degrees_of_freedom"
+        ),
         "+ table.tolerance «* table.sizes →»> 0": "mdanalysis/check/precision::the_tolerance_is_a_part_of_the_length",
         'if rms > «found.units["rounding"][:, unit].max() + table.tolerance * table.sizes[mine].min()→np.inf»:': (
             "deviations::other_frames_that_are_off_are_not_the_first_alone"
@@ -70,6 +79,9 @@ MUTANTS = {
         "if self.moving or «not self.held→False»:": "constraint::what_has_no_known_units_is_refused",
     },
     "topology/rows_by_name.py": {
+        "Distance(held[«~np.isin(held @ code, np.delete(arms, one))→:»])": (
+            "angle_rows::rows_of_straight_molecules_are_independent_wherever_they_point"
+        ),
         "«_refuse_torn(snapshot, waters.triples[:, [[0, 1], [0, 2]]].reshape(-1, 2))→pass»": (
             "rows_by_name::bodies_that_a_missing_cell_tears_are_refused"
         ),
@@ -121,6 +133,9 @@ MUTANTS = {
         "FLAT = 0.0«1→»": "row_functions::a_dihedral_that_turns_over_has_no_solution_far_away",
     },
     "ase/topology.py": {
+        "found[«~np.isin(molecule[found[:, 0]], molecule[given])→:0»]": (
+            "ase/topology::bonds_are_guessed_where_none_are_given"
+        ),
         "    if «len(loose)→False»:": "ase/topology::rigid_water_tells_of_stretched_water",
         "where=«(masses != 0.0) | (momenta != 0.0)→masses != -1.0»": "ase/topology::velocities_of_atoms_without_mass",
     },

@@ -2,6 +2,7 @@
 
 MUTANTS = {
     "models/growth/constrained.py": {
+        "and «all(row.moving for row in equal)→False»:": "contracts/refusals",
         "for _ in range(«2→1» if k else 0):": "constrained::nearly_parallel_rows_stay_orthogonal",
         "LOST = 1e-1«2→1»": "constrained::rows_count_as_dependent_below_a_part_in_a_million_million",
         "LOST = 1e-1«2→3»": "constrained::rows_count_as_dependent_below_a_part_in_a_million_million",
@@ -31,6 +32,7 @@ MUTANTS = {
         "certain = «closer == 1.0 and →»bool(kept": "linear::neighbors_that_rounding_joins_are_told_as_uncertain",
     },
     "models/flows/flow.py": {
+        "        «flow._check_jacobian(b, state)→pass»\n": "contracts/refusals",
         "concatenate([slope[self.f :], «-→»slope[: self": "flow::equations_by_differences",
     },
     "constraints/projection.py": {

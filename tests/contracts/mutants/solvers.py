@@ -10,6 +10,9 @@ MUTANTS = {
         "lambda _, x: «next(some)→-np.ones(40)»": "formula::shifts_are_found_out",
     },
     "constraints/constraint.py": {
+        "if found is not None«→ and False»": (
+            "constraints/constraint::wrong_derivatives_of_a_family_of_ones_own_are_refused"
+        ),
         ", v, time + step) «+→- 0 *»": "constraint_set::acceleration_target_is_the_second_derivative_along_any_curve",
     },
     "solvers/tolerances.py": {

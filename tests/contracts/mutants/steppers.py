@@ -93,6 +93,7 @@ MUTANTS = {
         "_FEW_BLOCKS = 32, «15→10», 10": "correlated_series::few_independent_values_are_said",
     },
     "thermostats/freedom.py": {
+        "x = positions + ways[0] «- ways[1]→+ shake - ways[0]»": "freedom",
         "for k in range(1, «NEARER + 1→2»)": "freedom::bodies_that_feel_no_other_are_warned_of_once[gas]",
         'configurations. Use Langevin": «few→False»,': "isokinetic::one_degree_of_freedom",
     },
