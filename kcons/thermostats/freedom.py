@@ -122,6 +122,8 @@ BALANCED = 1e-6
 EXACT = 1e-12
 #: Share of the kinetic energy above which total momentum is not zero.
 AT_REST = 1e-16
+#: Degrees of freedom of which constant kinetic energy does not visit all configurations, whatever the forces.
+FEW = 2
 #: How far the system is shifted, relative to its size, to see whether forces depend on its place.
 SHIFT = 1e-2
 #: How far each atom is moved besides, of the way to the nearest: nothing cancels by symmetry, and forces are far above

@@ -31,6 +31,7 @@ from kcons.steppers.interpreter import Interpreted, Interpreter
 from kcons.steppers.operations import Evaluate, Kick, Operation, Program, Project, Row, Turn, mirrored, splitting
 from kcons.steppers.splitting import KAHAN_LI_6, SUZUKI_4
 from kcons.thermostats.freedom import (
+    FEW,
     LOOK_AT,
     Momentum,
     carried,
@@ -366,7 +367,7 @@ class Isokinetic(Splitting):
             )
         free = freedom(system, state, state.forces, self.momentum)
         twice = self._twice_kinetic(system, free.count, found)
-        turns, few = (self.thermal_energy is not None and each for each in (free.turns, free.count == 2))
+        turns, few = (self.thermal_energy is not None and each for each in (free.turns, free.count == FEW))
         warn_of_conserved_momenta(system.masses, state.velocities, free.directions, turns, stacklevel=8, few=few)
         off = float(np.abs(velocities - state.velocities).max())
         if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:

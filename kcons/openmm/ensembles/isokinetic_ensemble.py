@@ -18,6 +18,7 @@ from kcons.openmm.integrator.program import Integrator, Program
 from kcons.openmm.quantities import GAS_CONSTANT, energy_of, kelvins
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.splitting import Composition, RungeKuttaNystrom, Splitting
+from kcons.thermostats.freedom import FEW
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that
 #: is continued stays as it is, bit for bit.
@@ -65,7 +66,7 @@ class Isokinetic(CountsMomenta):
 
     stays_tangent = True
     adds_up = True
-    few = 2
+    few = FEW
     temperature: float | None
     convention: Literal["exact", "notes"]
     momentum: Momentum
