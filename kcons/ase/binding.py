@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
+from threading import RLock
 from typing import Any
 
 import ase.constraints
@@ -72,8 +73,20 @@ _HELD = "index", "mask", "dir", "pairs", "bondlengths", "triples", "bonds", "ang
 #: ASE objects that only add forces, so that they get along with any constraint.
 FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
 
+#: Why there is no stress beside these, and what takes energies alone.
+BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a PressureReporter, which take energies alone"
+STRESSLESS = f"forces that constraints of ASE add have no stress; put them into the calculator, or {BY_ENERGIES}"
+
 _PLURAL = {"position": "positions", "momentum": "momenta", "force": "forces"}
 _FLOAT = np.dtype(np.float64)
+_LOCK = RLock()
+
+
+@contextmanager
+def in_turn() -> Iterator[None]:
+    """One thread at a time, where several ask one engine: copies share it, as the images of NEB(parallel=True) do."""
+    with _LOCK:
+        yield
 
 
 @dataclass
@@ -237,11 +250,11 @@ def applied_forces(atoms: Atoms) -> FloatArray:
     return with_added(atoms, atoms.get_forces(apply_constraint=False))
 
 
-def with_added(atoms: Atoms, given: Any) -> FloatArray:
-    """Forces of a calculator and of ASE objects that only add forces; a copy."""
+def with_added(atoms: Atoms, given: Any, present: Sequence[Any] | None = None) -> FloatArray:
+    """Forces and those that ASE objects add that only add forces, all or those among `present`; a copy."""
     forces = np.array(as_float_array(given, "forces of the calculator"))
     if forces.shape == (len(atoms), 3):  # otherwise whoever asked complains
-        for item in atoms.constraints:
+        for item in atoms.constraints if present is None else present:
             if isinstance(item, FORCES_ONLY):
                 item.adjust_forces(atoms, forces)
     return forces
@@ -388,23 +401,21 @@ def require_on_surface(
 VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
 
 
-def stress_of_rows(motion: Motion, atoms: Atoms, forces: FloatArray, time: float = 0.0) -> FloatArray:
+def stress_of_rows(motion: Motion, atoms: Atoms, time: float = 0.0) -> FloatArray:
     """Stress of the rows, Voigt order, at the present positions and momenta, which are zero where there are none.
 
     Raises
     ------
     UnsupportedError
         The atoms are off the constraints: what scales atoms with the cell and asks for the stress there, as ASE's
-        StrainFilter, does not respect them.
+        StrainFilter, does not respect them. Or objects of ASE add forces, which are in no stress.
     """
     x = atoms.arrays["positions"]
-    try:
-        require_on_surface(motion.constraint_set, x, time)
-    except InputError as error:
-        raise UnsupportedError(
-            f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms leave "
-            "them. Relax cells with FrechetCellFilter, or restore the atoms first"
-        ) from error
+    if with_added(atoms, np.zeros_like(x)).any():
+        raise UnsupportedError(STRESSLESS)
+    why = "the stress is asked for there, as StrainFilter does; take FrechetCellFilter, or call Constraints.restore"
+    require_on_surface(motion.constraint_set, x, time, why=why, by_class=True)
+    forces = atoms.get_forces(apply_constraint=False)
     return np.asarray(-constraint_virial(motion, x, velocities_of(atoms), forces, time)[VOIGT] / atoms.get_volume())
 
 

@@ -24,15 +24,16 @@ from kcons.ase.binding import (
     VOIGT,
     AcceptedPositions,
     Binding,
-    applied_forces,
     bind,
     check_company,
     fulfilled,
+    in_turn,
     refuse_not_finite,
     refuse_taken_along,
     stress_of_rows,
     touched_atoms,
     unchanged_on_failure,
+    with_added,
 )
 from kcons.ase.topology import REMEDY, bonds_of, require_atoms, snapshot_of, velocities_of
 from kcons.ase.translation import ase_forms, translated
@@ -61,7 +62,8 @@ class Constraints(FixConstraint):
     positions at once. Targets that are left open are taken from the positions when the object first
     meets its atoms, and are kept from then on: copies, slices, pickles and files carry them.
 
-    The engine is built at the first use, and again if masses, cell or the number of atoms change.
+    The engine is built at the first use, and again if masses, cell or the number of atoms change. Under ASE's
+    VelocityVerlet this is RATTLE; velocities from differences of positions lose accuracy far from the origin.
 
     Parameters
     ----------
@@ -73,12 +75,6 @@ class Constraints(FixConstraint):
     ------
     UnsupportedError
         At the first use: a target that moves with time, or a velocity constraint; `ConstrainedDynamics` takes these.
-
-    Notes
-    -----
-    Under ASE's VelocityVerlet this is RATTLE: positions by the SHAKE condition with the multipliers along
-    the gradients of the old positions, momenta by the mass-metric projection. ASE itself forms the
-    velocities from the difference of positions, which loses accuracy far from the origin.
     """
 
     def __init__(self, constraints: Constraint | Iterable[Constraint | Mapping[str, Any]] = ()) -> None:
@@ -149,6 +145,7 @@ class Constraints(FixConstraint):
 
     # -- ASE's hooks ----------------------------------------------------------------------------
 
+    @in_turn()
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
         """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails.
 
@@ -190,6 +187,7 @@ class Constraints(FixConstraint):
         if x is not new:
             new[...] = x
 
+    @in_turn()
     def redistribute_forces_md(self, atoms: Atoms, forces: FloatArray, rand: bool = False) -> None:
         """Leave forces of dynamics, and noise, as they are; put atoms right that were scaled together with the cell.
 
@@ -212,6 +210,7 @@ class Constraints(FixConstraint):
                 error.add_note("The atoms were scaled together with the cell: call Constraints.restore(atoms)")
                 raise
 
+    @in_turn()
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
         """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0.
 
@@ -232,6 +231,7 @@ class Constraints(FixConstraint):
         if p is not momenta:
             np.copyto(momenta, p, casting="unsafe")  # integers are all 0
 
+    @in_turn()
     def adjust_stress(self, atoms: Atoms, stress: FloatArray) -> None:
         """Add the constraints' part in place, Voigt order: -(1/V) sum of r (x) z over the rows.
 
@@ -239,24 +239,32 @@ class Constraints(FixConstraint):
         ``get_stress(include_ideal_gas=True)`` is the full pressure (an ideal gas of rigid molecules gives N k T / V).
         Without momenta, or where they are zero, it is the static part, which makes the stress the derivative of the
         energy under a strain after which the constraints are restored. Rows with a place in space count as external
-        forces and have no part. Refused where atoms are off the constraints.
+        forces and have no part. Refused where atoms are off the constraints, or objects of ASE add forces.
         """
-        stress += stress_of_rows(self._bound(atoms).motion, atoms, applied_forces(atoms))
+        stress += stress_of_rows(self._bound(atoms).motion, atoms)
+        self._accepted.know(atoms.arrays["positions"], atoms.cell.array)  # cell filters scale them next
 
+    @in_turn()
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
         if self._binding is not None and self._binding.fits(atoms):
             self._in_cell(atoms, as_float_array(cell, "cell"))
 
+    @in_turn()
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
-        """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
-        bound, accepted = self._bound(atoms), self._accepted
+        """Add the constraint force for b = 0 in place, also for forces that later objects add; any float dtype."""
+        bound, accepted, present = self._bound(atoms), self._accepted, atoms.constraints
         f = bound.kernel_array(forces, "force")
+        later = present[present.index(self) + 1 :] if self in present else []
+        added = with_added(atoms, np.zeros_like(f), later)
+        f += added
         _project(bound, atoms.arrays["positions"], f, "force")
+        f -= added
         if f is not forces:
             np.copyto(forces, f, casting="unsafe")
         accepted.between_steps = True
 
+    @in_turn()
     def get_removed_dof(self, atoms: Atoms) -> int:
         """The rank of the rows, which may be less than their number."""
         return self._bound(atoms).motion.rank
@@ -277,10 +285,15 @@ class Constraints(FixConstraint):
         ------
         IndexError
             If no row is left; ASE then drops the object.
+        InputError
+            An atom is taken twice.
         """
-        kept = self._within(np.arange(len(atoms))[ind], len(atoms))
+        taken = np.arange(len(atoms))[ind]
+        kept = self._within(taken, len(atoms))
         if not kept:
             raise IndexError("no constraint lies within the slice")
+        if len(np.unique(taken)) < len(taken):
+            raise InputError("atoms are taken twice; take constraints off first: atoms.set_constraint()", item="index")
         self.constraints = kept
 
     def _within(self, atoms: IntArray, n_atoms: int) -> tuple[Constraint, ...]:
@@ -345,6 +358,7 @@ class Constraints(FixConstraint):
 
     # -- for people -----------------------------------------------------------------------------
 
+    @in_turn()
     def restore(self, atoms: Atoms, bonds: ArrayLike | None = None) -> None:
         """Move atoms that are off the constraints onto them, and project their momenta if they have any.
 
@@ -582,6 +596,8 @@ class ConstrainedCalculator(Calculator):
     there, in the mass metric. So the energy is a function of the constrained motions alone, and finite differences of
     forces (`Vibrations`, `Phonons`) give its Hessian *on* the constraints, with zeros along held directions.
 
+    Stress is as of `Constraints.adjust_stress`, and per-atom properties are passed on.
+
     For optimizers, saddle searches and phonons; for dynamics take `constrain` or `ConstrainedDynamics`.
 
     Parameters
@@ -597,11 +613,6 @@ class ConstrainedCalculator(Calculator):
         At the first use: rows that need time or velocities.
     ConvergenceError
         Positions from which the constraints cannot be reached.
-
-    Notes
-    -----
-    Stress is the inner one plus the static part of the constraints: the derivative of the energy under a
-    strain after which the constraints are restored. Per-atom properties are passed on.
     """
 
     def __init__(self, inner: Any, constraints: Constraints | Constraint | Iterable[Constraint]) -> None:
@@ -652,8 +663,9 @@ class ConstrainedCalculator(Calculator):
             before, self._stressed = self._stressed, (x.copy(), work.cell.array.copy())
             if before is not None:
                 refuse_taken_along(motion, *before, *self._stressed)
-        if held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
-            motion.project_positions(x, x.copy(), out=x)
+        with in_turn():
+            if held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
+                motion.project_positions(x, x.copy(), out=x)
         wanted = {*properties, "forces"} if "stress" in properties else {*properties}
         found = {name: self.inner.get_property(name, work) for name in sorted(wanted)}
         known = getattr(self.inner, "results", {})  # of the same place, as what was asked for
@@ -665,7 +677,8 @@ class ConstrainedCalculator(Calculator):
             forces = as_float_array(found["forces"], "forces of the calculator")
             if "stress" in found:
                 stress = as_float_array(found["stress"], "stress of the calculator")
-                virial = constraint_virial(motion, x, np.zeros_like(x), forces)
+                with in_turn():
+                    virial = constraint_virial(motion, x, np.zeros_like(x), forces)
                 stress = stress[VOIGT] if stress.shape == (3, 3) else stress
                 found["stress"] = stress - virial[VOIGT] / work.get_volume()
             found["forces"] = forces.copy()

@@ -89,9 +89,8 @@ class ConstrainedDynamics(MolecularDynamics):
     Where a step fails, atoms keep positions and momenta of the last good step, and the error names the step; an
     exception of the calculator itself passes through, with the number of the step in its attribute `step`.
 
-    A run that is continued is the same to the last bit, if the calculator gives the same forces: from the positions
-    and momenta of a trajectory; or, where targets move or the system is far from the origin (more than 128
-    times its size), from `state`, which knows what rounding took from time and positions.
+    A run that is continued is the same to the last bit, if the calculator gives the same forces: from a trajectory; or,
+    where targets move or the system is far from the origin (more than 128 times its size), from `state`.
     """
 
     #: Besides that of the atoms.
@@ -362,9 +361,7 @@ class ConstrainedDynamics(MolecularDynamics):
 
     def _force(self, x: FloatArray, time: float) -> Any:
         self.atoms.arrays["positions"][...] = x
-        if self._only_forces:
-            return applied_forces(self.atoms)
-        return self.atoms.get_forces(apply_constraint=False)
+        return applied_forces(self.atoms) if self._only_forces else self.atoms.get_forces(apply_constraint=False)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -437,10 +434,6 @@ class ConstraintLogger(MDLogger):
         a column: its multiplier, in eV by angstrom or by radian, the force along the coordinate that holds it.
     **kwargs
         As for `ase.md.MDLogger`: header, stress, peratom, mode.
-
-    Examples
-    --------
-    ``dynamics.attach(ConstraintLogger(dynamics, atoms, "md.log", {"torsion": torsion}), interval=10)``
     """
 
     def __init__(
@@ -483,7 +476,7 @@ class ConstraintLogger(MDLogger):
         if self.stress:
             stress = atoms.get_stress(apply_constraint=not ours, include_ideal_gas=True)
             if ours:  # that of all rows that the dynamics holds
-                stress = stress + stress_of_rows(dyn.motion, atoms, applied_forces(atoms), time)
+                stress = stress + stress_of_rows(dyn.motion, atoms, time)
             row += (stress / units.GPa).tolist()
         if self.coordinates:
             motion = _motion(dyn, atoms)

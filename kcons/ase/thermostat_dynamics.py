@@ -15,11 +15,11 @@ from ase.calculators.calculator import PropertyNotImplementedError
 from ase.calculators.mixing import SumCalculator
 from numpy.typing import NDArray
 
-from kcons.ase.binding import with_added
+from kcons.ase.binding import BY_ENERGIES, STRESSLESS, with_added
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.topology import require_atoms
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import Rng, as_float_array, checked, generator_of, positive, refuse_other, seed_from
+from kcons.constraints.arguments import Rng, checked, generator_of, positive, refuse_other, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -44,8 +44,6 @@ from kcons.thermostats.cells import (
     instantaneous_pressure,
     refuse_virial,
 )
-
-_BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a reporter, which take energies alone"
 
 
 class AtomsSystem(CellSystem):
@@ -79,12 +77,12 @@ class AtomsSystem(CellSystem):
 
     def _stress(self, x: FloatArray, time: float, cell: FloatArray) -> FloatArray:
         if self._stressless:
-            raise UnsupportedError(f"forces that constraints of ASE add have no stress; {_BY_ENERGIES}")
+            raise UnsupportedError(STRESSLESS)
         self.atoms.arrays["positions"][...] = x
         try:
             found = self.atoms.get_stress(voigt=False, apply_constraint=False)
         except PropertyNotImplementedError as error:
-            raise UnsupportedError(f"the calculator has no stress; {_BY_ENERGIES}") from error
+            raise UnsupportedError(f"the calculator has no stress; {BY_ENERGIES}") from error
         return np.asarray(found, dtype=float)
 
 
@@ -386,8 +384,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
 
         def force(x: FloatArray, time: float) -> FloatArray:
             self.atoms.arrays["positions"][...] = x
-            found = np.array(as_float_array(calculator.get_forces(self.atoms), "forces of the calculator"))
-            return with_added(self.atoms, found) if others else found
+            return with_added(self.atoms, calculator.get_forces(self.atoms), None if others else ())
 
         return force
 

@@ -60,10 +60,6 @@ def translated(atoms: Atoms, items: Iterable[Any]) -> list[Constraint]:
     return result
 
 
-def _bond_lengths(atoms: Atoms, item: Any) -> list[Constraint]:
-    return [Distance(np.asarray(item.pairs).reshape(-1, 2), item.bondlengths)]
-
-
 def _internals(atoms: Atoms, item: Any) -> list[Constraint]:
     result: list[Constraint] = [
         DistanceDifference([row[:2] for row in rows], value, weights=[row[2] for row in rows])
@@ -109,7 +105,7 @@ def _indices(atoms: Atoms, item: Any) -> IntArray:
 _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
     **dict.fromkeys(("Constraints", "ConstraintsWithFixedAtoms"), lambda atoms, item: list(item.constraints)),
     "FixAtoms": lambda atoms, item: [FixedAtoms(_indices(atoms, item))],
-    "FixBondLengths": _bond_lengths,
+    "FixBondLengths": lambda atoms, item: [Distance(np.reshape(item.pairs, (-1, 2)), item.bondlengths)],
     "FixInternals": _internals,
     "FixLinearTriatomic": _linear_triatomic,
     "FixCartesian": _cartesian,
@@ -138,10 +134,6 @@ def ase_forms(rows: Sequence[Constraint]) -> tuple[list[dict[str, Any]], list[Co
         forms += found
         left += [] if found else items
     return forms, left
-
-
-def _fixed(items: list[Constraint]) -> list[dict[str, Any]]:
-    return [_named("FixAtoms", indices=sorted({atom for item in items for atom in item.atoms.ravel().tolist()}))]
 
 
 def _internal(items: list[Constraint]) -> list[dict[str, Any]]:
@@ -200,7 +192,7 @@ def _centers(items: list[Constraint]) -> list[dict[str, Any]]:
 _FORMS: dict[str, Callable[[list[Constraint]], list[dict[str, Any]]]] = {
     **dict.fromkeys(("Distance", "DistanceDifference", "Angle", "Dihedral"), _internal),
     **dict.fromkeys(("Plane", "Line"), _directed),
-    "FixedAtoms": _fixed,
+    "FixedAtoms": lambda items: [_named("FixAtoms", indices=np.unique([a for c in items for a in c.atoms]).tolist())],
     "LinearCombination": _components,
     "CenterOfMass": _centers,
 }

@@ -224,14 +224,6 @@ class ConstraintSet:
         columns = (3 * pattern.indices[:, None] + np.arange(3)).ravel()
         return sp.csr_array((data, columns, 3 * pattern.indptr), shape=(self.n_rows, 3 * self.n_atoms))
 
-    def target_rates(self, time: float = 0.0, order: int = 1) -> FloatArray:
-        """Rates of what rows are held at, or of `order` 2 their accelerations, shape (n_rows,).
-
-        Of velocity rows what they are held at, and its rate.
-        """
-        time = finite_number(time, "time")
-        return self._rows(lambda c: _rate_of(c, time, order))
-
     def velocity_target(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """c with A v = c for admissible velocities, shape (n_rows,); 0 where nothing moves by itself."""
         time, x = finite_number(time, "time"), self._positions(x)

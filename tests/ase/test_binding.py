@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from time import sleep
 
 import numpy as np
 import pytest
@@ -102,6 +104,18 @@ def test_copies_in_cells_of_their_own():
             assert off(image, image.constraints[0]) <= 1e-14
     assert len({id(image.constraints[0].engine(image)) for image in images}) == 3
     assert np.array_equal(atoms.constraints[0].engine(atoms).cell()[0], atoms.cell.array)
+
+
+def test_copies_are_asked_in_turn(monkeypatch):
+    """Threads, as those of NEB(parallel=True), wrote into one array of the engine that copies share."""
+    atoms, forces = molecule("CO"), np.random.default_rng(0).normal(size=(3, 2, 3))
+    motion = constrain(atoms, Distance([0, 1])).engine(atoms)
+    images, project = [atoms.copy() for _ in forces], motion.project_velocities
+    wanted = [motion.project_forces(atoms.positions, each) for each in forces]
+    monkeypatch.setattr(motion, "project_velocities", lambda *x, **out: (sleep(0.05), project(*x, **out))[1])
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda image, each: image.constraints[0].adjust_forces(image, each), images, forces))
+    np.testing.assert_allclose(forces, wanted, rtol=0, atol=1e-14)
 
 
 def test_cells_that_are_set():

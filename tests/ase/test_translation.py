@@ -220,6 +220,10 @@ def test_attach_keeps_objects_that_add_forces_and_refuses_unknown_ones():
     held = attach(atoms)
     assert atoms.constraints == [held, spring]
     assert [row.family for row in held.constraints] == ["FixedAtoms", "Distance"]
+    atoms.calc = EMT()
+    forces = atoms.get_forces()  # of the spring, too, without what the rows take
+    atoms.set_constraint([spring, held])
+    assert np.abs(atoms.get_forces() - forces).max() <= 1e-13
     before = [FixAtoms([8]), MirrorForce(0, 1)]
     atoms.set_constraint(before)
     with pytest.raises(UnsupportedError, match=r"MirrorForce.*Custom"):

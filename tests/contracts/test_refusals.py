@@ -325,6 +325,7 @@ REFUSED: list[tuple[str, ...]] = [
     ("constrain(ATOMS.copy(), 3)", "constraints"),
     ("constrain(ATOMS.copy(), ?)", "atoms", "Distance([0, 9])", "FixedAtoms([0, 0])"),
     ("constrain(ATOMS.copy(), Distance([0, 1], 2.0))", "positions"),
+    ("(lambda a: (constrain(a, Distance([0, 1])), a[[0, 1, 0, 1]]))(ATOMS.copy())", "index"),
     ("constraints_of(ATOMS, ?)", "constrain", '"bond"', "3", '"none", rigid_water=False', "select=[0]"),
     ('constraints_of(ATOMS[1:], "none", guess_bonds=True)', "constrain"),
     ("constraints_of(ATOMS, on=?)", "on", '{"protein": "CenterOfMass"}', '[("protein", None)]', '["protein"]', "[1]"),
