@@ -7,9 +7,10 @@ constraints accepted last.
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from math import isfinite
 from threading import RLock
 from typing import Any
@@ -79,14 +80,19 @@ STRESSLESS = f"forces that constraints of ASE add have no stress; put them into 
 
 _PLURAL = {"position": "positions", "momentum": "momenta", "force": "forces"}
 _FLOAT = np.dtype(np.float64)
-_LOCK = RLock()
+#: Of engines, which copies of atoms share: the images of NEB(parallel=True) ask them in threads.
+IN_TURN = RLock()
 
 
-@contextmanager
-def in_turn() -> Iterator[None]:
-    """One thread at a time, where several ask one engine: copies share it, as the images of NEB(parallel=True) do."""
-    with _LOCK:
-        yield
+def in_turn(hook: Callable[..., Any]) -> Callable[..., Any]:
+    """The method, for one thread at a time."""
+
+    @wraps(hook)
+    def asked(*given: Any, **named: Any) -> Any:
+        with IN_TURN:
+            return hook(*given, **named)
+
+    return asked
 
 
 @dataclass

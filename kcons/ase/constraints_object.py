@@ -20,6 +20,7 @@ from kcons.ase.binding import (
     ELSEWHERE,
     FAR,
     FORCES_ONLY,
+    IN_TURN,
     UNKNOWN,
     VOIGT,
     AcceptedPositions,
@@ -145,7 +146,7 @@ class Constraints(FixConstraint):
 
     # -- ASE's hooks ----------------------------------------------------------------------------
 
-    @in_turn()
+    @in_turn
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
         """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails.
 
@@ -187,7 +188,7 @@ class Constraints(FixConstraint):
         if x is not new:
             new[...] = x
 
-    @in_turn()
+    @in_turn
     def redistribute_forces_md(self, atoms: Atoms, forces: FloatArray, rand: bool = False) -> None:
         """Leave forces of dynamics, and noise, as they are; put atoms right that were scaled together with the cell.
 
@@ -210,7 +211,7 @@ class Constraints(FixConstraint):
                 error.add_note("The atoms were scaled together with the cell: call Constraints.restore(atoms)")
                 raise
 
-    @in_turn()
+    @in_turn
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
         """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0.
 
@@ -231,7 +232,7 @@ class Constraints(FixConstraint):
         if p is not momenta:
             np.copyto(momenta, p, casting="unsafe")  # integers are all 0
 
-    @in_turn()
+    @in_turn
     def adjust_stress(self, atoms: Atoms, stress: FloatArray) -> None:
         """Add the constraints' part in place, Voigt order: -(1/V) sum of r (x) z over the rows.
 
@@ -244,27 +245,27 @@ class Constraints(FixConstraint):
         stress += stress_of_rows(self._bound(atoms).motion, atoms)
         self._accepted.know(atoms.arrays["positions"], atoms.cell.array)  # cell filters scale them next
 
-    @in_turn()
+    @in_turn
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
         if self._binding is not None and self._binding.fits(atoms):
             self._in_cell(atoms, as_float_array(cell, "cell"))
 
-    @in_turn()
+    @in_turn
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place, also for forces that later objects add; any float dtype."""
         bound, accepted, present = self._bound(atoms), self._accepted, atoms.constraints
         f = bound.kernel_array(forces, "force")
-        later = present[present.index(self) + 1 :] if self in present else []
-        added = with_added(atoms, np.zeros_like(f), later)
-        f += added
+        later = present[present.index(self) + 1 :] if self in present else ()
+        added = with_added(atoms, np.zeros_like(f), later) if later else None
+        f = f if added is None else f + added
         _project(bound, atoms.arrays["positions"], f, "force")
-        f -= added
+        f = f if added is None else f - added
         if f is not forces:
             np.copyto(forces, f, casting="unsafe")
         accepted.between_steps = True
 
-    @in_turn()
+    @in_turn
     def get_removed_dof(self, atoms: Atoms) -> int:
         """The rank of the rows, which may be less than their number."""
         return self._bound(atoms).motion.rank
@@ -358,7 +359,7 @@ class Constraints(FixConstraint):
 
     # -- for people -----------------------------------------------------------------------------
 
-    @in_turn()
+    @in_turn
     def restore(self, atoms: Atoms, bonds: ArrayLike | None = None) -> None:
         """Move atoms that are off the constraints onto them, and project their momenta if they have any.
 
@@ -663,7 +664,7 @@ class ConstrainedCalculator(Calculator):
             before, self._stressed = self._stressed, (x.copy(), work.cell.array.copy())
             if before is not None:
                 refuse_taken_along(motion, *before, *self._stressed)
-        with in_turn():
+        with IN_TURN:
             if held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
                 motion.project_positions(x, x.copy(), out=x)
         wanted = {*properties, "forces"} if "stress" in properties else {*properties}
@@ -677,7 +678,7 @@ class ConstrainedCalculator(Calculator):
             forces = as_float_array(found["forces"], "forces of the calculator")
             if "stress" in found:
                 stress = as_float_array(found["stress"], "stress of the calculator")
-                with in_turn():
+                with IN_TURN:
                     virial = constraint_virial(motion, x, np.zeros_like(x), forces)
                 stress = stress[VOIGT] if stress.shape == (3, 3) else stress
                 found["stress"] = stress - virial[VOIGT] / work.get_volume()
