@@ -175,7 +175,7 @@ protected:
         getline(in, text);
         // Where constraints were added, `Context::reinitialize` brings what belongs to fewer rows.
         restore(text, false);
-        steps->valid = false;
+        steps->valid = false; steps->last = 0;     // its noise comes again
     }
     void serializeParameters(SerializationNode& node) const override {
         node.setIntProperty("version", 1).setStringProperty("state", saved());
@@ -212,8 +212,8 @@ private:
         }
         if (!known)
             throw OpenMMException("kcons: this state belongs to other steps or rows; OpenMM has taken over its positions and velocities, and the rest of it is left out");
-        if (exactly) found.erase("seed"); else steps->last = 0;
-        for (auto& array : steps->arrays) if (found.count(array.name)) steps->write(array.name, found[array.name]);
+        for (auto& array : steps->arrays) if (found.count(array.name) && !(exactly && array.name == "seed"))
+            steps->write(array.name, found[array.name]);
         shared.told[1] = middle; shared.told[6] = end;
     }
     unique_ptr<Steps> steps;
