@@ -63,6 +63,11 @@ def started(system, integrator, x, v=None, platform="Reference"):
     return context
 
 
+def image(k):
+    """The place of particle k turned through the origin."""
+    return openmm.SymmetrySite(k, *map(openmm.Vec3, *-np.eye(3)), openmm.Vec3(0, 0, 0), False)
+
+
 def particles(masses, *forces, held=(), x=None):
     """A System of particles under forces; `held` are pairs at their distances at x, or (i, j, length)."""
     system = openmm.System()

@@ -51,6 +51,7 @@ def begun(system, part=None, platform="Reference", **options):
     if options.get("device") and (why := build.refusal()):
         pytest.skip(why)
     integrator = ProjectedIntegrator(0.002, parts=[part] if part else [], **options)
+    integrator.setRandomNumberSeed(1)
     context = started(system, integrator, X, 0.3 * np.random.default_rng(1).normal(size=X.shape), platform)
     if part:
         integrator.applyConstraints()

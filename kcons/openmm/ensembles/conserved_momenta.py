@@ -19,7 +19,7 @@ from kcons.openmm.integrator.guard import (
     removes_center_of_mass_motion,
 )
 from kcons.openmm.integrator.program import Ensemble, Integrator
-from kcons.openmm.quantities import box_of, forces_at, held_without_mass, masses_of, positions_of, velocities_of
+from kcons.openmm.quantities import box_of, forces_at, masses_of, positions_of, velocities_of
 from kcons.thermostats.freedom import BALANCED, SHIFT, RigidMotions, open_directions, shaking, warn_of_conserved_momenta
 
 Momentum = Literal["auto", "conserved", "free"]
@@ -101,7 +101,7 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     masses, removed = masses_of(system), removes_center_of_mass_motion(system)
     turns = RigidMotions(x, turn=not system.usesPeriodicBoundaryConditions())
     broken: list[FloatArray] = []
-    fixed = held_without_mass(system)
+    fixed = integrator._watch().bound()
     if fixed:
         if not removed:  # what a remover takes is not there, whatever holds the others
             broken.append(np.eye(3))
@@ -127,7 +127,7 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
         _, sizes, axes = np.linalg.svd(np.vstack(broken))
         directions = axes[int(np.sum(sizes > 1e-6)) :]
     if momentum == "conserved" and not len(directions):
-        raise UnsupportedError("total momentum is not conserved: rows or particles without mass are held in space")
+        raise UnsupportedError("total momentum is not conserved: rows, massless particles or images hold a place")
     return Momenta(directions, turns.found)
 
 

@@ -12,7 +12,7 @@ import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.integrator.guard import groups_in, groups_of
+from kcons.openmm.integrator.guard import groups_in, groups_of, virtual_sites
 from kcons.openmm.integrator.program import BetweenHalves, Integrator, Program
 from kcons.openmm.quantities import GAS_CONSTANT, kelvins, number
 from kcons.steppers.operations import Exchange, Fly, Kick, Operation, Project
@@ -211,8 +211,7 @@ class LangevinRespa(Langevin):
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Refuse groups that do not act, and virtual sites, which are placed at the end of a step only."""
         refuse_other_groups(integrator, context, self.steps)
-        system = context.getSystem()
-        if any(system.isVirtualSite(k) for k in range(system.getNumParticles())):
+        if virtual_sites(context.getSystem()):
             raise UnsupportedError(f"{self!r} has no virtual sites: they are placed at the end of a step; use Langevin")
 
     def verify(self, integrator: Integrator) -> None:

@@ -501,10 +501,7 @@ class Guard:
         applied = [force for force in forces_of(self.system) if force.getForceGroup() not in integrator.row_groups]
         self.undisturbed = not (
             any(isinstance(force, openmm.AndersenThermostat) for force in applied)
-            or (
-                removes_center_of_mass_motion(self.system)
-                and (any(map(knows_a_place, applied)) or held_without_mass(self.system))
-            )
+            or (removes_center_of_mass_motion(self.system) and (any(map(knows_a_place, applied)) or self.bound()))
         )
         #: Whether the start was looked at.
         self.started = False
@@ -621,9 +618,7 @@ class Guard:
     def knows(self) -> bool:
         """Whether the Context is where the last call left it, as far as clock, box, and what the System has tell."""
         context = self._context()
-        if context is None or self._size != _size(self.system):
-            return False
-        return self._left is None or self._left == self._place(context)
+        return context is not None and self._size == _size(self.system) and self._left in (None, self._place(context))
 
     def _place(self, context: openmm.Context) -> tuple[Any, ...]:
         """Where a call ends: step count, box, and the time, where targets depend on it."""
@@ -867,13 +862,18 @@ class Guard:
 
     # -- degrees of freedom ---------------------------------------------------------------------
 
+    def bound(self) -> list[int]:
+        """Particles that stay or go elsewhere as others are shifted: without mass, and images by symmetry."""
+        system, kinds = self.system, ("SymmetrySite", "VirtualSite")  # OpenMM's Python tells the class of all others
+        images = [k for k in virtual_sites(system) if type(system.getVirtualSite(k)).__name__ in kinds]
+        return held_without_mass(system) + images
+
     def independent_momenta(self) -> int:
         """Three for each particle with a mass, less the rank of all constraints."""
         if self._freedom is None:
             moving = 3 * int(np.sum(self.rows.masses > 0))
-            held = self.rows.rank(positions_of(self.context))
-            held += sum(part.rank(self.context) for part in self.integrator.parts)
-            self._freedom = moving - held
+            held = sum(part.rank(self.context) for part in self.integrator.parts)
+            self._freedom = moving - held - self.rows.rank(positions_of(self.context))
         return self._freedom
 
     def degrees_of_freedom(self) -> int:

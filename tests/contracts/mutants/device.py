@@ -27,6 +27,7 @@ MUTANTS = {
     "openmm/device/plugin/program_integrator.cpp": {
         "«steps->valid = false;→»   ": "device_integrator::others_move_positions_and_velocities",
         'array.name != «"memory"→""»;': "device_integrator::states_of_other_rows_are_refused",
+        '!(«exactly→false» && array.name == "seed")': "device_integrator::replicas_of_openmm_have_noise_of_their_own",
     },
     "plan/clusters.py": {
         "for k in left if not «(k in last and coupled[k] - last)→False»]": "rows::levels_have_rows_that_share_no_entry",

@@ -20,7 +20,8 @@ MUTANTS = {
         "any(«map(knows_a_place, applied)→isinstance(force, openmm.CustomExternalForce) for force in applied»)": (
             "guard::a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_place"
         ),
-        "«self._left == self._place(context)→True»": "steps::change_of_the_box",
+        "+ «images→[]»": "conserved_momenta::a_motion_remover_takes_momentum_beside_particles_without_mass",
+        "«self._left in (None, self._place(context))→True»": "steps::change_of_the_box",
         "except (ConvergenceError, «InputError, →»NonFiniteError) as": (
             "langevin_ensemble::a_force_that_gets_another_group_leaves_the_state_that_was_checked"
         ),

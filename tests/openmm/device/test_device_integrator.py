@@ -7,6 +7,7 @@ import numpy as np
 import openmm
 import pytest
 from device_systems import waters
+from openmm import app
 from openmm_systems import GPUS, LONG, dumbbell, field, particles, residuals, started, state_of
 
 from kcons.constraints import Distance, Plane
@@ -104,10 +105,21 @@ def test_noise_belongs_to_particle_and_step():
     assert np.abs(runs[0] - runs[1]).max() < 1e-12
     assert np.abs(runs[0] - runs[2]).max() < 1e-6
     assert np.abs(runs[2] - runs[3]).max() > 1e-4
-    # A state has its own noise if it is a whole one; to another one no noise comes twice.
+    # No noise comes twice, whether a state is a whole one or not.
     states = [context.getState(positions=True, velocities=True, integratorParameters=p) for p in (False, True)]
     ends = [(context.setState(states[k]), integrator.step(9), state_of(context)[0])[2] for k in (0, 0, 1, 1)]
-    assert np.abs(ends[0] - ends[1]).max() > 1e-4 and np.array_equal(ends[2], ends[3])
+    assert len({f"{end[0, 0]:.6f}" for end in ends}) == 4
+
+
+def test_replicas_of_openmm_have_noise_of_their_own():
+    """Those of its ReplicaExchangeSampler begin with one State, and go on with theirs."""
+    integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300.0, 20.0), device=True)
+    system, reference = particles([12.0], field("x^2", 1)), openmm.Platform.getPlatform("Reference")
+    simulation = app.Simulation(app.Topology(), system, integrator, reference)
+    simulation.context.setPositions([[0.1, 0.0, 0.0]])
+    replicas = app.ReplicaExchangeSampler([{"temperature": 300.0}] * 3, simulation, 5)
+    replicas.simulate(2)
+    assert len({f"{state.getPositions()[0].x:.6f}" for state in replicas.replicaConformation}) == 3
 
 
 # -- operations -----------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from openmm_systems import (
     free_alanine,
     hexagon,
     holding,
+    image,
     loose_alanine,
     pairs_force,
     particles,
@@ -285,15 +286,17 @@ def test_a_motion_remover_meets_complete_velocities_beside_forces_that_know_a_pl
         np.testing.assert_allclose(same[1], end[1], rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("kind", [*BATHS, "constant energy"])
+@pytest.mark.parametrize("kind", [*BATHS, "constant energy", pytest.param("device, images", marks=DEVICE.marks)])
 def test_a_motion_remover_meets_complete_velocities_beside_particles_without_mass(kind):
-    """They take up momentum that forces between particles give: half a kick has some for the others."""
+    """They take up momentum that forces between particles give, and images turn it: half a kick has some."""
     rng, pairs = np.random.default_rng(1), [(j, k) for k in range(5) for j in range(k)]
     springs = pairs_force(openmm.CustomBondForce("200*(r-0.3)^2"), *pairs)
     system = particles([0.0, 0.0, 20.0, 25.0, 30.0], springs, openmm.CMMotionRemover())
     x = np.array([[0, 0, 0], [0.4, 0, 0], [0.1, 0.3, 0], [0.2, 0.1, 0.3], [0.3, 0.3, 0.3]])
     v = np.vstack([np.zeros((2, 3)), rng.normal(size=(3, 3))])
-    the_same_in_any_calls(system, x, v, 40, ensemble=BATHS.get(kind))
+    for k in (0, 1) if "images" in kind else ():
+        system.setVirtualSite(k, image(k + 2))
+    the_same_in_any_calls(system, x, v, 40, ensemble=BATHS.get(kind), device="device" in kind)
 
 
 def test_rows_beside_a_motion_remover_know_no_place():

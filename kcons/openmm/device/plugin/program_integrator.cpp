@@ -175,7 +175,7 @@ protected:
         getline(in, text);
         // Where constraints were added, `Context::reinitialize` brings what belongs to fewer rows.
         restore(text, false);
-        steps->valid = false;
+        steps->valid = false; steps->last = 0;     // its noise comes again
     }
     void serializeParameters(SerializationNode& node) const override {
         node.setIntProperty("version", 1).setStringProperty("state", saved());
@@ -196,7 +196,7 @@ private:
         }
         return text.str();
     }
-    // `exactly` that of these rows; else arrays of other rows stay as they are.
+    // `exactly` that of these rows, but for its noise; else arrays of other rows stay as they are.
     void restore(const string& text, bool exactly) {
         istringstream words(text);
         map<string, vector<double>> found;
@@ -212,8 +212,9 @@ private:
         }
         if (!known)
             throw OpenMMException("kcons: this state belongs to other steps or rows; OpenMM has taken over its positions and velocities, and the rest of it is left out");
-        for (auto& array : steps->arrays) if (found.count(array.name)) steps->write(array.name, found[array.name]);
-        shared.told[1] = middle; shared.told[6] = end; steps->last = 0;
+        for (auto& array : steps->arrays) if (found.count(array.name) && !(exactly && array.name == "seed"))
+            steps->write(array.name, found[array.name]);
+        shared.told[1] = middle; shared.told[6] = end;
     }
     unique_ptr<Steps> steps;
 };

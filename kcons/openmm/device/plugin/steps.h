@@ -53,7 +53,7 @@ public:
     vector<Action> parts[3];
     int items = 0, workGroup = 64, slots = 1;
     bool valid = false;            // whether forces are those at the present positions
-    long long last = 0;            // the step that the last call ended with; 0 where a state brought its own noise
+    long long last = 0;            // the step that the last call ended with; 0 where a checkpoint brought its own noise
     virtual void prepare(ContextImpl& c) = 0;
     virtual vector<double> read(const string& name) = 0;
     virtual void write(const string& name, const vector<double>& values) = 0;
