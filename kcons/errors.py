@@ -194,3 +194,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     names = {name.lower(): name for name in known}
     near = get_close_matches(word.lower(), names, n=1, cutoff=0.6)
     return f" (did you mean {names[near[0]]!r}?)" if near else ""
+
+
+def unknown(word: str, known: Iterable[str]) -> str:
+    """A name that is not known, with what there is instead, at the end of a sentence."""
+    return f"{word!r}{did_you_mean(word, names := list(known))}; there are {', '.join(names)}"

@@ -15,7 +15,7 @@ from ase import Atoms
 from ase.calculators.names import names as ase_names
 
 from kcons.ase.binding import FORCES_ONLY
-from kcons.errors import InputError, KconsError, UnsupportedError, did_you_mean
+from kcons.errors import InputError, KconsError, UnsupportedError, did_you_mean, unknown
 
 #: Endings of files that say what a calculator computes, not what it writes.
 WEIGHTS = [".model", ".pt", ".pth", ".ckpt", ".pb", ".safetensors", ".h5", ".npz", ".xml", ".yace"]
@@ -118,9 +118,7 @@ def _refuse_unknown(name: str, kind: Any, given: Mapping[str, Any]) -> None:
     known = list(kind.default_parameters)
     for key in given:
         if key not in known:
-            raise InputError(
-                f"{name} has no setting {key!r}{did_you_mean(key, known)}; there are {', '.join(known)}", item=key
-            )
+            raise InputError(f"{name} has no setting {unknown(key, known)}", item=key)
 
 
 def described(calculator: Any, atoms: Atoms) -> list[Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from kcons.cli.terminal import HELD, Command, Option, names, numbers, show
-from kcons.errors import InputError, did_you_mean
+from kcons.errors import InputError, unknown
 
 #: Options that are arguments of `from_file`, by the same names, and those of them that `plan` takes.
 GIVEN = ("constrain", "force_field", "add_hydrogens", "platform", "coordinates", "forces", "select")
@@ -32,17 +32,16 @@ def option_of(name: str) -> str:
 def check_name(chosen: argparse.Namespace) -> None:
     from kcons.comparison import test_systems
 
-    known, name = ", ".join(test_systems.SYSTEMS), chosen.system
+    known, name = test_systems.SYSTEMS, chosen.system
     if name is None:
-        raise InputError(f"name a test system: {known}; or give a file", item="system")
+        raise InputError(f"name a test system: {', '.join(known)}; or give a file", item="system")
     if test_systems.is_file(name):
         if not Path(name).is_file():
             raise InputError(f"there is no file {name}", item="system")
         if chosen.size is not None:
             raise InputError("a file has the size it has; leave --size out", item="size")
-    elif name not in test_systems.SYSTEMS:
-        said = f"there is no test system {name!r}{did_you_mean(name, test_systems.SYSTEMS)}"
-        raise InputError(f"{said}; there are {known}; or give a file", item="system")
+    elif name not in known:
+        raise InputError(f"there is no test system {unknown(name, known)}; or give a file", item="system")
 
 
 def molecules(chosen: argparse.Namespace) -> dict[str, Any]:

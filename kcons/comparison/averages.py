@@ -21,7 +21,7 @@ from kcons.comparison.methods import lines_on_arrays
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.constraints.arguments import Positive, Rng, checked, positive, seed_from
-from kcons.errors import InputError, did_you_mean
+from kcons.errors import InputError, unknown
 from kcons.steppers import BlanesMoan4, State, Stepper, System
 from kcons.thermostats import (
     Counts,
@@ -164,14 +164,11 @@ def choose_samplers(names: Iterable[str] | None, cheap: bool = False) -> list[Sa
     wanted = list((USUAL_WITH_CHEAP if cheap else USUAL) if names is None else names)
     if wanted == ["all"]:
         wanted = [name for name, sampler in SAMPLERS.items() if cheap or not sampler.several]
-    known = ", ".join(SAMPLERS)
-    if not wanted:
-        raise InputError(f"no thermostat is named; there are {known}", item="methods")
+    if not wanted or isinstance(names, str):
+        raise InputError(f"methods is {names!r:.80}; give a list of {', '.join(SAMPLERS)}", item="methods")
     for name in wanted:
         if name not in SAMPLERS:
-            raise InputError(
-                f"there is no thermostat {name!r}{did_you_mean(name, SAMPLERS)}; there are {known}", item="methods"
-            )
+            raise InputError(f"there is no thermostat {unknown(name, SAMPLERS)}", item="methods")
         if SAMPLERS[name].several and not cheap:
             raise InputError(f"{name} uses cheap forces beside expensive ones: give --slow and --fast", item="methods")
     return [SAMPLERS[name] for name in dict.fromkeys(wanted)]
@@ -236,9 +233,7 @@ def compare_averages(
         if system.motion.rank != cheap.motion.rank:
             raise InputError("expensive and cheap forces come with different constraints", item="fast")
     unit, inner = system.units.time_unit, inner_step(system)
-    for step in steps or ():
-        if not (math.isfinite(step) and step > 0):
-            raise InputError(f"time step {step:g} {system.units.time}: give a positive number", item="dt")
+    steps = [positive(step, "dt") for step in steps or ()]
     rates = [rate / inner for rate in FRICTIONS]
     planned: dict[str, list[tuple[float, float]]] = {}
     for sampler in chosen:

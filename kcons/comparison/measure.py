@@ -303,10 +303,13 @@ def measure(
     try:
         with watching.piece(what, system.horizon), InterruptedAfter(PATIENCE * budget), np.errstate(all="ignore"):
             run = method.start(system, setting)
+            if not isinstance(run, Run):
+                raise KconsError(f"start gives a {type(run).__name__}; let it give a kcons.comparison.Run")
             row["setup_seconds"] = clock() - begun
             planned = None if method.adaptive else round(system.horizon / setting)
             row["note"] = log.follow(run, method, planned, begun + (budget if left is None else left), budget, watching)
-            row["status"] = "partial" if row["note"] else "ok"
+        status = "partial" if row["note"] else "ok"
+        row |= {"status": status, **log.judged(run, method, reference, status)}
     except OverBudgetError:
         row |= {"status": "partial", "note": f"step {log.steps + 1} was not done after {clock() - begun:.3g} s"}
     except Exception as error:  # whatever an MD engine raises is a result, and is shown
@@ -314,10 +317,7 @@ def measure(
             return {**row, "status": "not run", "note": textwrap.shorten(str(error), 300)}
         row |= {"status": "failed", "note": f"step {log.steps + 1}: {first_line(error)}"}  # a shorter one may succeed
     row["steps"] = log.steps
-    if run is None or not log.seconds:
-        return row
-    row |= log.costs(run)
-    return row if row["status"] == "failed" else {**row, **log.judged(run, method, reference, row["status"])}
+    return row if run is None or not log.seconds else row | log.costs(run)
 
 
 @dataclass
@@ -342,9 +342,6 @@ class _Log:
         self.times.append(run.time)
         self.energies.append(energy)
 
-    def evaluations(self, run: Run) -> int:
-        return self.system.potential.evaluations if run.evaluations is None else run.evaluations
-
     def follow(
         self, run: Run, method: Method, planned: int | None, deadline: float, budget: float, watcher: Watcher
     ) -> str:
@@ -357,11 +354,11 @@ class _Log:
                 rewind(self.system, run)
             count = stride if self.steps and planned else 1
             count = count if planned is None else min(count, planned - run.done)
-            before, begun = self.evaluations(run), clock()
+            before, begun = evaluations(self.system, run), clock()
             run.advance(count)
             now = clock()
             self.seconds.append((now - begun) / count)
-            self.counted += self.evaluations(run) - before
+            self.counted += evaluations(self.system, run) - before
             self.steps += count
             self.observe(run)
             watcher.advance(run.time)
@@ -369,6 +366,13 @@ class _Log:
             doubtful = len(self.seconds) == 1 and self.seconds[0] < max(FIRST_STEP, 0.25 * budget)
             if left > 0 and not doubtful and (now > deadline or now + self.seconds[-1] * left > deadline):
                 return _too_slow(self.seconds[-1], budget)
+        end = f"{run.time / self.system.units.time_unit:g} {self.system.units.time}, not at the horizon"
+        for wrong, said in (
+            (abs(run.time / horizon - 1) > 1e-6, f"the run ends at {end}: make steps of dt, give states their time"),
+            (not self.counted, "no force evaluation is counted: use the test system's potential or Run.evaluations"),
+        ):
+            if wrong and method.holds:
+                raise KconsError(said)
         return ""
 
     def costs(self, run: Run) -> dict[str, float]:
@@ -399,6 +403,11 @@ class _Log:
         e = np.array(self.energies) / max(self.system.motion.degrees_of_freedom, 1)
         found = slope(t, e)
         return {"slope": found.value, "slope_error": found.error}
+
+
+def evaluations(system: TestSystem, run: Run) -> int:
+    """Force evaluations of a run so far."""
+    return system.potential.evaluations if run.evaluations is None else run.evaluations
 
 
 def _too_slow(step_seconds: float, budget: float) -> str:
@@ -484,11 +493,14 @@ class Rounds:
                 rewind(system, run)
                 if run.evaluations is not None:
                     run.advance()  # it pays for the forces at the start
-                begun = self.clock()
+                before, begun = evaluations(system, run), self.clock()
                 run.advance(steps)
                 passes.append(self.clock() - begun)
         if not np.isfinite(run.observe()[0]).all():
             raise KconsError("positions are not finite")
+        each = row["evaluations"] * row["setting"] * system.units.time_unit / system.units.long_time_unit
+        if 2 * (made := evaluations(system, run) - before) < each * steps:
+            raise KconsError(f"advance({steps}) makes {made} force evaluations, not {each * steps:.0f}: make all steps")
         return float(np.median(passes)) / steps
 
 

@@ -24,7 +24,7 @@ from kcons.constraints import Angle, Distance
 from kcons.constraints.arguments import Count, checked
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError, did_you_mean
+from kcons.errors import InputError, KconsError, unknown
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, System
 from kcons.steppers.splitting import SCHEMES as STEPPERS
@@ -140,10 +140,7 @@ def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> lis
             able = [m for m in groups[name.lower()] if system is None or m.refusal(system) is None]
             picked |= {m.name: m for m in able}
         else:
-            known = ", ".join((*METHODS, *groups))
-            raise InputError(
-                f"there is no method {name!r}{did_you_mean(name, METHODS)}; there are {known}", item="methods"
-            )
+            raise InputError(f"there is no method {unknown(name, (*METHODS, *groups))}", item="methods")
     if not picked:
         raise InputError(f"no method is named; there are {', '.join(METHODS)}", item="methods")
     return list(picked.values())

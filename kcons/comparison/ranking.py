@@ -19,6 +19,7 @@ from kcons.comparison.methods import METHODS
 from kcons.comparison.progress import Watcher
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.test_systems.potential import NO_FORCES
+from kcons.constraints.arguments import Positive, checked
 from kcons.errors import InputError
 
 Criterion = Literal["error", "temperature"]
@@ -45,6 +46,8 @@ ORDERS, REACH = (0.5, 10.0), 30.0
 
 def cost_that_decides(table: pd.DataFrame) -> str:
     """'seconds', or 'evaluations' where there are forces that take no time."""
+    if "force_seconds" not in table.attrs:
+        raise InputError("the table does not say of what it is; read it by kcons.comparison.read_csv", item="table")
     forced = table.attrs.get("forces") != NO_FORCES
     return "evaluations" if forced and table.attrs["force_seconds"] < NO_FORCE else "seconds"
 
@@ -56,9 +59,7 @@ def resolution(table: pd.DataFrame) -> float:
 
 def scatter(table: pd.DataFrame, cost: str) -> float:
     """The fraction by which costs may differ and still be the same."""
-    if cost == "evaluations":
-        return SAME_EVALUATIONS
-    return max(SAME_TIME, float(table.attrs.get("margin") or 0.0))
+    return SAME_EVALUATIONS if cost == "evaluations" else max(SAME_TIME, float(table.attrs.get("margin") or 0.0))
 
 
 def with_errors(table: pd.DataFrame) -> pd.DataFrame:
@@ -117,7 +118,8 @@ class Ranking:
     scatter: float
 
 
-def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: float | None = None) -> Ranking | None:
+@checked
+def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: Positive | None = None) -> Ranking | None:
     """Rank methods; None where nothing can be ranked.
 
     Parameters
@@ -222,10 +224,11 @@ def predict(rows: pd.DataFrame, error: float, least: float = 0.0) -> dict[str, A
     return found
 
 
+@checked
 def find_steps(
     system: TestSystem,
     table: pd.DataFrame,
-    target: float,
+    target: Positive,
     reference: Reference,
     *,
     budget: float = 20.0,
@@ -251,8 +254,6 @@ def find_steps(
     list of dict
         New rows for the table.
     """
-    if not (math.isfinite(target) and target > 0):
-        raise InputError(f"the target error is {target}; give a positive number", item="target_error")
     cost, least = cost_that_decides(table), resolution(table)
     if target < least:
         return []

@@ -40,7 +40,7 @@ def write_csv(path: Path, table: pd.DataFrame) -> None:
         file.write((head + table.to_csv(index=False)).encode())
 
 
-def read_csv(path: Path) -> pd.DataFrame:
+def read_csv(path: Path | str) -> pd.DataFrame:
     """What `write_csv` wrote.
 
     Raises
@@ -49,7 +49,7 @@ def read_csv(path: Path) -> pd.DataFrame:
         The file holds something else.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
         count = next(k for k, line in enumerate(lines) if not line.startswith("# "))
         head = dict(line[2:].split(": ", 1) for line in lines[:count])
         attrs = {name: json.loads(value) for name, value in head.items()}
@@ -57,7 +57,7 @@ def read_csv(path: Path) -> pd.DataFrame:
         table["note"] = table["note"].astype(object).fillna("")
         table["adaptive"] = table["adaptive"].astype(bool)
         assert {"title", "reference_error", "force_seconds"} <= set(attrs)
-    except (AssertionError, KeyError, ValueError, StopIteration) as error:
+    except (AssertionError, KeyError, OSError, ValueError, StopIteration) as error:
         raise InputError(f"{path} holds no comparison of kcons: {error!r}", item="file") from None
     table.attrs = attrs
     return table
@@ -79,14 +79,9 @@ def text(table: pd.DataFrame, found: Ranking | None, code: str = "", more: str =
         What else to say, after the sentence.
     """
     about = table.attrs
-    parts = [sentence(table, found)]
-    if more:
-        parts.append(more)
-    if found is not None and (len(found.table) or "what" in about):
-        parts.append(_places(found, about))
-    if code:
-        parts.append(f"In Python:\n{code.rstrip()}")
-    return "\n\n".join(parts)
+    places = _places(found, about) if found is not None and (len(found.table) or "what" in about) else ""
+    lines = f"In Python:\n{code.rstrip()}" if code else ""
+    return "\n\n".join(filter(None, [sentence(table, found), more, places, lines]))
 
 
 def sentence(table: pd.DataFrame, found: Ranking | None) -> str:
@@ -142,9 +137,8 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
     ]
     if len(ranked) > PLACES:
         lines.append(f"... and {len(ranked) - PLACES} more")
-    lines.append(f"Measured on {about['title']}.")
-    same = f"Costs that differ by less than {100 * found.scatter:.0f} % are equal (=)"
-    lines.append(f"cost: {COSTS[found.cost]} {_per(about)}. {same}.")
+    lines += [f"Measured on {about['title']}.", f"cost: {COSTS[found.cost]} {_per(about)}. Costs that differ by less"]
+    lines[-1] += f" than {100 * found.scatter:.0f} % are equal (=)."
     return "\n".join(lines)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import MDAnalysis
 from MDAnalysis.lib.util import anyopen, guess_format
 
-from kcons.errors import InputError, UnreadableError, did_you_mean
+from kcons.errors import InputError, UnreadableError, unknown
 
 #: What MDAnalysis and the readers below it raise on a bad file; the last two of sizes that are not so.
 READ_ERRORS = (
@@ -101,6 +101,8 @@ def open_universe(
         )
     if trajectory is not None:
         load_trajectory(universe, trajectory, topology, format=format)
+    else:
+        _warn_of_a_cell(topology, getattr(universe, "trajectory", None))
     return universe
 
 
@@ -145,7 +147,7 @@ def load_trajectory(
             item="topology",
         )
     if not failure:
-        return
+        return _warn_of_a_cell(trajectory, universe.trajectory)
     packages, advice = _advice_on_packages(failure), "is it complete, and does its ending tell its format?"
     if named in ("NC", "NCDF", "H5MD"):
         advice = "files of this format that were cut off cannot be read at all: write DCD, XTC or TRR if that happens"
@@ -161,10 +163,7 @@ def _format(path: str | Path, given: str | None, item: str) -> str:
         return name
     option = f"--{item.replace('_', '-')}"
     if given is not None:
-        raise InputError(
-            f"MDAnalysis has no format {given!r}{did_you_mean(given, readers)}; there are {', '.join(sorted(readers))}",
-            item=item,
-        )
+        raise InputError(f"MDAnalysis has no format {unknown(given, sorted(readers))}", item=item)
     if name == "TRAJ":
         raise InputError(
             f"{path}: that is ASE's own format: write with kcons.mdanalysis.write_ase, or ase convert run.traj run.pdb "
@@ -205,6 +204,15 @@ def format_of(reader: Any) -> str:
     """What MDAnalysis calls the format of a reader; '' of none."""
     name = getattr(reader, "format", "")
     return str(name if isinstance(name, str) else name[0]).upper()
+
+
+def _warn_of_a_cell(path: str | Path, reader: Any) -> None:
+    if format_of(reader) == "XYZ":
+        with anyopen(str(path), "rb") as file:
+            said = [file.readline(), file.readline()][1]
+        if b"Lattice=" in said and b'pbc="F F F"' not in said:
+            remedy = "convert it by ase convert to a format that has one, such as PDB"
+            warnings.warn(f"{path}: its cell is not read, since it is an XYZ file; {remedy}", UserWarning, stacklevel=3)
 
 
 def _look_at(path: Path, what: str) -> None:

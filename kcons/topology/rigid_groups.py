@@ -226,11 +226,8 @@ def residue_bodies(snapshot: Snapshot, names: Sequence[str]) -> list[IntArray]:
     for name in names:
         same = present == str(name).strip().upper()
         if not same.any():
-            raise InputError(
-                f"no residue is called {name}{did_you_mean(str(name), present.tolist())}; there are "
-                + listed(topology.residue_names),
-                item="rigid_residues",
-            )
+            there = f"{did_you_mean(str(name), present.tolist())}; there are {listed(topology.residue_names)}"
+            raise InputError(f"no residue is called {name}{there}", item="rigid_residues")
         chosen |= same
     # Virtual sites follow the others by themselves.
     real = (topology.masses > 0) | (topology.elements != "")

@@ -23,7 +23,7 @@ from kcons.constraints.arguments import checked
 from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.one_piece import connected, lined_up
-from kcons.errors import InputError, did_you_mean
+from kcons.errors import InputError, unknown
 from kcons.topology.angle_rows import STRAIGHT, angle_rows
 from kcons.topology.rigid_groups import (
     GEOMETRIES,
@@ -116,11 +116,7 @@ class Holding:
 
     def __post_init__(self) -> None:
         if self.kind not in CONSTRAIN:
-            raise InputError(
-                f"cannot constrain {self.constrain!r}{did_you_mean(self.kind, CONSTRAIN)}; there are "
-                f"{', '.join(CONSTRAIN)}",
-                item="constrain",
-            )
+            raise InputError(f"cannot constrain {unknown(str(self.constrain), CONSTRAIN)}", item="constrain")
         if not (self.kind != "none" or self.rigid_water or self.residues or self.bodies or self.on):
             raise InputError("nothing is to be held; name bonds, water, residues, bodies or rows", item="constrain")
         for entry in self.own_rows:
@@ -165,11 +161,8 @@ class Holding:
         if isinstance(given, str):
             name = given.lower().replace("-", "").replace("/", "").replace("_", "")
             if name not in GEOMETRIES:
-                raise InputError(
-                    f"no water model {given!r}{did_you_mean(given, GEOMETRIES)}; there are {', '.join(GEOMETRIES)}; or "
-                    "give (O-H in angstrom, H-O-H in degrees)",
-                    item="water_geometry",
-                )
+                remedy = "or give (O-H in angstrom, H-O-H in degrees)"
+                raise InputError(f"no water model {unknown(given, GEOMETRIES)}; {remedy}", item="water_geometry")
             length, angle, site = GEOMETRIES[name]
             return (length, angle), site
         return water_geometry(given, "water_geometry"), 0.0

@@ -170,10 +170,11 @@ def test_a_sampler_of_ones_own_goes_on_and_its_lines_run():
     ("options", "words"),
     [
         ({"methods": ["rattle"]}, "there is no thermostat 'rattle'; there are langevin"),
-        ({"methods": []}, "no thermostat is named"),
+        ({"methods": []}, "give a list of langevin"),
+        ({"methods": "langevin"}, "methods is 'langevin'; give a list of langevin"),
         ({"methods": ["spheres"]}, "spheres uses cheap forces"),
         ({"budget": 0}, "budget is 0; give a positive number"),
-        ({"steps": [4.0, -3.0]}, "time step -3 fs: give a positive number"),
+        ({"steps": [4.0, -3.0]}, "dt is -3.0; give a positive number"),
         ({"steps": [4.0, 4000.0]}, "a step of 4000 fs is too long"),
         ({"system": small("rotor")}, "rotor has no temperature"),
         ({"cheap": small("water")}, "different atoms"),

@@ -14,9 +14,9 @@ import pytest
 
 from kcons.comparison import METHODS, add_method, compare, measure, test_systems
 from kcons.comparison.methods import on_arrays
-from kcons.comparison.runs import Run
+from kcons.comparison.runs import OnArrays
 from kcons.errors import InputError, UnsupportedError
-from kcons.steppers import Rattle
+from kcons.steppers import Rattle, State, System
 
 
 @pytest.fixture
@@ -83,26 +83,23 @@ def test_the_slope_of_the_energy_is_found(registry):
 # -- budgets and failures ---------------------------------------------------------------------------
 
 
-class Slow(Run):
+class Slow(OnArrays):
     """Sleeps in each step."""
 
     seconds = 0.1
 
-    def __init__(self, system, dt):
-        super().__init__(dt)
-        self.system = system
-
     def advance(self, steps=1):
-        for _ in range(steps):
-            time.sleep(self.seconds)
+        time.sleep(steps * self.seconds)
         self.done += steps
 
-    def observe(self):
-        return self.system.positions, self.system.velocities
+
+def run(s, dt, stepper=Rattle, kind=OnArrays, **own):
+    made = kind(System(s.motion, s.potential.forces), State(s.positions, s.velocities), stepper(), dt)
+    return vars(made).update(own) or made
 
 
 def test_what_exceeds_the_budget_is_stopped_after_a_step(registry):
-    add_method("slow", Slow)
+    add_method("slow", functools.partial(run, kind=Slow))
     found = compare(chain(), ["slow", "rattle"], budget=0.4, rounds=0)
     slow = found[found.method == "slow"]
     assert "partial" in set(slow.status) and set(slow.status) <= {"ok", "partial", "not run"}
@@ -113,10 +110,7 @@ def test_what_exceeds_the_budget_is_stopped_after_a_step(registry):
 
 
 def test_a_step_that_does_not_end_is_interrupted(registry):
-    class Hanging(Slow):
-        seconds = 60.0
-
-    add_method("hanging", Hanging)
+    add_method("hanging", functools.partial(run, kind=Slow, seconds=60.0))
     begun = time.perf_counter()
     (row,) = compare(chain(), ["hanging"], budget=0.2, rounds=0).to_dict("records")
     assert time.perf_counter() - begun < 10
@@ -143,7 +137,7 @@ def test_what_a_finalizer_swallows_is_raised_again(monkeypatch):
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0) and signal.getsignal(signal.SIGALRM) is before
 
 
-def test_what_a_method_raises_is_a_result(registry):
+def test_what_a_method_raises_or_does_wrong_is_a_result(registry, monkeypatch):
     class Failing(Rattle):
         def step(self, system, state, dt):
             if state.step == 2:
@@ -154,14 +148,27 @@ def test_what_a_method_raises_is_a_result(registry):
         def check(self, system):
             raise UnsupportedError("no such constraints here; use Rattle")
 
-    add_method("failing", functools.partial(on_arrays, lambda dt: Failing()))
-    add_method("unable", functools.partial(on_arrays, lambda dt: Unable()))
-    found = compare(chain(), ["failing", "unable"], rounds=0)
-    failed = found[found.method == "failing"]
-    assert (failed.status == "failed").all()
-    assert failed.note.str.contains("InputError: no solution at this step").iloc[0]
-    (unable,) = found[found.method == "unable"].to_dict("records")
-    assert (unable["status"], unable["note"]) == ("not run", "no such constraints here; use Rattle")
+    class Lazy(OnArrays):
+        def advance(self, steps=1):
+            super().advance()
+            self.done += steps - 1
+
+    monkeypatch.setattr(measure, "MORE_SECONDS", 0.0)
+    for start, status, words in (
+        (functools.partial(run, stepper=Failing), "failed", "InputError: no solution at this step"),
+        (functools.partial(run, stepper=Unable), "not run", "^no such constraints here; use Rattle$"),
+        (functools.partial(run, kind=Lazy), "ok", "makes 1 force evaluations, not .*: make all steps"),
+        (lambda s, dt: None, "failed", "start gives a NoneType"),
+        (lambda s, dt: run(s, 2 * dt), "failed", "the run ends at 160 fs, not at the horizon"),
+        (functools.partial(run, evaluations=0), "failed", "no force evaluation is counted"),
+        (lambda s, dt: run(s, dt, observe=lambda: (s.positions[:1],) * 2), "failed", "positions must have shape"),
+        (lambda s, dt: s.velocities.fill(0.0), "failed", "read-only"),
+    ):
+        add_method("wrong", start)
+        found = compare(chain(), ["wrong", "rattle"], rounds=1)
+        wrong = found[found.method == "wrong"]
+        assert set(wrong.status) == {status} and wrong.note.str.contains(words).all() and not wrong.rounds.any()
+        assert list(found.status)[-4:] == ["ok"] * 4
 
 
 def test_a_set_up_of_openmm_beyond_the_budget_is_refused_from_then_on():

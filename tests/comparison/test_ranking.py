@@ -121,6 +121,6 @@ def test_steps_are_found_for_an_error():
     assert found.table.method.iloc[0] == "blanes-moan4" and found.table.error.iloc[0] <= target
     assert find_steps(system, whole, target, reference) == []  # as --resume asks: what has run is not run again
     assert find_steps(system, table, 1e-6, reference) == []  # the step of 40 fs does, and RATTLE is dearer
-    with pytest.raises(InputError, match="the target error is -1; give a positive number"):
+    with pytest.raises(InputError, match="target is -1; give a positive number"):
         find_steps(system, table, -1, reference)
     assert find_steps(system, table, 1e-16, reference) == []

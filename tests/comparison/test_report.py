@@ -56,11 +56,13 @@ def test_few_steps_and_times_that_were_taken_once_are_told():
 def test_the_file_gives_back_the_table(tmp_path):
     path = tmp_path / "compare.csv"
     write_csv(path, table())
-    again = read_csv(path)
+    again = read_csv(str(path))
     pd.testing.assert_frame_equal(again, table(), check_dtype=False, check_exact=True)
     assert again.attrs == table().attrs
     assert path.read_text(encoding="utf-8").startswith("# name: ")
     assert [file.name for file in tmp_path.iterdir()] == ["compare.csv"]
+    with pytest.raises(InputError, match=r"read it by kcons\.comparison\.read_csv"):
+        rank(pd.read_csv(path, comment="#"))
     for bad in ("", "a,b\n1,2\n", "# title: 1\n"):
         path.write_text(bad)
         with pytest.raises(InputError, match="holds no comparison of kcons"):

@@ -5,6 +5,7 @@ No array that was given changes.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from math import inf, nan
 from typing import Any
@@ -17,7 +18,7 @@ from ase.build import molecule
 from ase.calculators.emt import EMT
 
 import kcons.ase
-import kcons.comparison
+import kcons.comparison.test_systems
 import kcons.constraints.projection
 import kcons.mdanalysis
 import kcons.motion
@@ -90,6 +91,7 @@ def names() -> dict[str, Any]:
         "PAIR": growth.ConstrainedGrowth(growth.Hypercycle(2)),
         "ORACLE": kcons.constraints.projection,
         "X": X,
+        "CHAIN": partial(replace, kcons.comparison.test_systems.build("chain", 3)),
         "LINE": np.arange(4.0)[:, None] * [1.0, 0.0, 0.0],
         "V": np.zeros_like(X),
         "F": X,
@@ -530,6 +532,11 @@ REFUSED: list[tuple[str, ...]] = [
     ('kcons.mdanalysis.write_ase(type("BFGS", (), {"atoms": ATOMS}), "nowhere/a.trr")', "dynamics"),
     ('kcons.comparison.compare("chain")', "system"),
     ("kcons.comparison.compare(None, rounds=-1)", "rounds"),
+    ("kcons.comparison.compare_averages(CHAIN(positions=X))", "positions"),
+    ("kcons.comparison.compare(CHAIN(potential=kcons.comparison.Potential(np.sin, 'mine')))", "potential"),
+    ("CHAIN().deviation(X, X[:1])", "reference"),
+    ("CHAIN(time_steps=?)", "dt", "()", "[7.0]", "[-1.0]", "[nan]"),
+    ('kcons.comparison.rank(CHAIN(), criterion="temprature")', "criterion"),
 ]
 #: Errors of other types.
 OTHERS: list[tuple[str, type[KconsError], str | None]] = [

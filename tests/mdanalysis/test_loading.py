@@ -44,6 +44,13 @@ def test_files_that_cannot_be_opened(tmp_path, ending):
         load_trajectory(made, path)
 
 
+def test_a_cell_in_an_xyz_file_is_not_read_which_is_said(tmp_path):
+    (path := tmp_path / "a.xyz").write_text('1\nLattice="9 0 0 0 9 0 0 0 9" pbc="T T T"\nO 0 0 0\n')
+    for trajectory in (None, path):
+        with pytest.warns(UserWarning, match=r"a\.xyz: its cell is not read"):
+            open_universe(path, trajectory)
+
+
 @pytest.mark.parametrize(
     "ending,error,package",
     [

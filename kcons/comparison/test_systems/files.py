@@ -123,7 +123,7 @@ def plan(
         except KconsError as error:
             error.args = (f"{path}: {error}",)
             raise
-    told = ("were guessed from distances", "no bond was guessed")
+    told = ("were guessed from distances", "no bond was guessed", "its cell is not read")
     said = (str(w.message).partition(", or pass guess_bonds=")[0] for w in caught)
     return _planned(path.name, rows, constrain, tuple(line for line in said if any(words in line for words in told)))
 

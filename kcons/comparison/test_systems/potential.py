@@ -14,7 +14,7 @@ from ase import Atoms
 from ase.calculators import calculator as of_ase
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import CalculatorError
+from kcons.errors import CalculatorError, InputError
 
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray]]
 #: Name of the potential of systems on which no forces act.
@@ -41,39 +41,38 @@ class Potential:
         self._evaluate = evaluate
         self.name = name
         self.evaluations = 0
-        self._last: FloatArray | None = None
-        self._energy = 0.0
-        self._forces: FloatArray | None = None
+        self._last: tuple[FloatArray, float, FloatArray] | None = None
 
     def forces(self, x: FloatArray, time: float = 0.0) -> FloatArray:
         """Forces at `x`, shape (n_atoms, 3); a copy."""
-        self._update(x)
-        assert self._forces is not None
-        return self._forces.copy()
+        return self._known(x)[2].copy()
 
     def energy(self, x: FloatArray, time: float = 0.0) -> float:
         """Potential energy at `x`."""
-        self._update(x)
-        return self._energy
+        return self._known(x)[1]
 
     def watched(self, x: FloatArray) -> tuple[float, FloatArray]:
         """Energy and forces at `x` for an onlooker: neither counted nor remembered."""
-        if self._last is not None and self._forces is not None and np.array_equal(self._last, x):
-            return self._energy, self._forces.copy()
-        energy, forces = self._evaluate(x)
-        return float(energy), np.asarray(forces, float)
+        if self._last is not None and np.array_equal(self._last[0], x):
+            return self._last[1], self._last[2].copy()
+        return self._evaluated(x)
 
     def forget(self) -> None:
         """Start counting anew; the next point is evaluated whatever it is."""
         self._last = None
         self.evaluations = 0
 
-    def _update(self, x: FloatArray) -> None:
-        if self._last is not None and np.array_equal(self._last, x):
-            return
-        energy, forces = self._evaluate(x)
-        self.evaluations += 1
-        self._last, self._energy, self._forces = np.array(x, dtype=float), float(energy), np.asarray(forces, float)
+    def _known(self, x: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+        if self._last is None or not np.array_equal(self._last[0], x):
+            self._last = np.array(x, dtype=float), *self._evaluated(x)
+            self.evaluations += 1
+        return self._last
+
+    def _evaluated(self, x: FloatArray) -> tuple[float, FloatArray]:
+        found = self._evaluate(x)
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise InputError(f"{self.name} gives a {type(found).__name__}; give (energy, forces)", item="potential")
+        return float(found[0]), np.asarray(found[1], float)
 
 
 def no_forces() -> Potential:

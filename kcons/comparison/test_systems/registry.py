@@ -8,7 +8,7 @@ from typing import Any
 
 from kcons.comparison.test_systems.system import TestSystem
 from kcons.constraints.arguments import Count, Rng, checked, seed_from
-from kcons.errors import InputError, did_you_mean
+from kcons.errors import InputError, unknown
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,7 @@ def build(name: str, size: Count | None = None, rng: Rng = 1, *, quick: bool = F
         Unknown name; a size the test system cannot be built at; an option that it does not take.
     """
     if name not in SYSTEMS:
-        raise InputError(
-            f"there is no test system {name!r}{did_you_mean(name, SYSTEMS)}; there are {', '.join(SYSTEMS)}",
-            item="system",
-        )
+        raise InputError(f"there is no test system {unknown(name, SYSTEMS)}", item="system")
     entry = SYSTEMS[name]
     if size is None:
         size = entry.quick_size if quick and entry.quick_size else entry.size

@@ -11,7 +11,7 @@ from ase import Atoms, units
 
 from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
 from kcons.comparison.test_systems.potential import Potential, PotentialCalculator
-from kcons.constraints.arguments import Rng, generator_of
+from kcons.constraints.arguments import Rng, finite_array, generator_of
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -100,10 +100,25 @@ class TestSystem:
     #: k_B T of its velocities; 0 for test systems that have no temperature.
     thermal_energy: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name in ("positions", "velocities"):  # which no run can change for the next one
+            object.__setattr__(self, name, array := np.array(getattr(self, name), dtype=float))
+            array.setflags(write=False)
+        if not len(self.time_steps):
+            raise InputError("there is no time step; give one or more", item="dt")
+        for dt in self.time_steps:
+            count = max(1, round(self.horizon / dt)) if dt > 0 else 1
+            if not abs(self.horizon - count * dt) <= 1e-6 * self.horizon:
+                step, horizon = (f"{t / self.units.time_unit:g} {self.units.time}" for t in (dt, self.horizon))
+                remedy = f"give a positive step of at most the horizon, such as {horizon} / {count}"
+                raise InputError(f"time step {step} does not divide the horizon of {horizon}; {remedy}", item="dt")
+
     @cached_property
     def motion(self) -> Motion:
-        """The engine for this test system, set up once."""
-        return Motion(self.constraint_set, self.positions)
+        """The engine for this test system, set up once; `InputError` for a start off the constraints."""
+        motion = Motion(self.constraint_set, self.positions)
+        System(motion, None).initial_state(self.positions, self.velocities)
+        return motion
 
     @property
     def masses(self) -> FloatArray:
@@ -125,17 +140,7 @@ class TestSystem:
 
     def with_time_steps(self, shown: Sequence[float]) -> TestSystem:
         """The same test system with other steps, in the unit of time it shows."""
-        horizon, unit = self.horizon / self.units.time_unit, self.units.time
-        for dt in shown:
-            if not (np.isfinite(dt) and 0 < dt <= horizon * (1 + 1e-9)):
-                remedy = f"give a positive step of at most the horizon, {horizon:g} {unit}"
-                raise InputError(f"time step {dt:g} {unit}: {remedy}", item="dt")
-            count = round(horizon / dt)
-            if abs(horizon / dt - count) > 1e-6 * count:
-                remedy = f"does not divide the horizon of {horizon:g} {unit}; try {horizon / max(1, count):g}"
-                raise InputError(f"time step {dt:g} {unit} {remedy}", item="dt")
-        steps = sorted({dt * self.units.time_unit for dt in shown}, reverse=True)
-        return replace(self, time_steps=tuple(steps))
+        return replace(self, time_steps=sorted({dt * self.units.time_unit for dt in shown}, reverse=True))
 
     def shortened(self, factor: int) -> TestSystem:
         """The same test system with its horizon divided by `factor` and only the steps that still divide it."""
@@ -151,7 +156,8 @@ class TestSystem:
 
     def deviation(self, positions: FloatArray, reference: FloatArray) -> float:
         """Root-mean-square distance of the atoms."""
-        return float(np.sqrt(np.mean(np.sum((positions - reference) ** 2, axis=1))))
+        apart = positions - finite_array(reference, self.n_atoms, "reference")
+        return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
     def residuals(self, x: FloatArray, v: FloatArray, time: float = 0.0) -> tuple[float, float]:
         """max |sigma| in natural units, and max |A v - c| / v_rms with rows scaled to unit norm."""

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, DistanceDifference, FixedAtoms
 from kcons.constraints.arguments import Count, Positive, rules_of
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, did_you_mean
+from kcons.errors import InputError, unknown
 from kcons.free_energy.windows.driver import Sampler, Settings
 from kcons.steppers.files import as_path
 
@@ -263,8 +263,7 @@ def _read(kind: Any, name: str, entry: Any) -> Any:
 
 def _refuse_unknown(key: str, known: Collection[str], where: str) -> None:
     if key not in known:
-        hint = did_you_mean(key, known)
-        raise InputError(f"{where} has an unknown key {key!r}{hint}; there are {', '.join(known)}", item=key)
+        raise InputError(f"{where} has an unknown key {unknown(key, known)}", item=key)
 
 
 def coordinate_of(family: str, atoms: Sequence[int], first: int) -> Constraint:

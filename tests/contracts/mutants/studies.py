@@ -24,6 +24,7 @@ MUTANTS = {
     },
     "comparison/measure.py": {
         "if «method.name not in ther→Tru»e:": "cli/compare::it_goes_on_from_the_rows_that_are_there",
+        "if wrong and «method.holds→False»:": "comparison/measure::what_a_method_raises_or_does_wrong_is_a_result",
         ", max(self.seconds, 1e-3)«, RING_AGAIN→»)": "comparison/measure::what_a_finalizer_swallows_is_raised_again",
         '«row["seconds"] *= step / row["step_seconds"]→pass»': (
             "measure::a_row_a_method_and_setting_and_beside_them_what_they_are_of"
