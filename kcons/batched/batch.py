@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -81,8 +81,8 @@ class Batch:
         compiled: bool = False,
         check_every: int | None = None,
     ) -> None:
-        given = [motions] if isinstance(motions, Motion) else list(motions)
-        if not given or copies < 1 or not all(isinstance(each, Motion) for each in given):
+        given, copies = list(motions) if isinstance(motions, Iterable) else [motions], whole_number(copies, "copies")
+        if not given or not all(isinstance(each, Motion) for each in given):
             raise InputError("give a kcons.Motion and the number of copies, or a list of Motions", item="motions")
         if dtype not in (torch.float64, torch.float32):
             raise InputError(f"dtype is {dtype}; give torch.float64 or torch.float32", item="dtype")
@@ -94,6 +94,8 @@ class Batch:
         self.atom_starts = np.cumsum([0, *(each.n_atoms for each in self.systems)])
         self.row_starts = np.cumsum([0, *(each.constraint_set.n_rows for each in self.systems)])
         self.n_atoms, self.n_rows = int(self.atom_starts[-1]), int(self.row_starts[-1])
+        whole = [copies, self.n_systems] if len({each.n_atoms for each in given}) == 1 else [copies]
+        self._shapes = [(self.n_atoms, 3), *((k, self.n_atoms // k, 3) for k in whole)]
         self._numbers: dict[Motion, list[int]] = {}
         for number, each in enumerate(self.systems):
             self._numbers.setdefault(each, []).append(number)
@@ -168,16 +170,19 @@ class Batch:
     # -- what is given --------------------------------------------------------------------------------
 
     def _flat(self, x: Tensor, item: str) -> Tensor:
-        right = isinstance(x, Tensor) and x.shape[-1:] == (3,) and x.numel() == 3 * self.n_atoms
-        if not right or x.dtype != self.dtype or x.device.type != self.device.type:
-            here = f"{self.dtype} on {self.device}"
-            wanted = f"a tensor of shape ({self.n_atoms}, 3) or (copies, atoms, 3), {here}; convert it"
-            raise InputError(f"{item} must be {wanted}", item=item)
+        right = isinstance(x, Tensor) and x.shape in self._shapes and x.device.type == self.device.type
+        if not right or x.dtype != self.dtype:
+            wanted = f"{' or '.join(map(str, dict.fromkeys(self._shapes)))}, {self.dtype} on {self.device}"
+            raise InputError(f"{item} must be a tensor of shape {wanted}; convert it", item=item)
         return x.reshape(-1, 3)
 
     def _all(self, values: Tensor, count: int, item: str) -> Tensor:
-        if not isinstance(values, Tensor) or values.shape != (count,):
-            raise InputError(f"{item} must be a tensor of shape ({count},), one for each in all systems", item=item)
+        if not isinstance(values, Tensor) or values.shape != (count,) or values.device.type != self.device.type:
+            raise InputError(f"{item} must be a tensor of shape ({count},) on {self.device}", item=item)
+        bad = ~values.isfinite() if item == "targets" else self._free & ~((values > 0) & values.isfinite())
+        if bad.any():
+            said = f"{item}[{int(bad.nonzero()[0])}] is {float(values[bad][0])}"
+            raise InputError(f"{said}; give finite numbers, masses above 0", item=item)
         return values.to(self.dtype)
 
     def weights(self, masses: Tensor | None = None) -> Tensor:
@@ -190,10 +195,9 @@ class Batch:
         """
         if masses is None:
             return self._inverse_masses
-        for item in (
-            each for motion in self._numbers for each in motion.constraint_set.constraints if each.uses_masses
-        ):
-            raise UnsupportedError(f"{item!r} is defined by the masses of its Motion; make another with other ones")
+        items = [each for motion in self._numbers for each in motion.constraint_set.constraints if each.uses_masses]
+        if items:
+            raise UnsupportedError(f"{items[0]!r} is defined by the masses of its Motion; make another with other ones")
         return self._inverse(self._all(masses, self.n_atoms, "masses"))
 
     def _task(self, of_positions: bool, flight: float = 0.0) -> Task:
@@ -272,7 +276,7 @@ class Batch:
     def multipliers(self, x: Tensor, v: Tensor, forces: Tensor, *, masses: Tensor | None = None) -> Tensor:
         """lambda of the constraint forces A^T lambda, in natural units; of least norm where rows depend on each other.
 
-        Shapes are as for `solve_positions`; the result has shape (n_rows,) or (copies, rows).
+        Shapes are as for `solve_positions`; the result has shape (n_rows,), or (copies, rows) if copies are alike.
         """
         here, speed, f = self._flat(x, "x"), self._flat(v, "v"), self._flat(forces, "forces")
         w, rest, task = self.weights(masses), torch.zeros_like(self._rates), self._task(False)
@@ -287,7 +291,8 @@ class Batch:
         inert = self.masses if masses is None else self._all(masses, self.n_atoms, "masses")
         lacking = (inert[:, None] * a - held.reshape(-1, 3))[self._fixed]
         lam = lam.index_copy(0, self._fixed_rows, lacking.reshape(-1))
-        return lam.reshape(x.shape[0], -1) if x.ndim == 3 else lam
+        rows: Any = np.diff(self.row_starts[:: self.n_systems // len(x)]) if x.ndim == 3 else []
+        return lam.reshape(len(x), -1) if len(set(rows)) == 1 else lam
 
     # -- what is told ---------------------------------------------------------------------------------
 
@@ -312,14 +317,10 @@ class Batch:
         residual, copy = float(off[k]), int(np.searchsorted(self.row_starts, int(rows[k]), "right")) - 1
         row, held = int(rows[k] - self.row_starts[copy]), self.systems[copy].constraint_set
         said = f"is off by {residual:.3g} of its scale" if np.isfinite(residual) else "has turned or is not finite"
-        error = ConvergenceError(
-            f"copy {copy}, row {held.row_name(row)} {said} in one of the last {calls} projections: there is no "
-            "solution near enough. Take a smaller time step, or start on the rows (Motion.restore_positions)",
-            residual=residual,
-            tolerance=limit,
-            row=row,
-            atoms=held.row_atoms(row).tolist(),
-        )
+        said = f"copy {copy}, row {held.row_name(row)} {said} in one of the last {calls} projections"
+        remedy = "Take a smaller time step, or start on the rows (Motion.restore_positions)"
+        where: dict[str, Any] = {"residual": residual, "row": row, "atoms": held.row_atoms(row).tolist()}
+        error = ConvergenceError(f"{said}: there is no solution near enough. {remedy}", tolerance=limit, **where)
         error.copy = copy
         raise error
 
@@ -353,10 +354,8 @@ def kinds_of(motion: Motion, velocity_rows: bool) -> dict[Pattern, Kind]:
     held, plan = motion.constraint_set, motion.plan
     missing = int(((plan.labels >= 0) & ~plan.eliminate_last).sum()) + len(plan.pinned_rows) - motion.rank
     if missing:
-        raise UnsupportedError(
-            f"{missing} rows depend on others, in clusters of so many rows that nobody knows which; leave out what "
-            "others hold (Motion.report names the kinds of clusters)"
-        )
+        remedy = "leave out what others hold (Motion.report names the kinds of clusters)"
+        raise UnsupportedError(f"{missing} rows depend on others, in clusters too large to know which; {remedy}")
     what: list[tuple[Row, bool]] = []
     atoms: list[IntArray] = []
     parameters: list[FloatArray] = []
@@ -501,7 +500,7 @@ def _solve(group: Group, of: Problem) -> tuple[Tensor, Tensor]:
         following, moved, size = group.solver.newton(of, lam)
         worst = float((size / group.scale).max()) if watched else torch.inf
         # Near the end an iteration that gains nothing shows what rounding leaves.
-        if not worst > ENOUGH * eps or eps**0.5 > worst > 0.5 * before:
+        if worst <= ENOUGH * eps or eps**0.5 > worst > 0.5 * before:
             break
         before = worst
     group.worst = torch.maximum(group.worst, size / group.scale)

@@ -56,10 +56,8 @@ def tape_of(item: Any) -> Tape:
     try:
         tape = differentiated(row, n)
     except (TypeError, AttributeError, IndexError, ValueError) as error:
-        raise UnsupportedError(
-            f"{item!r} cannot be run on tensors ({error}); write it with elementary functions of NumPy without "
-            "branches, or as a Formula"
-        ) from error
+        remedy = "write it with elementary functions of NumPy without branches, or as a Formula"
+        raise UnsupportedError(f"{item!r} cannot be run on tensors ({error}); {remedy}") from error
     return tape._replace(results=tape.results[:-1])
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcons.batched.batch import Batch
-from kcons.constraints.arguments import positive
+from kcons.constraints.arguments import not_negative, positive
 from kcons.errors import InputError
 
 
@@ -29,7 +29,7 @@ def kick(batch: Batch, x: Tensor, v: Tensor, forces: Tensor, h: Any, masses: Ten
 def drift(batch: Batch, x: Tensor, v: Tensor, h: Any, **held: Any) -> tuple[Tensor, Tensor]:
     """Positions a time h later on the rows, and velocities with the impulse that has kept them there."""
     found, push = batch.solve_positions(x + h * v, x, flight=h, **held)
-    return found, v + push / (h if isinstance(h, Tensor) else h or 1.0)
+    return found, v + push / (h + (h == 0))
 
 
 def drift_in_bath(
@@ -105,6 +105,8 @@ def gbaoab(
     B. Leimkuhler and C. Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
     positive(dt, "dt")  # noise cannot be taken back
+    for item, given in (("kT", kT), ("friction", friction)):
+        not_negative(torch.as_tensor(given).min().item(), item)
     masses = held.get("masses")
     v = kick(batch, x, v, forces, 0.5 * dt, masses)
     x, v = drift_in_bath(batch, x, v, dt, (kT, friction, generator), **held)

@@ -1,7 +1,7 @@
 """Dynamics on constraints for `torch_sim.integrate`: constant energy, Langevin dynamics, Nosé-Hoover chains.
 
 Each is a pair (init, step) with the arguments and units of TorchSim's own. A step gives a new state, and leaves the one
-that it is given as it was.
+that it is given as it was, but for its random numbers.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from torch_sim.models.interface import ModelInterface
 from torch_sim.units import unit_factor_from_annotation
 
 from kcons.batched.steps import drift_in_bath, kick, rattle
+from kcons.constraints.arguments import finite_number, not_negative, positive, whole_number
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.thermostats.freedom import open_directions
-from kcons.torchsim.holding import array_of, constraints_of
+from kcons.torchsim.holding import AGAIN, array_of, constraints_of
 
 #: Without other settings, as in TorchSim: tau over time step, and friction times time step.
 PERIODS, FRICTION = 10.0, 0.01
@@ -38,7 +39,15 @@ class Integrator(NamedTuple):
 
 
 @dataclass(kw_only=True)
-class NoseHooverState(MDState):
+class RestingState(MDState):
+    """State with 3 degrees of freedom less where no row knows a place in space: the center of mass rests there."""
+
+    def get_number_of_degrees_of_freedom(self) -> torch.Tensor:
+        return super().get_number_of_degrees_of_freedom() - 3 * _free(self)
+
+
+@dataclass(kw_only=True)
+class NoseHooverState(RestingState):
     """State of dynamics with a chain of thermostats for each system; slices and joins keep the right chains.
 
     Attributes
@@ -55,10 +64,6 @@ class NoseHooverState(MDState):
 
     _system_attributes = {*MDState._system_attributes, "chain_positions", "chain_momenta", "tau", "target_kT"}
 
-    def get_number_of_degrees_of_freedom(self) -> torch.Tensor:
-        """3n less the rank, less 3 where no row knows a place in space: the center of mass then stays at rest."""
-        return super().get_number_of_degrees_of_freedom() - 3 * _free(self)
-
     @property
     def chain(self) -> NoseHooverChain:
         """The chain in the form of TorchSim, for example for `torch_sim.nvt_nose_hoover_invariant`."""
@@ -70,24 +75,25 @@ class NoseHooverState(MDState):
         return NoseHooverChain(self.chain_positions, self.chain_momenta.clone(), masses, self.tau, kinetic, freedom)
 
 
-def _start(state: SimState, model: ModelInterface, *, kT: Any, at_rest: bool = True, **_: Any) -> MDState:
+def _start(state: SimState, model: ModelInterface, *, kT: Any, dt: Any = None, at_rest: bool | None = None) -> MDState:
     """A state with forces, on the constraints, its momenta projected, or drawn if it has none."""
-    start = copy.copy(state)
+    start, energy = copy.copy(state), _each(state, kT, "kT", not_negative, True)
     start.positions = _placed(state)
-    masses = state.masses[:, None]
-    given = getattr(state, "momenta", None)
+    masses, given = state.masses[:, None], getattr(state, "momenta", None)
+    rests = given is None or isinstance(state, RestingState) if at_rest is None else at_rest
     if given is None:
         given = torch.randn(start.positions.shape, device=state.device, dtype=state.dtype, generator=start.rng)
-        given = torch.sqrt(_each(state, kT, atoms=True) * masses) * given
-        if at_rest:
-            # Rows of systems that are free to move know no place in space: this leaves velocities on them.
-            sums = torch.zeros((state.n_systems, 4), dtype=state.dtype, device=state.device)
-            sums = sums.index_add(0, state.system_idx, torch.cat([given, masses], dim=1))
-            given = given - masses * (_free(state)[:, None] * sums[:, :3] / sums[:, 3:])[state.system_idx]
+        given = torch.sqrt(energy * masses) * given
+    if rests:
+        # Rows of systems that are free to move know no place in space: this leaves velocities on them.
+        sums = torch.zeros((state.n_systems, 4), dtype=state.dtype, device=state.device)
+        sums = sums.index_add(0, state.system_idx, torch.cat([given, masses], dim=1))
+        given = given - masses * (_free(state)[:, None] * sums[:, :3] / sums[:, 3:])[state.system_idx]
     momenta = masses * constraints_of(state).batch(state).project_velocities(start.positions, given / masses)
     output = model(start)
     _check_forces(state, output["forces"])
-    made = MDState.from_state(start, momenta=momenta, energy=output["energy"], forces=output["forces"])
+    kind = RestingState if rests else MDState
+    made = kind.from_state(start, momenta=momenta, energy=output["energy"], forces=output["forces"])
     made.store_model_extras(output)
     return made
 
@@ -100,23 +106,17 @@ def _placed(state: SimState) -> torch.Tensor:
     away = (found - state.positions).abs().amax(1)
     if bool(away.max() > FAR):
         atom = int(away.argmax())
-        raise InputError(
-            f"system {int(state.system_idx[atom])} has atom {atom} {float(away[atom]):.3g} off its constraints, moved "
-            "since these were made; put it back, or set state.constraints = [] and hold again",
-            item="state",
-        )
+        off = f"system {int(state.system_idx[atom])} has atom {atom} {float(away[atom]):.3g} off its constraints"
+        raise InputError(f"{off}, moved since these were made; put it back, or {AGAIN}", item="state")
     return found
 
 
 def _check_forces(state: SimState, forces: torch.Tensor) -> None:
     bad = (~torch.isfinite(forces).all(dim=1)).nonzero().ravel()
     if len(bad):
-        raise NonFiniteError(
-            f"force of atom {int(bad[0])} (in system {int(state.system_idx[bad[0]])}) is not finite: look at what the "
-            "model returned; the state is as before the step",
-            item="force",
-            atom=int(bad[0]),
-        )
+        atom, remedy = int(bad[0]), "look at what the model returned; the state is as before the step"
+        said = f"force of atom {atom} (in system {int(state.system_idx[atom])}) is not finite: {remedy}"
+        raise NonFiniteError(said, item="force", atom=atom)
 
 
 def _free(state: SimState) -> torch.Tensor:
@@ -127,9 +127,13 @@ def _free(state: SimState) -> torch.Tensor:
     return free
 
 
-def _each(state: SimState, value: Any, atoms: bool = False) -> torch.Tensor:
+def _each(state: SimState, value: Any, item: str, rule: Any = positive, atoms: bool = False) -> torch.Tensor:
     """A number or one for each system, shape (n_systems,), or as a column for all atoms."""
-    numbers = torch.as_tensor(value, device=state.device, dtype=state.dtype).expand(state.n_systems)
+    numbers = torch.as_tensor(value, device=state.device, dtype=state.dtype)
+    rule(numbers.min().item(), item)
+    if numbers.shape not in ((), (1,), (state.n_systems,)):
+        raise InputError(f"{item} has shape {tuple(numbers.shape)}; give a number or one for each system", item=item)
+    numbers = numbers.expand(state.n_systems)
     return numbers[state.system_idx, None] if atoms else numbers.clone()
 
 
@@ -159,19 +163,20 @@ def _evaluate(state: MDState, model: ModelInterface, positions: torch.Tensor) ->
     return state.forces
 
 
-def _rattle(state: MDState, model: ModelInterface, *, dt: Any, **_: Any) -> MDState:
-    batch, given = constraints_of(state).batch(state), (state.positions, state.velocities, state.forces)
-    _, v, _ = rattle(batch, functools.partial(_evaluate, state, model), *given, _each(state, dt, atoms=True))
-    state.momenta = state.masses[:, None] * v
+def _rattle(state: MDState, model: ModelInterface, *, dt: Any, kT: Any = None) -> MDState:
+    batch, force = constraints_of(state).batch(state), functools.partial(_evaluate, state, model)
+    given = state.positions, state.velocities, state.forces, _each(state, dt, "dt", finite_number, True)
+    state.momenta = state.masses[:, None] * rattle(batch, force, *given)[1]
     return state
 
 
 @_whole
 def _langevin_step(state: MDState, model: ModelInterface, *, dt: Any, kT: Any, gamma: Any = None) -> MDState:
-    batch, dt = constraints_of(state).batch(state), _each(state, dt, atoms=True)
-    friction = FRICTION / dt if gamma is None else _each(state, gamma, atoms=True)
+    batch, dt = constraints_of(state).batch(state), _each(state, dt, "dt", atoms=True)
+    friction = FRICTION / dt if gamma is None else _each(state, gamma, "gamma", not_negative, True)
+    kT = _each(state, kT, "kT", not_negative, True)
     v = kick(batch, state.positions, state.velocities, state.forces, dt)
-    x, v = drift_in_bath(batch, state.positions, v, dt, (_each(state, kT, atoms=True), friction, state.rng))
+    x, v = drift_in_bath(batch, state.positions, v, dt, (kT, friction, state.rng))
     state.momenta = state.masses[:, None] * batch.project_velocities(x, v)
     _evaluate(state, model, x)
     return state
@@ -181,23 +186,23 @@ def _nose_hoover_init(
     state: SimState, model: ModelInterface, *, kT: Any, dt: Any, tau: Any = None, chain_length: int = 3
 ) -> NoseHooverState:
     held, free = constraints_of(state), _free(state)
+    if len(still := (3 * (state.n_atoms_per_system - free) <= held.get_removed_dof(state)).nonzero().ravel()):
+        raise UnsupportedError(f"system {int(still[0])} has no degrees of freedom left; take it out of the state")
     for motion, k in zip(held.motions, held.system_idx.tolist(), strict=True):
         x = array_of(state.positions[state.system_idx == k])
         if not free[k] and len(axes := open_directions(motion, x)):
-            raise UnsupportedError(
-                f"system {k} has constraints that leave its total momentum conserved along {len(axes)} of three axes, "
-                "for which a Nose-Hoover chain does not sample; use kcons.torchsim.langevin"
-            )
-    made = _start(state, model, kT=kT)
-    rest = torch.zeros((state.n_systems, chain_length), dtype=state.dtype, device=state.device)
-    period = _each(state, PERIODS * dt if tau is None else tau)
-    chain = {"chain_positions": rest, "chain_momenta": rest.clone(), "tau": period, "target_kT": _each(state, kT)}
-    return NoseHooverState.from_state(made, **chain)
+            said = f"rows of system {k} leave its total momentum conserved along {len(axes)} of three axes"
+            raise UnsupportedError(f"{said}, which a Nose-Hoover chain does not sample; use kcons.torchsim.langevin")
+    length, period = whole_number(chain_length, "chain_length"), PERIODS * dt if tau is None else tau
+    settings = {"tau": _each(state, period, "tau"), "target_kT": _each(state, kT, "kT")}
+    rest = torch.zeros((state.n_systems, length), dtype=state.dtype, device=state.device)
+    made = _start(state, model, kT=kT, at_rest=True)
+    return NoseHooverState.from_state(made, chain_positions=rest, chain_momenta=rest.clone(), **settings)
 
 
 @_whole
 def _nose_hoover_step(state: NoseHooverState, model: ModelInterface, *, dt: Any, kT: Any) -> NoseHooverState:
-    state.target_kT = _each(state, kT)
+    state.target_kT = _each(state, kT, "kT")
     half_step = construct_nose_hoover_chain(dt, state.chain_positions.shape[1], 3, 3, state.tau).half_step
     for first in (True, False):
         momenta, chain = half_step(state.momenta, state.chain, state.target_kT, state.system_idx)

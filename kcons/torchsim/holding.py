@@ -28,6 +28,7 @@ from kcons.topology.topology import require_kind
 
 #: How far masses and cells may be from those that rows were made for, relative: what single precision leaves.
 SAME = 1e-5
+AGAIN = "set state.constraints = [] and hold again"
 _OWN = (
     "this integrator does not keep momenta on constraints: TorchSim's own correct positions and do not tell momenta, "
     "which cools the system. Give torch_sim.integrate one of kcons, integrator=kcons.torchsim.nve, langevin or "
@@ -55,22 +56,20 @@ class Constraints(SystemConstraint):
         Refuses a state with other masses or cells than the rows were made for.
         """
         # TorchSim sets another system_idx where it reorders systems; masses and cells can be edited in a run.
-        seen = [(each, each._version) for each in (self.system_idx, state.masses, state.cell)]
+        seen = [(each, each._version) for each in (self.system_idx, state.masses, state.cell, state.pbc)]
         if self._made is None or any(a is not b or n != m for (a, n), (b, m) in zip(self._made[0], seen, strict=True)):
             held = dict(zip(self.system_idx.tolist(), self.motions, strict=True))
-            masses, cells = state.masses.split(state.n_atoms_per_system.tolist()), state.row_vector_cell
+            masses = state.masses.split(state.n_atoms_per_system.tolist())
+            cells = state.row_vector_cell * state.pbc[:, None]
             motions = [held[k] if k in held else _unheld(array_of(each)) for k, each in enumerate(masses)]
             for k, motion in enumerate(motions):
                 part, lattice = array_of(masses[k]), motion.lattice
                 same = part.shape == motion.masses.shape and np.allclose(part, motion.masses, SAME)
                 if lattice is not None:
-                    same &= np.abs(array_of(cells[k]) - lattice[0]).max() <= SAME * np.abs(lattice[0]).max()
+                    there = lattice[0] * lattice[1].any(axis=0)[:, None]  # rows without periodicity are unit vectors
+                    same &= np.abs(array_of(cells[k]) - there).max() <= SAME * np.abs(there).max()
                 if not same:
-                    raise InputError(
-                        f"system {k} has masses or a cell its rows were not made for; set state.constraints = [] and "
-                        "hold again",
-                        item="state",
-                    )
+                    raise InputError(f"system {k} has masses, cell or pbc its rows are not for; {AGAIN}", item="state")
             self._made = seen, Batch(motions, device=state.device, dtype=state.dtype, check_every=sys.maxsize)
         return self._made[1]
 
@@ -119,11 +118,10 @@ class Constraints(SystemConstraint):
         return Constraints(self.motions, self.system_idx + system_offset)
 
     @classmethod
-    def merge(cls, constraints: Sequence[TorchSimConstraint]) -> Constraints:
+    def merge(cls, constraints: Sequence[Any]) -> Constraints:
         """One object for states that are joined."""
-        own = [item for item in constraints if isinstance(item, Constraints)]
-        motions = [motion for item in own for motion in item.motions]
-        return cls(motions, torch.cat([item.system_idx for item in own]))
+        motions = [motion for item in constraints for motion in item.motions]
+        return cls(motions, torch.cat([item.system_idx for item in constraints]))
 
     def to(self, device: torch.device | None = None, dtype: torch.dtype | None = None) -> Constraints:
         """The same on another device."""
@@ -228,10 +226,8 @@ def constraints_of(state: SimState) -> Constraints:
 def refuse_others(constraints: Sequence[TorchSimConstraint]) -> None:
     """Refuse constraints that would undo the work of those of kcons."""
     for item in constraints:
-        raise UnsupportedError(
-            f"{type(item).__name__} on the state would undo the work of the constraints of kcons: set "
-            "state.constraints = [] and give all that is held to one call of hold, FixAtoms as kcons' FixedAtoms"
-        )
+        said = f"{type(item).__name__} on the state would undo the work of the constraints of kcons"
+        raise UnsupportedError(f"{said}: {AGAIN}, all by one call of hold, FixAtoms as kcons' FixedAtoms")
 
 
 def array_of(values: torch.Tensor) -> Any:

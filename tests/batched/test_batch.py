@@ -33,6 +33,8 @@ def test_shapes_follow_what_is_given():
     assert torch.equal(found.reshape(-1, 3), batch.project_positions(flat, x))
     assert torch.equal(cube, moved(batch, x).reshape(4, 3, 3)), "what is given stays"
     assert batch.multipliers(x, flat, flat).shape == (12,) and batch.multipliers(cube, cube, cube).shape == (4, 3)
+    other = Batch([water(), Motion(ConstraintSet(Distance([[0, 1]]), WATER, MASSES), WATER)])
+    assert other.multipliers(cube[:2], cube[:2], cube[:2]).shape == (4,)
     lengths = torch.tensor([1.0, 1.0, 1.6] * 4, dtype=torch.float64)
     other = batch.project_positions(flat, x, targets=lengths)
     assert ((other[1::3] - other[::3]).norm(dim=1) - 1).abs().max() < 1e-14
@@ -62,6 +64,8 @@ def test_a_failure_names_copy_and_row_when_it_is_looked_for():
     batch.check()
     assert not torch.equal(wrong[:9], far[:9]) and ((wrong[:3] - wrong[0]).norm(dim=1)[1] - 0.9572).abs() < 1e-13
     x[4, 1] = torch.nan
+    found = Batch([water(), water(0.1)], copies=2, check_every=9).project_positions(moved(batch, x), x)
+    assert ((found[1] - found[0]).norm() - 0.9572).abs() < 1e-13
     batch = Batch([water(), water(0.1)], copies=2)
     with pytest.raises(ConvergenceError, match="copy 1, row"):
         batch.project_positions(x, x)
@@ -96,9 +100,15 @@ def test_what_is_refused():
     v = torch.zeros_like(x)
     with pytest.raises(InputError, match=r"forces must have shape \(6, 3\), not \(1, 3\)"):
         rattle(batch, lambda x: x[:1], x, v, v, 0.1)
-    with pytest.raises(InputError, match="dt is -0"):
-        gbaoab(batch, lambda x: -x, x, v, v, -0.1, 1.0, 1.0)
-    assert torch.equal(rattle(batch, lambda x: -x, x, v, v, 0.0)[1], v)
+    for settings, item in (((-0.1, 1.0, 1.0), "dt"), ((0.1, -1.0, 1.0), "kT"), ((0.1, 1.0, -1.0), "friction")):
+        with pytest.raises(InputError, match=rf"{item} is -\d\.\d; give"):
+            gbaoab(batch, lambda x: -x, x, v, v, *settings)
+    for masses in (0.0 * batch.masses, -batch.masses, torch.nan * batch.masses):
+        with pytest.raises(InputError, match=r"masses\[0\] is .* above 0"):
+            batch.project_velocities(x, v, masses=masses)
+    with pytest.raises(InputError, match=r"v must be a tensor of shape \(6, 3\) or \(2, 3, 3\)"):
+        batch.project_velocities(x, v.reshape(3, 2, 3))
+    assert all(torch.equal(rattle(batch, lambda x: -x, x, v, v, zero)[1], v) for zero in (0.0, 0 * x.sum()))
     with pytest.raises(InputError, match=r"x_reference must be .*torch.float64 on cpu; convert it"):
         batch.project_positions(x, x.float())
     for item in ("masses", "targets"):
@@ -110,8 +120,9 @@ def test_what_is_refused():
                 other.project_positions(x, x)
     with pytest.raises(InputError, match=r"targets must be a tensor of shape \(6,\)"):
         batch.project_positions(x, x, targets=torch.ones(4, dtype=torch.float64))
-    with pytest.raises(InputError, match=r"a kcons.Motion and the number of copies"):
-        Batch([])
+    for wrong in ([], None):
+        with pytest.raises(InputError, match=r"a kcons.Motion and the number of copies"):
+            Batch(wrong)
     with pytest.raises(InputError, match=r"float64 or torch\.float32"):
         Batch(water(), dtype=torch.float16)
     for wrong in (0, "often"):

@@ -8,7 +8,7 @@ import torch
 import torch_sim as ts
 from torch_models import Drops, K, WithStress, drop, state_of
 
-from kcons.constraints import Distance, Plane, VelocityFormula
+from kcons.constraints import Distance, FixedAtoms, Plane, VelocityFormula
 from kcons.errors import InputError, UnsupportedError
 from kcons.torchsim import hold, langevin, nose_hoover, nve, report
 
@@ -89,6 +89,18 @@ def test_momentum_that_is_conserved_along_some_axes_is_refused():
         nose_hoover.init(state, Drops(), kT=300 * K, dt=1.0)
     assert torch.equal(state.rng.get_state(), numbers)
     langevin.init(state, Drops(), kT=300 * K)
+    hold(fixed := drop(1), [FixedAtoms([0, 1, 2])])
+    with pytest.raises(UnsupportedError, match=r"system 1 has no degrees of freedom left"):
+        nose_hoover.init(ts.concatenate_states([held(), fixed]), Drops(), kT=300 * K, dt=1.0)
+
+
+WRONG = [(langevin.step, "dt", -1.0), (nve.init, "kT", -1.0), (nve.step, "gamma", 5.0), (nose_hoover.init, "tau", 0)]
+
+
+@pytest.mark.parametrize(("call", "item", "value"), [*WRONG, (langevin.step, "kT", [1.0, 1.0, 1.0])], ids=str)
+def test_settings_that_are_none_are_refused(call, item, value):
+    with pytest.raises((InputError, TypeError), match=rf"{item} is .*; give|{item} has shape|argument '{item}'"):
+        call(nve.init(held(), Drops(), kT=300 * K), Drops(), **{"dt": 1.0, "kT": 300 * K, item: value})
 
 
 @pytest.mark.filterwarnings("ignore")  # TorchSim's own about constraints
@@ -108,9 +120,10 @@ def test_integrators_of_torchsim_are_refused(integrator):
     [
         (lambda state: setattr(state, "masses", 2 * state.masses), "mass"),
         (lambda state: setattr(state, "cell", 1.1 * state.cell), "cell"),
+        (lambda state: setattr(state, "pbc", False), "pbc"),
         (lambda state: state.positions[1].add_(0.1), "atom [012] 0.0.* off its constraints"),
     ],
-    ids=["masses", "cell", "positions"],
+    ids=["masses", "cell", "pbc", "positions"],
 )
 def test_a_state_that_has_become_another_is_refused(change, says):
     x = drop(2).positions.numpy()

@@ -12,14 +12,17 @@ MUTANTS = {
         ),
         "«batch.check()→pass»": "torchsim/torchsim_optimizers::steps_that_cannot_be_held_are_told",
         "self.system_idx + «system_offset→0»": "torchsim/torchsim_states::splitting_joining_popping_and_copies",
+        "state.row_vector_cell «* state.pbc[:, None]→»": "torchsim/torchsim_states::a_periodic_cell",
         "if «not same→False»:": "torchsim/torchsim_refusals::a_state_that_has_become_another_is_refused[masses]",
         "project=«project→True»)": "torchsim/torchsim_refusals::bad_input_is_named_and_leaves_the_state",
     },
     "torchsim/dynamics.py": {
         "away.max() > «FAR→1e9»": "torchsim/torchsim_refusals::a_state_that_has_become_another_is_refused[positions]",
-        "«_each(state, dt, atoms=True)→0.5 * _each(state, dt, atoms=True)»)\n    state.momenta": (
+        '«_each(state, dt, "dt", finite_number, True)→0.5 * _each(state, dt, "dt", finite_number, True)»': (
             "torchsim/torchsim_dynamics::constant_energy_is_the_trajectory_of_the_engine"
         ),
+        "kT=kT, at_rest=«True→False»)": "torchsim/torchsim_dynamics::momenta_are_drawn_from_the_canonical_distribution",
+        "    «rule(numbers.min().item(), item)→»\n": "torchsim/torchsim_refusals::settings_that_are_none_are_refused",
         "- 3 * «_free(self)→1»": "torchsim/torchsim_states::fixed_atoms_stay",
         "held.batch(state)«.check()→»\n    state.positions = positions": (
             "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"
