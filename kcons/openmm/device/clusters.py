@@ -276,8 +276,8 @@ class ItemWriter:
         return text
 
     def _sums(self, by: str) -> str:
-        summed = [k for k, row in enumerate(self.rows) if row.summed]
-        return "".join(f" ROWS_ADD({self.row_number}+{k}, {self._unit(k)}sum[{k}]{by})\n" for k in summed)
+        add = f" ROWS_ADD(rows_sums, rows_lost, {self.row_number}+"
+        return "".join(f"{add}{k}, {self._unit(k)}sum[{k}]{by})\n" for k, row in enumerate(self.rows) if row.summed)
 
     # -- functions -------------------------------------------------------------------------------
 

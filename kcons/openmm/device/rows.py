@@ -59,13 +59,13 @@ _COMMON = f"""
 #if defined(USE_DOUBLE_PRECISION) || defined(USE_MIXED_PRECISION)
 #define ROWS_PIVOT ((mixed) {PIVOT_TOLERANCE})
 #define ROWS_ROUNDING ((mixed) 4e-16)
-#define ROWS_ADD(row, impulse) rows_sums[row] -= impulse;
+#define ROWS_ADD(sums, lost, row, impulse) sums[row] -= impulse;
 #else
 #define ROWS_PIVOT ((mixed) {PIVOT_SINGLE})
 #define ROWS_ROUNDING ((mixed) 5e-7)
 /* What rounding takes from a long sum of single numbers comes back with the next one. */
-#define ROWS_ADD(row, impulse) {{volatile mixed y_ = -(impulse)-rows_lost[row], t_ = rows_sums[row]+y_; \
-  rows_lost[row] = (t_-rows_sums[row])-y_; rows_sums[row] = t_;}}
+#define ROWS_ADD(sums, lost, row, impulse) {{volatile mixed y_ = -(impulse)-lost[row], t_ = sums[row]+y_; \
+  lost[row] = (t_-sums[row])-y_; sums[row] = t_;}}
 #endif
 #define ROWS_DOT(a, b) ((a)[0]*(b)[0]+(a)[1]*(b)[1]+(a)[2]*(b)[2])
 #define ROWS_SHIFT(to, n) {{to[0] += n[0]*box0.x+n[1]*box1.x+n[2]*box2.x; \\
