@@ -298,7 +298,7 @@ _LOOK = f"""KERNEL void look(ARGUMENTS) {{
  }}
  for (int k = LOCAL_ID; k < MOST_GROUPS; k += LOCAL_SIZE) acc1 += partial[k+6*MOST_GROUPS];
 {_summed(["acc0", "acc1", "acc2"])} if (LOCAL_ID == 0) {{
-  looked[0] = shared[0]; looked[1] = shared[WG]; looked[6] = shared[2*WG];
+  looked[0] = shared[0]; looked[1] = NOTED; looked[6] = shared[2*WG];
   for (int k = 0; k < 3; k++) looked[2+k] = failure[k];
  }}
 }}
@@ -630,7 +630,8 @@ def plan(
     names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
     names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}
     names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(n)}
-    look = _LOOK
+    noted = "P_kT*P_friction > 0 ? shared[WG] : (mixed) -1" if described["noisy"] else "-1"
+    look = _with(_LOOK, {"NOTED": noted})
     if recorded:
         forces = "+".join(f"FORCE(force{k}, p, c)" for k in range(len(masks)))
         look += _with(_RECORD, {"COUNT": len(recorded), "FIRST": kernels.particles, "FORCES": forces})
