@@ -138,7 +138,7 @@ DEVICE void positions_large(ROWS int cluster, mixed h, mixed time, GLOBAL const 
         int k = (missed > 0 ? missed : -missed)-1;
         FAIL(ROWS_FIRST_LARGE+k, rows_off[k])
     }
-    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 2) ROWS_ADD(ROWS_FIRST_LARGE+k, rows_sum[k]/h)
+    for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 2) ROWS_ADD(rows_sums, rows_lost, ROWS_FIRST_LARGE+k, rows_sum[k]/h)
     SYNC_THREADS;
 }
 
@@ -159,7 +159,7 @@ DEVICE void velocities_large(ROWS int cluster, mixed rate, mixed time, GLOBAL co
         SYNC_THREADS;
         rows_solve(ROWS_PASS cluster, pass == 0, rows_there, rows_there, w);
         rows_push(ROWS_PASS cluster, rows_there, v, w);
-        if (rate != 0) for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 2) ROWS_ADD(ROWS_FIRST_LARGE+k, rows_answer[k])
+        if (rate != 0) for (int k = first+LOCAL_ID; k < rows_cluster[3*cluster+3]; k += LOCAL_SIZE) if (ROW(k, 6) & 2) ROWS_ADD(rows_sums, rows_lost, ROWS_FIRST_LARGE+k, rows_answer[k])
         SYNC_THREADS;
     } while (++pass < 2);
 }

@@ -142,7 +142,7 @@ class ItemWriter:
         for row, mine in zip(self.rows, shape.clusters.T, strict=True):
             self.targets.append(self._number((held.mover if row.moves else held.target)[mine], row))
             self.scales.append(self._number(held.scale[mine], row))
-            self.cells.append(self._number(held.cell[mine], row) if row.how == IN_CELLS else "")
+            self.cells.append(self._number(held.shift[mine], row) if row.how == IN_CELLS else "")
             self.parameters.append(f"n+{self.table.shape[1]}")
             self.table = np.column_stack([self.table, [held.parameters[i] for i in mine]])
 
@@ -276,8 +276,8 @@ class ItemWriter:
         return text
 
     def _sums(self, by: str) -> str:
-        summed = [k for k, row in enumerate(self.rows) if row.summed]
-        return "".join(f" ROWS_ADD({self.row_number}+{k}, {self._unit(k)}sum[{k}]{by})\n" for k in summed)
+        add = f" ROWS_ADD(rows_sums, rows_lost, {self.row_number}+"
+        return "".join(f"{add}{k}, {self._unit(k)}sum[{k}]{by})\n" for k, row in enumerate(self.rows) if row.summed)
 
     # -- functions -------------------------------------------------------------------------------
 
@@ -379,7 +379,7 @@ def large_clusters(shapes: list[Shape], held: Any, first_row: int) -> tuple[list
         np.searchsorted(entry_column[earlier], np.arange(count + 1)),
         [*flags, 0],
         [*np.where(moves, held.mover[rows], -1), 0],
-        [*held.cell[rows], 0],
+        [*held.shift[rows], 0],
     ]
     base = np.repeat([first_atom for _, first_atom, _ in clusters[:-1]], np.diff([first for first, _, _ in clusters]))
     tables: dict[str, Any] = {

@@ -48,7 +48,7 @@ class _Shared(ctypes.Structure):
     """What both sides read and write of an integrator, as plugin/steps.h has it."""
 
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("whole", "noisy", "every", "since", "moved", "bound", "planned")),
+        *((name, ctypes.c_int) for name in ("whole", "every", "since", "moved", "bound", "planned")),
         ("origin", ctypes.c_double),
         ("told", ctypes.c_double * 7),
     )
@@ -205,8 +205,6 @@ class DeviceIntegrator(ProjectedIntegrator):
         if description == self._described:
             return False
         self._described = description
-        spread = program.settings.get("kT", 0.0) * program.settings.get("friction", 0.0)
-        self.shared.noisy = self.ensemble.noisy and spread > 0
         held = [item.atoms for item in constraints_of(self.parts) if item.width > 1]
         pairs = [np.stack([atoms[:, :-1], atoms[:, 1:]], axis=2).ravel() for atoms in held]
         tied = np.concatenate([np.zeros(0), *pairs]).astype(np.int32)

@@ -58,9 +58,7 @@ _COMMON = """
 #define UNROLLED
 #endif
 #define XYZ UNROLLED for (int c = 0; c < 3; c++)
-#define GET_U(a, p) XYZ d[3*(a)+c] = kept[3*(p)+c];
-#define PUT_U(a, p) XYZ kept[3*(p)+c] = d[3*(a)+c];
-#define AWAY(a, p, sign) {mixed n_[3]; XYZ n_[c] = sign cells[4*(p)+c]; ROWS_SHIFT((x+3*(a)), n_)}
+#define AWAY(a, cell, sign) {mixed n_[3]; XYZ n_[c] = sign (cell)[c]; ROWS_SHIFT((x+3*(a)), n_)}
 /* In double precision Newton's last turn has all digits. */
 #ifdef USE_DOUBLE_PRECISION
 #define HELD_TO min(tolerance, (mixed) 1e-13)
@@ -300,7 +298,7 @@ _LOOK = f"""KERNEL void look(ARGUMENTS) {{
  }}
  for (int k = LOCAL_ID; k < MOST_GROUPS; k += LOCAL_SIZE) acc1 += partial[k+6*MOST_GROUPS];
 {_summed(["acc0", "acc1", "acc2"])} if (LOCAL_ID == 0) {{
-  looked[0] = shared[0]; looked[1] = shared[WG]; looked[6] = shared[2*WG];
+  looked[0] = shared[0]; looked[1] = NOTED; looked[6] = shared[2*WG];
   for (int k = 0; k < 3; k++) looked[2+k] = failure[k];
  }}
 }}
@@ -508,10 +506,10 @@ class Kernels:
             return
         sums = "acc0 += m*u*s; acc1 += m*u*u; acc2 += m*s*s;"
         each = f"if (w[a] != 0) XYZ {{mixed u = d[3*a+c], s = v[3*a+c], m = 1/w[a]; {sums}}}"
-        self._tangent(push, f" EACH {{{each} PUT_U(a, AT)}}\n }}\n", summed=True)
+        self._tangent(push, f" EACH {{{each} XYZ kept[3*(AT)+c] = d[3*a+c];}}\n }}\n", summed=True)
         self._gather(3)
         self._before += _once(_CLOSED_FORM, "keep", "push")
-        self._add(" {ROOM EACH {GET_U(a, AT) XYZ v[3*a+c] = keep*v[3*a+c]+push*d[3*a+c];}\n }\n")
+        self._add(" EACH XYZ v[3*a+c] = keep*v[3*a+c]+push*kept[3*(AT)+c];\n")
 
     def _chain(self, op: Op) -> None:
         self._add(" EACH if (w[a] != 0) XYZ acc0 += v[3*a+c]*v[3*a+c]/w[a];\n")
@@ -597,7 +595,7 @@ class Kernels:
             room = f" mixed x[{3 * n}], v[{3 * n}], w[{n}]; int at[{n}];\n EACH at[a] = RESTS({atom});\n"
             words |= {"EACH": f"UNROLLED {every}", "SYNC": "", "ROOM": f"mixed d[{3 * n}];"}
             words |= {"AT": "at[a]", "FIRST": "1"}
-        away = " AWAY(a, AT, {})" * bool(np.isin(shape.atoms, self.placed).any())
+        away = " AWAY(a, (cells+4*(AT)), {})" * bool(np.isin(shape.atoms, self.placed).any())
         load = f" EACH {{GET_V(a, AT) GET_X(a, AT){away.format('-')} if ({atom} < 0) w[a] = 0;}}\n"
         store = f" EACH if (w[a] != 0) {{PUT_V(a, AT){(away.format('+') + ' PUT_X(a, AT)') * self._moves}}}\n"
         return f" {loop} {{\n{_with(room + load + code + store, words)} }}\n"
@@ -632,27 +630,18 @@ def plan(
     names = {f"P_{name}": f"parameters[{k}]" for k, name in enumerate(parameters)}
     names |= {f"M_{name}": str(k) for k, name in enumerate(memory)}
     names |= {"LINKS": str(sum(name.startswith("link") for name in memory)), "PARTICLES": str(n)}
-    look = _LOOK
+    noted = "P_kT*P_friction > 0 ? shared[WG] : (mixed) -1" if described["noisy"] else "-1"
+    look = _with(_LOOK, {"NOTED": noted})
     if recorded:
         forces = "+".join(f"FORCE(force{k}, p, c)" for k in range(len(masks)))
         look += _with(_RECORD, {"COUNT": len(recorded), "FIRST": kernels.particles, "FORCES": forces})
-    source = "".join(f"#define {name} {text}\n" for name, text in names.items())
-    source += "".join([held.source, *kernels.source, look])
-    known = _words(source)
+    source = "".join([held.source, *kernels.source, look])
+    source = "".join(f"#define {name} {text}\n" for name, text in names.items() if name in source) + source
+    known = set(re.findall(r"\w+", source))  # launches cost less with fewer arguments
     arrays = [array._replace(passed=array.name in known) for array in arrays]
     source = preamble(platform, arrays, held.scratch, held.work_group, len(masks)) + source
     items = kernels.items + kernels.crowds * work_group
     return source, arrays, actions, (items, work_group, len(masks))
-
-
-def _words(text: str) -> set[str]:
-    """What is named in a text, by macros too if they are used: launches cost less with fewer arguments."""
-    macros = re.findall(r"#define (\w+)(.*)", (_COMMON + text).replace("\\\n", ""))
-    found, more = set[str](), set(re.findall(r"\w+", re.sub(r"#define.*", "", text)))
-    while more:
-        found |= more
-        more = {word for name, body in macros if name in more for word in re.findall(r"\w+", body)} - found
-    return found
 
 
 def room_for(particles: int) -> int:

@@ -59,13 +59,13 @@ _COMMON = f"""
 #if defined(USE_DOUBLE_PRECISION) || defined(USE_MIXED_PRECISION)
 #define ROWS_PIVOT ((mixed) {PIVOT_TOLERANCE})
 #define ROWS_ROUNDING ((mixed) 4e-16)
-#define ROWS_ADD(row, impulse) rows_sums[row] -= impulse;
+#define ROWS_ADD(sums, lost, row, impulse) sums[row] -= impulse;
 #else
 #define ROWS_PIVOT ((mixed) {PIVOT_SINGLE})
 #define ROWS_ROUNDING ((mixed) 5e-7)
 /* What rounding takes from a long sum of single numbers comes back with the next one. */
-#define ROWS_ADD(row, impulse) {{volatile mixed y_ = -(impulse)-rows_lost[row], t_ = rows_sums[row]+y_; \
-  rows_lost[row] = (t_-rows_sums[row])-y_; rows_sums[row] = t_;}}
+#define ROWS_ADD(sums, lost, row, impulse) {{volatile mixed y_ = -(impulse)-lost[row], t_ = sums[row]+y_; \
+  lost[row] = (t_-sums[row])-y_; sums[row] = t_;}}
 #endif
 #define ROWS_DOT(a, b) ((a)[0]*(b)[0]+(a)[1]*(b)[1]+(a)[2]*(b)[2])
 #define ROWS_SHIFT(to, n) {{to[0] += n[0]*box0.x+n[1]*box1.x+n[2]*box2.x; \\
@@ -114,13 +114,13 @@ def function_on_device(item: Constraint) -> Function:
     return found
 
 
-class DeviceRows:
+class DeviceRows(Engine):
     """What kernels hold: the System's constraints, pairs (n, 2) and lengths in nm (n,), and what was given beside them.
 
     Masses are 0 for particles that do not move; `positions` are on or near the constraints, nm, in a `cell` where rows
     take periodic images. Raises UnsupportedError for rows that only Python can compute and fixed atoms that move.
     Of the `set` of all rows, the System's first, `motion` is the engine; `scale` is the length held, 1 for all that is
-    no length; `mover` and `cell` are numbers of moving targets and where cells begin, of other rows those of the next.
+    no length; `mover` and `shift` are numbers of moving targets and where cells begin, of other rows those of the next.
     `shapes`, `arrays` and `source` belong to the functions ``positions_NAME`` and ``velocities_NAME`` as C, which need
     `scratch` numbers of LOCAL memory in work-groups of the size `work_group`. Particles that are `fixed` do not move;
     rows of those that are `placed` have a place in space, as a State tells of it. `renew` is due after `block` steps.
@@ -146,7 +146,8 @@ class DeviceRows:
                 )
         # Rows that were converted stand in another order: then all are summed.
         self._summed_from = 0 if motion.conversions else len(pairs)
-        self.motion, self.set, self.fixed = motion, motion.constraint_set, motion.fixed_atoms
+        super().__init__(motion, masses, cell)
+        self.set, self.fixed = motion.constraint_set, motion.fixed_atoms
         held, plan = self.set, motion.plan
         self.target = held.target(time)
         size = np.concatenate([item.scale(time) for item in held.constraints] or [np.zeros(0)])
@@ -175,7 +176,7 @@ class DeviceRows:
         self.functions = list(known)
         sizes = [[row.moves, 3 * len(a) * (row.how == IN_CELLS)] for row, a in zip(rows, atoms, strict=True)]
         ends = np.cumsum([[0, 0], *sizes], axis=0)
-        (self.mover, self.cell), (self.n_movers, self.n_cells) = ends[:-1].T, ends[-1].tolist()
+        (self.mover, self.shift), (self.n_movers, self.n_cells) = ends[:-1].T, ends[-1].tolist()
         found = alike(plan.labels, plan.eliminate_last, rows, atoms).items()
         self._write([Shape(e.atoms, tuple(r._replace(atoms=a) for r, a in key), e.rows) for key, e in found])
 
@@ -280,7 +281,7 @@ class KernelRows(CarriedConstraints):
         self.groups = frozenset().union(*(getattr(part, "groups", ()) for part in parts))
         #: Whether rows take periodic images: as `hold` was told, else as the System.
         self._wraps = not self._carried or any(part.motion.lattice is not None for part in self._carried)
-        self._bound: tuple[DeviceRows, Engine] | None = None
+        self._bound: DeviceRows | None = None
         self._of: tuple[Any, ...] = ()
         #: Time at which sums of multipliers began, and where the last call of `step` left it, ps.
         self._since = self.left = math.nan
@@ -312,10 +313,9 @@ class KernelRows(CarriedConstraints):
         made_of = tuple(array.tobytes() for array in (masses, pairs, lengths))
         if self._bound is None or self._of != made_of:
             cell = cell if self._wraps else None
-            rows = DeviceRows(masses, (pairs, lengths), self.given, positions, cell, time)
-            self._bound, self._of = (rows, Engine(rows.motion, masses, cell)), made_of
-            self._slopes = None
-        return self._bound[0]
+            self._bound = DeviceRows(masses, (pairs, lengths), self.given, positions, cell, time)
+            self._of, self._slopes = made_of, None
+        return self._bound
 
     def bind(self, context: openmm.Context) -> DeviceRows:
         """The rows for a Context, at its positions."""
@@ -324,24 +324,24 @@ class KernelRows(CarriedConstraints):
             refuse_virtual_sites(context.getSystem(), self.atoms, masses_of(context.getSystem()))
             self.program.integrator.read("seed")  # makes the plan, which asks `rows_at`
         assert self._bound is not None
-        return self._bound[0]
+        return self._bound
 
     @property
     def atoms(self) -> IntArray:
         """Particles that a row of the parts touches, and of the System's constraints once they are known."""
         if self._bound is not None:
-            return self._bound[1].atoms
+            return self._bound.atoms
         return np.unique(np.concatenate([_NONE, *(item.atoms.ravel() for item in self.given)]))
 
     @property
     def _engine(self) -> Any:  # type: ignore[override]
         if self._bound is None:
             raise InputError(
-                "these rows are known at the first step of a Context; call integrator.attach(context) after its "
-                "positions were set",
+                "these rows are known at the first step of a Context; call integrator.applyConstraints(context) "
+                "after its positions were set",
                 item="context",
             )
-        return self._bound[1]
+        return self._bound
 
     @property
     def driven(self) -> bool:

@@ -7,7 +7,7 @@ MUTANTS = {
         "step+({op.begun}), {{}}, «seed[0]→7»);": "device_integrator::noise_belongs_to_particle_and_step",
         "link[k] = (link[k]*damp+h*push«/2→»)*damp;": "device_integrator::settings_change_what_is_done",
         "self._tangent(push, «summed=True→»)": "kernel_rows::multipliers_of_ensembles_are_those_of_configurations",
-        'PUT_U(a, AT)}}\\n }}\\n", summed=«True→False»)': (
+        'd[3*a+c];}}\\n }}\\n", summed=«True→False»)': (
             "kernel_rows::multipliers_of_ensembles_are_those_of_configurations"
         ),
         "scale = 1+(1«-→+»cosine)*twice/2;": "molecule_spheres::trajectories_are_those_on_arrays",
@@ -16,7 +16,7 @@ MUTANTS = {
         "if «not item.n_rows→False»:": "rows::constraints_of_no_rows_hold_nothing",
         "np.isin(pairs, fixed).all(axis=1) «& rounded→»": "kernel_rows::fixed_atoms_of_rigid_water_in_single_precision",
         "#define ROWS_PIVOT ((mixed) {«PIVOT_SINGLE→PIVOT_TOLERANCE»})": "kernel_rows::multipliers_in_single_precision",
-        "{volatile mixed y_ = -(impulse)«-rows_lost[row]→», t_": "kernel_rows::multipliers_in_single_precision",
+        "{volatile mixed y_ = -(impulse)«-lost[row]→», t_": "kernel_rows::multipliers_in_single_precision",
         "part._engine._integrator = «weakref.ref(integrator)→other»": (
             "kernel_rows::states_with_energies_of_rows_of_hold_that_move"
         ),

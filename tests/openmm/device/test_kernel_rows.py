@@ -12,7 +12,7 @@ from openmm_systems import field as on_each
 
 from kcons import ConstraintSet, Motion, State, System
 from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms, Formula, LinearRelation, Plane, Sphere
-from kcons.errors import ContradictionError
+from kcons.errors import ContradictionError, InputError
 from kcons.openmm import Isokinetic, IsokineticSpheres, Langevin, NoseHoover, ProjectedIntegrator, hold
 from kcons.openmm.device import build
 from kcons.steppers import Rattle
@@ -98,6 +98,10 @@ def test_rows_of_hold_go_over_to_the_device(carried):
     # Before the first step of another Context, too.
     copied = copy.deepcopy(context.getIntegrator())
     fresh = started(system, copied, x)
+    with pytest.raises(InputError, match=r"call integrator\.applyConstraints\(context\) after its positions were set"):
+        _ = copied.parts[0].motion
+    copied.applyConstraints(fresh)
+    assert copied.parts[0].motion.rank == 27 + 6
     copied.setVelocitiesToTemperature(fresh, 300, 1)
     assert copied.parts[0].worst_violation(fresh) is None
     assert copied.degrees_of_freedom(fresh) == 81 - 27 - 6

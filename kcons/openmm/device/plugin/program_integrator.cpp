@@ -98,7 +98,7 @@ public:
         shared.moved = 0;                          // by barostats, which keep to the constraints
         vector<double> told = s.read("looked");    // the only wait of a call
         copy(told.begin(), told.end(), shared.told);
-        if (told[2] != 0 || !shared.noisy || count == 0) shared.told[1] = -1;
+        if (told[2] != 0 || count == 0) shared.told[1] = -1;
         if (told[2] != 0) {
             s.write("failure", {0, 0, 0});
             s.valid = false;
@@ -226,7 +226,7 @@ public:
         auto& i = *static_cast<const ProgramIntegrator*>(static_cast<const Integrator*>(object));
         node.setIntProperty("version", 1).setDoubleProperty("stepSize", i.getStepSize());
         node.setDoubleProperty("constraintTolerance", i.getConstraintTolerance());
-        node.setIntProperty("forceGroups", i.getIntegrationForceGroups()).setBoolProperty("noisy", i.shared.noisy);
+        node.setIntProperty("forceGroups", i.getIntegrationForceGroups());
         node.setStringProperty("description", i.description);
     }
     void* deserialize(const SerializationNode& node) const override {
@@ -234,7 +234,6 @@ public:
         i->setStepSize(node.getDoubleProperty("stepSize"));
         i->setConstraintTolerance(node.getDoubleProperty("constraintTolerance"));
         i->setIntegrationForceGroups(node.getIntProperty("forceGroups", -1));
-        i->shared.noisy = node.getBoolProperty("noisy", false);
         i->description = node.getStringProperty("description");
         return static_cast<Integrator*>(i);
     }

@@ -33,12 +33,11 @@ struct Action {
 // What Python reads and writes directly.
 struct Shared {
     int whole = 1;                 // whether others look at velocities between steps, which must then end
-    int noisy = 0;                 // whether the kinetic energy is that of the middle of the last step
     int every = 0, since = 0;      // steps from one record to the next, 0 for none, and the step that they count from
     int moved = 0;                 // whether others have set positions or velocities since the last step
     int bound = 0, planned = 0;    // whether there is a Context, and whether it has its kernels; not after reinitialize
     double origin = 0;             // time that kernels count from
-    double told[7] = {};           // by the kernel `look`, at the end of the last call: 1 is -1 where that does not hold
+    double told[7] = {};           // by the kernel `look`, at the end of the last call: 1 is -1 where it tells nothing
 };
 
 // Steps in one Context: what Python makes of an integrator for it, and how a platform runs that. n steps are the head,
