@@ -31,6 +31,7 @@ import harness  # noqa: E402
 import result_pictures  # noqa: E402
 import result_tables  # noqa: E402
 
+from kcons.comparison.machine import processor_of  # noqa: E402
 from kcons.steppers import RungeKuttaNystrom  # noqa: E402
 from kcons.steppers.splitting import SCHEMES  # noqa: E402
 
@@ -69,14 +70,16 @@ def markdown(table: pd.DataFrame) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in ([str(c) for c in table.columns], rules, *cells))
 
 
-def machine_of(data: Any) -> dict[str, Any]:
-    """The first record of a machine in a JSON file."""
+def runs_of(data: Any) -> dict[str, str]:
+    """The commits of a JSON file, each with its day and its processor."""
+    found: dict[str, str] = {}
     if isinstance(data, dict):
-        if "cpu" in data and "python" in data:
-            return data
+        if data.get("commit") and "cpu" in data:
+            found[data["commit"][:8]] = f"{data['date'][:10]}; {processor_of(data)}"
         data = list(data.values())
-    found = (machine_of(each) for each in data) if isinstance(data, list) else iter(())
-    return next(filter(None, found), {})
+    for each in data if isinstance(data, list) else ():
+        found = found | runs_of(each) | found
+    return found
 
 
 def steppers() -> pd.DataFrame:
@@ -105,10 +108,10 @@ def results(name: str) -> tuple[str, dict[str, pd.DataFrame]]:
         )
         return made, study(name).tables(table)
     data = json.loads((harness.RESULTS / f"{name}.json").read_text(encoding="utf-8"))
-    machine = machine_of(data) or {"commit": data.get("commit"), "cpu": data.get("machine")}
-    words = [f"Commit {machine['commit'][:8]}" if machine.get("commit") else "", str(machine.get("date", ""))[:10]]
-    place = f"{data['device'] + ' with ' if data.get('device') else ''}{machine.get('cpu', '')}"
-    made = f"{', '.join(filter(None, words))}; {place}; [all numbers](RESULTS/{name}.json)."
+    runs = runs_of(data) or {data["commit"][:8]: data["machine"]}
+    device = f"; {data['device']}" if data.get("device") else ""
+    words = "; commit ".join(f"{commit}, {run}" for commit, run in runs.items())
+    made = f"Commit {words}{device}; [all numbers](RESULTS/{name}.json)."
     return made, result_tables.TABLES[name](data)
 
 
