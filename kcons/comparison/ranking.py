@@ -102,7 +102,7 @@ class Ranking:
     """The cheapest setting of each method that is good enough, by place."""
 
     #: Rows of the comparison with 'place', 'cost' and 'times' (of the first). Methods whose costs differ by less than
-    #: the scatter share a place, the one with the shortest step, which is the simplest, first.
+    #: the scatter share a place, the one with the shortest step first, and of equal steps a usual method.
     table: pd.DataFrame
     #: The best row of each method that is not good enough.
     beyond: pd.DataFrame
@@ -151,6 +151,7 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: Positive | 
     beyond = done[~done.method.isin(good.method)].sort_values("error").drop_duplicates("method")
     same = scatter(table, cost)
     best = best.assign(place=_places(list(best.cost), same), times=best.cost / best.cost.min())
+    best = best.loc[best.method.isin(USUAL_METHODS).sort_values(ascending=False, kind="stable").index]
     return Ranking(
         table=best.sort_values(["place", "adaptive", "setting"], kind="stable"),
         beyond=beyond,
@@ -166,13 +167,11 @@ def rank(table: pd.DataFrame, criterion: Criterion = "error", limit: Positive | 
 def _places(costs: Sequence[float], same: float) -> list[int]:
     """Of costs in their order; those within the scatter of the first of a place share it."""
     places: list[int] = []
-    leader = -math.inf
+    place, leader = 1, -math.inf
     for number, cost in enumerate(costs, 1):
-        if cost > leader * (1 + same) or not places:
-            places.append(number)
-            leader = cost
-        else:
-            places.append(places[-1])
+        if cost > leader * (1 + same):
+            place, leader = number, cost
+        places.append(place)
     return places
 
 

@@ -132,13 +132,13 @@ def _places(found: Ranking, about: dict[str, Any]) -> str:
     }
     if found.cost == "evaluations" or "what" in about:
         del cells["timed"]
-    lines = [
-        pd.DataFrame({f" {name}": [f" {c}" for c in column] for name, column in cells.items()}).to_string(index=False)
-    ]
+    padded = {f" {name}": [f" {c}" for c in column] for name, column in cells.items()}
+    lines = [pd.DataFrame(padded).to_string(index=False)]
     if len(ranked) > PLACES:
         lines.append(f"... and {len(ranked) - PLACES} more")
-    lines += [f"Measured on {about['title']}.", f"cost: {COSTS[found.cost]} {_per(about)}. Costs that differ by less"]
-    lines[-1] += f" than {100 * found.scatter:.0f} % are equal (=)."
+    run = "" if "what" in about else f"; a run of {about['horizon']:g} {about['time']}"
+    lines += [f"Measured on {about['title']}{run}.", f"cost: {COSTS[found.cost]} {_per(about)}. Costs that differ"]
+    lines[-1] += f" by less than {100 * found.scatter:.0f} % are equal (=)."
     return "\n".join(lines)
 
 

@@ -184,6 +184,13 @@ def test_a_set_up_of_openmm_beyond_the_budget_is_refused_from_then_on():
 # -- times ------------------------------------------------------------------------------------------
 
 
+def test_kernels_of_kcons_are_loaded_before_a_budget_begins_also_in_openmm():
+    begun, names = [], ("openmm-verlet", "openmm-kcons-rattle")
+    methods = [replace(METHODS[name], start=lambda *_, name=name: begun.append(name)) for name in names]
+    measure.warm_up(test_systems.build("rotor"), methods, 1.0)
+    assert begun == ["openmm-kcons-rattle"]
+
+
 def test_short_runs_are_timed_in_rounds_and_long_ones_once():
     assert (table()[table().method == "rattle"].rounds >= 2).all()
     once = compare(chain(), ["rattle"], rounds=0)

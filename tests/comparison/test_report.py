@@ -29,6 +29,7 @@ def test_the_text_has_at_most_thirty_lines():
     assert len(shown.splitlines()) + 1 <= 30  # and one that says what was written
     assert shown.splitlines()[0].startswith("Use ") and "In Python:" in shown
     assert "... and" in shown and "are equal (=)" in shown
+    assert f"Measured on {table().attrs['title']}; a run of {table().attrs['horizon']:g} " in shown
     assert max(len(line) for line in shown.splitlines()[3:]) <= 100
 
 

@@ -19,7 +19,7 @@ MUTANTS = {
         "return x« / self.length, v / self.speed→, v»": "methods::lines_of_python_end_where_the_run_ends",
     },
     "comparison/ranking.py": {
-        "if «cost > leader * (1 + same) or not places→True»:": "ranking::costs_within_the_scatter_share_a_place",
+        "if «cost > leader * (1 + same)→True»:": "ranking::costs_within_the_scatter_share_a_place",
         "beyond = done«[~done.method.isin(good.method)]→»": "ranking::the_cheapest_that_is_as_good_as_the_usual",
     },
     "comparison/measure.py": {
