@@ -123,15 +123,19 @@ class Constraints(FixConstraint):
             self._forget(atoms)
             self.constraints, self._binding, self._own = bound.given, bound, True
         elif bound.periodic:
-            bound = self._in_cell(atoms, atoms.cell.array)
+            bound = self._in_cell(atoms, atoms.cell.array, bound)
         if len(atoms.constraints) > 1:
-            check_company(atoms.constraints, self, bound)
+            check_company(self._present(atoms), self, bound)
         return bound
 
-    def _in_cell(self, atoms: Atoms, cell: FloatArray) -> Binding:
+    def _present(self, atoms: Atoms) -> list[Any]:
+        """Constraints on the atoms, this object in the place of its copy: rows of a database ask one for the other."""
+        present: list[Any] = atoms.constraints
+        alike = (isinstance(item, Constraints) and np.array_equal(item.touched, self.touched) for item in present)
+        return present if self in present else [self if own else item for own, item in zip(alike, present, strict=True)]
+
+    def _in_cell(self, atoms: Atoms, cell: FloatArray, bound: Binding) -> Binding:
         """The engine, which knows the cell; an `InputError` leaves it as it was."""
-        bound = self._binding
-        assert bound is not None
         if not self._own and cell.tobytes() != bound.cell and bound.periodic:
             bound = self._binding = bind(self.constraints, atoms)
             self._own = True
@@ -185,8 +189,7 @@ class Constraints(FixConstraint):
             self._positions_due = CHECK_EVERY
         self._positions_due -= 1
         accepted.accept(x, cell)
-        if x is not new:
-            new[...] = x
+        new[...] = x
 
     @in_turn
     def redistribute_forces_md(self, atoms: Atoms, forces: FloatArray, rand: bool = False) -> None:
@@ -229,8 +232,7 @@ class Constraints(FixConstraint):
         due = self._momenta_due <= 0
         _project(bound, atoms.arrays["positions"], p, "momentum", certified=due)
         self._momenta_due = CHECK_EVERY - 1 if due else self._momenta_due - 1
-        if p is not momenta:
-            np.copyto(momenta, p, casting="unsafe")  # integers are all 0
+        np.copyto(momenta, p, casting="unsafe")  # integers are all 0
 
     @in_turn
     def adjust_stress(self, atoms: Atoms, stress: FloatArray) -> None:
@@ -249,20 +251,19 @@ class Constraints(FixConstraint):
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
         if self._binding is not None and self._binding.fits(atoms):
-            self._in_cell(atoms, as_float_array(cell, "cell"))
+            self._in_cell(atoms, as_float_array(cell, "cell"), self._binding)
 
     @in_turn
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place, also for forces that later objects add; any float dtype."""
-        bound, accepted, present = self._bound(atoms), self._accepted, atoms.constraints
+        bound, accepted, present = self._bound(atoms), self._accepted, self._present(atoms)
         f = bound.kernel_array(forces, "force")
         later = present[present.index(self) + 1 :] if self in present else ()
         added = with_added(atoms, np.zeros_like(f), later) if later else None
         f = f if added is None else f + added
         _project(bound, atoms.arrays["positions"], f, "force")
         f = f if added is None else f - added
-        if f is not forces:
-            np.copyto(forces, f, casting="unsafe")
+        np.copyto(forces, f, casting="unsafe")
         accepted.between_steps = True
 
     @in_turn
@@ -690,8 +691,7 @@ class ConstrainedCalculator(Calculator):
     def restore(self, atoms: Atoms) -> None:
         """Move `atoms` to the point on the constraints that energy and forces belong to."""
         x = atoms.get_positions()
-        motion = self.constraints.engine(atoms)
-        atoms.set_positions(motion.project_positions(x, x.copy()), apply_constraint=False)
+        atoms.set_positions(self.constraints.engine(atoms).project_positions(x, x), apply_constraint=False)
 
 
 # So that ASE's readers make this object again.
