@@ -133,10 +133,7 @@ class HamiltonianMonteCarlo:
         self.steps = step_range(steps)
         self.seed = seed_from(rng)
         self.keep, self.tolerance = keep, tolerance
-        self.integrator = _integrator_of(self.context)
-        self._masses = masses_of(self.context.getSystem())[:, None]
-        with np.errstate(divide="ignore"):
-            self._weights = np.where(self._masses > 0, 1 / self._masses, 0.0)
+        self._look()
         self._held = np.array([math.nan, *[0.0] * (SIZE - 1)])
         #: Proposals so far.
         self.number = 0
@@ -181,6 +178,7 @@ class HamiltonianMonteCarlo:
         InputError, UnsupportedError
             As for the first step of the integrator.
         """
+        self._look()
         for number in range(whole_number(proposals, "proposals", 0)):
             due = [] if self.simulation is None else [r for r in self.simulation.reporters if self._next(r) == 1]
             self._propose(first=number == 0)
@@ -194,10 +192,15 @@ class HamiltonianMonteCarlo:
 
     # -- a proposal -----------------------------------------------------------------------------
 
+    def _look(self) -> None:
+        """Refuse what cannot be sampled, and read masses, as the Context has them now."""
+        self.integrator = _integrator_of(self.context)
+        self._masses = masses_of(self.context.getSystem())[:, None]
+        self._weights = np.divide(1.0, self._masses, out=np.zeros_like(self._masses), where=self._masses > 0)
+
     def _propose(self, *, first: bool) -> None:
         """One proposal; before the `first` of a call others may have moved particles, or changed forces."""
-        held, context = self._held, self.context
-        number = self.number + 1
+        held, context, number = self._held, self.context, self.number + 1
         guard = self.integrator._watch(context)
         guard.enter()  # positions near the constraints are brought onto them
         x, time = positions_of(context), context.getTime()
@@ -263,7 +266,8 @@ class HamiltonianMonteCarlo:
         integrator.check(context)
         end = velocities_of(context)
         potential = self._potential()
-        change = self._kinetic(end) - self._kinetic(v) + (potential - float(self._held[POTENTIAL]))
+        kinetic = 0.5 * float((self._masses * (end * end - v * v)).sum())
+        change = kinetic + (potential - float(self._held[POTENTIAL]))
         if not math.isfinite(change):
             raise NonFiniteError("the energy is not finite", item="energy")
         if reversing:
@@ -283,9 +287,6 @@ class HamiltonianMonteCarlo:
 
     def _potential(self) -> float:
         return energy_of(self.context, self.integrator.getIntegrationForceGroups())
-
-    def _kinetic(self, v: FloatArray) -> float:
-        return 0.5 * float((self._masses * v * v).sum())
 
     # -- the Context ----------------------------------------------------------------------------
 
@@ -319,9 +320,8 @@ def _integrator_of(context: openmm.Context) -> ProjectedIntegrator:
         raise UnsupportedError(f"{integrator!r} makes no reversible steps; use 'rattle' or 'blanes-moan4'")
     if not isinstance(integrator.ensemble, ConstantEnergy):
         raise UnsupportedError(f"{integrator.ensemble!r} has no energy to accept or reject by; leave out ensemble")
-    moving = [part for part in integrator.parts if part.driven]
-    if moving:
-        raise UnsupportedError(f"{moving[0]!r} moves with time: there is no stationary density to sample")
+    for part in (part for part in integrator.parts if part.driven):
+        raise UnsupportedError(f"{part!r} moves with time: there is no stationary density to sample")
     for force in forces_of(context.getSystem()):
         name = type(force).__name__
         if any(other in name for other in OTHERS):

@@ -122,17 +122,11 @@ def test_reporters_of_a_simulation_see_every_proposal(rows):
     system, x = water_box(8)
     parts = [CollectiveRows(system, [bond(0, 3)], positions=x)] if rows else []
     topology = app.Topology()
-    chain = topology.addChain()
-    for _ in range(8):
-        residue = topology.addResidue("HOH", chain)
-        for name in ("O", "H", "H"):
-            topology.addAtom(name, app.Element.getBySymbol(name), residue)
-    simulation = app.Simulation(
-        topology,
-        system,
-        ProjectedIntegrator(0.005, parts=parts) if rows else reversing(0.005),
-        openmm.Platform.getPlatformByName("Reference"),
-    )
+    residue = topology.addResidue("HOH", topology.addChain())
+    for name in 8 * "OHH":
+        topology.addAtom(name, app.Element.getBySymbol(name), residue)
+    integrator = ProjectedIntegrator(0.005, parts=parts) if rows else reversing(0.005)
+    simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
     simulation.context.setPositions(x)
     sampler = HamiltonianMonteCarlo(simulation, 300 * unit.kelvin, 3, 5)
     told = io.StringIO()
@@ -151,8 +145,7 @@ def trimer(steps=(3, 8), dt=0.15, spring=0.0, **options):
     """Masses 10, 1, 10, two bonds held, each in a well if there is a spring; kT = 1."""
     well = [field(f"{spring}*(x^2+2*y^2+3*z^2)/2", 3)] if spring else []
     system = particles([10.0, 1.0, 10.0], *well, held=[(0, 1, 1.0), (1, 2, 1.0)])
-    integrator = HamiltonianMonteCarlo.reversing_integrator(dt * unit.picosecond)
-    context = started(system, integrator, np.array([[1.0, 0, 0], [0, 0, 0], [0, 1.0, 0]]))
+    context = started(system, reversing(dt * unit.picosecond), np.array([[1.0, 0, 0], [0, 0, 0], [0, 1.0, 0]]))
     return HamiltonianMonteCarlo(context, 1 / GAS_CONSTANT, steps, 21, **options)
 
 
@@ -203,16 +196,15 @@ def test_bad_input_changes_nothing():
         ({"tolerance": 0.0}, "tolerance is 0.0"),
     ):
         with pytest.raises(InputError, match=words):
-            sampler(HamiltonianMonteCarlo.reversing_integrator(1e-3), **options)
+            sampler(reversing(1e-3), **options)
     for integrator, others, words in (
         (openmm.VerletIntegrator(1e-3), (), "is no ProjectedIntegrator"),
         (ProjectedIntegrator(1e-3, ensemble=Langevin(300.0, 1.0)), (), "leave out ensemble"),
-        (HamiltonianMonteCarlo.reversing_integrator(1e-3), (openmm.CMMotionRemover(),), "removeCMMotion=False"),
-        (HamiltonianMonteCarlo.reversing_integrator(1e-3), (openmm.AndersenThermostat(300, 1),), "AndersenThermostat"),
+        (reversing(1e-3), (openmm.AndersenThermostat(300, 1),), "AndersenThermostat"),
     ):
         with pytest.raises(UnsupportedError, match=words):
             sampler(integrator, others)
-    good = sampler(HamiltonianMonteCarlo.reversing_integrator(1e-3))
+    good = sampler(reversing(1e-3))
     assert np.array_equal(state_of(good.context)[0], x)
 
 
@@ -220,7 +212,7 @@ def test_an_energy_that_is_not_finite_is_an_error():
     sampler = trimer()
     system = openmm.XmlSerializer.clone(sampler.context.getSystem())
     system.addForce(field("log(x-10)", 1))
-    context = started(system, HamiltonianMonteCarlo.reversing_integrator(0.01), state_of(sampler.context)[0])
+    context = started(system, reversing(0.01), state_of(sampler.context)[0])
     with pytest.raises(NonFiniteError, match="potential energy is nan"):
         HamiltonianMonteCarlo(context, 300, 2, 1).step(1)
 
@@ -236,6 +228,19 @@ def test_energies_are_asked_for_again_once_forces_have_changed():
     force.updateParametersInContext(sampler.context)
     sampler.step(1)
     assert abs(sampler.counts.change) < 1
+
+
+def test_the_system_is_read_anew_at_each_call():
+    sampler = trimer(dt=0.01, spring=1.0)
+    system, context = sampler.context.getSystem(), sampler.context
+    system.setParticleMass(1, 40.0)
+    context.reinitialize(preserveState=True)
+    sampler.step(5)
+    assert sampler.counts.mean_square < 1e-6
+    system.addForce(openmm.CMMotionRemover())
+    context.reinitialize(preserveState=True)
+    with pytest.raises(UnsupportedError, match=r"CMMotionRemover.*\(removeCMMotion=False\)"):
+        sampler.step(1)
 
 
 # -- drifts that are taken back -----------------------------------------------------------------------
