@@ -215,12 +215,11 @@ def _of_openmm(
     topology: Any, positions: unit.Quantity, system: openmm.System | None, velocities: unit.Quantity | None, part: Any
 ) -> tuple[Snapshot, list[Constraint]]:
     """A snapshot, and what a System and a part hold, in angstrom."""
-    from kcons.openmm.quantities import held_pairs, held_without_mass
+    from kcons.openmm.callback_rows import constraints_about
+    from kcons.openmm.quantities import held_without_mass
     from kcons.openmm.topology import snapshot_of as snapshot_of_topology
 
-    rows: list[Constraint] = []
-    if system is not None and system.getNumConstraints():
-        rows.append(Distance(*held_pairs(system)))
+    rows = [] if system is None else constraints_about(system, np.arange(system.getNumParticles()))
     if part is not None:
         rows += part.motion.constraint_set.constraints
     fixed = [item.atoms.ravel() for item in rows if item.fixes_atoms]

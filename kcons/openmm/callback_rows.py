@@ -104,7 +104,7 @@ def move_constraints(system: openmm.System, *, keep_water: bool = True) -> list[
     Returns
     -------
     list of Constraint
-        A Distance in nm; empty if there is nothing to take.
+        A Distance in nm, without those between two particles without mass; empty if there is nothing to take.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def move_constraints(system: openmm.System, *, keep_water: bool = True) -> list[
         No System.
     """
     table = _Table(system)
-    return table.release(table.all_but_water() if keep_water else table.all())
+    return table.release(table.all(keep_water))
 
 
 def hold(
@@ -170,7 +170,7 @@ def hold(
         raise InputError(f"take is {take!r}; give 'touched' or 'all'", item="take")
     chosen = table.sharing(np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)]))
     if take == "all":
-        chosen |= table.all_but_water() if keep_water else table.all()
+        chosen |= table.all(keep_water)
     part = CarriedConstraints(system, [*table.rows(chosen), *given], positions, periodic=periodic, time=time)
     # Nothing can fail from here on.
     table.release(chosen)
@@ -200,23 +200,23 @@ class _Table:
             )
         self.system = system
         self.pairs, self.lengths = held_pairs(system)
+        self.moving = (masses_of(system)[self.pairs] != 0).any(axis=1)
         self.clusters = components(system.getNumParticles(), self.pairs)
         self.cluster = self.clusters[self.pairs[:, 0]]
 
-    def all(self) -> NDArray[np.bool_]:
-        return np.ones(len(self.pairs), dtype=bool)
-
-    def all_but_water(self) -> NDArray[np.bool_]:
-        """All but those of molecules that are a triangle of constraints and nothing else."""
+    def all(self, keep_water: bool) -> NDArray[np.bool_]:
+        """All, or all but those of molecules that are a triangle of constraints and nothing else."""
         rows = np.bincount(self.cluster, minlength=len(self.clusters))[self.cluster]
         atoms = np.bincount(self.clusters)[self.cluster]
-        return (rows != 3) | (atoms != 3)
+        return (rows != 3) | (atoms != 3) | (not keep_water)
 
     def sharing(self, atoms: IntArray) -> NDArray[np.bool_]:
         """Constraints of the clusters that these atoms belong to; what is no particle is told later."""
         return np.asarray(np.isin(self.cluster, self.clusters[atoms[atoms < len(self.clusters)]]))
 
     def rows(self, chosen: NDArray[np.bool_]) -> list[Constraint]:
+        """Without those between two particles without mass, which OpenMM ignores."""
+        chosen = chosen & self.moving
         return [Distance(self.pairs[chosen], self.lengths[chosen])] if chosen.any() else []
 
     def release(self, chosen: NDArray[np.bool_]) -> list[Constraint]:

@@ -120,8 +120,8 @@ class Plan:
         if len(bad):
             row = int(rows[bad[0]])
             name, atoms = self.named.row_name(row), self.named.row_atoms(row)
-            said = "moves" if moving[bad[0]] else f"is off by {miss[row]:g}"
-            message = f"row {name} lies between fixed atoms and {said}; remove it or free one of its atoms"
+            said = "moves;" if moving[bad[0]] else f"is off by {miss[row]:g}; fix them where it holds,"
+            message = f"row {name} lies between fixed atoms and {said} remove it or free one of its atoms"
             raise ContradictionError(message, rows=[row], atoms=atoms)
 
     def least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:

@@ -42,7 +42,7 @@ SAID = {
     "X41": "ConvergenceError: .*too large for this geometry; use a smaller time step",
     "X60": "InfeasibleError: .*violate the triangle inequality",
     "X62": "NonFiniteError: non-finite force at step 50 on atom 0.*The state before this step is intact",
-    "X70": r"ContradictionError: row #6 Distance\(0, 1\) lies between fixed atoms and is off by 0\.01; remove it",
+    "X70": r"ContradictionError: row #6 Distance\(0, 1\) lies between fixed atoms and is off by 0\.01; fix them",
 }
 #: What differs in the adapters: degrees of freedom, bad masses, thermostats, starts off the constraints, long steps.
 IN_ENGINES = ("H05", "H13", "H17", "H20", "H22", "H23", "H24", "H39", "X04", "X33", "X40")

@@ -292,9 +292,11 @@ def test_converted_atoms_carry_constraints():
         (held,) = atoms.constraints
         assert len(atoms) == len(group) and held.get_removed_dof(atoms) == removed
     made = to_openmm(ethane)
-    made.system.setParticleMass(3, 0.0)  # OpenMM does not move it
+    for k in (3, 4):
+        made.system.setParticleMass(k, 0.0)  # OpenMM does not move it, and ignores what ties it to another
+    made.system.addConstraint(3, 4, 9.0)
     (held,) = openmm_to_ase(made.topology, made.positions, made.system).constraints
-    assert held.get_indices().tolist() == [3]
+    assert held.get_indices().tolist() == [3, 4]
     for options, words in (
         ({"constraints": 3}, "constraints has 3"),
         ({"constrain": "hbonds", "constraints": [one]}, "not both"),

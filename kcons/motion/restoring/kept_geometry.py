@@ -296,8 +296,8 @@ class Geometry:
         what = ("the bond " if len(atoms) == 2 else "the angle ") + "-".join(str(a) for a in atoms)
         return InfeasibleError(
             f"row {held.row_name(row)} was reached only with {what} changed {words}, which no row asks for. Start "
-            "nearer to the target, check the bonds, or hold what may change; restore(..., bonds=[]) of the constraints "
-            "in ASE, restore_positions(..., bonds=[]) of a Motion look at nothing but the rows",
+            "nearer to the target, check the bonds, or hold what may change; Constraints(rows).restore(atoms, "
+            "bonds=[]) in ASE, restore_positions(..., bonds=[]) of a Motion look at nothing but the rows",
             residual=float(self.misfit[row]),
             row=row,
             atoms=held.row_atoms(row),

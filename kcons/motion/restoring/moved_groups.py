@@ -93,7 +93,7 @@ def restored(
             wrong = geometry.changed(found, strict=geometry.turned)
             if wrong is None:
                 return found
-        error = wrong
+        error = error if isinstance(error, InfeasibleError) else wrong
     assert error is not None
     raise error
 
