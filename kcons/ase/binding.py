@@ -204,8 +204,8 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
         if len(both):
             raise UnsupportedError(
                 f"{type(other).__name__} acts on atom {both[0]}, which kcons holds too; ASE would apply the two "
-                "one after the other, and neither would hold. Put all of it into one Constraints object, if kcons has a "
-                "counterpart: attach(atoms) does so for what is on the atoms; for new rows, held = "
+                "one after the other, and neither would hold. Put all of it into one Constraints object, if kcons has "
+                "a counterpart: attach(atoms) does so for what is on the atoms; for new rows, held = "
                 "from_ase_constraints(atoms), atoms.set_constraint(), constrain(atoms, [*held, *new])"
             )
     bound.others = now

@@ -53,8 +53,8 @@ def translated(atoms: Atoms, items: Iterable[Any]) -> list[Constraint]:
         name = type(item).__name__
         if name not in _TRANSLATORS:
             raise UnsupportedError(
-                f"{name} has no counterpart in kcons; known are {', '.join(sorted(_TRANSLATORS))}. Take it off, or hold "
-                "what it means by a LinearCombination, a Formula or a Custom constraint"
+                f"{name} has no counterpart in kcons; known are {', '.join(sorted(_TRANSLATORS))}. Take it off, or "
+                "hold what it means by a LinearCombination, a Formula or a Custom constraint"
             )
         result.extend(_TRANSLATORS[name](atoms, item))
     return result

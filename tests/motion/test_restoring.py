@@ -196,7 +196,7 @@ def test_without_bonds_the_nearest_point_as_asked() -> None:
     assert np.flatnonzero(np.linalg.norm(x - ring.positions, axis=1) > 1e-12).tolist() == [0, 1]
     bonds, lengths = bond_table(ring), shape(ring, ring.positions)[0]
     ring.rattle(0.02, seed=2)
-    with pytest.raises(InfeasibleError, match="2-1-7 changed from 123.8 to 121.5"):  # as at the nearest point
+    with pytest.raises(InfeasibleError, match=r"2-1-7 changed from 123\.8 to 121\.5"):  # as at the nearest point
         engine(ring, [held.Distance(bonds, lengths)]).restore_positions(ring.positions, bonds=bonds)
 
 
