@@ -390,7 +390,7 @@ class RigidTurn(NamedTuple):
         return e / norm(e)[..., None]
 
 
-def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray) -> None:
+def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray, stacklevel: int) -> None:
     """Warn of torsions over atoms that are not bonded: most often the atoms are in another order than the chain.
 
     Not of improper torsions, where one atom is bonded to the three others, nor of atoms without any bond.
@@ -406,7 +406,7 @@ def warn_of_gaps(coordinates: Mapping[str, Constraint], bonds: IntArray) -> None
                 warnings.warn(
                     f"{name} is a torsion over the atoms {', '.join(map(str, four))}, counted from 0, and {said}; give "
                     "the atoms in the order in which they are bonded, unless this is what you mean",
-                    stacklevel=4,
+                    stacklevel=stacklevel,
                 )
 
 

@@ -176,7 +176,7 @@ class _Wavefront:
             for value in axis.tolist():
                 item.with_target(value).check(self.start[item.atoms], 0.0, 0)
         self._bonds = bonds_of(self.atoms)
-        warn_of_gaps({item.row_name(0): item for item in grid.coordinates}, self._bonds)
+        warn_of_gaps({item.row_name(0): item for item in grid.coordinates}, self._bonds, stacklevel=5)
         #: Where relaxations are kept.
         self.place: Path | None = None
         #: The attempt whose structure a point has handed on to its neighbors.

@@ -172,7 +172,7 @@ class Sampler(ABC):
         self.held = list(everything.constraints[: len(held)])
         there = HeldCoordinates(everything, self.coordinates, positions)
         self.start, self.periods = everything.measure(positions)[there.rows], there.periods
-        warn_of_gaps(self.coordinates, bonds)
+        warn_of_gaps(self.coordinates, bonds, stacklevel=4)
 
     @property
     @abstractmethod

@@ -229,5 +229,6 @@ def test_large_structures_need_no_table(monkeypatch):
 def test_a_torsion_over_atoms_that_are_not_bonded():
     atoms = molecule("trans-butane")
     atoms.calc = EMT()
-    with pytest.warns(UserWarning, match=r"the atoms 2, 0, 1, 3, counted from 0, and 2-0, 1-3 are no bonds; give"):
+    with pytest.warns(UserWarning, match=r"2, 0, 1, 3, counted from 0, and 2-0, 1-3 are no bonds; give") as told:
         scan(atoms, Dihedral([[2, 0, 1, 3]]), [1.0], evaluations=1, fmax=100.0)
+    assert told[0].filename == __file__
