@@ -173,8 +173,9 @@ class _Wavefront:
         there = HeldCoordinates(motion, dict(zip(grid.keys, grid.coordinates, strict=True)), self.start)
         self._measured = motion.sources[0].measure(self.start)[there.rows].tolist()
         for item, axis in zip(grid.coordinates, grid.values, strict=True):
+            weighted = item.with_masses(bare.get_masses()[item.atoms])
             for value in axis.tolist():
-                item.with_target(value).check(self.start[item.atoms], 0.0, 0)
+                weighted.with_target(value).check(self.start[item.atoms], 0.0, 0)
         self._bonds = bonds_of(self.atoms)
         warn_of_gaps({item.row_name(0): item for item in grid.coordinates}, self._bonds, stacklevel=5)
         #: Where relaxations are kept.

@@ -416,11 +416,10 @@ def refuse_agents(
         name = type(force).__name__
         moves, scales = isinstance(force, openmm.CMMotionRemover), name in BAROSTATS and force.getFrequency() > 0
         if bound is not None and (moves or scales):
-            what = "shifts all velocities" if moves else "moves molecules"
             way = "createSystem(..., removeCMMotion=False)" if moves else "constant volume"
             raise UnsupportedError(
-                f"{name} {what}, and {bound} holds particles in space: take it out of the System ({way}), or hold "
-                "differences of positions only"
+                f"{name} moves what {bound} holds in space: take it out of the System ({way}), or hold differences of "
+                "positions only"
             )
         if isinstance(force, openmm.AndersenThermostat):
             raise UnsupportedError(f"{name} draws velocities of single atoms, which makes rows cold; use Langevin")

@@ -11,7 +11,7 @@ from ase.calculators.emt import EMT
 from ase.constraints import ExternalForce, FixAtoms, Hookean
 from scan_systems import chain, threefold, two_wells
 
-from kcons.constraints import Custom, Dihedral, Distance
+from kcons.constraints import CenterDistance, Custom, Dihedral, Distance
 from kcons.errors import CalculatorError, InputError, OccupiedError, UnreadableError
 from kcons.free_energy import scan
 
@@ -98,16 +98,17 @@ def test_what_else_is_held_stays():
     """Constraints of kcons and of ASE; those that only add forces count in the energy."""
     atoms = chain(5, threefold)
     atoms.set_constraint(FixAtoms([0]))
-    place = atoms.positions[0].copy()
     found = scan(atoms, Dihedral([[1, 2, 3, 4]]), [0.5, 0.6], held=Distance([[2, 3]], 1.5), fmax=2e-3)
     for attempt in found.best.values():
-        np.testing.assert_allclose(attempt.positions[0], place, atol=1e-14)
+        np.testing.assert_allclose(attempt.positions[0], atoms.positions[0], atol=1e-14)
         assert abs(np.linalg.norm(attempt.positions[2] - attempt.positions[3]) - 1.5) < 1e-14
     np.testing.assert_allclose(found.energies, profile([0.5, 0.6]) + 15 * 0.1**2, atol=2e-6)
     atoms.set_constraint(Hookean(0, 4, k=1.0, rt=3.0))
     pulled = scan(atoms, TURN, [0.5], fmax=2e-3)
     assert pulled.energies[0] > profile(0.5) + 0.01
     assert [type(item) for item in atoms.constraints] == [Hookean]
+    pair = [scan(atoms, row, [1.5], fmax=2e-3).energies for row in (Distance([[0, 1]]), CenterDistance([0], [1]))]
+    np.testing.assert_allclose(*pair, atol=1e-6)
 
 
 def test_one_failed_point_does_not_stop_the_others():
