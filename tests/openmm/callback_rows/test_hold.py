@@ -188,7 +188,7 @@ def test_a_barostat_of_frequency_0_is_off():
     _context = started(system, integrator := ProjectedIntegrator(0.001, parts=parts), x)
     integrator.step(1)
     next(force for force in system.getForces() if type(force) is openmm.MonteCarloBarostat).setFrequency(5)
-    with pytest.raises(UnsupportedError, match="MonteCarloBarostat moves molecules"):
+    with pytest.raises(UnsupportedError, match="MonteCarloBarostat moves what"):
         integrator.step(1)
 
 
