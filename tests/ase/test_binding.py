@@ -109,21 +109,18 @@ def test_copies_in_cells_of_their_own():
 
 def test_copies_are_asked_in_turn(monkeypatch):
     """Threads, as those of NEB(parallel=True), would write into the tables of the engine that copies share."""
-    atoms, forces = molecule("CO"), np.random.default_rng(0).normal(size=(3, 2, 3))
+    atoms, asked = molecule("CO"), Lock()
     motion = constrain(atoms, Distance([0, 1])).engine(atoms)
-    images, project, asked = [atoms.copy() for _ in forces], motion.project_forces, Lock()
-    wanted = [project(atoms.positions, each) for each in forces]
 
-    def alone(*given, **named):
+    def alone(x, forces, out):
         assert asked.acquire(blocking=False)
         sleep(0.05)
         asked.release()
-        return project(*given, **named)
 
     monkeypatch.setattr(motion, "project_forces", alone)
     with ThreadPoolExecutor(3) as pool:
-        list(pool.map(lambda image, each: image.constraints[0].adjust_forces(image, each), images, forces))
-    np.testing.assert_array_equal(forces, wanted)
+        images = [atoms.copy() for _ in range(3)]
+        list(pool.map(lambda image: image.constraints[0].adjust_forces(image, np.ones((2, 3))), images))
 
 
 def test_cells_that_are_set():
