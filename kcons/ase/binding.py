@@ -311,7 +311,7 @@ class AcceptedPositions:
 
         `UnsupportedError` where the last corrections were larger than any usable time step makes them.
         """
-        found = compared(old, self._positions, new, self.asked)
+        found: int = compared(old, self._positions, new, self.asked)
         if self._momenta_since:
             if found & LARGE and np.isfinite(self.asked).all():
                 self._refuse_absurd(held)
@@ -323,7 +323,7 @@ class AcceptedPositions:
         elif self._momenta_since:
             self._again = True
         self._momenta_since = False
-        return int(found)
+        return found
 
     def accept(self, new: FloatArray, cell: bytes) -> None:
         """Remember the corrected positions."""
@@ -444,7 +444,7 @@ def differ(a: FloatArray, b: FloatArray) -> bool:
     return a.tobytes() != b.tobytes()
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def compared(old, accepted, new, asked):  # type: ignore[no-untyped-def]
     """The sum of what is found of ELSEWHERE, NEW, FAR and LARGE."""
     x, known, y, last = old.ravel(), accepted.ravel(), new.ravel(), asked.ravel()
