@@ -7,10 +7,9 @@ constraints accepted last.
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import wraps
 from math import isfinite
 from threading import RLock
 from typing import Any
@@ -23,12 +22,12 @@ from numpy.typing import NDArray
 
 from kcons.ase.topology import velocities_of
 from kcons.constraints import Constraint
-from kcons.constraints.arguments import as_float_array, finite_array
+from kcons.constraints.arguments import as_array, as_float_array, finite_array
 from kcons.constraints.compilation import njit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion.certificate import off_row
 from kcons.motion.motion import Motion
 from kcons.thermostats.cells import constraint_virial, rows_open
@@ -79,20 +78,8 @@ BY_ENERGIES = "use MonteCarloBarostat, or virial='difference' of a PressureRepor
 STRESSLESS = f"forces that constraints of ASE add have no stress; put them into the calculator, or {BY_ENERGIES}"
 
 _PLURAL = {"position": "positions", "momentum": "momenta", "force": "forces"}
-_FLOAT = np.dtype(np.float64)
 #: Of engines, which copies of atoms share: the images of NEB(parallel=True) ask them in threads.
 IN_TURN = RLock()
-
-
-def in_turn(hook: Callable[..., Any]) -> Callable[..., Any]:
-    """The method, for one thread at a time."""
-
-    @wraps(hook)
-    def asked(*given: Any, **named: Any) -> Any:
-        with IN_TURN:
-            return hook(*given, **named)
-
-    return asked
 
 
 @dataclass
@@ -104,47 +91,47 @@ class Binding:
     made_for: tuple[Any, ...]
     periodic: bool
     cell: bytes
-    #: m and 1/m (0 for fixed atoms) for each component, and room for velocities; None if only some atoms are held.
-    weights: tuple[FloatArray, FloatArray, FloatArray] | None
+    #: Whether rows touch some atoms only, so that solvers do not see the others.
+    partial: bool
     #: Other constraints on the atoms, and what these held when they were looked at.
     others: tuple[Any, ...] = ()
-
-    def fits(self, atoms: Atoms) -> bool:
-        """Whether number of atoms, periodicity and masses are still the same."""
-        return _read_by_engine(atoms) == self.made_for
 
     def follow_cell(self, atoms: Atoms, cell: FloatArray) -> None:
         """Let the engine know the cell, if it has changed; an `InputError` leaves it as it was."""
         content = cell.tobytes()
-        if self.periodic and content != self.cell:
-            self.motion.set_cell(cell, atoms.pbc, atoms.arrays["positions"])
+        if content != self.cell:
+            if self.periodic:
+                self.motion.set_cell(cell, atoms.pbc, atoms.arrays["positions"])
             self.cell = content
 
     def kernel_array(self, values: NDArray[Any], what: str) -> FloatArray:
         """The array itself where kernels can write to it, else a copy; integers and what is not finite are refused."""
-        array = values
-        if values.dtype is not _FLOAT or not values.flags.c_contiguous:
-            # The answer is written into `values`, which would cut it; that for momenta and forces of 0 is 0.
-            if values.dtype.kind in "biu" and (what == "position" or values.any()):
-                raise InputError(
-                    f"{_PLURAL[what]} are integers ({values.dtype}), which cannot hold what the constraints leave of "
-                    "them; give floats, for example array.astype(float)",
-                    item=what,
-                )
-            array = np.array(values, np.float64, order="C")
-        wanted = (self.motion.n_atoms, 3)
-        if array.shape != wanted:
-            raise InputError(f"{_PLURAL[what]} must have shape {wanted}, not {array.shape}", item=what)
-        if self.weights is None and not isfinite(np.vdot(array, array)):
+        array = as_array(values, (self.motion.n_atoms, 3), _PLURAL[what])
+        # The answer is written into `values`, which would cut it; that for momenta and forces of 0 is 0.
+        if array is not values and values.dtype.kind in "biu" and (what == "position" or values.any()):
+            raise InputError(
+                f"{_PLURAL[what]} are integers ({values.dtype}), which cannot hold what the constraints leave of "
+                "them; give floats, for example array.astype(float)",
+                item=what,
+            )
+        if self.partial and not isfinite(np.vdot(array, array)):
             refuse_not_finite(array, what)
         return array
 
+    def projected(self, x: FloatArray, values: FloatArray, what: str, out: FloatArray | None) -> FloatArray:
+        """Momenta, or forces, without what leaves the constraints: p - A^T (A M^-1 A^T)^-1 A M^-1 p."""
+        try:
+            return self.motion.project_forces(x, values, out=out)
+        except KconsError:
+            refuse_not_finite(values, what)
+            raise
 
-def _read_by_engine(atoms: Atoms) -> tuple[Any, ...]:
-    """What an engine is made of besides rows and cell; every hook asks: bytes, compared in part of a microsecond."""
+
+def read_by_engine(atoms: Atoms) -> tuple[Any, ...]:
+    """Periodicity and masses, of which an engine is made besides rows and cell; every hook asks, so bytes."""
     arrays = atoms.arrays
     name = "masses" if "masses" in arrays else "numbers"
-    return len(arrays["positions"]), atoms.pbc.tobytes(), name, arrays[name].tobytes()
+    return atoms.pbc.tobytes(), name, arrays[name].tobytes()
 
 
 def refuse_not_finite(values: FloatArray, what: str) -> None:
@@ -169,10 +156,10 @@ def bind(given: Sequence[Constraint], atoms: Atoms, time: float = 0.0) -> Bindin
     return Binding(
         motion=motion,
         given=held.constraints,
-        made_for=_read_by_engine(atoms),
+        made_for=read_by_engine(atoms),
         periodic=periodic,
         cell=atoms.cell.array.tobytes(),
-        weights=_weights(motion) if len(held.touched) == len(atoms) else None,
+        partial=len(held.touched) < len(atoms),
     )
 
 
@@ -241,16 +228,6 @@ def touched_atoms(constraints: Sequence[Constraint]) -> IntArray:
     return np.unique(np.concatenate(atoms)) if atoms else np.zeros(0, dtype=np.int64)
 
 
-def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
-    masses = np.repeat(motion.masses, 3).reshape(-1, 3)
-    for item in motion.constraint_set.constraints:
-        if item.fixes_atoms:
-            masses[item.atoms.ravel()] = np.inf
-    inverse_masses = 1.0 / masses
-    masses[np.isinf(masses)] = 0.0
-    return masses, inverse_masses, np.empty_like(masses)
-
-
 def applied_forces(atoms: Atoms) -> FloatArray:
     """Forces of the calculator and of ASE objects that only add forces; a copy."""
     return with_added(atoms, atoms.get_forces(apply_constraint=False))
@@ -284,16 +261,18 @@ class AcceptedPositions:
         self._positions, self._before, self.asked = np.full((3, n_atoms, 3), np.nan)
         self._momenta_since = self._again = False
         self._repeats = self._absurd = 0
+        #: Calls of the hooks until what they find is certified.
+        self.positions_due = self.momenta_due = 0
 
-    def in_another(self, cell: FloatArray) -> bool:
+    def in_another(self, cell: bytes) -> bool:
         """Whether positions were accepted in another cell than this."""
-        return self._cell is not None and cell.tobytes() != self._cell
+        return self._cell is not None and cell != self._cell
 
-    def know(self, x: FloatArray, cell: FloatArray) -> None:
+    def know(self, x: FloatArray, cell: bytes) -> None:
         """Accept positions that are on the constraints."""
-        self._positions[...], self._cell = x, cell.tobytes()
+        self._positions[...], self._cell = x, cell
 
-    def look(self, motion: Motion, x: FloatArray, cell: FloatArray, *, elsewhere: bool = False) -> bool:
+    def look(self, motion: Motion, x: FloatArray, cell: bytes, *, elsewhere: bool = False) -> bool:
         """Whether positions before a step, or where momenta are set, may stay: near enough to the constraints.
 
         What they are off by less than START_TOLERANCE the next step puts right, along the rows, which momenta then
@@ -321,19 +300,18 @@ class AcceptedPositions:
         self.between_steps = False
         return good
 
-    def _scaled(self, motion: Motion, x: FloatArray, cell: FloatArray) -> bool:
+    def _scaled(self, motion: Motion, x: FloatArray, cell: bytes) -> bool:
         """Whether positions are those accepted last but for a change of the cell that took them along."""
-        before = np.frombuffer(self._cell or b"").reshape(3, 3)
-        refuse_taken_along(motion, self._positions, before, x, cell)
-        moved = self._positions @ deformation(before, cell)
-        return float(np.abs(moved - x).max(initial=0.0)) <= START_TOLERANCE
+        before, after = (np.frombuffer(each or b"").reshape(3, 3) for each in (self._cell, cell))
+        refuse_taken_along(motion, self._positions, before, x, after)
+        return _near(self._positions @ deformation(before, after), x)
 
     def ask(self, held: ConstraintSet, old: FloatArray, new: FloatArray) -> int:
         """Remember positions before they are corrected; what `compared` finds of them.
 
         `UnsupportedError` where the last corrections were larger than any usable time step makes them.
         """
-        found = compared(old, self._positions, new, self.asked)
+        found: int = compared(old, self._positions, new, self.asked)
         if self._momenta_since:
             if found & LARGE and np.isfinite(self.asked).all():
                 self._refuse_absurd(held)
@@ -341,14 +319,13 @@ class AcceptedPositions:
                 self._absurd = 0
         if found & NEW:
             self._repeats, self._again = self._repeats + 1 if self._again else 0, False
-            np.copyto(self._before, self._positions)
-            np.copyto(self.asked, new)
+            self._before[...], self.asked[...] = self._positions, new
         elif self._momenta_since:
             self._again = True
         self._momenta_since = False
-        return int(found)
+        return found
 
-    def accept(self, new: FloatArray, cell: FloatArray) -> None:
+    def accept(self, new: FloatArray, cell: bytes) -> None:
         """Remember the corrected positions."""
         self.know(new, cell)
         if self._again and (_near(self.asked, new) or _near(self._before, new)):
@@ -467,7 +444,7 @@ def differ(a: FloatArray, b: FloatArray) -> bool:
     return a.tobytes() != b.tobytes()
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def compared(old, accepted, new, asked):  # type: ignore[no-untyped-def]
     """The sum of what is found of ELSEWHERE, NEW, FAR and LARGE."""
     x, known, y, last = old.ravel(), accepted.ravel(), new.ravel(), asked.ravel()

@@ -28,7 +28,7 @@ from kcons.ase.binding import (
     bind,
     check_company,
     fulfilled,
-    in_turn,
+    read_by_engine,
     refuse_not_finite,
     refuse_taken_along,
     stress_of_rows,
@@ -42,7 +42,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.arguments import as_float_array
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
+from kcons.errors import CertificateError, ConvergenceError, InputError, UnsupportedError
 from kcons.motion.certificate import CHECK_EVERY
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
@@ -115,15 +115,15 @@ class Constraints(FixConstraint):
     def _bound(self, atoms: Atoms) -> Binding:
         if self._last is None or self._last() is not atoms:
             self._last = ref(atoms)
-            self._forget(atoms)
-        bound = self._binding
-        if bound is None or not bound.fits(atoms):
+            self._accepted = AcceptedPositions(len(atoms))
+        bound, cell = self._binding, atoms.cell.array
+        if bound is None or bound.made_for != read_by_engine(atoms):
             _refuse_moving(self.constraints)
             bound = bind(self.constraints, atoms)
-            self._forget(atoms)
+            self._accepted = AcceptedPositions(len(atoms))
             self.constraints, self._binding, self._own = bound.given, bound, True
-        elif bound.periodic:
-            bound = self._in_cell(atoms, atoms.cell.array, bound)
+        elif bound.cell != cell.tobytes():
+            bound = self._in_cell(atoms, cell, bound)
         if len(atoms.constraints) > 1:
             check_company(self._present(atoms), self, bound)
         return bound
@@ -142,15 +142,8 @@ class Constraints(FixConstraint):
         bound.follow_cell(atoms, cell)
         return bound
 
-    def _forget(self, atoms: Atoms) -> None:
-        """What is known of the positions is void."""
-        self._accepted = AcceptedPositions(len(atoms))
-        #: Calls of each hook until its result is certified.
-        self._positions_due = self._momenta_due = 0
-
     # -- ASE's hooks ----------------------------------------------------------------------------
 
-    @in_turn
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
         """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails.
 
@@ -163,35 +156,36 @@ class Constraints(FixConstraint):
         UnsupportedError
             They were moved along with the cell, where a row holds them in space.
         """
-        bound, accepted = self._bound(atoms), self._accepted
-        x = bound.kernel_array(new, "position")
-        motion, old, cell = bound.motion, atoms.arrays["positions"], atoms.cell.array
-        found = accepted.ask(motion.constraint_set, old, x)
-        if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x):
-            motion.project_positions(x, accepted.asked, out=x)
-        else:
-            try:
-                if found & ELSEWHERE or accepted.in_another(cell):
-                    accepted.look(motion, old, cell, elsewhere=True)
-                accepted.between_steps = False
-                motion.project_positions(x, old, out=x)
-            except (ConvergenceError, InputError, UnsupportedError) as error:
-                refuse_not_finite(x, "position")
-                if isinstance(error, ConvergenceError):
-                    error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
-                raise
-        if self._positions_due <= 0:
-            try:
-                motion.certify(x)
-            except CertificateError:
-                x[...] = accepted.asked
-                raise
-            self._positions_due = CHECK_EVERY
-        self._positions_due -= 1
-        accepted.accept(x, cell)
-        new[...] = x
+        with IN_TURN:
+            bound, accepted = self._bound(atoms), self._accepted
+            x = bound.kernel_array(new, "position")
+            motion, old, cell = bound.motion, atoms.arrays["positions"], bound.cell
+            found = accepted.ask(motion.constraint_set, old, x)
+            if found & FAR and np.isfinite(x).all() and fulfilled(motion.constraint_set, x):
+                motion.project_positions(x, accepted.asked, out=x)
+            else:
+                try:
+                    if found & ELSEWHERE or accepted.in_another(cell):
+                        accepted.look(motion, old, cell, elsewhere=True)
+                    accepted.between_steps = False
+                    motion.project_positions(x, old, out=x)
+                except (ConvergenceError, InputError, UnsupportedError) as error:
+                    refuse_not_finite(x, "position")
+                    if isinstance(error, ConvergenceError):
+                        error.add_note("In ASE: a smaller timestep, maxstep, or dr of BasinHopping")
+                    raise
+            if accepted.positions_due <= 0:
+                try:
+                    motion.certify(x)
+                except CertificateError:
+                    x[...] = accepted.asked
+                    raise
+                accepted.positions_due = CHECK_EVERY
+            accepted.positions_due -= 1
+            accepted.accept(x, cell)
+            if x is not new:
+                new[...] = x
 
-    @in_turn
     def redistribute_forces_md(self, atoms: Atoms, forces: FloatArray, rand: bool = False) -> None:
         """Leave forces of dynamics, and noise, as they are; put atoms right that were scaled together with the cell.
 
@@ -203,18 +197,18 @@ class Constraints(FixConstraint):
         InputError
             The atoms were moved past the constraints in another way; see `restore`.
         """
-        if rand or not self._accepted.in_another(atoms.cell.array):
+        if rand or not self._accepted.in_another(atoms.cell.array.tobytes()):
             return  # other edits are seen where positions are set
-        bound, accepted = self._bound(atoms), self._accepted
-        x = atoms.arrays["positions"]
-        if not accepted.look(bound.motion, x, atoms.cell.array):
-            try:
-                self._move(atoms, bound.motion, bound.motion.project_positions(x, x))
-            except ConvergenceError as error:
-                error.add_note("The atoms were scaled together with the cell: call Constraints.restore(atoms)")
-                raise
+        with IN_TURN:
+            bound, accepted = self._bound(atoms), self._accepted
+            x = atoms.arrays["positions"]
+            if not accepted.look(bound.motion, x, bound.cell):
+                try:
+                    self._move(atoms, bound, bound.motion.project_positions(x, x))
+                except ConvergenceError as error:
+                    error.add_note("The atoms were scaled together with the cell: call Constraints.restore(atoms)")
+                    raise
 
-    @in_turn
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
         """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0.
 
@@ -225,16 +219,21 @@ class Constraints(FixConstraint):
         UnsupportedError
             They were moved within a step, or as if nothing was held: such dynamics do not respect constraints.
         """
-        bound, accepted = self._bound(atoms), self._accepted
-        p = bound.kernel_array(momenta, "momentum")
-        accepted.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
-        accepted.note_momenta()
-        due = self._momenta_due <= 0
-        _project(bound, atoms.arrays["positions"], p, "momentum", certified=due)
-        self._momenta_due = CHECK_EVERY - 1 if due else self._momenta_due - 1
-        np.copyto(momenta, p, casting="unsafe")  # integers are all 0
+        with IN_TURN:
+            bound, accepted = self._bound(atoms), self._accepted
+            p = bound.kernel_array(momenta, "momentum")
+            x, due = atoms.arrays["positions"], accepted.momenta_due <= 0
+            accepted.look(bound.motion, x, bound.cell)
+            accepted.note_momenta()
+            left = bound.projected(x, p, "momentum", None if due else p)
+            if due:  # positions may be as a file gave them, off by less than START_TOLERANCE
+                # Of momenta along the constraints alone, as of molecules at rest, the projection leaves rounding.
+                still = KICK_ROUNDING * float(np.abs(velocities_of(atoms, p)).max(initial=0.0))
+                bound.motion.certify(x, velocities_of(atoms, left), still=still, moved=False)
+            accepted.momenta_due = CHECK_EVERY - 1 if due else accepted.momenta_due - 1
+            if left is not momenta:
+                np.copyto(momenta, left, casting="unsafe")  # integers are all 0
 
-    @in_turn
     def adjust_stress(self, atoms: Atoms, stress: FloatArray) -> None:
         """Add the constraints' part in place, Voigt order: -(1/V) sum of r (x) z over the rows.
 
@@ -244,32 +243,37 @@ class Constraints(FixConstraint):
         energy under a strain after which the constraints are restored. Rows with a place in space count as external
         forces and have no part. Refused where atoms are off the constraints, or objects of ASE add forces.
         """
-        stress += stress_of_rows(self._bound(atoms).motion, atoms)
-        self._accepted.know(atoms.arrays["positions"], atoms.cell.array)  # cell filters scale them next
+        with IN_TURN:
+            bound = self._bound(atoms)
+            stress += stress_of_rows(bound.motion, atoms)
+            self._accepted.know(atoms.arrays["positions"], bound.cell)  # cell filters scale them next
 
-    @in_turn
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
-        if self._binding is not None and self._binding.fits(atoms):
-            self._in_cell(atoms, as_float_array(cell, "cell"), self._binding)
+        with IN_TURN:
+            if self._binding is not None and self._binding.made_for == read_by_engine(atoms):
+                self._in_cell(atoms, as_float_array(cell, "cell"), self._binding)
 
-    @in_turn
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place, also for forces that later objects add; any float dtype."""
-        bound, accepted, present = self._bound(atoms), self._accepted, self._present(atoms)
-        f = bound.kernel_array(forces, "force")
-        later = present[present.index(self) + 1 :] if self in present else ()
-        added = with_added(atoms, np.zeros_like(f), later) if later else None
-        f = f if added is None else f + added
-        _project(bound, atoms.arrays["positions"], f, "force")
-        f = f if added is None else f - added
-        np.copyto(forces, f, casting="unsafe")
-        accepted.between_steps = True
+        with IN_TURN:
+            bound = self._bound(atoms)
+            f, added = bound.kernel_array(forces, "force"), None
+            if len(atoms.constraints) > 1:
+                present = self._present(atoms)
+                later = present[present.index(self) + 1 :] if self in present else ()
+                added = with_added(atoms, np.zeros_like(f), later) if later else None
+            f = f if added is None else f + added
+            bound.projected(atoms.arrays["positions"], f, "force", f)
+            f = f if added is None else f - added
+            if f is not forces:
+                np.copyto(forces, f, casting="unsafe")
+            self._accepted.between_steps = True
 
-    @in_turn
     def get_removed_dof(self, atoms: Atoms) -> int:
         """The rank of the rows, which may be less than their number."""
-        return self._bound(atoms).motion.rank
+        with IN_TURN:
+            return self._bound(atoms).motion.rank
 
     @property
     def touched(self) -> IntArray:
@@ -323,7 +327,7 @@ class Constraints(FixConstraint):
         # Calculators copy the atoms at every step, so this is quick. Rows never change, and of an engine only the cell;
         # each object takes a new engine where it needs one.
         twin = object.__new__(type(self))
-        twin.__dict__.update(self.__dict__, _own=False, _last=None, _accepted=UNKNOWN)
+        twin.__dict__ = {**self.__dict__, "_own": False, "_last": None, "_accepted": UNKNOWN}
         return twin
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Constraints:
@@ -360,7 +364,6 @@ class Constraints(FixConstraint):
 
     # -- for people -----------------------------------------------------------------------------
 
-    @in_turn
     def restore(self, atoms: Atoms, bonds: ArrayLike | None = None) -> None:
         """Move atoms that are off the constraints onto them, and project their momenta if they have any.
 
@@ -381,20 +384,21 @@ class Constraints(FixConstraint):
             If there is no way to fulfil the constraints from here with other bonds and angles as they are; nothing is
             changed.
         """
-        bound, accepted = self._bound(atoms), self._accepted
-        kept = (lambda: bonds_of(atoms)) if bonds is None else bonds
-        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept)
-        self._move(atoms, bound.motion, x)
-        accepted.between_steps = True
-        self._binding = None  # which rows are independent is seen there anew
+        with IN_TURN:
+            bound, accepted = self._bound(atoms), self._accepted
+            kept = (lambda: bonds_of(atoms)) if bonds is None else bonds
+            x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept)
+            self._move(atoms, bound, x)
+            accepted.between_steps = True
+            self._binding = None  # which rows are independent is seen there anew
 
-    def _move(self, atoms: Atoms, motion: Motion, x: FloatArray) -> None:
+    def _move(self, atoms: Atoms, bound: Binding, x: FloatArray) -> None:
         """Put atoms where they are on the constraints, and project momenta that they have."""
-        momenta = motion.project_forces(x, atoms.arrays["momenta"]) if "momenta" in atoms.arrays else None
+        momenta = bound.motion.project_forces(x, atoms.arrays["momenta"]) if "momenta" in atoms.arrays else None
         atoms.set_positions(x, apply_constraint=False)
         if momenta is not None:
             atoms.set_momenta(momenta, apply_constraint=False)
-        self._accepted.know(x, atoms.cell.array)
+        self._accepted.know(x, bound.cell)
 
     def report(self, atoms: Atoms) -> Report:
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
@@ -459,25 +463,6 @@ def _refuse_moving(given: Iterable[Constraint]) -> None:
             )
 
 
-def _project(bound: Binding, x: FloatArray, values: FloatArray, what: str, *, certified: bool = False) -> None:
-    """Take out of momenta, or forces, what leaves the constraints, in place: p - A^T (A M^-1 A^T)^-1 A M^-1 p."""
-    if bound.weights is None:
-        bound.motion.project_forces(x, values, out=values)
-        return
-    masses, inverse_masses, velocities = bound.weights
-    np.multiply(values, inverse_masses, velocities)
-    # Of momenta along the constraints alone, as of molecules at rest, the projection leaves rounding.
-    still = KICK_ROUNDING * float(np.abs(velocities).max(initial=0.0)) if certified else 0.0
-    try:
-        bound.motion.project_velocities(x, velocities, out=velocities)
-    except KconsError:
-        refuse_not_finite(values, what)
-        raise
-    if certified:  # positions may be as a file gave them, off by less than START_TOLERANCE
-        bound.motion.certify(x, velocities, still=still, moved=False)
-    np.multiply(velocities, masses, values)
-
-
 def constrain(
     atoms: Atoms,
     constraints: str | Constraint | Iterable[Constraint],
@@ -520,7 +505,7 @@ def constrain(
         if project:
             held.restore(atoms)
         bound, accepted = held._bound(atoms), held._accepted
-        accepted.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
+        accepted.look(bound.motion, atoms.arrays["positions"], bound.cell)
         accepted.between_steps = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])

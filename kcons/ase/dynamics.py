@@ -22,6 +22,7 @@ from kcons.ase.binding import (
     bind,
     company,
     differ,
+    read_by_engine,
     require_on_surface,
     stress_of_rows,
     unchanged_on_failure,
@@ -323,7 +324,7 @@ class ConstrainedDynamics(MolecularDynamics):
         for name in ("positions", "momenta"):  # kernels write to them
             atoms.arrays[name] = np.ascontiguousarray(atoms.arrays[name], np.float64)
         present, bound = company(atoms.constraints), self._bound
-        if bound is None or present != self._present or not bound.fits(atoms):
+        if bound is None or present != self._present or bound.made_for != read_by_engine(atoms):
             gone = 0 if bound is None else bound.motion.n_atoms - len(atoms)
             if gone > 0 and self._more:
                 raise InputError(

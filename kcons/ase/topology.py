@@ -90,9 +90,10 @@ def require_atoms(atoms: object) -> None:
     require_kind(atoms, Atoms, "atoms", "an ase.Atoms object, as ase.io.read(file) gives it")
 
 
-def velocities_of(atoms: Atoms) -> FloatArray:
-    """As ``atoms.get_velocities()``, but 0 for fixed atoms without mass, where ASE divides 0 by 0."""
-    momenta, masses = atoms.get_momenta(), atoms.get_masses()[:, np.newaxis]
+def velocities_of(atoms: Atoms, momenta: FloatArray | None = None) -> FloatArray:
+    """As ``atoms.get_velocities()``, or of other momenta, but 0 for fixed atoms without mass: ASE divides 0 by 0."""
+    momenta = atoms.get_momenta() if momenta is None else momenta
+    masses = atoms.get_masses()[:, np.newaxis]
     return np.divide(momenta, masses, out=np.zeros_like(momenta), where=(masses != 0.0) | (momenta != 0.0))
 
 

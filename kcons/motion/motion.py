@@ -96,6 +96,12 @@ class Motion:
         self._flat: IntArray = (3 * touched[:, None] + np.arange(3)).ravel() if self._atoms is not None else touched
         self._lattice = self._local.lattice
         self._solve = SolverSequence(self._local, self.plan, self._atoms)
+        #: 1/m and m, 0 for fixed atoms, of each component; None where rows touch some atoms only.
+        self._weights: tuple[FloatArray, FloatArray] | None = None
+        if len(touched) == self.n_atoms:
+            inverse = self.plan.inverse_masses
+            both = np.repeat([inverse, np.where(inverse > 0, self.masses, 0.0)], 3).reshape(2, -1, 3)
+            self._weights = both[0], both[1]
         free = self.plan.inverse_masses[self.plan.inverse_masses > 0]
         self._uneven = bool(free.max(initial=0.0) > UNEVEN * free.min(initial=np.inf))
 
@@ -252,7 +258,7 @@ class Motion:
         atoms = self._atoms
         if atoms is None:
             work = x if out is x_new else x.copy()
-            ref = ref.copy() if np.may_share_memory(work, ref) else ref
+            ref = _apart(ref, work)
             self._solve.positions(work, ref, time, reference_time, velocities, inv_dt, multipliers, flight)
             return _in(out, work)
         part = x.take(atoms, 0)
@@ -301,7 +307,7 @@ class Motion:
         atoms = self._atoms
         if atoms is None:
             work = y if out is v else y.copy()
-            here = here.copy() if np.may_share_memory(work, here) else here
+            here = _apart(here, work)
             self._solve.tangents(here, work, self._solve.rates(here, time), time, multipliers, "velocity")
             return _in(out, work)
         here, part = here.take(atoms, 0), y.take(atoms, 0)
@@ -453,12 +459,17 @@ class Motion:
         self, x: ArrayLike, f: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None
     ) -> FloatArray:
         """f + z with b = 0: what is left of the force on the surface, for optimizers, shape (n_atoms, 3)."""
-        time = finite_number(time, "time")
+        if type(time) is not float or not isfinite(time):
+            time = finite_number(time, "time")
         force = as_array(f, self._shape, "forces")
         here = as_array(x, self._shape, "positions")
-        if out is not None:
+        if out is not None and out is not force:
             check_out(out, self._shape)
         self.cell()
+        if self._weights is not None:
+            y = force * self._weights[0]
+            self._solve.tangents(here, y, None, time, None, "force")
+            return np.multiply(y, self._weights[1], out)
         touched, masses = self._touched, self._local.masses[:, None]
         local = force if self._atoms is None else force.take(touched, 0)
         y = local * self.plan.inverse_masses[:, None]
@@ -515,6 +526,12 @@ class Motion:
 
     def __repr__(self) -> str:
         return f"<Motion: {self.constraint_set.n_rows} rows of rank {self.rank} on {self.n_atoms} atoms>"
+
+
+def _apart(x: FloatArray, work: FloatArray) -> FloatArray:
+    """`x`, or a copy where it may be in the memory of `work`, which is written to."""
+    alone = x is not work and x.flags.owndata and work.flags.owndata  # as quickly as that
+    return x if alone or not np.may_share_memory(work, x) else x.copy()
 
 
 def _in(out: FloatArray | None, work: FloatArray) -> FloatArray:

@@ -238,7 +238,7 @@ class SolverSequence:
             y[plan.pinned] = 0.0 if rates is None else rates[plan.pinned_rows].reshape(-1, 3)
         found: list[FloatArray | None] = []
         moved: FloatArray | None = None
-        if lattice is not None:
+        if lattice is not None and self.rows.images is not None:
             places = None if self._placed is None else x[self._placed]
             x = self.rows.whole(x)
             moved = None if places is None else self.rows.moved_places(places, x)

@@ -116,7 +116,7 @@ def test_ase_hooks_and_dynamics_are_certified(dynamics, what):
     driver = dynamics(atoms, 0.05)
     motion = driver.motion if dynamics is ConstrainedDynamics else held.engine(atoms)
     motion.plan.solvers[0] = Careless(motion.plan.solvers[0], what)
-    held._momenta_due = 0
+    held._accepted.momenta_due = 0
     before, momenta = atoms.positions.copy(), atoms.get_momenta()
     with pytest.raises(CertificateError):
         driver.run(5)

@@ -31,10 +31,10 @@ MUTANTS = {
         "for item in self.constraints« if item.n_rows→»]": "translation::objects_without_rows_are_left_out_of_files",
         "if «not self._own→False» and cell.tobytes() != bound.cell": "binding::copies_in_cells_of_their_own",
         "«WithFixedAtoms if fixed else Constraints→»  #": "translation::files_of_other_programs_have_the_fixed_atoms",
-        "«        accepted.between_steps = True\n→»\n    @in_turn\n    def get_removed_dof": (
-            "binding::an_edit_is_named_before_a_class"
+        "«            self._accepted.between_steps = True\n→»": "binding::an_edit_is_named_before_a_class",
+        "«with→if» IN_TURN:\n            bound = self._bound(atoms)\n            f,": (
+            "binding::copies_are_asked_in_turn"
         ),
-        "«@in_turn→»\n    def adjust_forces": "binding::copies_are_asked_in_turn",
         "f if added is None else f + «added→0»": (
             "translation::attach_keeps_objects_that_add_forces_and_refuses_unknown_ones"
         ),
