@@ -75,7 +75,7 @@ MUTANTS = {
         "if «not missed <= self.tolerance→False»:": "monte_carlo_sampler::a_way_back_that_misses_its_start_is_rejected",
     },
     "constraints/constraint.py": {
-        "«→not »self.positive and not (target > 0).all(": "families::remedies",
+        "(target > 0) «& (target < self.below)→»).all(": "families::remedies",
     },
     "constraints/target.py": {
         ".abs(fine - given) > «WRONG→100» * size)": "target::derivatives_that_contradict_a_moving_target_are_refused",
