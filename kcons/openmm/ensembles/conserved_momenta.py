@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Literal, NamedTuple, cast
 
 import numpy as np
@@ -17,6 +18,7 @@ from kcons.openmm.integrator.guard import (
     groups_of,
     knows_a_place,
     removes_center_of_mass_motion,
+    virtual_sites,
 )
 from kcons.openmm.integrator.program import Ensemble, Integrator
 from kcons.openmm.quantities import box_of, forces_at, masses_of, positions_of, velocities_of
@@ -104,7 +106,7 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     fixed = integrator._watch().bound()
     if fixed:
         if not removed:  # what a remover takes is not there, whatever holds the others
-            broken.append(np.eye(3))
+            broken.append(_left_behind(context, x, fixed) if virtual_sites(system) else np.eye(3))
         turns.keep(turns.fields(x[fixed]))
     for part in integrator.parts:
         solver = part.solver_at(context)
@@ -129,6 +131,20 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     if momentum == "conserved" and not len(directions):
         raise UnsupportedError("total momentum is not conserved: rows, massless particles or images hold a place")
     return Momenta(directions, turns.found)
+
+
+def _left_behind(given: openmm.Context, x: FloatArray, atoms: list[int]) -> FloatArray:
+    """How some particles do not follow shifts of all that has mass, shape (3 n, 3): images may follow along an axis."""
+    system, places = copy.deepcopy(given.getSystem()), []
+    for _ in range(system.getNumForces()):
+        system.removeForce(0)
+    system.setDefaultPeriodicBoxVectors(*box_of(given))
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+    for shift in np.eye(4, 3, -1):  # none, then along each axis
+        context.setPositions(x + shift * (masses_of(system) > 0)[:, None])
+        context.computeVirtualSites()
+        places.append(positions_of(context)[atoms])
+    return (np.array(places[1:]) - places[0] - np.eye(3)[:, None]).reshape(3, -1).T
 
 
 def _totals(
