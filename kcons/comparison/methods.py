@@ -109,9 +109,11 @@ def add_method(
     name: str, start: Start, *, engine: Engine = "arrays", force_evaluations: Count = 1, **options: Any
 ) -> Method:
     """Register a `Method`, which takes these arguments, in place of one of that name."""
-    options = {"title": name, "engine": engine, "force_evaluations": force_evaluations, **options}
-    METHODS[name] = made = Method(name, start, **options)
-    return made
+    if name.lower() in ("all", *map(str.lower, ENGINES)) or "," in name:
+        raise InputError(f"name is {name!r}, which stands for several methods; choose another", item="name")
+    options = {"title": name, **options}
+    METHODS[name] = Method(name, start, engine=engine, force_evaluations=force_evaluations, **options)
+    return METHODS[name]
 
 
 def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> list[Method]:
