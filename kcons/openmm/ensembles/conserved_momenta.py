@@ -26,7 +26,8 @@ from kcons.thermostats.freedom import BALANCED, SHIFT, RigidMotions, open_direct
 
 Momentum = Literal["auto", "conserved", "free"]
 
-_PLACES = 3
+#: How many shifted places are looked at, and how far atoms are moved where nothing acts there, as `SHIFT`.
+_PLACES, FAR = 3, 100.0
 
 
 class Momenta(NamedTuple):
@@ -156,10 +157,12 @@ def _totals(
     size = extent(x) or 1.0
     found: list[FloatArray] = []
     while len(found) < _PLACES or turns.open:
-        there = x + SHIFT * size * rng.standard_normal(3) + shaking(x, rng)
-        there[fixed] = x[fixed]
-        context.setPositions(there)
-        f = forces_at(context, -1)
+        for away in (SHIFT * rng.standard_normal(3), FAR * rng.standard_normal(x.shape)):  # walls act far away only
+            there = x + size * away + shaking(x, rng)
+            there[fixed] = x[fixed]
+            context.setPositions(there)
+            if (f := forces_at(context, -1)).any():
+                break
         total, whole = f.sum(axis=0), float(np.abs(f).sum())
         found.append(total / whole if whole > 0 and np.abs(total).max() > BALANCED * whole else np.zeros(3))
         turns.see(there, f)

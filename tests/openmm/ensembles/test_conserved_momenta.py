@@ -25,6 +25,9 @@ def test_momenta_that_are_conserved_are_found():
     with pytest.warns(UserWarning, match="total momentum is not zero"):
         context = run(system, integrator := ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
     assert ensemble.count(integrator) == 3  # along y and z nothing acts
+    system.getForce(0).setEnergyFunction("k*max(0,x^2+y^2+z^2-9)^2+c*0")  # a wall that is not touched
+    context = run(system, integrator := ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
+    assert ensemble.count(integrator) == 5
     free = Isokinetic(300.0, momentum="free")
     context = run(system, integrator := ProjectedIntegrator(1e-4, ensemble=free), x, v, 1)
     assert free.count(integrator) == 5
