@@ -265,9 +265,8 @@ class Constraint:
         target = self.target.at(time, self.n_rows)
         if self.positive and not (possible := (target > 0) & (target < self.below)).all():
             k = int(np.argmin(possible))  # without the number of the row, which only the set knows
-            most = "" if math.isinf(self.below) else f" and below {self.below:.6g}"
-            words = f"at t = {time:g}; give a function that stays above 0{most}, or end the run before"
-            said = f"{self.row_name(k)}: {self.positive} {target[k]:g} is not possible {words}"
+            remedy = f"give a function that stays between 0 and {self.below:.6g}, or end the run before"
+            said = f"{self.row_name(k)}: {self.positive} {target[k]:g} is not possible at t = {time:g}; {remedy}"
             raise InputError(said, item="target", atoms=self.atoms[k].tolist())
         return target
 

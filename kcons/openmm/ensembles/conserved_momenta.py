@@ -103,7 +103,7 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     system, x = context.getSystem(), positions_of(context)
     masses, removed = masses_of(system), removes_center_of_mass_motion(system)
     turns = RigidMotions(x, turn=not system.usesPeriodicBoundaryConditions())
-    broken: list[FloatArray] = []
+    broken = [np.zeros((1, 3))]
     fixed = integrator._watch().bound()
     if fixed:
         if not removed:  # what a remover takes is not there, whatever holds the others
@@ -125,10 +125,8 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
                 _totals(context, force, x, fixed, turns)
     if removed:  # the center of mass rests
         turns.keep(np.tensordot(masses, turns.fields(x).reshape(-1, 3, 6), 1) / masses.sum())
-    directions = np.eye(3)
-    if broken:
-        _, sizes, axes = np.linalg.svd(np.vstack(broken))
-        directions = axes[int(np.sum(sizes > 1e-6)) :]
+    _, sizes, axes = np.linalg.svd(np.vstack(broken))
+    directions = axes[int(np.sum(sizes > 1e-6)) :]
     if momentum == "conserved" and not len(directions):
         raise UnsupportedError("total momentum is not conserved: rows, massless particles or images hold a place")
     return Momenta(directions, turns.found)
