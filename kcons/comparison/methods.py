@@ -111,8 +111,8 @@ def add_method(
     """Register a `Method`, which takes these arguments, in place of one of that name."""
     if name.lower() in ("all", *map(str.lower, ENGINES)) or "," in name:
         raise InputError(f"name is {name!r}, which stands for several methods; choose another", item="name")
-    options = {"title": name, **options}
-    METHODS[name] = Method(name, start, engine=engine, force_evaluations=force_evaluations, **options)
+    options = {"title": name, "engine": engine, "force_evaluations": force_evaluations, **options}
+    METHODS[name] = Method(name, start, **options)
     return METHODS[name]
 
 

@@ -209,8 +209,7 @@ class _Table:
     def all_but_water(self) -> NDArray[np.bool_]:
         """All but those of molecules that are a triangle of constraints and nothing else."""
         rows = np.bincount(self.cluster, minlength=len(self.clusters))[self.cluster]
-        atoms = np.bincount(self.clusters)[self.cluster]
-        return (rows != 3) | (atoms != 3)
+        return (rows != 3) | (np.bincount(self.clusters)[self.cluster] != 3)
 
     def sharing(self, atoms: IntArray) -> NDArray[np.bool_]:
         """Constraints of the clusters that these atoms belong to; what is no particle is told later."""

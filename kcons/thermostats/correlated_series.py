@@ -203,5 +203,4 @@ def slope(times: FloatArray, values: FloatArray) -> Estimate:
     n, size = len(t), float(np.sqrt(np.mean(left * left)))
     if not size > _ROUNDING * float(np.abs(values).max()):
         return Estimate(steep, size / math.sqrt(square))
-    error = size * _error(left / size, 1)[0]
-    return Estimate(steep, error * math.sqrt(n * (n * n - 1) / 12.0 / square))
+    return Estimate(steep, size * _error(left / size, 1)[0] * math.sqrt(n * (n * n - 1) / 12.0 / square))

@@ -58,8 +58,7 @@ class Constraints(SystemConstraint):
         # TorchSim sets another system_idx where it reorders systems; masses and cells can be edited in a run.
         watched = self.system_idx, state.masses, state.cell, state.pbc
         if torch.is_inference_mode_enabled() or any(each.is_inference() for each in (state.positions, *watched)):
-            said = "tensors of torch.inference_mode() do not tell that they were written to; use torch.no_grad()"
-            raise UnsupportedError(said)
+            raise UnsupportedError("tensors of torch.inference_mode() do not tell of edits; use torch.no_grad()")
         seen = [(each, each._version) for each in watched]
         if self._made is None or any(a is not b or n != m for (a, n), (b, m) in zip(self._made[0], seen, strict=True)):
             held = dict(zip(self.system_idx.tolist(), self.motions, strict=True))
