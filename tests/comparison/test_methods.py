@@ -118,8 +118,7 @@ def test_steps_cost_as_much_as_those_of_rattle():
     pendulum = built("double-pendulum")
     assert METHODS["rattle"].settings(pendulum) == pytest.approx(list(pendulum.time_steps))
     # At least two steps, and no step twice.
-    few = pendulum.with_time_steps([2.5, 5.0])
-    assert METHODS["yoshida4"].settings(few) == pytest.approx([2.5, 1.25])
+    assert METHODS["yoshida4"].settings(pendulum.with_time_steps([2.5, 5.0])) == pytest.approx([2.5, 1.25])
 
 
 # -- on arrays and in ASE ---------------------------------------------------------------------------

@@ -193,8 +193,7 @@ def test_without_bonds_the_nearest_point_as_asked() -> None:
         motion.restore_positions(ring.positions)
     x = motion.restore_positions(ring.positions, bonds=[])
     fulfilled(motion.constraint_set, x)
-    away = np.linalg.norm(x - ring.positions, axis=1)
-    assert set(np.flatnonzero(away > 1e-12).tolist()) == {0, 1}
+    assert set(np.flatnonzero(np.linalg.norm(x - ring.positions, axis=1) > 1e-12).tolist()) == {0, 1}
 
 
 # -- bounds -------------------------------------------------------------------------------------------
