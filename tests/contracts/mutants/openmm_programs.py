@@ -84,6 +84,10 @@ MUTANTS = {
         "long > «np.minimum(TORN, FAR * radii)→TORN»": "ase/topology::held_by_name",
     },
     "openmm/ensembles/conserved_momenta.py": {
+        ", fixed) if «virtual_sites(system)→False»": (
+            "conserved_momenta::a_motion_remover_takes_momentum_beside_particles_without_mass"
+        ),
+        "«FAR→SHIFT» * rng.stand": "conserved_momenta::momenta_that_are_conserved_are_found",
         "«not removed→True»:  #": "conserved_momenta::a_motion_remover_takes_momentum_beside_particles_without_mass",
         "«turns.keep(turns.fields(x[fixed]))→pass»": "conserved_momenta::particles_without_mass_leave_turns_about_them",
         "«turns.keep_rows(motion, x[atoms], time)→pass»": (
