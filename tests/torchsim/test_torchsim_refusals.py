@@ -95,7 +95,7 @@ def test_momentum_that_is_conserved_along_some_axes_is_refused():
 
 
 WRONG = [(langevin.step, "dt", -1.0), (nve.init, "kT", -1.0), (nve.step, "gamma", 5.0), (nose_hoover.init, "tau", 0)]
-WRONG += [(langevin.step, "dt", np.inf), (nose_hoover.step, "dt", torch.tensor([1.0, np.nan]))]
+WRONG += [(langevin.step, "dt", torch.tensor([1.0, np.inf])), (nose_hoover.step, "dt", torch.tensor([1.0, np.nan]))]
 
 
 @pytest.mark.parametrize(("call", "item", "value"), [*WRONG, (langevin.step, "kT", [1.0, 1.0, 1.0])])
