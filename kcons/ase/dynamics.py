@@ -196,8 +196,7 @@ class ConstrainedDynamics(MolecularDynamics):
 
     def listing(self) -> str:
         """What a step consists of, a line for each operation; the name alone for steppers that have no list."""
-        system = self._systems()
-        return self._mover.listing(system) if isinstance(self._mover, Listed) else repr(self._mover)
+        return self._mover.listing(self._systems()) if isinstance(self._mover, Listed) else repr(self._mover)
 
     @property
     def _mover(self) -> Stepper:

@@ -71,6 +71,7 @@ class Batch:
         No systems, no copies, or another type of number.
     """
 
+    @torch.inference_mode(False)  # whose tensors have no versions, by which it is seen that they were written to
     def __init__(
         self,
         motions: Motion | Sequence[Motion],

@@ -106,7 +106,8 @@ def gbaoab(
     """
     positive(dt, "dt")  # noise cannot be taken back
     for item, given in (("kT", kT), ("friction", friction)):
-        not_negative(torch.as_tensor(given).min().item(), item)
+        for extreme in torch.stack(torch.as_tensor(given).aminmax()).tolist():
+            not_negative(extreme, item)
     masses = held.get("masses")
     v = kick(batch, x, v, forces, 0.5 * dt, masses)
     x, v = drift_in_bath(batch, x, v, dt, (kT, friction, generator), **held)

@@ -46,8 +46,7 @@ def environment() -> dict[str, Any]:
 
 def kernels_cached() -> bool:
     """Whether compiled kernels of an earlier run are on disk beside the package (or where NUMBA_CACHE_DIR says)."""
-    here = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE)
-    return next(here.rglob("*.nbi"), None) is not None
+    return next(Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE).rglob("*.nbi"), None) is not None
 
 
 def processor() -> str:

@@ -109,9 +109,11 @@ def add_method(
     name: str, start: Start, *, engine: Engine = "arrays", force_evaluations: Count = 1, **options: Any
 ) -> Method:
     """Register a `Method`, which takes these arguments, in place of one of that name."""
+    if name.lower() in ("all", *map(str.lower, ENGINES)) or "," in name:
+        raise InputError(f"name is {name!r}, which stands for several methods; choose another", item="name")
     options = {"title": name, "engine": engine, "force_evaluations": force_evaluations, **options}
-    METHODS[name] = made = Method(name, start, **options)
-    return made
+    METHODS[name] = Method(name, start, **options)
+    return METHODS[name]
 
 
 def choose(names: Iterable[str] | None, system: TestSystem | None = None) -> list[Method]:
@@ -194,22 +196,19 @@ dynamics.run($steps)
 """
 
 
-def _system(system: TestSystem, held: ConstraintSet | None = None) -> System:
-    motion = Motion(system.constraint_set if held is None else held, system.positions)
-    return System(motion, system.potential.forces)
-
-
-def on_arrays(make: Callable[[float], steppers.Stepper], system: TestSystem, dt: float) -> Run:
-    """A run of the stepper that `make` gives for a time step."""
+def on_arrays(
+    make: Callable[[float], steppers.Stepper], system: TestSystem, dt: float, held: ConstraintSet | None = None
+) -> Run:
+    """A run of the stepper that `make` gives for a time step, with what the test system holds or something else."""
     stepper = make(dt)
-    # What does not keep positions on the surface cannot have rows that depend on each other there.
-    made = _system(system, None if stepper.symplectic else independent_rows(system))
+    if held is None:  # what does not keep positions on the surface cannot have rows that depend on each other there
+        held = system.constraint_set if stepper.symplectic else independent_rows(system)
+    made = System(Motion(held, system.positions), system.potential.forces)
     return OnArrays(made, made.with_forces(State(system.positions, system.velocities)), stepper, dt)
 
 
 def _nothing_held(system: TestSystem, dt: float) -> Run:
-    made = _system(system, ConstraintSet([], system.positions, system.masses))
-    return OnArrays(made, made.with_forces(State(system.positions, system.velocities)), Rattle(), dt)
+    return on_arrays(lambda dt: Rattle(), system, dt, ConstraintSet([], system.positions, system.masses))
 
 
 def _code_of_stepper(stepper: str, system: TestSystem) -> str:

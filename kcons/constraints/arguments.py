@@ -147,7 +147,8 @@ def atom_table(atoms: Any, name: str, width: int | None, item: str = "atoms") ->
     if table.ndim != 2:
         raise wrong(f"atoms must have shape (n_rows, width), not {table.shape}")
     if width is not None and table.shape[1] != width:
-        raise wrong(f"a row has {width} atom{'s' if width > 1 else ''}, but atoms has shape {np.shape(atoms)}")
+        words = f"give the atoms of a row as one list, such as {list(range(width))}"
+        raise wrong(f"a row has {width} atom{'s' if width > 1 else ''}, not shape {np.shape(atoms)}; {words}")
     if table.min() < 0:
         row, slot = np.argwhere(table < 0)[0]
         raise wrong(f"row {row} has the negative atom index {table[row, slot]}; count atoms from 0", table[row])
@@ -372,8 +373,13 @@ def checked(function: Callable[P, R], *, named: bool = False) -> Callable[P, R]:
 
     @functools.wraps(function)
     def checked_function(*args: P.args, **kwargs: P.kwargs) -> R:
-        bound, rules = signature.bind(*args, **kwargs), rules_of(function)
-        of = f"{type(args[0]).__name__}: " if named else ""
+        rules, of = rules_of(function), f"{type(args[0]).__name__}: " if named else ""
+        try:
+            bound = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            if named and len(atoms := [each for each in args[1:] if isinstance(each, int | np.integer)]) > 1:
+                raise InputError(f"{of}{error}; give atoms as a list, such as {atoms}", item="atoms") from None
+            raise
         for name, value in bound.arguments.items():
             optional, asked = rules[name]
             for rule in () if optional and value is None else asked:

@@ -111,6 +111,7 @@ class Constraint:
     held: ClassVar[str] = LENGTH
     #: What the target is called where it has to be above zero; nothing where it may be any number.
     positive: str = ""
+    below: ClassVar[float] = math.inf  #: What a positive target stays below.
     #: Where the gradient is undefined, and the remedy, with {atom} for the first one.
     singular: ClassVar[str] = "its gradient is undefined; move the atoms"
     #: Whether the coordinate depends on the masses of its atoms.
@@ -162,14 +163,10 @@ class Constraint:
         """Numbers for all rows or for each, spread over the rows; `entry` is the shape of one row's."""
         shape = (self.n_rows, *(self.width if size < 0 else size for size in entry))
         array = as_float_array(value, f"{self.family}: {name}")
-        try:
-            array = np.broadcast_to(array, shape)
-        except ValueError:
-            raise InputError(
-                f"{self.family}: {name} has shape {array.shape}; give {shape[1:] or 'one number'} for all, or {shape}",
-                item=name,
-            ) from None
-        check_range(array, f"{self.family}: {name} of row {{row}}", name, self.atoms)
+        if array.shape not in (shape[1:], (1, *shape[1:]), shape):
+            words = f"give {shape[1:] or 'one number'} for all, or {shape}"
+            raise InputError(f"{self.family}: {name} has shape {array.shape}; {words}", item=name)
+        check_range(array := np.broadcast_to(array, shape), f"{self.family}: {name} of row {{row}}", name, self.atoms)
         return array
 
     def __setstate__(self, own: dict[str, Any]) -> None:
@@ -266,10 +263,10 @@ class Constraint:
         if not isinstance(self.target, MovingTarget):
             return self.target
         target = self.target.at(time, self.n_rows)
-        if self.positive and not (target > 0).all():
-            k = int(np.argmin(target))  # without the number of the row, which only the set knows
-            words = f"is not positive at t = {time:g}; give a function that stays above zero, or end the run before"
-            said = f"{self.row_name(k)}: {self.positive} {target[k]:g} {words}"
+        if self.positive and not (possible := (target > 0) & (target < self.below)).all():
+            k = int(np.argmin(possible))  # without the number of the row, which only the set knows
+            remedy = f"give a function that stays between 0 and {self.below:.6g}, or end the run before"
+            said = f"{self.row_name(k)}: {self.positive} {target[k]:g} is not possible at t = {time:g}; {remedy}"
             raise InputError(said, item="target", atoms=self.atoms[k].tolist())
         return target
 

@@ -407,10 +407,7 @@ class ConstraintSet:
     @property
     def half_width(self) -> float:
         """Half the smallest perpendicular width of the periodic cell; infinite without one."""
-        if self.lattice is None:
-            return np.inf
-        norms = np.linalg.norm(self.lattice[1], axis=0)
-        return 0.5 / float(norms.max())
+        return np.inf if self.lattice is None else 0.5 / float(np.linalg.norm(self.lattice[1], axis=0).max())
 
     def refuse_unheld_links(self, whole: FloatArray, numbers: IntArray | None = None) -> None:
         """Raise `ImageError` where atoms of a row, made whole, are half the cell apart and nothing ties them.

@@ -210,6 +210,8 @@ class Angle(Internal):
         Angle held, in radian, between 0 and pi, both excluded.
     """
 
+    positive = "target"
+    below = np.pi
     row_width = 3
     reversible = True
     held = ANGLE
@@ -237,12 +239,12 @@ class Angle(Internal):
     def faults(self, r: FloatArray, time: float) -> Iterator[Fault]:
         angle = self.measure(r, time)
         yield ~(np.sin(angle) >= COLLINEAR), lambda k: self.coincident(k, r[k]) or self._straight(angle[k])
-        yield from super().faults(r, time)
         if self.target is not None:
             target, words = self.target_at(time), "is no angle between 0 and pi; targets are in radian"
             outside = (target < -COLLINEAR) | (target > np.pi + COLLINEAR)
             yield outside, lambda k: f"target {target[k]:g} {words}", "target"
             yield np.sin(target) < COLLINEAR, lambda k: self._straight(target[k], "has the target")
+        yield from super().faults(r, time)
 
 
 class Dihedral(Internal):

@@ -300,8 +300,7 @@ class Plane(LinearCombination):
     row_width = 1
 
     def __init__(self, atoms: ArrayLike, normal: Directions, offset: Target = None) -> None:
-        n = np.asarray(normal)
-        super().__init__(atoms, n if n.ndim == 1 else n[:, None], offset)
+        super().__init__(atoms, np.asarray(normal)[..., None, :], offset)
 
     @staticmethod
     def row(r: Any, p: Any, t: Any, out: Any) -> None:

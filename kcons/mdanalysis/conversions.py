@@ -177,7 +177,8 @@ def to_openmm(
     force_field : sequence of str
         Files for openmm.app.ForceField; without them the System has masses, constraints and no forces.
     **options
-        For createSystem, beside ``constraints`` and ``rigidWater``, which are given here.
+        For createSystem, beside ``constraints`` and ``rigidWater``, which are given here. Masses are those of the
+        universe, unless there is a ``hydrogenMass``.
 
     Raises
     ------
@@ -393,7 +394,11 @@ def _system(
     import openmm
 
     if force_field:
-        return _with_forces(topology, force_field, options)
+        system = _with_forces(topology, force_field, options)
+        for k, mass in enumerate(() if "hydrogenMass" in options else snapshot.topology.masses.tolist()):
+            if mass and system.getParticleMass(k)._value:  # neither unknown nor a site
+                system.setParticleMass(k, mass)
+        return system
     if options:
         raise InputError(f"{', '.join(options)} is for a force field; give force_field", item=next(iter(options)))
     system = openmm.System()

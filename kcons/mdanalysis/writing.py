@@ -376,8 +376,7 @@ class OpenMMReporter:
 
     def describeNextReport(self, simulation: Any) -> tuple[int, bool, bool, bool, bool, bool]:
         """What OpenMM asks reporters for: steps to go, and which data."""
-        steps = self.interval - simulation.currentStep % self.interval
-        return steps, True, True, self._forces, False, False
+        return self.interval - simulation.currentStep % self.interval, True, True, self._forces, False, False
 
     def report(self, simulation: Any, state: Any) -> None:
         """Write a frame."""

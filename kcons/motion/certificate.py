@@ -100,9 +100,7 @@ def checked_every(check_every: int | None) -> tuple[int, bool]:
     InputError
         Less than 0.
     """
-    if check_every is None:
-        return CHECK_EVERY, True
-    return whole_number(check_every, "check_every", 0), False
+    return (CHECK_EVERY, True) if check_every is None else (whole_number(check_every, "check_every", 0), False)
 
 
 class Schedule:

@@ -407,10 +407,8 @@ class Motion:
 
     def constraint_force(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """z = M a - f, the constraint force, shape (n_atoms, 3) (notes eq. 101)."""
-        lam = self.respond(x, v, f, time)[1]
-        here = as_array(x, self._shape, "positions")
-        z = self.constraint_set.jacobian(here, time).T @ lam
-        return np.asarray(z).reshape(-1, 3)
+        slopes = self.constraint_set.jacobian(as_array(x, self._shape, "positions"), time)
+        return np.asarray(slopes.T @ self.respond(x, v, f, time)[1]).reshape(-1, 3)
 
     def respond(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """`acceleration` and `multipliers` of one solve."""

@@ -207,8 +207,7 @@ class _Table:
     def all(self, keep_water: bool) -> NDArray[np.bool_]:
         """All, or all but those of molecules that are a triangle of constraints and nothing else."""
         rows = np.bincount(self.cluster, minlength=len(self.clusters))[self.cluster]
-        atoms = np.bincount(self.clusters)[self.cluster]
-        return (rows != 3) | (atoms != 3) | (not keep_water)
+        return (rows != 3) | (np.bincount(self.clusters)[self.cluster] != 3) | (not keep_water)
 
     def sharing(self, atoms: IntArray) -> NDArray[np.bool_]:
         """Constraints of the clusters that these atoms belong to; what is no particle is told later."""

@@ -90,7 +90,8 @@ def snapshot_of(
                 f"the Topology has {n} atoms, the System {system.getNumParticles()} particles", item="system"
             )
         masses = masses_of(system)
-        charges = _charges(system)
+        nonbonded = next((force for force in system.getForces() if isinstance(force, openmm.NonbondedForce)), None)
+        charges = nonbonded and np.array([nonbonded.getParticleParameters(k)[0]._value for k in range(n)])
     described = Topology(
         names=np.array([a.name for a in atoms] or [""])[:n],
         elements=elements,
@@ -158,13 +159,6 @@ def reduced(cell: FloatArray) -> FloatArray:
     c = c - a * np.round(c[0] / a[0])
     b = b - a * np.round(b[0] / a[0])
     return np.stack([a, b, c])
-
-
-def _charges(system: openmm.System) -> FloatArray | None:
-    for force in system.getForces():
-        if isinstance(force, openmm.NonbondedForce):
-            return np.array([force.getParticleParameters(k)[0]._value for k in range(system.getNumParticles())])
-    return None
 
 
 def bonds_of(system: openmm.System, x: FloatArray) -> IntArray:

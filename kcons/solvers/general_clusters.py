@@ -126,7 +126,8 @@ class GeneralClusters:
                 outcome = self._newton(batch, state, moves, along, total, *measures)
                 if not outcome.converged:
                     return outcome
-                worst = _worse(worst, outcome)
+                iterations = max(worst.iterations, outcome.iterations)
+                worst = max(outcome, worst, key=lambda each: each.residual)._replace(iterations=iterations)
         request.changed[self.atoms] = state
         if request.velocities is not None:
             request.velocities[self.atoms] += request.inv_dt * moves
@@ -272,12 +273,6 @@ class GeneralClusters:
         self.subset.moved = None if here.moved is None else here.moved[self.atoms]
         data = self.subset.jacobian(here.reference[self.atoms], here.time).data
         return sum(rank(self._weighted(batch, data)) for batch in self._batches)
-
-
-def _worse(one: Outcome, other: Outcome) -> Outcome:
-    """The outcome with the larger residual, with the larger number of iterations of the two."""
-    chosen = other if other.residual >= one.residual else one
-    return chosen._replace(iterations=max(one.iterations, other.iterations))
 
 
 def _failed(batch: Stack, bad: NDArray[np.bool_], iterations: int, residual: FloatArray | None = None) -> Outcome:

@@ -134,9 +134,12 @@ def packed_system(motion: Motion, *more: NDArray[Any]) -> PackedSystem | None:
                 chains = solver
             else:
                 rows.append(solver.rows)
-    if chains is not None and not _worth_it(chains, sum(map(len, rows))):
-        rows.append(chains.rows)
-        chains = None
+    if chains is not None:  # with other rows by the kernel for all shapes, where they are no faster by their own
+        besides = sum(map(len, rows))
+        least = (CHAIN_ROWS_BESIDES if besides else CHAIN_ROWS) + ROWS_A_SLOT * chains.slots
+        if len(chains.rows) <= min(least, MOST_ROWS - besides):
+            rows.append(chains.rows)
+            chains = None
     others = np.concatenate(rows)
     if len(others) > MOST_ROWS or not all(isinstance(each, SparseRows | SingleRows) for each in mixed):
         return None
@@ -165,9 +168,3 @@ def _solver_like(
     like = SparseRows(held, rows, inverse_masses, eliminate_last[rows])
     like.numbers[COUNT] = 1.0  # all positions here are the ends of flights
     return like
-
-
-def _worth_it(chains: Chains, others: int) -> bool:
-    """Whether chains are faster by their own kernel than with other rows by that for all shapes."""
-    least = (CHAIN_ROWS_BESIDES if others else CHAIN_ROWS) + ROWS_A_SLOT * chains.slots
-    return len(chains.rows) > least or len(chains.rows) + others > MOST_ROWS

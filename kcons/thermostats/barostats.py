@@ -104,8 +104,7 @@ class Strains:
     def log_measure(self, e: FloatArray, moving: IntArray) -> float:
         """ln of the factor by which the measure of states grows; `moving` pieces follow the cell along each axis."""
         logs = e @ self.diagonals  # ln S_ii
-        shape = 2 * (logs[0] - logs[2]) if self.flexible else 0.0
-        return float(logs @ moving + logs.sum() + shape)
+        return float(logs @ moving + logs.sum() + (2 * (logs[0] - logs[2]) if self.flexible else 0.0))
 
 
 def _exponential(a: FloatArray) -> FloatArray:

@@ -130,7 +130,8 @@ def _free(state: SimState) -> torch.Tensor:
 def _each(state: SimState, value: Any, item: str, rule: Any = positive, atoms: bool = False) -> torch.Tensor:
     """A number or one for each system, shape (n_systems,), or as a column for all atoms."""
     numbers = torch.as_tensor(value, device=state.device, dtype=state.dtype)
-    rule(numbers.min().item(), item)
+    for extreme in torch.stack(numbers.aminmax()).tolist():
+        rule(extreme, item)
     if numbers.shape not in ((), (1,), (state.n_systems,)):
         raise InputError(f"{item} has shape {tuple(numbers.shape)}; give a number or one for each system", item=item)
     numbers = numbers.expand(state.n_systems)
@@ -202,7 +203,7 @@ def _nose_hoover_init(
 
 @_whole
 def _nose_hoover_step(state: NoseHooverState, model: ModelInterface, *, dt: Any, kT: Any) -> NoseHooverState:
-    state.target_kT = _each(state, kT, "kT")
+    state.target_kT, dt = _each(state, kT, "kT"), finite_number(dt, "dt")
     half_step = construct_nose_hoover_chain(dt, state.chain_positions.shape[1], 3, 3, state.tau).half_step
     for first in (True, False):
         momenta, chain = half_step(state.momenta, state.chain, state.target_kT, state.system_idx)

@@ -56,7 +56,10 @@ class Constraints(SystemConstraint):
         Refuses a state with other masses or cells than the rows were made for.
         """
         # TorchSim sets another system_idx where it reorders systems; masses and cells can be edited in a run.
-        seen = [(each, each._version) for each in (self.system_idx, state.masses, state.cell, state.pbc)]
+        watched = self.system_idx, state.masses, state.cell, state.pbc
+        if torch.is_inference_mode_enabled() or any(each.is_inference() for each in (state.positions, *watched)):
+            raise UnsupportedError("tensors of torch.inference_mode() do not tell of edits; use torch.no_grad()")
+        seen = [(each, each._version) for each in watched]
         if self._made is None or any(a is not b or n != m for (a, n), (b, m) in zip(self._made[0], seen, strict=True)):
             held = dict(zip(self.system_idx.tolist(), self.motions, strict=True))
             masses = state.masses.split(state.n_atoms_per_system.tolist())

@@ -92,7 +92,8 @@ def test_single_precision_is_two_units_in_the_last_place():
 
 
 def test_what_is_refused():
-    batch, x = Batch(water(), copies=2), torch.as_tensor(np.concatenate([WATER, WATER]))
+    with torch.inference_mode():  # in which nothing is refused
+        batch, x = Batch(water(), copies=2), torch.as_tensor(np.concatenate([WATER, WATER]))
     with pytest.raises(InputError, match=r"x_new must be a tensor of shape \(6, 3\)"):
         batch.project_positions(x[:3], x)
     with pytest.raises(InputError, match=r"x_new must be a tensor"):
@@ -100,8 +101,9 @@ def test_what_is_refused():
     v = torch.zeros_like(x)
     with pytest.raises(InputError, match=r"forces must have shape \(6, 3\), not \(1, 3\)"):
         rattle(batch, lambda x: x[:1], x, v, v, 0.1)
-    for settings, item in (((-0.1, 1.0, 1.0), "dt"), ((0.1, -1.0, 1.0), "kT"), ((0.1, 1.0, -1.0), "friction")):
-        with pytest.raises(InputError, match=rf"{item} is -\d\.\d; give"):
+    hot = torch.tensor([1.0, np.inf])
+    for settings, item in (((-0.1, 1.0, 1.0), "dt"), ((0.1, hot, 1.0), "kT"), ((0.1, 1.0, -1.0), "friction")):
+        with pytest.raises(InputError, match=rf"{item} is (-\d\.\d|inf); give"):
             gbaoab(batch, lambda x: -x, x, v, v, *settings)
     for masses in (0.0 * batch.masses, -batch.masses, torch.nan * batch.masses):
         with pytest.raises(InputError, match=r"masses\[0\] is .* above 0"):

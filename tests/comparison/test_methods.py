@@ -100,9 +100,10 @@ def test_what_is_wrong_with_a_method_is_said(registry):
     for options, words in (
         ({"engine": "gromacs"}, "engine is 'gromacs'; choose 'arrays', 'ASE' or 'OpenMM'"),
         ({"force_evaluations": 0}, "force_evaluations is 0; give a whole number, 1 or more"),
+        *(({"name": name}, f"name is {name!r}, which stands for several") for name in ("all", "ASE", "openmm", "a,b")),
     ):
         with pytest.raises(InputError, match=words):
-            add_method("wrong", lambda system, dt: None, **options)
+            add_method(**{"name": "wrong", "start": lambda system, dt: None, **options})
     assert "wrong" not in registry
     for names, words in (
         (["ratle"], r"there is no method 'ratle' \(did you mean 'rattle'"),
@@ -117,8 +118,7 @@ def test_steps_cost_as_much_as_those_of_rattle():
     pendulum = built("double-pendulum")
     assert METHODS["rattle"].settings(pendulum) == pytest.approx(list(pendulum.time_steps))
     # At least two steps, and no step twice.
-    few = pendulum.with_time_steps([2.5, 5.0])
-    assert METHODS["yoshida4"].settings(few) == pytest.approx([2.5, 1.25])
+    assert METHODS["yoshida4"].settings(pendulum.with_time_steps([2.5, 5.0])) == pytest.approx([2.5, 1.25])
 
 
 # -- on arrays and in ASE ---------------------------------------------------------------------------

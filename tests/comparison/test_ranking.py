@@ -99,8 +99,7 @@ def test_a_step_is_predicted_by_the_slope():
     assert found["setting"] == pytest.approx(1.0 * math.sqrt(0.4)) and found["order"] == pytest.approx(2.0)
     assert found["seconds"] == pytest.approx(4.0 / math.sqrt(0.4))
     assert predict(rattle[:1], 1e-4) is None and predict(rattle, 1e-12) is None
-    flat = pd.DataFrame(rattle).assign(error=[1e-3, 1.1e-3, 1e-3])
-    assert predict(flat, 1e-4) is None
+    assert predict(pd.DataFrame(rattle).assign(error=[1e-3, 1.1e-3, 1e-3]), 1e-4) is None
 
 
 def test_steps_are_found_for_an_error():

@@ -37,8 +37,7 @@ def test_the_sentence_names_ties_and_no_winner_within_the_scatter():
     found = rank(table())
     words = sentence(table(), replace(found, table=found.table.assign(place=1)))
     assert "; equally cheap within" in words and "more" in words
-    none = rank(table(), limit=1e-30)
-    assert sentence(table(), none).startswith("No method makes an error of at most 1e-30")
+    assert sentence(table(), rank(table(), limit=1e-30)).startswith("No method makes an error of at most 1e-30")
     nothing = table()[table().method == "verlet"]
     assert rank(nothing) is None and "No method reached the horizon" in sentence(nothing, None)
     assert "no method reached the horizon" in [t.get_text() for t in figure(nothing).axes[0].texts]

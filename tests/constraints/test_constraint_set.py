@@ -87,8 +87,7 @@ def test_scale_is_the_length_held_or_one_radian_or_the_size_of_the_positions():
         Plane(1, [0.0, 0.0, 1.0], 0.0),
         Plane(0, [0.0, 0.0, 1.0], 0.0),
     ]
-    held = ConstraintSet(items, x, np.ones(3))
-    assert held.scale.tolist() == [5.0, 1.0, 2.0, 5.0, 4.0]
+    assert ConstraintSet(items, x, np.ones(3)).scale.tolist() == [5.0, 1.0, 2.0, 5.0, 4.0]
     assert ConstraintSet([Plane(0, [0.0, 0.0, 1.0], 0.0)], x[:1], np.ones(1)).scale.tolist() == [1.0]
     x[2, 0] = np.nan  # of an atom that no row touches
     assert ConstraintSet([Plane(0, [0.0, 0.0, 1.0], 0.0)], x, np.ones(3)).scale.tolist() == [4.0]

@@ -127,20 +127,20 @@ def names() -> dict[str, Any]:
 
 #: A call, the argument that its `InputError` names, and what stands for ? in it.
 REFUSED: list[tuple[str, ...]] = [
-    ("Distance(?)", "atoms", "[0]", "[0, 0]", "[0, -1]", "[0.5, 1]", '"ab"', "[[0, 1], [2]]"),
+    ("Distance(?)", "atoms", "[0]", "[0, 0]", "[0, -1]", "[0.5, 1]", '"ab"', "[[0, 1], [2]]", "0, 1", "0, 1, 1.5"),
     ("Distance([0, 1], ?)", "target", "nan", "[1.0, 2.0]", '"long"', "1 + 2j", "1e200"),
     ("DistanceDifference([[0, 1]])", "weights"),
     ("DistanceDifference([[0, 1], [1, 2]], weights=?)", "weights", "[1.0]", "[1.0, nan]", "[0.0, 0.0]"),
     ("DistanceDifference(?)", "pairs", "[0, 1, 2]", "[[0.0, 1.0], [1.0, 2.0]]", "[[0, 1], [2, 2]]"),
     ("Angle(?)", "atoms", "[0, 1]", "[0, 1, 0]"),
     ("Angle([0, 1, 2], inf)", "target"),
-    ("Dihedral([0, 1, 2])", "atoms"),
+    ("Dihedral(?)", "atoms", "[0, 1, 2]", "0, 1, 2, 3"),
     ("Dihedral([0, 1, 2, 3], nan)", "target"),
     ("CenterDistance([0, 1], [1, 2])", "atoms"),
     ("CenterDistance(?, [1, 2])", "groups", "[]", "[[0], [3]]"),
     ("CenterOfMass([0, 1], axes=?)", "axes", "(0, 3)", "()", "0", "(0.0, 1.0)", "(0, 0)"),
     ("CenterOfMass([0, 1]).measure(X[None, :2], 0.0)", "masses"),
-    ("Sphere(0, ?)", "center", "[0, 0]", "[0, 0, nan]"),
+    ("Sphere(0, ?)", "center", "[0, 0]", "[0, 0, nan]", "1"),
     ("Torus(0, [0, 0, 0], [0, 0, 1], -1.0)", "major_radius"),
     ("Torus(0, [0, 0, 0], [0, 0, 1], 1.0, nan)", "target"),
     ("Ellipsoid(0, [0, 0, 0], ?)", "semi_axes", "[1, 0, 1]", "[inf] * 3"),

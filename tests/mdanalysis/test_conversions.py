@@ -112,10 +112,11 @@ def test_velocities_have_the_units_of_their_host(villin):
 
 def test_forces_of_openmm_on_a_file_of_mdanalysis():
     universe = read_universe(ALANINE)
+    universe.atoms.masses = universe.atoms.masses + 0.5  # which the force field has others for
     rows = quietly(constraints_of, universe, "hangles", angles="distances")
     made = to_openmm(universe, rows, force_field=["amber14-all.xml"])
-    pdb = app.PDBFile(str(ALANINE))
-    field = app.ForceField("amber14-all.xml")
+    assert [made.system.getParticleMass(k)._value for k in range(22)] == pytest.approx(universe.atoms.masses.tolist())
+    pdb, field = app.PDBFile(str(ALANINE)), app.ForceField("amber14-all.xml")
     held = field.createSystem(pdb.topology, nonbondedMethod=app.NoCutoff, constraints=app.HAngles)
     assert made.system.getNumConstraints() == held.getNumConstraints() == 30
     theirs = field.createSystem(pdb.topology, nonbondedMethod=app.NoCutoff)

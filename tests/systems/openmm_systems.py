@@ -63,9 +63,9 @@ def started(system, integrator, x, v=None, platform="Reference"):
     return context
 
 
-def image(k):
-    """The place of particle k turned through the origin."""
-    return openmm.SymmetrySite(k, *map(openmm.Vec3, *-np.eye(3)), openmm.Vec3(0, 0, 0), False)
+def image(k, signs=(-1, -1, -1)):
+    """The place of particle k turned through the origin, about an axis, or at a plane."""
+    return openmm.SymmetrySite(k, *map(openmm.Vec3, *np.diag(np.float64(signs))), openmm.Vec3(0, 0, 0), False)
 
 
 def particles(masses, *forces, held=(), x=None):

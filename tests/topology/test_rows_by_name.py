@@ -146,8 +146,7 @@ def test_virtual_sites_are_no_degrees_of_freedom():
 def test_water_whose_hydrogens_are_listed_as_bonded_is_a_rigid_body():
     """PSF files of TIP3P list H-H; as a bond it would be torn."""
     made = snapshot(["O", "H", "H"], WATER, [(0, 1), (0, 2), (1, 2)], residue_names=("TIP3",))
-    rows = held_rows(made, "none", rigid_water=False, rigid_bodies=[[0, 1, 2]])
-    assert counts(rows) == {"Distance": 3}
+    assert counts(held_rows(made, "none", rigid_water=False, rigid_bodies=[[0, 1, 2]])) == {"Distance": 3}
 
 
 def test_no_masses_no_hydrogens_and_torn_molecules():

@@ -95,6 +95,7 @@ def test_momentum_that_is_conserved_along_some_axes_is_refused():
 
 
 WRONG = [(langevin.step, "dt", -1.0), (nve.init, "kT", -1.0), (nve.step, "gamma", 5.0), (nose_hoover.init, "tau", 0)]
+WRONG += [(langevin.step, "dt", torch.tensor([1.0, np.inf])), (nose_hoover.step, "dt", torch.tensor([1.0, np.nan]))]
 
 
 @pytest.mark.parametrize(("call", "item", "value"), [*WRONG, (langevin.step, "kT", [1.0, 1.0, 1.0])])
@@ -137,6 +138,8 @@ def test_a_state_that_has_become_another_is_refused(change, says):
 def test_masses_that_are_edited_in_a_run_are_refused():
     state = nve.init(held(), Drops(), kT=300 * K)
     state = nve.step(state, Drops(), dt=torch.tensor(0.01))
+    with torch.inference_mode(), pytest.raises(UnsupportedError, match=r"use torch\.no_grad\(\)"):
+        nve.step(state, Drops(), dt=torch.tensor(0.01))
     state.masses.mul_(2)
     with pytest.raises(InputError, match="system 0 has masses"):
         nve.step(state, Drops(), dt=torch.tensor(0.01))

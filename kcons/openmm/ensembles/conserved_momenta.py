@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Literal, NamedTuple, cast
 
 import numpy as np
@@ -17,6 +18,7 @@ from kcons.openmm.integrator.guard import (
     groups_of,
     knows_a_place,
     removes_center_of_mass_motion,
+    virtual_sites,
 )
 from kcons.openmm.integrator.program import Ensemble, Integrator
 from kcons.openmm.quantities import box_of, forces_at, masses_of, positions_of, velocities_of
@@ -24,7 +26,8 @@ from kcons.thermostats.freedom import BALANCED, SHIFT, RigidMotions, open_direct
 
 Momentum = Literal["auto", "conserved", "free"]
 
-_PLACES = 3
+#: How many shifted places are looked at, and how far atoms are moved where nothing acts there, as `SHIFT`.
+_PLACES, FAR = 3, 100.0
 
 
 class Momenta(NamedTuple):
@@ -100,11 +103,11 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
     system, x = context.getSystem(), positions_of(context)
     masses, removed = masses_of(system), removes_center_of_mass_motion(system)
     turns = RigidMotions(x, turn=not system.usesPeriodicBoundaryConditions())
-    broken: list[FloatArray] = []
+    broken = [np.zeros((1, 3))]
     fixed = integrator._watch().bound()
     if fixed:
         if not removed:  # what a remover takes is not there, whatever holds the others
-            broken.append(np.eye(3))
+            broken.append(_left_behind(context, x, fixed) if virtual_sites(system) else np.eye(3))
         turns.keep(turns.fields(x[fixed]))
     for part in integrator.parts:
         solver = part.solver_at(context)
@@ -122,13 +125,25 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
                 _totals(context, force, x, fixed, turns)
     if removed:  # the center of mass rests
         turns.keep(np.tensordot(masses, turns.fields(x).reshape(-1, 3, 6), 1) / masses.sum())
-    directions = np.eye(3)
-    if broken:
-        _, sizes, axes = np.linalg.svd(np.vstack(broken))
-        directions = axes[int(np.sum(sizes > 1e-6)) :]
+    _, sizes, axes = np.linalg.svd(np.vstack(broken))
+    directions = axes[int(np.sum(sizes > 1e-6)) :]
     if momentum == "conserved" and not len(directions):
         raise UnsupportedError("total momentum is not conserved: rows, massless particles or images hold a place")
     return Momenta(directions, turns.found)
+
+
+def _left_behind(given: openmm.Context, x: FloatArray, atoms: list[int]) -> FloatArray:
+    """How some particles do not follow shifts of all that has mass, shape (3 n, 3): images may follow along an axis."""
+    system, places = copy.deepcopy(given.getSystem()), []
+    for _ in range(system.getNumForces()):
+        system.removeForce(0)
+    system.setDefaultPeriodicBoxVectors(*box_of(given))
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform("Reference"))
+    for shift in np.eye(4, 3, -1):  # none, then along each axis
+        context.setPositions(x + shift * (masses_of(system) > 0)[:, None])
+        context.computeVirtualSites()
+        places.append(positions_of(context)[atoms])
+    return (np.array(places[1:]) - places[0] - np.eye(3)[:, None]).reshape(3, -1).T
 
 
 def _totals(
@@ -140,10 +155,12 @@ def _totals(
     size = extent(x) or 1.0
     found: list[FloatArray] = []
     while len(found) < _PLACES or turns.open:
-        there = x + SHIFT * size * rng.standard_normal(3) + shaking(x, rng)
-        there[fixed] = x[fixed]
-        context.setPositions(there)
-        f = forces_at(context, -1)
+        for away in (SHIFT * rng.standard_normal(3), FAR * rng.standard_normal(x.shape)):  # walls act far away only
+            there = x + size * away + shaking(x, rng)
+            there[fixed] = x[fixed]
+            context.setPositions(there)
+            if (f := forces_at(context, -1)).any():
+                break
         total, whole = f.sum(axis=0), float(np.abs(f).sum())
         found.append(total / whole if whole > 0 and np.abs(total).max() > BALANCED * whole else np.zeros(3))
         turns.see(there, f)

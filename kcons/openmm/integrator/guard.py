@@ -663,7 +663,10 @@ class Guard:
             for part in integrator.parts:
                 part.attach(integrator.program, context)
             self._put_right(x)
-            self._make_tangent(velocities_of(context))
+            off = self.speed_violation(*motion_of(context)) is not None
+            # Velocities of a run that is continued stay bit for bit.
+            if off or any(part.worst_violation(context) is not None for part in integrator.parts):
+                integrator.applyVelocityConstraints(context)
             for part in integrator.parts:
                 if not self.started:
                     part.check(context)
@@ -727,13 +730,6 @@ class Guard:
             worst = f"{self.rows.name(row)} was off by {miss[row]:.2g} of its length" if len(miss) else ""
             worst = f"the {misses[0]}" if misses else worst
             logger.warning("the start was put right: %s; particles were moved by up to %.3g nm", worst, moved)
-
-    def _make_tangent(self, v: FloatArray) -> None:
-        """Project velocities that were set from outside; those of a run that is continued stay bit for bit."""
-        integrator, context = self.integrator, self.context
-        off = self.speed_violation(positions_of(context), v) is not None
-        if off or any(part.worst_violation(context) is not None for part in integrator.parts):
-            integrator.applyVelocityConstraints(context)
 
     # -- after steps ----------------------------------------------------------------------------
 

@@ -311,8 +311,7 @@ def number_atoms(
     Row k has the atoms ``flat[slots[k]:slots[k + 1]]``; an atom of infinite mass that stands in several clusters has a
     copy for each.
     """
-    found = plain_if_small(_number_atoms, len(flat))(flat, slots, clusters, n_atoms)
-    return found  # type: ignore[no-any-return]
+    return plain_if_small(_number_atoms, len(flat))(flat, slots, clusters, n_atoms)  # type: ignore[no-any-return]
 
 
 @njit(cache=True)

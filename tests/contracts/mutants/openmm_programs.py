@@ -75,7 +75,7 @@ MUTANTS = {
         "if «not missed <= self.tolerance→False»:": "monte_carlo_sampler::a_way_back_that_misses_its_start_is_rejected",
     },
     "constraints/constraint.py": {
-        "«→not »self.positive and not (target > 0).all(": "families::remedies",
+        "(target > 0) «& (target < self.below)→»).all(": "families::remedies",
     },
     "constraints/target.py": {
         ".abs(fine - given) > «WRONG→100» * size)": "target::derivatives_that_contradict_a_moving_target_are_refused",
@@ -84,6 +84,10 @@ MUTANTS = {
         "long > «np.minimum(TORN, FAR * radii)→TORN»": "ase/topology::held_by_name",
     },
     "openmm/ensembles/conserved_momenta.py": {
+        ", fixed) if «virtual_sites(system)→False»": (
+            "conserved_momenta::a_motion_remover_takes_momentum_beside_particles_without_mass"
+        ),
+        "«FAR→SHIFT» * rng.stand": "conserved_momenta::momenta_that_are_conserved_are_found",
         "«not removed→True»:  #": "conserved_momenta::a_motion_remover_takes_momentum_beside_particles_without_mass",
         "«turns.keep(turns.fields(x[fixed]))→pass»": "conserved_momenta::particles_without_mass_leave_turns_about_them",
         "«turns.keep_rows(motion, x[atoms], time)→pass»": (

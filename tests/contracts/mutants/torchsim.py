@@ -22,7 +22,7 @@ MUTANTS = {
             "torchsim/torchsim_dynamics::constant_energy_is_the_trajectory_of_the_engine"
         ),
         "kT=kT, at_rest=«True→False»)": "torchsim/torchsim_dynamics::momenta_are_drawn_from_the_canonical_distribution",
-        "    «rule(numbers.min().item(), item)→»\n": "torchsim/torchsim_refusals::settings_that_are_none_are_refused",
+        "    «rule(extreme, item)→pass»\n": "torchsim/torchsim_refusals::settings_that_are_none_are_refused",
         "- 3 * «_free(self)→1»": "torchsim/torchsim_states::fixed_atoms_stay",
         "held.batch(state)«.check()→»\n    state.positions = positions": (
             "torchsim/torchsim_dynamics::a_failed_step_leaves_the_state"

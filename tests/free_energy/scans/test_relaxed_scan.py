@@ -104,8 +104,7 @@ def test_what_else_is_held_stays():
         assert abs(np.linalg.norm(attempt.positions[2] - attempt.positions[3]) - 1.5) < 1e-14
     np.testing.assert_allclose(found.energies, profile([0.5, 0.6]) + 15 * 0.1**2, atol=2e-6)
     atoms.set_constraint(Hookean(0, 4, k=1.0, rt=3.0))
-    pulled = scan(atoms, TURN, [0.5], fmax=2e-3)
-    assert pulled.energies[0] > profile(0.5) + 0.01
+    assert scan(atoms, TURN, [0.5], fmax=2e-3).energies[0] > profile(0.5) + 0.01
     assert [type(item) for item in atoms.constraints] == [Hookean]
     pair = [scan(atoms, row, [1.5], fmax=2e-3).energies for row in (Distance([[0, 1]]), CenterDistance([0], [1]))]
     np.testing.assert_allclose(*pair, atol=1e-6)

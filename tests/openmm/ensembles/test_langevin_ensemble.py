@@ -44,8 +44,7 @@ def test_langevin_without_friction_is_the_drift_in_two_halves():
     for n in (16, 32, 64):
         integrator = ProjectedIntegrator(0.016 / n, tolerance=1e-13, ensemble=Langevin(300.0, 0.0))
         errors.append(np.abs(state_of(run(system, integrator, x, v, n))[0] - exact).max())
-    slope = np.polyfit(np.log([4, 2, 1]), np.log(errors), 1)[0]
-    assert slope == pytest.approx(2, abs=0.15)
+    assert np.polyfit(np.log([4, 2, 1]), np.log(errors), 1)[0] == pytest.approx(2, abs=0.15)
 
 
 # -- several time steps ---------------------------------------------------------------------------
