@@ -266,8 +266,7 @@ def universe_of(snapshot: Snapshot) -> Any:
     snapshot = snapshot.in_unit(1.0)
     topology, box = snapshot.topology, None
     if snapshot.cell is not None and snapshot.pbc.any():
-        check_box(snapshot.cell, snapshot.pbc, stacklevel=4)
-        box = dimensions_of(snapshot.cell)
+        box = dimensions_of(snapshot.cell, snapshot.pbc, stacklevel=4)
     # Chains keep their order.
     chains = {chain: k for k, chain in enumerate(dict.fromkeys(topology.chains.tolist()))}
     universe = MDAnalysis.Universe.empty(
@@ -392,9 +391,27 @@ def _system(
     snapshot: Snapshot, topology: Any, sites: VirtualSites | None, force_field: Sequence[str], options: Any
 ) -> openmm.System:
     import openmm
+    from openmm import app, unit
 
+    vectors = topology.getPeriodicBoxVectors()
     if force_field:
-        system = _with_forces(topology, force_field, options)
+        try:
+            field = app.ForceField(*([force_field] if isinstance(force_field, str) else force_field))
+        except Exception as error:  # whatever went wrong inside of OpenMM's reader
+            said = f"force field {force_field}: {' '.join(str(error).split())}"
+            raise InputError(said, item="force_field") from error
+        settings: dict[str, Any] = {"constraints": None, "rigidWater": False}
+        for taken in settings.keys() & options:
+            raise UnsupportedError(f"{taken} is what `constraints` says here; leave it out")
+        settings |= {"removeCMMotion": False, "nonbondedMethod": app.NoCutoff}
+        if vectors is not None:
+            width = min(float(vectors[k][k].value_in_unit(unit.nanometer)) for k in range(3))
+            settings |= {"nonbondedMethod": app.PME, "nonbondedCutoff": min(0.9, 0.45 * width)}
+        try:
+            system = field.createSystem(topology, **(settings | options))
+        except ValueError as error:
+            said = f"the force field does not fit: {' '.join(str(error).split())}"
+            raise InputError(said, item="force_field") from error
         for k, mass in enumerate(() if "hydrogenMass" in options else snapshot.topology.masses.tolist()):
             if mass and system.getParticleMass(k)._value:  # neither unknown nor a site
                 system.setParticleMass(k, mass)
@@ -404,8 +421,8 @@ def _system(
     system = openmm.System()
     for mass in snapshot.topology.masses.tolist():
         system.addParticle(mass)
-    if topology.getPeriodicBoxVectors() is not None:
-        system.setDefaultPeriodicBoxVectors(*topology.getPeriodicBoxVectors())
+    if vectors is not None:
+        system.setDefaultPeriodicBoxVectors(*vectors)
     if sites is not None and len(sites):
         columns = sites.sites.tolist(), sites.parents.tolist(), sites.coefficients.tolist()
         for site, parents, (a, b, c) in zip(*columns, strict=True):
@@ -413,24 +430,3 @@ def _system(
             system.setParticleMass(site, 0.0)
             system.setVirtualSite(site, openmm.OutOfPlaneSite(*parents, a, b, c) if c else flat)
     return system
-
-
-def _with_forces(topology: Any, files: Sequence[str], options: Any) -> openmm.System:
-    from openmm import app, unit
-
-    try:
-        field = app.ForceField(*([files] if isinstance(files, str) else files))
-    except Exception as error:  # whatever went wrong inside of OpenMM's reader
-        raise InputError(f"force field {files}: {' '.join(str(error).split())}", item="force_field") from error
-    settings: dict[str, Any] = {"constraints": None, "rigidWater": False}
-    for taken in settings.keys() & options:
-        raise UnsupportedError(f"{taken} is what `constraints` says here; leave it out")
-    settings |= {"removeCMMotion": False, "nonbondedMethod": app.NoCutoff}
-    vectors = topology.getPeriodicBoxVectors()
-    if vectors is not None:
-        width = min(float(vectors[k][k].value_in_unit(unit.nanometer)) for k in range(3))
-        settings |= {"nonbondedMethod": app.PME, "nonbondedCutoff": min(0.9, 0.45 * width)}
-    try:
-        return field.createSystem(topology, **(settings | options))
-    except ValueError as error:
-        raise InputError(f"the force field does not fit: {' '.join(str(error).split())}", item="force_field") from error

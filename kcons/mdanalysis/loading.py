@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,12 @@ _OPEN_ERRORS = (*READ_ERRORS, ImportError, SyntaxError, AttributeError, NotImple
 
 #: Formats of files whose endings, or names without one, MDAnalysis does not know.
 _FORMATS = {"LAMMPSTRJ": "LAMMPSDUMP", "DUMP": "LAMMPSDUMP", "REVCON": "CONFIG", "NCRST": "NCDF", "RST": "RST7"}
-_HDF5 = b"\x89HDF\r\n"
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
     """Without MDAnalysis' warnings about files: what matters is checked and said here."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         yield
 
 
@@ -190,7 +189,7 @@ def format_named(path: str | Path) -> str:
             head: bytes = file.read(8)
         if name == "TOP":
             return "TOP" if head.startswith(b"%") else "ITP"
-        return "NCDF" if head.startswith((b"CDF", _HDF5)) else "INPCRD"
+        return "NCDF" if head.startswith((b"CDF", b"\x89HDF")) else "INPCRD"
     return name
 
 
@@ -208,11 +207,17 @@ def format_of(reader: Any) -> str:
 
 def _warn_of_a_cell(path: str | Path, reader: Any) -> None:
     if format_of(reader) == "XYZ":
-        with anyopen(str(path), "rb") as file:
-            said = [file.readline(), file.readline()][1]
+        said = line_of(path, 1)
         if b"Lattice=" in said and b'pbc="F F F"' not in said:
             remedy = "convert it by ase convert to a format that has one, such as PDB"
             warnings.warn(f"{path}: its cell is not read, since it is an XYZ file; {remedy}", UserWarning, stacklevel=3)
+
+
+def line_of(path: str | Path, number: int) -> bytes:
+    """A line of a text file, counted from 0; b'' behind its end."""
+    with anyopen(str(path), "rb") as file:
+        found: bytes = next(islice(file, number, None), b"")
+    return found
 
 
 def _look_at(path: Path, what: str) -> None:

@@ -51,11 +51,9 @@ def constraints_of(universe: Any, constrain: str | None = "hbonds", **options: U
     """
     _require_atoms(universe)
     group = universe.atoms
-    local = not isinstance(universe, MDAnalysis.Universe)
 
     def numbers(words: Any) -> IntArray:
-        found = selected(group, words)
-        return np.flatnonzero(np.isin(group.indices, found)) if local else found
+        return np.flatnonzero(np.isin(group.indices, selected(group, words)))
 
     return rows_of(snapshot_of(universe), Holding(constrain, **options), numbers, _REMEDY)
 
@@ -117,16 +115,15 @@ def snapshot_of(universe: Any) -> Snapshot:
     whole = group.universe
     if not len(group):
         raise InputError("there are no atoms in the group", item="atoms")
-    if group.n_atoms != group.unique.n_atoms:
-        _, first = np.unique(group.indices, return_index=True)
-        twice = int(np.setdiff1d(np.arange(len(group)), first)[0])
+    _, first = np.unique(group.indices, return_index=True)
+    for twice in np.setdiff1d(np.arange(len(group)), first).tolist():
         said = f"the group has atom {group.indices[twice]} of its Universe twice, the second time in place {twice}"
         raise InputError(f"{said}; take group.unique", item="atoms", atoms=[twice])
     try:
         step = whole.trajectory.ts
         x = as_written(group.positions)
     except (AttributeError, MDAnalysis.exceptions.NoDataError):
-        said = f"{_file(whole)} has no coordinates; load a coordinates file beside it"
+        said = f"{host_of(whole)} has no coordinates; load a coordinates file beside it"
         raise InputError(said, item="positions") from None
     require_angstrom(whole.trajectory)
     # Of a part, only the atoms of the part; but whole residues keep their numbers.
@@ -134,9 +131,7 @@ def snapshot_of(universe: Any) -> Snapshot:
     _refuse_alternates(group, described)
     cell = None
     if step.dimensions is not None and np.all(step.dimensions[:3] > NARROWEST):
-        sizes = as_written(np.asarray(step.dimensions))
-        # In double precision; right angles are right.
-        cell = np.diag(sizes[:3]) if np.all(sizes[3:] == 90.0) else triclinic_vectors(sizes, dtype=np.float64)
+        cell = triclinic_vectors(as_written(np.asarray(step.dimensions)), dtype=np.float64)
     velocities = as_written(group.velocities) if step.has_velocities and velocities_known(whole.trajectory) else None
     return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, host_of(whole), group.indices)
 
@@ -246,8 +241,9 @@ def check_box(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> N
     require_standard_form(cell, "MDAnalysis")
 
 
-def dimensions_of(cell: FloatArray) -> NDArray[np.float32]:
+def dimensions_of(cell: FloatArray, pbc: ArrayLike = True, stacklevel: int = 2) -> NDArray[np.float32]:
     """Lengths and angles of a cell, with a positive diagonal: those of others would be of its mirror image."""
+    check_box(cell, pbc, stacklevel + 1)
     return np.asarray(triclinic_box(*(cell * np.where(np.diag(cell) < 0, -1.0, 1.0)[:, None])))
 
 
@@ -267,14 +263,10 @@ def cell_of(state: State, motion: Motion | None) -> FloatArray | None:
 
 def host_of(whole: Any) -> str:
     """Where a `Snapshot` of a Universe says that it came from."""
-    return f"topology {_file(whole)}"
+    return f"topology {getattr(whole, 'filename', None) or 'of the Universe'}"
 
 
 def velocities_known(reader: Any) -> bool:
     """Whether velocities are in angstrom/ps: of dumps of LAMMPS nobody tells their unit."""
     named = (getattr(reader, "units", None) or {}).get("velocity", "")
     return named is not None or isinstance(reader, MemoryReader)
-
-
-def _file(whole: Any) -> str:
-    return str(getattr(whole, "filename", None) or "of the Universe")

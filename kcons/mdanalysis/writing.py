@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 from weakref import WeakSet
 
 import MDAnalysis
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import finite_number, positive, whole_number
+from kcons.constraints.arguments import as_array, finite_number, positive, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis.loading import quiet
@@ -57,7 +58,7 @@ ASE_UNITS = RunUnits(1.0, 0.010180505717, 96.4853321233, "Å, Å √(u/eV), eV")
 OPENMM_UNITS = RunUnits(10.0, 1.0, 1.0, "nm, ps, kJ/mol")
 
 
-class TrajectoryWriter:
+class TrajectoryWriter(AbstractContextManager["TrajectoryWriter"]):
     """One trajectory file.
 
     Parameters
@@ -188,11 +189,7 @@ class TrajectoryWriter:
         arrays = {name: self._array(a, name, units[name]) for name, a in given.items() if a is not None}
         if self._decimals is not None:
             _refuse_beyond_xtc(arrays["positions"] * self.units.length, self._decimals, self.path.name)
-        box = None
-        if cell is not None:
-            matrix = np.asarray(cell, dtype=np.float64) * self.units.length
-            check_box(matrix)
-            box = dimensions_of(matrix)
+        box = None if cell is None else dimensions_of(np.asarray(cell, dtype=np.float64) * length)
         time = finite_number(time, "time")
         extras = self._extras(arrays, time)
         ts = self._universe.trajectory.ts
@@ -209,10 +206,7 @@ class TrajectoryWriter:
         self.n_frames += 1
 
     def _array(self, values: ArrayLike, name: str, unit: float) -> FloatArray:
-        array = np.asarray(values, dtype=np.float64)
-        n = len(self._universe.atoms)
-        if array.shape != (n, 3):
-            raise InputError(f"{name} must have shape ({n}, 3), not {array.shape}", item=name)
+        array = as_array(values, (len(self._universe.atoms), 3), name)
         if not np.isfinite(array).all():
             atom = int(np.argmin(np.isfinite(array).all(axis=1)))
             raise NonFiniteError(f"{name} of atom {atom}: {array[atom]}; nothing was written", item=name, atom=atom)
@@ -256,9 +250,6 @@ class TrajectoryWriter:
         if self._writer is not None and (self.n_frames or self._format != "H5MD"):
             self._writer.close()
         self._writer = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -363,14 +354,12 @@ class OpenMMReporter:
     path : path
     interval : int
         Steps between frames.
-    motion : Motion, optional
-        Constraints in OpenMM's units, whose residuals are written into H5MD.
     **options
-        For `TrajectoryWriter`; ``forces=True`` for forces, and multipliers with them.
+        For `TrajectoryWriter`: `motion` in OpenMM's units; ``forces=True`` for forces, and multipliers with them.
     """
 
-    def __init__(self, path: str | Path, interval: int, *, motion: Motion | None = None, **options: Any) -> None:
-        self.path, self.interval, self.motion = Path(path), whole_number(interval, "interval"), motion
+    def __init__(self, path: str | Path, interval: int, **options: Any) -> None:
+        self.path, self.interval = Path(path), whole_number(interval, "interval")
         self._options, self._forces = options, bool(options.get("forces"))
         self.writer: TrajectoryWriter | None = None
 
@@ -385,9 +374,8 @@ class OpenMMReporter:
         periodic = simulation.system.usesPeriodicBoundaryConditions()
         cell = state.getPeriodicBoxVectors(asNumpy=True)._value if periodic else None
         if self.writer is None:
-            interval = self.interval * simulation.integrator.getStepSize()._value
-            options = {"units": OPENMM_UNITS, "motion": self.motion, "interval": interval, **self._options}
-            self.writer = TrajectoryWriter(self.path, len(x), **options)
+            own = {"units": OPENMM_UNITS, "interval": self.interval * simulation.integrator.getStepSize()._value}
+            self.writer = TrajectoryWriter(self.path, len(x), **(own | self._options))
         self.writer.write(x, v, time=state.getTime()._value, cell=cell, forces=f, step=simulation.currentStep)
 
     def close(self) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -24,16 +26,9 @@ from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
-from kcons.mdanalysis.check.deviations import Found, RowTable
-from kcons.mdanalysis.check.endings import Break, broken_by, damage, ending, first_break
-from kcons.mdanalysis.check.precision import (
-    FilePrecision,
-    by_frame,
-    described,
-    grid_of,
-    precision_of,
-    precision_of_reader,
-)
+from kcons.mdanalysis.check.deviations import Found, Frames, RowTable
+from kcons.mdanalysis.check.endings import DAMAGED, Break, broken_by, damage, dcd_head, ending, first_break
+from kcons.mdanalysis.check.precision import FilePrecision, by_frame, described, grid_of, precision_of_reader
 from kcons.mdanalysis.check.result import Asked, CheckResult, result_of
 from kcons.mdanalysis.check.targets import label, read_targets, with_targets
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, load_trajectory, open_universe, quiet
@@ -48,6 +43,8 @@ GRID_FRAMES, GRID_ATOMS = 5, 1000
 _MODES = {"given": "as given", "first": "the first frame", "mean": "the mean of the frames"}
 #: Positions, of all frames together, up to which one process is quickest: of files that need no unpacking, of others.
 ALONE = {"DCD": 5_000_000, "": 500_000}
+#: Bytes of a file that are looked at together.
+AT_ONCE = 2**20
 
 
 class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
@@ -135,7 +132,6 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         self._precision = [usual] * reader.n_frames
         if usual.exact and precision is None:
             self._precision = by_frame(self._path, reader._xdr.offsets, usual)
-        self._velocities = velocities_known(reader)
 
     @classmethod
     def get_supported_backends(cls) -> tuple[str, ...]:
@@ -163,15 +159,13 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         KconsError
             Constraints that cannot be, at the first frame.
         """
-        chosen = {"start": start, "stop": stop, "step": step, "frames": frames}
-        numbers = self._numbers(slice(start, stop, step) if frames is None else np.asarray(frames))
-        if frames is not None:
-            chosen["frames"] = numbers
+        part = slice(start, stop, step)
+        numbers = self._numbers(part if frames is None else np.asarray(frames))
+        chosen = {"start": start, "stop": stop, "step": step, "frames": None if frames is None else numbers}
         remarks = self._look_for_grid(numbers) if self._may_be_on_grid else []
         remarks += self._bind(int(numbers[0]))
-        damaged = None if _in_place(self._trajectory) else first_break(self._trajectory, damage)
-        how = self._masses, self._velocities, damaged, self._precision
-        self._compute = _Frames(self._trajectory, self._rows, *how)
+        damaged = None if _lies_plainly(self._trajectory) else first_break(self._trajectory, damage)
+        self._compute = partial(_look_at, self._trajectory, self._rows, damaged, self._precision)
         super().run(**chosen, **options)
         if self.asked.mode == "mean":
             self._rows.take_means(self.results.found)
@@ -180,9 +174,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         if not len(found.frames):
             raise self._nothing(found.broken)
         # Whether frames that were cut off would have been looked at.
-        first, end = (stop, start) if step is not None and step < 0 else (start, stop)
-        open_ended = end is None or end < 0 or end > self._trajectory.n_frames or (first or 0) < 0
-        if found.broken is None and Path(self._path).is_file() and frames is None and open_ended:
+        more = frames is None and range(sys.maxsize)[part] != range(self._trajectory.n_frames)[part]
+        if found.broken is None and Path(self._path).is_file() and more:
             found.broken = damaged or first_break(self._trajectory, ending)
         text = described([self._precision[frame] for frame in self.frames.tolist()], self._largest)
         asked = replace(self.asked, remarks=self.asked.remarks + remarks)
@@ -228,9 +221,8 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         except (*READ_ERRORS, NonFiniteError) as error:
             raise self._nothing(Break(frame, str(error))) from None
         self._largest = float(np.abs(ts.positions[self._used]).max())
-        masses = np.ones(ts.n_atoms) if self._masses is None else self._masses
         precision = self._precision[frame]
-        self._rows = RowTable(self._given, masses, ts, precision, self.target_error, self._tolerance)
+        self._rows = RowTable(self._given, self._masses, ts, precision, self.target_error, self._tolerance)
         self._rank: int | None = None
         try:
             if self._wants_rank:
@@ -255,87 +247,84 @@ class ConstraintCheck(AnalysisBase):  # type: ignore[misc]
         return self.results.check  # type: ignore[no-any-return]
 
 
-class _Uncopied(Timestep):  # type: ignore[misc]
-    """Has coordinates where the reader of DCD put them, all x before all y: to copy them takes longer than to read."""
-
-    cell = b""
-
-    @property
-    def positions(self) -> Any:
-        return self.given
-
-    @positions.setter
-    def positions(self, given: Any) -> None:
-        self.given = given
-
-    def read(self, reader: Any) -> _Uncopied:
-        """Take the next frame. Only a new cell is for the reader to turn into lengths and angles, and other units."""
-        frame, reader.ts = reader._file.read(), self
-        reader._frame = self.frame = reader._frame + 1
-        if reader.convert_units or frame.unitcell.tobytes() != self.cell:
-            reader._frame_to_ts(frame, self)
-            header, self.cell = reader._file.header, frame.unitcell.tobytes()
-            self.first = header["istart"] / header["nsavc"]
-        self.given, self.time = frame.xyz, (self.frame + self.first) * self.dt
-        return self
+def _lies_plainly(reader: Any) -> bool:
+    """Whether a file is DCD with all atoms in each frame, in angstrom."""
+    if not isinstance(reader, DCDReader) or reader.transformations:
+        return False
+    file = reader._file
+    sizes = {file._firstframesize, file._framesize, 56 * file.is_periodic + 12 * reader.n_atoms + 24}
+    return len(sizes) == 1 and not (reader.convert_units and reader.units["length"] != "Angstrom")
 
 
-def _in_place(reader: Any) -> bool:
-    """Whether frames are read like this, which each worker does for its own."""
-    return isinstance(reader, DCDReader) and not reader.transformations
+def _lying(reader: Any, numbers: NDArray[np.int64], rows: RowTable) -> Iterator[Frames]:
+    """Frames of DCD as they lie in the file: its reader takes longer than all else."""
+    file, n, known, cell = reader._file, reader.n_atoms, b"", reader.ts._unitcell.tobytes()
+    at_once = 1 if rows.others is not None else max(AT_ONCE // file._framesize, 1)
+    words = np.empty((at_once, file._framesize // 4), dcd_head(reader.filename).dtype)
+    begin = file.header["istart"] / file.header["nsavc"]
+    cells, planes = words[:, : -3 * (n + 2)], words[:, -3 * (n + 2) :].reshape(-1, 3, n + 2)
+    with open(reader.filename, "rb", buffering=0) as opened:
+        for some in np.split(numbers, range(at_once, len(numbers), at_once)):
+            words[:, -1] = 0  # where less than a frame can be read
+            for row, number in zip(words, some.tolist(), strict=False):
+                opened.seek(file._header_size + number * file._framesize)
+                opened.readinto(row)
+            # Records are framed by their lengths.
+            whole = (planes[:, :, :: n + 1] == 4 * n).all(axis=(1, 2)) & (cells[:, ::13] == 48).all(axis=1)
+            end = int(np.argmin([*whole[: len(some)], False]))
+            dimensions = []
+            for raw in map(bytes, cells[:end]):
+                if raw != known:
+                    stored = np.frombuffer(raw, np.dtype("f8").newbyteorder(words.dtype.byteorder), 6, 4)
+                    frame = SimpleNamespace(xyz=np.zeros((1, 3), np.float32), unitcell=stored.astype(np.float64))
+                    known, cell = raw, reader._frame_to_ts(frame, Timestep(1))._unitcell.tobytes()
+                dimensions.append(cell)
+            times = (some[:end] + begin) * reader.ts.dt + reader.ts.data.get("time_offset", 0)
+            if end:
+                yield Frames(words[:end].astype(np.int32, copy=False), dimensions, times)
+            if end < len(some):
+                raise OSError(DAMAGED)
+    _ = reader[numbers[-1]]
 
 
-@dataclass
-class _Frames:
-    """The work of one worker, all that goes to others: MDAnalysis' own loop takes the analysis, and ends in errors."""
+def _read(reader: Any, numbers: NDArray[np.int64], damaged: Break | None) -> Iterator[Frames]:
+    """Frames as a reader gives them, up to one that is damaged."""
+    words, previous = np.empty((1, 3 * (reader.n_atoms + 2)), np.int32), -1
+    x = words.view(np.float32).reshape(3, -1)[:, 1:-1]
+    for number in numbers.tolist():
+        if damaged is not None and number >= damaged.frame:
+            return
+        # Seeking reads compressed files from their beginning.
+        ts = reader.next() if 0 <= previous == number - 1 else reader[number]
+        previous = number
+        x[:] = ts.positions.T
+        v = ts.velocities if ts.has_velocities and velocities_known(reader) else None
+        yield Frames(words, [ts._unitcell.tobytes()], np.array([ts.time]), v)
 
-    trajectory: Any
-    rows: RowTable
-    #: None where there are none.
-    masses: FloatArray | None
-    velocities: bool
-    #: In files of which not each worker looks itself.
-    damaged: Break | None
-    #: Of each frame.
-    precision: list[FilePrecision]
 
-    def __call__(
-        self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
-    ) -> Any:
-        """Look at frames, in order, up to the first that cannot be used."""
-        numbers, trajectory, previous = indexed_frames[:, 1], self.trajectory, -1
-        own, damaged = None, self.damaged
-        if _in_place(trajectory):
-            damaged = damage(trajectory, trajectory.filename, numbers.tolist())
-            own, converts = _Uncopied.from_timestep(trajectory.ts), trajectory.convert_units
-            # That there is nothing to convert, the reader would find out for each frame again.
-            trajectory.convert_units = converts and trajectory.units["length"] != "Angstrom"
-        found = Found.nothing(numbers)
-        self.rows.begin()
-        with quiet(), ProgressBar(total=len(numbers), verbose=bool(verbose), **(progressbar_kwargs or {})) as bar:
-            for k, number in enumerate(numbers.tolist()):
-                try:
-                    if damaged is not None and number >= damaged.frame:
-                        found.broken = damaged
-                    else:
-                        # Seeking reads compressed files from their beginning.
-                        if not 0 <= previous == number - 1:
-                            ts = trajectory[number]
-                        else:
-                            ts = trajectory.next() if own is None else own.read(trajectory)
-                        previous = number
-                        v = ts.velocities if ts.has_velocities and self.velocities else None
-                        self.rows.look(found, k, ts, self.precision[number], self.masses, v)
-                except (*READ_ERRORS, KconsError) as error:
-                    found.broken = broken_by(error, trajectory, number)
-                if found.broken is not None:
-                    found.units, found.frames = found.units[:k], found.frames[:k]
-                    break
-                bar.update()
-        self.rows.end(found)
-        if own is not None:
-            trajectory.ts, trajectory.convert_units = Timestep.from_timestep(trajectory.ts), converts
-        return SimpleNamespace(frames=found.frames["frame"], times=found.frames["time"], results=Results(found=found))
+def _look_at(
+    trajectory: Any, rows: RowTable, damaged: Break | None, precision: Sequence[FilePrecision], part: Any, **shown: Any
+) -> Any:
+    """Look at frames, in order, up to the first that cannot be used: the work of one process.
+
+    MDAnalysis' own loop takes the analysis, and ends in errors. `damaged`: in files that are not read as they lie
+    there. `precision`: of each frame. `part`, `shown`: as for that loop.
+    """
+    numbers, options = part[:, 1], {"verbose": bool(shown["verbose"]), **(shown["progressbar_kwargs"] or {})}
+    given = _lying(trajectory, numbers, rows) if _lies_plainly(trajectory) else _read(trajectory, numbers, damaged)
+    found = Found.nothing(numbers)
+    rows.begin()
+    with quiet(), ProgressBar(total=len(numbers), **options) as bar:
+        try:
+            for frames in given:
+                rows.look(found, frames, precision[numbers[found.looked]])
+                bar.update(len(frames.words))
+        except (*READ_ERRORS, KconsError) as error:
+            found.broken = broken_by(error, trajectory, int(numbers[min(found.looked, len(numbers) - 1)]))
+    if found.looked < len(numbers):
+        found.broken = found.broken or damaged
+    rows.end(found)
+    return SimpleNamespace(frames=found.frames["frame"], times=found.frames["time"], results=Results(found=found))
 
 
 def _masses(
@@ -445,7 +434,7 @@ def check_trajectory(
             said = f"{topology} has no coordinates to take lengths from; give --targets first, mean, or a TOML file"
             raise InputError(said, item="targets")
         with quiet():
-            errors = precision_of(topology, format_of(universe.trajectory)).half_step(universe.atoms.positions)
+            errors = precision_of_reader(universe.trajectory).half_step(universe.atoms.positions)
     else:
         load_trajectory(universe, trajectory, topology, format=format)
         # Bonds are looked for in the first frame that is looked at; one that is not there is for the check to refuse.

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from MDAnalysis.lib.mdamath import triclinic_vectors
@@ -74,6 +75,8 @@ class Found:
     frames: NDArray[np.void]
     #: Why there are no more frames.
     broken: Break | None = None
+    #: Frames that were looked at so far.
+    looked: int = 0
 
     @classmethod
     def nothing(cls, numbers: IntArray) -> Found:
@@ -89,13 +92,10 @@ class Found:
         """Parts in order, up to the first break."""
         end = next((k for k, part in enumerate(parts) if part.broken is not None), len(parts) - 1)
         parts = parts[: end + 1]
-        rows = parts[0].rows.copy()
-        for part in parts[1:]:
-            larger = part.rows["margin"] > rows["margin"]
-            for name in ("margin", "largest", "frame"):
-                rows[name] = np.where(larger, part.rows[name], rows[name])
-            for name in ("total", "rounded", "counted"):
-                rows[name] += part.rows[name]
+        each = np.stack([part.rows for part in parts])
+        rows = each[np.argmax(each["margin"], axis=0), np.arange(each.shape[1])]
+        for name in ("total", "rounded", "counted"):
+            rows[name] = each[name].sum(axis=0)
         units, frames = (np.concatenate([getattr(part, name) for part in parts]) for name in ("units", "frames"))
         return cls(rows, units, frames, parts[-1].broken)
 
@@ -109,6 +109,17 @@ class Found:
         return np.asarray(np.sqrt(self.units["squares"] / np.maximum(self.units["seen"], 1)))
 
 
+class Frames(NamedTuple):
+    """Frames one after another; where there are rows that are no lengths, or velocities, a single one."""
+
+    #: Of four bytes, by frame; the last 3 (n_atoms + 2) are x, y and z, with a word before and one behind each.
+    words: NDArray[np.int32]
+    #: Lengths and angles, as MDAnalysis has them.
+    cells: Sequence[bytes]
+    times: FloatArray
+    velocities: Any = None
+
+
 class RowTable:
     """Rows with the targets they are checked against, at the first frame that is looked at.
 
@@ -119,25 +130,24 @@ class RowTable:
     def __init__(
         self,
         given: Sequence[Constraint],
-        masses: FloatArray,
+        masses: FloatArray | None,
         ts: Any,
         precision: FilePrecision,
         target_error: FloatArray,
         tolerance: float,
     ) -> None:
-        time, self.tolerance = float(ts.time), tolerance
-        self._known_cell, self._cell = b"", (NO_LATTICE, np.inf)
-        lattice, limit = self._cell_of(ts)
+        time, self.tolerance, self._masses = float(ts.time), tolerance, masses
+        lattice, limit = _cell_of(ts._unitcell.tobytes())
         x = precision.stored(ts.positions)
-        self.set = held = ConstraintSet(given, x, masses, cell=lattice[0] if limit < np.inf else None, time=time)
+        masses, cell = np.ones(len(x)) if masses is None else masses, lattice[0] if limit < np.inf else None
+        self.set = held = ConstraintSet(given, x, masses, cell=cell, time=time)
         #: By row: whether its target is that of this frame, or of the mean of all; which of `UNITS` it has; what a
         #: tolerance is a part of: the length held, 1 rad.
         self.measured = _by_row(given, [item.target is None for item in given])
-        angular = _by_row(given, [item.period is not None for item in given])
-        angles = [item.period is not None or item.held is ANGLE for item in given]
-        others = [2 * (item.held is not LENGTH) for item in given]
-        self.units = _by_row(given, np.where(angles, 1, others).tolist())
-        self.sizes = np.where(angular, 1.0, held.scale)
+        angular = [item.period is not None for item in given]
+        others = [1 if item.held is ANGLE else 2 * (item.held is not LENGTH) for item in given]
+        self.units = _by_row(given, np.where(angular, 1, others).tolist())
+        self.sizes = np.where(_by_row(given, angular), 1.0, held.scale)
         # Compiled code takes nearest images; whole rows may be longer than half the cell, and are for the set.
         plain = [
             np.full(item.n_rows, item.holds_length and not item.moving)
@@ -167,8 +177,7 @@ class RowTable:
         self.others: Any = None
         if len(self._rows):
             self.others, self._atoms = held.subset(self._rows)
-        self._is_held = np.zeros(held.n_atoms, dtype=bool)
-        self._is_held[held.touched] = True
+        self._is_held = np.isin(np.arange(held.n_atoms), held.touched)
         #: What was added to the targets.
         self.means = np.zeros(held.n_rows)
         with np.errstate(all="ignore"):
@@ -189,8 +198,8 @@ class RowTable:
 
     def __getstate__(self) -> dict[str, Any]:
         """What `look` needs, in other processes: to copy all of it takes longer than to look at some frames."""
-        kept = {"_known_cell", "_cell", "_offsets", "_targets", "_slack", "_most", "_given", "_runs", "_is_held"}
-        kept |= {"_places", "_n_places", "others", "_rows", "_atoms", "means"}
+        kept = {"_offsets", "_targets", "_slack", "_most", "_given", "_runs", "_is_held"}
+        kept |= {"_masses", "_places", "_n_places", "others", "_rows", "_atoms", "means"}
         return {name: value for name, value in vars(self).items() if name in kept}
 
     def _made_of(self, errors: FloatArray, slopes: Any) -> FloatArray:
@@ -213,22 +222,6 @@ class RowTable:
         seen = self.measured & (found.rows["counted"] > 0)
         self._allow(np.where(seen, found.mean("rounded"), self.of_targets))
 
-    def _cell_of(self, ts: Any) -> tuple[FloatArray, float]:
-        """Cell with its inverse, shape (2, 3, 3), and the square of half its smallest width, infinite without one."""
-        if ts._unitcell.tobytes() != self._known_cell:
-            dimensions = ts.dimensions
-            if dimensions is not None and not np.isfinite(dimensions).all():
-                raise NonFiniteError(f"the cell is ({', '.join(f'{value:g}' for value in dimensions)})", item="cell")
-            self._known_cell, self._cell = ts._unitcell.tobytes(), (NO_LATTICE, np.inf)
-            # Files without a cell have lengths of 1; of angles that cannot be there are no vectors.
-            if dimensions is not None and (dimensions[:3] > NARROWEST).all():
-                matrix = triclinic_vectors(dimensions, dtype=np.float64)
-                if matrix.any():
-                    inverse = np.linalg.inv(matrix)
-                    half = 0.5 / float(np.linalg.norm(inverse, axis=0).max())
-                    self._cell = np.stack([matrix, inverse]), half * half
-        return self._cell
-
     def begin(self) -> None:
         """Forget what was found by row."""
         self._by_row = np.zeros((_BY_ROW.itemsize // 8, self._n_places))
@@ -236,58 +229,77 @@ class RowTable:
 
     def end(self, found: Found) -> None:
         """Put what was found by row in the frames that were looked at."""
+        found.units, found.frames = found.units[: found.looked], found.frames[: found.looked]
         found.rows = self._by_row[:, self._places].T.copy().view(_BY_ROW)[:, 0]
         # Compiled code counts the others.
         found.rows["counted"] = len(found.frames) - found.rows["counted"]
 
-    def look(self, found: Found, k: int, ts: Any, precision: FilePrecision, masses: FloatArray | None, v: Any) -> None:
-        """Put what is found in one frame, which must be finite, into the k-th place; with velocities rates, too."""
-        frame = found.frames[k]
-        frame["time"] = time = float(ts.time)
-        lattice, limit = self._cell_of(ts)
-        frame["turning"] = np.nan if limit == np.inf else np.inf
-        planes, speeds = np.ascontiguousarray(ts.positions.T, dtype=np.float32), _NO_SPEEDS
+    def look(self, found: Found, given: Frames, precision: FilePrecision) -> None:
+        """Put what is found in frames, which must be finite, into the next places; with velocities rates, too."""
+        (words, cells, times, v), n, masses = given, len(self._is_held), self._masses
+        frames, units = (part[found.looked : found.looked + len(words)] for part in (found.frames, found.units))
+        frames["time"], speeds = times, _NO_SPEEDS
+        lattices, limits = (np.array(part) for part in zip(*map(_cell_of, cells), strict=True))
+        frames["turning"] = np.where(limits == np.inf, np.nan, np.inf)
+        x = words.view(np.float32)[:, -3 * (n + 2) :].reshape(-1, 3, n + 2)[:, :, 1:-1].swapaxes(1, 2)
         if v is not None:
             speeds = np.column_stack([v, np.zeros(len(v))])
             if not np.isfinite(speeds).all():
                 atom = int(np.argmin(np.isfinite(speeds).all(axis=1)))
                 raise NonFiniteError(f"velocity of atom {atom} is {v[atom]}", item="velocity", atom=atom)
-            found.units["rate_squares"][k] = found.units["rate"][k] = 0.0
+            units["rate_squares"] = units["rate"] = 0.0
             if masses is not None:
-                frame["kinetic"], frame["momentum"] = (masses @ (speeds * speeds)).sum(), (masses @ speeds)[:3]
-                if limit == np.inf:
-                    frame["turning"] = _turning(planes.T - masses @ planes.T / masses.sum(), speeds[:, :3], masses)
+                frames["kinetic"], frames["momentum"] = (masses @ (speeds * speeds)).sum(), (masses @ speeds)[:3]
+                if limits[0] == np.inf:
+                    frames["turning"] = _turning(x[0] - masses @ x[0] / masses.sum(), speeds[:, :3], masses)
         if self.others is not None:
-            self._look_at_others(planes.T, speeds[:, :3], lattice if limit < np.inf else None, precision, time)
-        bad = _look(
-            (planes, planes.view(np.int32), self._is_held, speeds),
-            (lattice, limit, precision.grid, *precision.coefficients),
+            lattice = lattices[0] if limits[0] < np.inf else None
+            self._look_at_others(x[0], speeds[:, :3], lattice, precision, float(times[0]))
+        looked, bad = _look(
+            (words, self._is_held, speeds),
+            (lattices, limits, precision.step * precision.exact, *precision.coefficients),
             (self._offsets, self._targets, self._slack, self._most, self._given, self._runs),
             self._by_row,
-            found.units[k].view(np.float64),
-            float(frame["frame"]),
+            units.view(np.float64),
+            frames["frame"].astype(np.float64),
         )
+        found.looked += looked
         if bad >= 0:
-            raise NonFiniteError(f"position of atom {bad} is {planes[:, bad]}", item="position", atom=bad)
+            raise NonFiniteError(f"position of atom {bad} is {x[looked, bad]}", item="position", atom=bad)
+        if looked < len(words):
+            said = ", ".join(f"{value:g}" for value in np.frombuffer(cells[looked], np.float32))
+            raise NonFiniteError(f"the cell is ({said})", item="cell")
 
     def _look_at_others(
         self, x: NDArray[np.float32], v: FloatArray, lattice: FloatArray | None, precision: FilePrecision, time: float
     ) -> None:
         """Put deviation, rounding and rate of the rows that are no lengths where compiled code finds them."""
         others, rows, atoms = self.others, self._rows, self._atoms
-        given = self._given[:, self._places[rows]]
         others.lattice = lattice
         here = precision.stored(x[atoms])
         with np.errstate(all="ignore"):
             off = others.value(here, time) - self.means[rows]
             slopes = others.jacobian(here, time)
             rounding = SECOND_ORDER * (abs(slopes) @ np.repeat(precision.half_step(here), 3))
-            if len(v):
-                given[2] = np.abs(slopes @ v[atoms].ravel() - others.velocity_target(here, time))
+            rate = np.abs(slopes @ v[atoms].ravel() - others.velocity_target(here, time)) if len(v) else 0.0 * off
         # Where atoms coincide, an angle is no number, nor is its rounding.
-        given[0] = off
-        given[1] = np.where(np.isfinite(off + rounding), np.where(others.holonomic, rounding, 0), np.inf)
-        self._given[:, self._places[rows]] = given
+        rounding = np.where(np.isfinite(off + rounding), np.where(others.holonomic, rounding, 0), np.inf)
+        self._given[:, self._places[rows]] = off, rounding, rate
+
+
+@lru_cache(maxsize=1)
+def _cell_of(unitcell: bytes) -> tuple[FloatArray, float]:
+    """Cell with its inverse, and the square of half its smallest width: infinite without one, -1 if it is no number."""
+    dimensions = np.frombuffer(unitcell, np.float32)
+    if not np.isfinite(dimensions).all():
+        return NO_LATTICE, -1.0
+    # Files without a cell have lengths of 1; of angles that cannot be there are no vectors.
+    matrix = triclinic_vectors(dimensions * (dimensions[:3] > NARROWEST).all(), dtype=np.float64)
+    if not matrix.any():
+        return NO_LATTICE, np.inf
+    inverse = np.linalg.inv(matrix)
+    half = 0.5 / float(np.linalg.norm(inverse, axis=0).max())
+    return np.stack([matrix, inverse]), half * half
 
 
 def _turning(r: FloatArray, v: FloatArray, masses: FloatArray) -> float:
@@ -303,85 +315,92 @@ def _by_row(constraints: Sequence[Constraint], values: Sequence[Any]) -> Any:
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH)
-def _look(atoms, space, held, by_row, by_unit, frame):  # type: ignore[no-untyped-def]
-    """Put deviations of all rows in one frame into `by_row` and `by_unit`; the first held atom of no number, or -1.
+def _look(atoms, space, held, by_row, by_unit, frames):  # type: ignore[no-untyped-def]
+    """Put deviations of all rows in frames into `by_row` and `by_unit`, up to one whose cell or held atom is no number.
 
-    `atoms`: positions, shape (3, n_atoms), and their bits; which are held; velocities with 0 behind each, or none.
-    `space`: the cell and its inverse, and the square of half its smallest width, below which vectors are their own
+    How many frames were looked at, and this atom, or -1.
+
+    `atoms`: bits of positions, shape (n_frames, 3, n_atoms + 2), of which the first and the last in a row are others;
+    which are held; velocities with 0 behind each, or none. `by_unit`: of each frame. `frames`: their numbers.
+    `space`: cells and their inverses, and the squares of half their smallest widths, below which vectors are their own
     nearest images; the grid of coordinates in the file, or 0; the coefficients of `FilePrecision`. `held`: where both
     atoms of eight rows at a time are among quads; target, slack and largest rounding of rows; deviation, rounding and
     rate of those that are no lengths; first row, end and unit of runs, and whether they are lengths.
     """
-    x, bits, is_held, speeds = atoms
-    lattice, limit, step, base, factor, reach = space
-    cell = lattice_numbers(lattice)
+    words, is_held, speeds = atoms
+    lattices, limits, step, base, factor, reach = space
     offsets, targets, slack, most, given, runs = held
     n_atoms, n_rows = len(is_held), len(targets)
-    # Coordinates as the file holds them, and the power of two below the largest.
     quads, inverse = np.empty((n_atoms, 4)), 1.0 / step if step > 0.0 else 0.0
-    least, worst = np.float32(reach).view(np.int32), np.int32(0)
-    for a in range(n_atoms):
-        exponent = max(max(bits[0, a] & _EXPONENT, bits[1, a] & _EXPONENT), bits[2, a] & _EXPONENT)
-        worst = max(worst, exponent)
-        p, q, r = np.float64(x[0, a]), np.float64(x[1, a]), np.float64(x[2, a])
-        if step > 0.0:
-            p, q, r = np.rint(p * inverse) * step, np.rint(q * inverse) * step, np.rint(r * inverse) * step
-        power = np.int32(exponent if exponent >= least else 0).view(np.float32)
-        quads[a, 0], quads[a, 1], quads[a, 2], quads[a, 3] = p, q, r, power
-    if worst == _EXPONENT:
+    lanes, zero, one, least = np.empty(8 * WIDTH), splat(0.0), splat(1.0), np.float32(reach).view(np.int32)
+    for f in range(len(frames)):
+        cell, limit = lattice_numbers(lattices[f]), limits[f]
+        if limit < 0.0:
+            return f, -1
+        # Coordinates as the file holds them, and the power of two below the largest.
+        bits, worst = words[f, -3 * (n_atoms + 2) :].reshape((3, n_atoms + 2)), np.int32(0)
+        x = bits.view(np.float32)
         for a in range(n_atoms):
-            if is_held[a] and not np.isfinite(quads[a, 0] + quads[a, 1] + quads[a, 2]):
-                return a
-    lanes, zero, one = np.empty(8 * WIDTH), splat(0.0), splat(1.0)
-    for run in range(len(runs)):
-        begin, end, unit, lengths = runs[run]
-        total, squares, violated, seen = zero, zero, zero, zero
-        rates, fastest, largest, coarsest = zero, zero, zero, zero
-        for r in range(begin, end, WIDTH):
-            rate, told = zero, one
-            if lengths:
-                dx, dy, dz, power = gather_ends(quads, offsets, 2 * r, 2 * r + WIDTH)
-                square = dx * dx + dy * dy + dz * dz
-                if not all_within(square, limit):
-                    dx, dy, dz = minimum_image((dx, dy, dz), cell, TRICLINIC)
+            exponent = max(max(bits[0, 1 + a] & _EXPONENT, bits[1, 1 + a] & _EXPONENT), bits[2, 1 + a] & _EXPONENT)
+            worst = max(worst, exponent)
+            p, q, r = np.float64(x[0, 1 + a]), np.float64(x[1, 1 + a]), np.float64(x[2, 1 + a])
+            if step > 0.0:
+                p, q, r = np.rint(p * inverse) * step, np.rint(q * inverse) * step, np.rint(r * inverse) * step
+            power = np.int32(exponent if exponent >= least else 0).view(np.float32)
+            quads[a, 0], quads[a, 1], quads[a, 2], quads[a, 3] = p, q, r, power
+        if worst == _EXPONENT:
+            for a in range(n_atoms):
+                if is_held[a] and not np.isfinite(quads[a, 0] + quads[a, 1] + quads[a, 2]):
+                    return f, a
+        for run in range(len(runs)):
+            begin, end, unit, lengths = runs[run]
+            total, squares, violated, seen = zero, zero, zero, zero
+            rates, fastest, largest, coarsest = zero, zero, zero, zero
+            for r in range(begin, end, WIDTH):
+                rate, told = zero, one
+                if lengths:
+                    dx, dy, dz, power = gather_ends(quads, offsets, 2 * r, 2 * r + WIDTH)
                     square = dx * dx + dy * dy + dz * dz
-                off = square_root(square) - load(targets, r)
-                rounding = power * (_ROOT_THREE * factor) + 2.0 * _ROOT_THREE * base
-                if len(speeds):
-                    vx, vy, vz, _ = gather_ends(speeds, offsets, 2 * r, 2 * r + WIDTH)
-                    along = absolute(dx * vx + dy * vy + dz * vz) / square_root(square)
-                    rate = where_greater(square, zero, along, zero)
-            else:
-                off, rounding, rate = load(given, r), load(given, n_rows + r), load(given, 2 * n_rows + r)
-            size, bound = absolute(off), load(most, r)
-            margin = size - rounding - load(slack, r)
-            if not all_within(rounding, bound):
-                told = where_greater(rounding, bound, zero, one)
-                off, size = where_greater(rounding, bound, zero, off), where_greater(rounding, bound, zero, size)
-                margin = where_greater(rounding, bound, splat(-np.inf), margin)
-                rate = where_greater(rounding, bound, zero, rate)  # where atoms coincide, no number
-                rounding = where_greater(rounding, bound, zero, rounding)
-                store(by_row, 5 * n_rows + r, load(by_row, 5 * n_rows + r) + one - told)
-            total = total + off
-            squares = squares + off * off
-            violated = violated + where_greater(margin, zero, one, zero)
-            seen = seen + told
-            rates = rates + rate * rate
-            fastest = where_greater(rate, fastest, rate, fastest)
-            largest = where_greater(size, largest, size, largest)
-            coarsest = where_greater(rounding, coarsest, rounding, coarsest)
-            store(by_row, 3 * n_rows + r, load(by_row, 3 * n_rows + r) + off)
-            store(by_row, 4 * n_rows + r, load(by_row, 4 * n_rows + r) + rounding)
-            best = load(by_row, r)
-            if not all_within(margin, best):
-                store(by_row, r, where_greater(margin, best, margin, best))
-                for k, value in ((1, size), (2, splat(frame))):
-                    before = load(by_row, k * n_rows + r)
-                    store(by_row, k * n_rows + r, where_greater(margin, best, value, before))
-        # Sums, then what is largest.
-        for k, vector in enumerate((total, squares, violated, seen, rates, fastest, largest, coarsest)):
-            store(lanes, k * WIDTH, vector)
-        for k in range(8 * WIDTH):
-            at = 8 * unit + k // WIDTH
-            by_unit[at] = by_unit[at] + lanes[k] if k < 5 * WIDTH else max(by_unit[at], lanes[k])
-    return -1
+                    if not all_within(square, limit):
+                        dx, dy, dz = minimum_image((dx, dy, dz), cell, TRICLINIC)
+                        square = dx * dx + dy * dy + dz * dz
+                    off = square_root(square) - load(targets, r)
+                    rounding = power * (_ROOT_THREE * factor) + 2.0 * _ROOT_THREE * base
+                    if len(speeds):
+                        vx, vy, vz, _ = gather_ends(speeds, offsets, 2 * r, 2 * r + WIDTH)
+                        along = absolute(dx * vx + dy * vy + dz * vz) / square_root(square)
+                        rate = where_greater(square, zero, along, zero)
+                else:
+                    off, rounding, rate = load(given, r), load(given, n_rows + r), load(given, 2 * n_rows + r)
+                size, bound = absolute(off), load(most, r)
+                margin = size - rounding - load(slack, r)
+                if not all_within(rounding, bound):
+                    told = where_greater(rounding, bound, zero, one)
+                    off, size = where_greater(rounding, bound, zero, off), where_greater(rounding, bound, zero, size)
+                    margin = where_greater(rounding, bound, splat(-np.inf), margin)
+                    rate = where_greater(rounding, bound, zero, rate)  # where atoms coincide, no number
+                    rounding = where_greater(rounding, bound, zero, rounding)
+                    store(by_row, 5 * n_rows + r, load(by_row, 5 * n_rows + r) + one - told)
+                total = total + off
+                squares = squares + off * off
+                violated = violated + where_greater(margin, zero, one, zero)
+                seen = seen + told
+                rates = rates + rate * rate
+                fastest = where_greater(rate, fastest, rate, fastest)
+                largest = where_greater(size, largest, size, largest)
+                coarsest = where_greater(rounding, coarsest, rounding, coarsest)
+                store(by_row, 3 * n_rows + r, load(by_row, 3 * n_rows + r) + off)
+                store(by_row, 4 * n_rows + r, load(by_row, 4 * n_rows + r) + rounding)
+                best = load(by_row, r)
+                if not all_within(margin, best):
+                    store(by_row, r, where_greater(margin, best, margin, best))
+                    for k, value in ((1, size), (2, splat(frames[f]))):
+                        before = load(by_row, k * n_rows + r)
+                        store(by_row, k * n_rows + r, where_greater(margin, best, value, before))
+            # Sums, then what is largest.
+            for k, vector in enumerate((total, squares, violated, seen, rates, fastest, largest, coarsest)):
+                store(lanes, k * WIDTH, vector)
+            for k in range(8 * WIDTH):
+                at = 8 * unit + k // WIDTH
+                by_unit[f, at] = by_unit[f, at] + lanes[k] if k < 5 * WIDTH else max(by_unit[f, at], lanes[k])
+    return len(frames), -1

@@ -6,26 +6,23 @@ first that it does not recognize. Of formats of structures, such as GRO, it read
 
 from __future__ import annotations
 
-import io
 import os
-import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
+import numpy as np
 from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.exceptions import NoDataError
 from MDAnalysis.lib.util import anyopen
+from numpy.typing import NDArray
 
 from kcons.errors import NonFiniteError
-from kcons.mdanalysis.loading import READ_ERRORS, format_of
+from kcons.mdanalysis.loading import READ_ERRORS, format_of, line_of
 
 #: What is said of a frame of DCD whose records are not as long as they say.
 DAMAGED = "its records are damaged"
-#: What stands before and behind a cell in DCD: its bytes, in either order.
-CELL_MARKS = tuple(struct.pack(f"{order}i", 48) for order in "<>")
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,7 @@ class Break:
 
 def broken_by(error: BaseException, reader: Any, frame: int) -> Break:
     """Where and why a trajectory cannot be read further; what the reader says, which iteration hides."""
-    if isinstance(error, StopIteration):
+    if isinstance(error.__cause__ or error, StopIteration):
         try:
             reader[frame]
         except READ_ERRORS as hidden:
@@ -81,12 +78,7 @@ def ending(reader: Any, path: str) -> Break | None:
     if isinstance(reader, DCDReader):
         file = reader._file
         end = file._header_size + file._firstframesize + (n - 1) * file._framesize
-        with open(path, "rb") as opened:
-            head = opened.read(12)
-        # The first record has 84 or 164 bytes, in the order of bytes of the file.
-        order = "<" if struct.unpack_from("<i", head)[0] in (84, 164) else ">"
-        announced = struct.unpack_from(order + "i", head, 8)[0]
-        if end >= size and announced > n:
+        if end >= size and (announced := dcd_head(path)[2]) > n:
             return Break(n, f"its header announces {announced} frames, and it has {n}")
     elif name in ("XTC", "TRR"):
         end = reader._xdr._bytes_tell()
@@ -98,19 +90,26 @@ def ending(reader: Any, path: str) -> Break | None:
     return Break(n, f"{size - end} bytes follow the last whole frame") if end < size else None
 
 
-def damage(reader: Any, path: str, frames: Iterable[int] | None = None) -> Break | None:
-    """The first damaged frame of a DCD or text file, of all or of some, that the reader does not refuse itself."""
+def dcd_head(path: str) -> NDArray[np.int32]:
+    """The first three words of a DCD file: bytes of the first record, its name, number of frames."""
+    head = np.fromfile(path, "<i4", 3)
+    return head if head[0] in (84, 164) else head.view(">i4")
+
+
+def damage(reader: Any, path: str) -> Break | None:
+    """The first damaged frame of a DCD or text file that the reader does not refuse itself."""
     if not isinstance(reader, DCDReader):
         with suppress(OSError, EOFError):
             return _text_break(path, format_of(reader), reader.n_atoms)
     elif (file := reader._file).is_periodic:
         # Records are framed by their lengths, at which the reader looks itself, but for the one behind a cell.
-        with open(path, "rb", buffering=0 if file._framesize > io.DEFAULT_BUFFER_SIZE else -1) as opened:
-            for k in range(reader.n_frames) if frames is None else frames:
+        with open(path, "rb") as opened:
+            for k in range(reader.n_frames):
                 # Of fixed atoms, the first frame alone has coordinates.
                 opened.seek(file._header_size + (file._firstframesize + (k - 1) * file._framesize if k else 0))
                 cell = opened.read(56)
-                if cell[:4] != cell[52:] or cell[:4] not in CELL_MARKS:
+                # 48, in either order of bytes.
+                if cell[:4] != cell[52:] or cell[:4] not in (b"0\0\0\0", b"\0\0\x000"):
                     return Break(k, DAMAGED)
     return None
 
@@ -135,7 +134,7 @@ def _behind_the_only_frame(path: str, file_format: str, n_atoms: int) -> str:
             lines = max((number for number, line in enumerate(file, 1) if line.strip()), default=0)
         # At most: title, number of atoms and a cell; of INPCRD two atoms a line, with velocities.
         most = {"GRO": n_atoms + 3, "INPCRD": 3 + 2 * ((n_atoms + 1) // 2)}.get(file_format)
-        more = lines - (most or 5 + n_atoms * (2 + int(_line(path, 1).split()[0])))
+        more = lines - (most or 5 + n_atoms * (2 + int(line_of(path, 1).split()[0])))
     if models > 1:
         return f"this one has {models}"
     return f"{more} {what} follow it" if more > 0 else ""
@@ -158,10 +157,10 @@ def _text_break(path: str, file_format: str, n_atoms: int) -> Break | None:
     if file_format == "TRJ":
         # Ten numbers a line; a line of three for the cell may follow.
         per_frame = -(-3 * n_atoms // 10)
-        per_frame += _all_numbers(_line(path, 1 + per_frame), 3)
+        per_frame += _all_numbers(line_of(path, 1 + per_frame), 3)
     elif file_format == "TXYZ":
         # Six numbers of the cell may follow the number of atoms.
-        per_frame += _all_numbers(_line(path, 1), 6)
+        per_frame += _all_numbers(line_of(path, 1), 6)
     lines = -title
     with anyopen(path, "rb") as file:
         for line in file:
@@ -180,13 +179,6 @@ def _text_break(path: str, file_format: str, n_atoms: int) -> Break | None:
     whole = (lines - (not line.endswith(b"\n"))) // per_frame
     more = lines - whole * per_frame
     return Break(whole, f"{more} lines follow the last whole frame") if more > 0 else None
-
-
-def _line(path: str, number: int) -> bytes:
-    """A line of a text file, counted from 0; b'' behind its end."""
-    with anyopen(path, "rb") as file:
-        found: bytes = next(islice(file, number, None), b"")
-    return found
 
 
 def _all_numbers(line: bytes, n: int) -> bool:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import positive
 from kcons.constraints.target import FloatArray
-from kcons.mdanalysis.loading import format_named, format_of
+from kcons.mdanalysis.loading import format_named, format_of, line_of
 
 #: Formats whose numbers are floats in nanometers, which MDAnalysis turns into angstrom, in single precision again.
 _NANOMETERS = {"TRR", "H5MD", "TNG"}
@@ -53,11 +53,6 @@ class FilePrecision:
     #: Coordinates were moved by up to this after they had been rounded to these digits.
     shift: float = 0.0
 
-    @property
-    def grid(self) -> float:
-        """Steps of coordinates that can be had back exactly, in angstrom; 0 if they cannot."""
-        return self.step if self.exact else 0.0
-
     @cached_property
     def coefficients(self) -> tuple[float, float, float]:
         """Rounding moves coordinates of an atom, 2^e <= largest < 2^(e+1), by base; + factor 2^e from `reach` on."""
@@ -76,7 +71,7 @@ class FilePrecision:
     def stored(self, coordinates: ArrayLike) -> FloatArray:
         """Coordinates in double precision, as the file holds them."""
         exact = np.asarray(coordinates, dtype=np.float64)
-        return np.rint(exact * (1.0 / self.grid)) * self.grid if self.grid > 0 else exact
+        return np.rint(exact * (1.0 / self.step)) * self.step if self.exact else exact
 
     def half_step(self, coordinates: ArrayLike) -> FloatArray:
         """Largest error by rounding of coordinates of atoms, shape (..., 3); infinite where there are no numbers."""
@@ -99,9 +94,7 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
         return FilePrecision(name, 10.0 / steps, exact=True) if steps else FilePrecision(name, unit=10.0)
     if name == "GRO":
         # Columns are n + 5 wide for n decimals, so that two points of the third line are n + 5 apart.
-        with anyopen(str(path), "rb") as file:
-            line: bytes = [file.readline() for _ in range(3)][2]
-        points = [k for k, c in enumerate(line) if c == ord(".")]
+        points = [k for k, c in enumerate(line_of(path, 2)) if c == ord(".")]
         return FilePrecision(name, 10.0 * 10.0 ** -(points[1] - points[0] - 5 if len(points) > 1 else 3))
     if name in _DECIMALS:
         return FilePrecision(name, 10.0 ** -_DECIMALS[name])

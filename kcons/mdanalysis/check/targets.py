@@ -69,12 +69,8 @@ class Rule(NamedTuple):
 
 
 def _all_match(labels: NDArray[np.str_], patterns: Sequence[str]) -> NDArray[np.bool_]:
-    found = np.ones(len(labels), dtype=bool)
-    for column, pattern in zip(labels.T, patterns, strict=True):
-        if pattern != "*":
-            distinct, place = np.unique(column, return_inverse=True)
-            found &= np.array([fnmatchcase(str(each), pattern) for each in distinct], dtype=bool)[place]
-    return found
+    columns = zip(labels.T.tolist(), patterns, strict=True)
+    return np.all([[fnmatchcase(each, pattern) for each in column] for column, pattern in columns], axis=0)
 
 
 def read_targets(path: str | Path) -> dict[str, list[Rule]]:

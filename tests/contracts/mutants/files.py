@@ -18,7 +18,7 @@ MUTANTS = {
         '«np.where(seen, found.mean("rounded"), self.of_targets)→self.of_targets»': (
             "mdanalysis/check/precision::targets_that_are_means_have_the_mean_rounding_of_their_frames"
         ),
-        ".where(angular, 1.0, «held.scale→1.0»)": "mdanalysis/check/precision::the_tolerance_is_a_part_of_the_length",
+        "angular), 1.0, «held.scale→1.0»)": "mdanalysis/check/precision::the_tolerance_is_a_part_of_the_length",
         "n_rows + r) + one« - told→»)": "deviations::targets_of_the_first_frame_and_of_the_mean",
         "rate = «where_greater(rounding, bound, zero, rate)→told * rate»": (
             "deviations::where_atoms_coincide_nothing_is_told_of_their_angle"
@@ -39,9 +39,8 @@ MUTANTS = {
     },
     "mdanalysis/check/constraint_check.py": {
         "«reader.skip_timestep == 1→True» and": "mdanalysis/check/targets::times_that_files_do_not_have_are_said",
-        "«Timestep.from_timestep(trajectory.ts)→trajectory.ts», converts": (
-            "deviations::rows_that_were_made_for_a_part_are_refused"
-        ),
+        "    «_ = reader[numbers[-1]]→pass»": "deviations::rows_that_were_made_for_a_part_are_refused",
+        "« & (cells[:, ::13] == 48).all(axis=1)→»": "endings::records_of_all_kinds_of_dcd",
         '«str(given.get("select", "all")) != "all"→False»': (
             "mdanalysis/check/results::of_a_selection_there_is_no_temperature"
         ),
@@ -56,7 +55,7 @@ MUTANTS = {
     },
     "mdanalysis/check/endings.py": {
         "if «cell[:4] != cell[52:] or→»": "endings::records_of_all_kinds_of_dcd",
-        "cell[52:]« or cell[:4] not in CELL_MARKS→»:": "endings::records_of_all_kinds_of_dcd",
+        'cell[52:]« or cell[:4] not in (b"0\\0\\0\\0", b"\\0\\0\\x000")→»:': "endings::records_of_all_kinds_of_dcd",
         '"GRO": «n_atoms + 3→2 * n_atoms + 6»,': "endings::what_lies_behind_the_only_frame_that_is_read",
         "word.isdigit()« and int(word) == n_atoms→»": "endings::a_frame_with_another_number_of_atoms",
     },
