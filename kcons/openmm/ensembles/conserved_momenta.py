@@ -143,7 +143,7 @@ def _totals(
         there = x + SHIFT * size * rng.standard_normal(3) + shaking(x, rng)
         there[fixed] = x[fixed]
         context.setPositions(there)
-        f = forces_at(context, -1)
+        f = np.nan_to_num(forces_at(context, -1), posinf=0.0, neginf=0.0)  # a place may lie behind a wall
         total, whole = f.sum(axis=0), float(np.abs(f).sum())
         found.append(total / whole if whole > 0 and np.abs(total).max() > BALANCED * whole else np.zeros(3))
         turns.see(there, f)
