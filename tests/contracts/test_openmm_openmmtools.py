@@ -96,13 +96,8 @@ def test_what_openmmtools_asks_of_an_integrator(name):
 
 def test_integrators_that_differ_in_more_have_contexts_of_their_own():
     same = cache.ContextCache._generate_integrator_id
-    made = [
-        ProjectedIntegrator(0.001),
-        ProjectedIntegrator(0.001, "suzuki4"),
-        ProjectedIntegrator(0.001, ensemble=Langevin(300, 1.0)),
-        ProjectedIntegrator(0.001, ensemble=NoseHoover(300, 1.0)),
-        ProjectedIntegrator(0.001, ensemble=NoseHoover(300, 2.0)),
-    ]
+    others = ProjectedIntegrator(0.001, "suzuki4"), ProjectedIntegrator(0.001, ensemble=NoseHoover(300, 2.0))
+    made = [*(maker(300) for maker in MAKERS.values()), *others]
     assert len({same(integrator) for integrator in made}) == len(made)
 
 

@@ -8,7 +8,7 @@ import json
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import openmm
@@ -106,7 +106,8 @@ class DeviceProgram(Program):
     def write(self, name: str, value: float) -> None:
         """Change a variable that is no setting; settings go over to the plugin and into its text."""
         self.push()
-        if self.known(name) in self.kept and self.integrator.shared.bound:
+        bound, now = self.integrator.shared.bound, self.integrator.getGlobalVariableByName(self.known(name))
+        if name in self.kept and bound and value != now:
             values = self.integrator.read("memory")
             values[self.kept.index(name)] = value
             self.recall({"memory": values})
@@ -230,8 +231,7 @@ class DeviceIntegrator(ProjectedIntegrator):
 
     def attach(self, context: openmm.Context) -> None:
         super().attach(context)
-        guard = self._guard
-        assert guard is not None
+        guard = cast(Guard, self._guard)
         self.shared.whole = guard.moving or not guard.undisturbed
 
     def _run(self, guard: Guard, steps: int, ends: bool) -> None:
@@ -314,7 +314,7 @@ class DeviceIntegrator(ProjectedIntegrator):
             return float(self.shared.told[_MOTION])
         if name == "failed":  # a call that fails raises
             return 0.0
-        if name in program.kept and self.shared.bound:
+        if name in program.kept and self.shared.planned:  # before they are 0, whatever positions are
             return float(self.read("memory")[program.kept.index(name)])
         return {**program.numbers, **program.settings}[program.known(name)]
 
@@ -372,13 +372,14 @@ def _planner(made: int, address: int, description: bytes, name: bytes, groups: i
         masses, box = given("masses"), given("box", 3)
         at = given("positions", 3), box if box.any() else None, float(given("time")[0])
         rows = part.rows_at(masses, given("constraints", 3), *at)
+        cells = rows.renew(0.0, 0.0, 0, *at[:2])  # a CompoundIntegrator makes steps without Python
         source, arrays, parts, sizes = plan(described, platform, masses, groups, rows)
         if integrator is not None:
             integrator.rows, integrator.saved = rows, [array.name for array in arrays if array.saved]
         compiled = str(build.kernels_library(source)) if platform in PLAIN else ""
         library.kcons_source(steps, source.encode(), compiled.encode(), *sizes)
         for array in arrays:
-            values = np.ascontiguousarray(array.values, dtype=np.float64)
+            values = np.ascontiguousarray(cells.get(array.name, array.values), dtype=np.float64)
             about = array.name.encode(), array.kind == "int", array.saved, array.passed
             library.kcons_array(steps, *about, values.ctypes.data_as(_DOUBLES), values.size)
         for number, actions in enumerate(parts):

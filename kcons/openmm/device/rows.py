@@ -215,7 +215,7 @@ class DeviceRows(Engine):
     ) -> dict[str, FloatArray]:
         """What functions of Python say for so many steps, at most `block`, and of positions where they have changed."""
         found: dict[str, FloatArray] = {}
-        if self.n_movers:
+        if self.n_movers and steps:
             # Times, those of knots, then value, rate and acceleration of moving rows at each knot, per spacing.
             start, spacing, count = -BEYOND * dt, dt / KNOTS, (steps + 2 * BEYOND) * KNOTS + 1
             times = time + start + spacing * np.arange(count)

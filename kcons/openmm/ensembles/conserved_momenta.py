@@ -159,7 +159,8 @@ def _totals(
             there = x + size * away + shaking(x, rng)
             there[fixed] = x[fixed]
             context.setPositions(there)
-            if (f := forces_at(context, -1)).any():
+            f = np.nan_to_num(forces_at(context, -1), posinf=0.0, neginf=0.0)  # a place may lie behind a wall
+            if f.any():
                 break
         total, whole = f.sum(axis=0), float(np.abs(f).sum())
         found.append(total / whole if whole > 0 and np.abs(total).max() > BALANCED * whole else np.zeros(3))

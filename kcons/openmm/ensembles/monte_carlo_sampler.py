@@ -183,11 +183,9 @@ class HamiltonianMonteCarlo:
             due = [] if self.simulation is None else [r for r in self.simulation.reporters if self._next(r) == 1]
             self._propose(first=number == 0)
             for reporter in due:
-                asked = _asked(reporter.describeNextReport(self.simulation))
-                acting = self.integrator.getIntegrationForceGroups()
-                found = self.context.getState(
-                    positions=True, velocities=True, forces=True, energy=True, groups=acting, enforcePeriodicBox=asked
-                )
+                wraps, acting = self._wraps(reporter), self.integrator.getIntegrationForceGroups()
+                options = {"groups": acting, "parameters": True, "enforcePeriodicBox": wraps}
+                found = self.context.getState(positions=True, velocities=True, forces=True, energy=True, **options)
                 reporter.report(self.simulation, found)
 
     # -- a proposal -----------------------------------------------------------------------------
@@ -302,11 +300,11 @@ class HamiltonianMonteCarlo:
         told = reporter.describeNextReport(self.simulation)
         return int(told["steps"] if isinstance(told, dict) else told[0])
 
-
-def _asked(told: Any) -> bool:
-    """Whether a reporter wants molecules in the box."""
-    periodic = told.get("periodic") if isinstance(told, dict) else (told[5] if len(told) > 5 else None)
-    return bool(periodic)
+    def _wraps(self, reporter: Any) -> bool:
+        """Whether a reporter is given molecules in the box; one that does not say, where the System is periodic."""
+        told = reporter.describeNextReport(self.simulation)
+        asked = told.get("periodic") if isinstance(told, dict) else (*told, None)[5]
+        return bool(self.context.getSystem().usesPeriodicBoundaryConditions() if asked is None else asked)
 
 
 def _integrator_of(context: openmm.Context) -> ProjectedIntegrator:

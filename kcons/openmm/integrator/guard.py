@@ -632,17 +632,17 @@ class Guard:
 
     def enter(self) -> None:
         """A call of `step` begins."""
+        if self.started and self._parameters != dict(self.context.getParameters()):
+            self.integrator.refresh()
+            if self.momenta is not None:  # a field may have been switched on, and g is another
+                before, self.thermal, self.momenta = self.thermal, None, None
+                self.started = before == cast(Any, self.integrator.ensemble).count(self.integrator)
         if not self.started:
             self.begin()
-        elif self.integrator.parts and self._parameters != dict(self.context.getParameters()):
-            self.integrator.refresh()
 
     def leave(self) -> None:
         """A call of `step` ends."""
-        context = self.context
-        self._left = self._place(context)
-        if self.integrator.parts:
-            self._parameters = dict(context.getParameters())
+        self._left, self._parameters = self._place(self.context), dict(self.context.getParameters())
 
     def begin(self) -> None:
         """Before the first step, and where others have moved x: x and v on the constraints, or refused.
@@ -799,7 +799,7 @@ class Guard:
             check_finite(x, v, step, self.rows.n_rows > 0)
             for part in integrator.parts:
                 part.check_masses(self.system)
-            if self.thermal is not None and not np.array_equal(masses_of(self.system), self.rows.masses):
+            if (self.thermal or self._freedom) and not np.array_equal(masses_of(self.system), self.rows.masses):
                 self._read_again()
             self.check_lengths(x, step)
             for miss in (self.speed_violation(x, v), *(part.worst_violation(context) for part in integrator.parts)):

@@ -43,6 +43,7 @@ MUTANTS = {
     },
     "openmm/device/device_integrator.py": {
         "or build.accelerated() «or→and» (build.is_built()": "device_integrator::which_steps_are_made_on_the_device",
+        "cells.get(«array.name→0», array": "device_integrator::a_compound_integrator_begins_with_rows_through_faces",
         "array in «arrays→rows.arrays» if array.saved": "molecule_spheres::a_failure_puts_auxiliary_variables_back",
         "np.isfinite(told[_RESIDUAL])«→ and False»:": "device_integrator::a_failure_puts_back_what_was_checked_last",
         "yield x, v, f, time + «k→(k - 1)» * every * self": "device_integrator::records_are_the_states_after_steps",

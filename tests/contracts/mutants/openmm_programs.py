@@ -6,6 +6,7 @@ MUTANTS = {
             "hold::a_barostat_in_place_of_another_force_refuses_rows_through_the_faces_of_the_box"
         ),
         "«self._read_again()→»  # `Context": "openmm/integrator/edits::particles_that_lose_their_mass_take_no_heat",
+        "if (self.thermal «or self._freedom→»)": "openmm/integrator/edits::particles_that_lose_their_mass_take_no_heat",
         "            if «self._read_again()→False»:\n": (
             "openmm/integrator/edits::masses_and_lengths_after_reinitialize"
         ),
@@ -72,6 +73,7 @@ MUTANTS = {
         ),
     },
     "openmm/ensembles/monte_carlo_sampler.py": {
+        "if asked is None«→ and False» else": "monte_carlo_sampler::reporters_of_a_simulation_see_every_proposal",
         "if «not missed <= self.tolerance→False»:": "monte_carlo_sampler::a_way_back_that_misses_its_start_is_rejected",
     },
     "constraints/constraint.py": {

@@ -8,7 +8,7 @@ import openmm
 import pytest
 from device_systems import waters
 from openmm import app
-from openmm_systems import GPUS, LONG, dumbbell, field, particles, residuals, started, state_of
+from openmm_systems import GPUS, LONG, context_of, dumbbell, field, particles, residuals, started, state_of
 
 from kcons.constraints import Distance, Plane
 from kcons.errors import ConvergenceError, UnsupportedError
@@ -179,7 +179,9 @@ def test_constraints_that_are_taken_away_before_reinitialize_hold_no_more():
 
 def test_settings_change_what_is_done():
     system, x, v = waters()
-    made = [ProjectedIntegrator(0.001, ensemble=NoseHoover(300.0, 10.0), device=d) for d in (True, False)]
+    made = [ProjectedIntegrator(0.001, ensemble=NoseHoover(300.0, 10.0), device=d) for d in (True, False, True)]
+    early = context_of(system, made.pop())  # openmmtools copies variables before there are positions
+    early.getIntegrator().setGlobalVariable(2, early.getIntegrator().getGlobalVariableByName("link1"))
     contexts = [run(integrator, system, x, v, calls=(5,)) for integrator in made]
     for integrator in made:
         integrator.setTemperature(900.0)
@@ -237,6 +239,15 @@ def test_reinitialize_keeps_what_belongs_to_the_state():
     integrator.step(5)
     expected = run(ProjectedIntegrator(0.001, ensemble=bath, device=True), system, x, v, calls=(10,))
     assert difference(context, expected) < 1e-11
+
+
+def test_a_compound_integrator_begins_with_rows_through_faces():
+    bonds, compound = openmm.HarmonicBondForce(), openmm.CompoundIntegrator()
+    bonds.setUsesPeriodicBoundaryConditions(True)
+    compound.addIntegrator(made := ProjectedIntegrator(0.001, parts=[Distance([[0, 1]], 0.2)], device=True))
+    context = started(particles([1.0] * 2, bonds), compound, x := [[0.1, 0.0, 0.0], [1.9, 0.0, 0.0]])
+    compound.step(3)
+    np.testing.assert_allclose(state_of(context)[0], x, atol=1e-12, err_msg=repr(made))
 
 
 def test_several_contexts_and_threads():
@@ -312,15 +323,13 @@ def test_records_are_the_states_after_steps(platform, ensemble):
 def test_which_steps_are_made_on_the_device(monkeypatch):
     """Where nobody says: on machines with a GPU, and where the plugin was compiled."""
     build.library()
-    assert type(ProjectedIntegrator(0.001)) is DeviceIntegrator
     monkeypatch.setattr(build, "accelerated", list)
     assert type(ProjectedIntegrator(0.001)) is DeviceIntegrator
     monkeypatch.setattr(build, "is_built", lambda: False)
     integrator = ProjectedIntegrator(0.001)
     assert type(integrator) is type(copy.copy(integrator)) is ProjectedIntegrator
     assert "not on the device: the plugin is not compiled" in integrator.listing()
-    only_there = ProjectedIntegrator(0.001, parts=Distance([[0, 1]], 0.1))
-    assert type(only_there) is DeviceIntegrator
+    assert type(ProjectedIntegrator(0.001, parts=Distance([[0, 1]], 0.1))) is DeviceIntegrator  # only there
     monkeypatch.setattr(build, "accelerated", lambda: ["CUDA"])
     assert type(ProjectedIntegrator(0.001)) is DeviceIntegrator
 
@@ -331,7 +340,6 @@ def test_what_the_device_has_not_is_refused_or_left_to_the_custom_integrator(mon
     with pytest.raises(UnsupportedError, match="OtherLangevin has no kernels"):
         DeviceIntegrator(0.001, ensemble=type("OtherLangevin", (Langevin,), {})(300, 1))
     assert type(HamiltonianMonteCarlo.reversing_integrator(0.001, device=None)) is ProjectedIntegrator
-    assert type(ProjectedIntegrator(0.001, device=False)) is ProjectedIntegrator
     monkeypatch.setattr(build, "refusal", lambda: "there is no C++ compiler")
     with pytest.raises(UnsupportedError, match="no C\\+\\+ compiler"):
         ProjectedIntegrator(0.001, device=True)

@@ -127,10 +127,7 @@ def test_weak_forces_are_not_lost_in_single_precision(platform, ensemble):
     system = particles([1000.0] * 20, field("-30*x", 20))
     rng = np.random.default_rng(0)
     x, v = 4.5 + 2.5 * rng.random((20, 3)), 0.05 * rng.normal(size=(20, 3))
-    ends = []
-    for place in ("Reference", platform):
-        integrator = ProjectedIntegrator(2e-3, ensemble=ensemble)
-        context = run(system, integrator, x, v, 1000, place)
-        ends.append(state_of(context)[1])
+    made = [(ProjectedIntegrator(2e-3, ensemble=ensemble), place) for place in ("Reference", platform)]
+    ends = [state_of(run(system, integrator, x, v, 1000, place))[1] for integrator, place in made]
     assert ends[0][:, 0].mean() > v[:, 0].mean() + 0.02
     assert np.abs(ends[1] - ends[0]).max() < 1e-4

@@ -52,8 +52,7 @@ def test_a_chain_in_the_middle_stays_itself_and_may_have_a_relaxation_time():
     ensemble = NoseHooverMiddle(300.0, 20.0, length=2)
     assert ensemble != NoseHoover(300.0, 20.0, length=2)
     warmer = ensemble.replaced(temperature=310.0)
-    assert type(warmer) is NoseHooverMiddle
-    assert repr(warmer) == "NoseHooverMiddle(310 K, 20/ps, length=2)"
+    assert type(warmer) is NoseHooverMiddle and repr(warmer) == "NoseHooverMiddle(310 K, 20/ps, length=2)"
     assert NoseHoover(300, 20) == NoseHoover(300 * unit.kelvin, 50 * unit.femtosecond)
     assert NoseHoover(300, 20).frequency == pytest.approx(NoseHoover(300, 0.02 / unit.femtosecond).frequency)
 
@@ -70,8 +69,7 @@ def test_a_step_that_fails_leaves_the_chain_where_it_was():
     context.setVelocities(30 * u)
     with pytest.raises(ConvergenceError):
         integrator.step(1)
-    assert integrator.program.remembered() == before
-    assert np.array_equal(positions_of(context), r)
+    assert integrator.program.remembered() == before and np.array_equal(positions_of(context), r)
 
 
 @pytest.mark.usefixtures("without_device")
@@ -101,9 +99,8 @@ def test_what_cannot_be_thermostatted_is_refused():
     system, x, v = dumbbell()
     with pytest.raises(InputError, match="take a frequency of at most 100/ps"):
         run(system, ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 5000.0)), x, v, 1)
-    one = particles([1.0])
     with pytest.raises(OverdeterminedError, match="no degree of freedom"):
-        run(one, ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 20.0)), np.zeros((1, 3)), np.ones((1, 3)), 1)
+        run(particles([1.0]), ProjectedIntegrator(1e-3, ensemble=NoseHoover(300, 20)), np.eye(1, 3), np.eye(1, 3), 1)
 
 
 def test_step_sizes_that_the_chain_cannot_follow_are_refused_in_a_run():

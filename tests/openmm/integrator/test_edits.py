@@ -12,7 +12,7 @@ from openmm_systems import potential_energy, started, state_of, with_and_without
 from tied_cluster import ON_DEVICE, X, carried_at, cluster, row_at, thermostatted
 
 from kcons.errors import CertificateError, InputError, KconsError
-from kcons.openmm import Isokinetic, ProjectedIntegrator
+from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 from kcons.openmm.quantities import GAS_CONSTANT
 
 parts = pytest.mark.parametrize("make", [row_at, carried_at], ids=["collective", "carried"])
@@ -72,9 +72,10 @@ def test_masses_and_lengths_after_reinitialize(device):
 
 
 @with_and_without_device
+@pytest.mark.parametrize("ensemble", [Isokinetic(300, momentum="free"), Langevin(300, 1.0)], ids=repr)
 @pytest.mark.parametrize("begun", [True, False])
-def test_particles_that_lose_their_mass_take_no_heat(begun, device):
-    system, ensemble = cluster(), Isokinetic(300, momentum="free")
+def test_particles_that_lose_their_mass_take_no_heat(begun, ensemble, device):
+    system = cluster()
     context = started(system, integrator := ProjectedIntegrator(0.002, ensemble=ensemble, device=device), X, X)
     assert integrator.degrees_of_freedom() == 24
     if begun:
@@ -84,7 +85,8 @@ def test_particles_that_lose_their_mass_take_no_heat(begun, device):
     integrator.step(100 if begun else 1)  # a check, or the first step, notices
     integrator.step(1)
     assert integrator.degrees_of_freedom() == 21
-    assert twice_kinetic(system, state_of(context)[1]) == pytest.approx(20 * GAS_CONSTANT * 300, rel=1e-9)
+    if isinstance(ensemble, Isokinetic):
+        assert twice_kinetic(system, state_of(context)[1]) == pytest.approx(20 * GAS_CONSTANT * 300, rel=1e-9)
 
 
 # -- forces change --------------------------------------------------------------------------------------
@@ -176,18 +178,15 @@ def test_solvers_that_lie_are_found(make):
     _lie(make, made)
     with pytest.raises(CertificateError, match=r"positions are off row .* back at step 20") as caught:
         made.run(15)
-    assert caught.value.step == 30
-    assert caught.value.residual > 1e-6
-    assert caught.value.state.getStepCount() == 20
+    assert caught.value.step == 30 and caught.value.residual > 1e-6
+    assert caught.value.state.getStepCount() == made.context.getStepCount() == 20
     np.testing.assert_array_equal(state_of(made.context), good)
-    assert made.context.getStepCount() == 20
 
 
 def _lie(make, made):
     """Let the solver believe in a target that is 1e-5 nm off."""
-    program = made.integrator.program
     if make is row_at:
-        program.set("tolerance1", 1e-3)
+        made.integrator.program.set("tolerance1", 1e-3)
     else:
         solve = made.part.motion.project_positions
 
