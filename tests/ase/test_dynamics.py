@@ -202,7 +202,7 @@ def test_with_noise_the_log_is_of_the_middle_of_the_step():
     dynamics.run(50)
     dynamics.attach(ConstraintLogger(dynamics, atoms, log))
     dynamics.attach(lambda: ends.append(atoms.get_temperature()))
-    dynamics.run(3000)
+    dynamics.run(1700)
     found = columns(log)
     total, potential, kinetic, temperature = found[:, 1:].T
     error = 300 * np.sqrt(2 / 150 / (len(found) / 3))  # friction leaves a third of the samples independent

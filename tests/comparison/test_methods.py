@@ -321,7 +321,7 @@ def test_lines_of_python_end_where_the_run_ends(system, method):
     size = {"chain": 3}.get(system)
     made = test_systems.build(system, size, quick=True)
     chosen = METHODS[method]
-    setting = 1e-6 if chosen.adaptive else chosen.settings(made)[-1] / made.units.time_unit
+    setting = 1e-6 if chosen.adaptive else chosen.settings(made)[0] / made.units.time_unit
     lines = code(made, method, np.float64(setting), f"test_systems.build({system!r}, {size}, quick=True)")
     space = {"__name__": "pasted"}
     exec(compile(lines, "pasted", "exec"), space)

@@ -60,7 +60,7 @@ def test_velocity_verlet_has_no_energy_slope():
 @pytest.mark.parametrize("name", CANONICAL)
 def test_temperature(name):
     atoms, held = dumbbells()
-    seen = follow(CANONICAL[name](atoms), atoms.get_temperature, 2000)
+    seen = follow(CANONICAL[name](atoms), atoms.get_temperature, 1400)
     mean, error = mean_and_error(seen[200:])
     assert error < 6
     assert abs(mean - TEMPERATURE) <= 3 * error + (0.01 * TEMPERATURE if name == "NVTBerendsen" else 0)

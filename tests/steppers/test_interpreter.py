@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import pickle
 from dataclasses import replace
 
@@ -154,6 +155,7 @@ TRIANGLES = {
 NAMES = [*MOLECULES, *TRIANGLES, *MIXED]
 
 
+@functools.cache
 def held_system(name: str, **more) -> tuple[System, State]:
     """The system of a name, and where it begins."""
     if name in MOLECULES:
@@ -179,13 +181,13 @@ PIECEWISE = pytest.mark.parametrize("piecewise", [False, True], ids=["kernels", 
 
 @ALL
 @pytest.mark.parametrize("name", NAMES)
-def test_steps_in_kernels_are_those_of_the_engine(stepper, name) -> None:
+def test_steps_in_kernels_are_those_of_the_engine(stepper, name, monkeypatch) -> None:
     """Without a call of the engine; one by one and many at once to the last bit."""
     (system, state), (other, _) = held_system(name), held_system(name, piecewise=True)
     assert system.packed is not None and other.packed is None
     calls = []
     for call in ("project_positions", "project_velocities"):
-        setattr(system.motion, call, calls.append)
+        monkeypatch.setattr(system.motion, call, calls.append)
     rounding = float(np.spacing(np.abs(state.positions).max()))
     assert (state.remainder is not None) == ("far" in name)
     for dt in (0.02, -0.01, 0.015):
@@ -496,8 +498,8 @@ def test_steps_without_solution_are_the_engines(name) -> None:
     many = make is triangles
     steps = np.geomspace(0.5, 8.0, 20) if many else [0.5, 20.0] if name == "longer" else np.geomspace(0.5, 20.0, 6)
     few = make is mixed or name == "longer"
-    for stepper in (Rattle(), Suzuki4(), BlanesMoan4()) if few else SYMMETRIC:
-        for dt in steps:
+    for k, stepper in enumerate((Rattle(), Suzuki4(), BlanesMoan4()) if few else SYMMETRIC):
+        for dt in steps if few else steps[k % 3 :: 3]:  # each with each stepper or with a third of them
             calls.clear()
             one, two = outcome(stepper, system, state, dt), outcome(stepper, other, state, dt)
             if isinstance(two, State) and isinstance(one, State):

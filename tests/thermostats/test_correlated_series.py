@@ -103,7 +103,7 @@ def test_errors_of_ratios():
 @pytest.mark.parametrize("name", ["independent", "memory 10", "fast and slow", "smooth"])
 def test_errors_of_slopes(name):
     rng, found = np.random.default_rng(5), []
-    for _ in range(1500):
+    for _ in range(500):
         values = SERIES[name](rng)
         times = 3.0 + 0.1 * np.arange(len(values))
         found.append(slope(times, values + 2.0 * times))

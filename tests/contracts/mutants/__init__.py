@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 TESTS = Path(__file__).resolve().parents[2]
+FILES = list(TESTS.rglob("test_*.py"))
 
 
 def both(text: str) -> tuple[str, str]:
@@ -23,7 +24,7 @@ def found(test: str) -> str:
     """The test as pytest takes it."""
     place, sign, name = test.partition("::")
     folder, _, file = place.rpartition("/")
-    (path,) = (TESTS / folder).rglob(f"test_{file}.py")
+    (path,) = [path for path in FILES if path.name == f"test_{file}.py" and (TESTS / folder) in path.parents]
     return path.relative_to(TESTS.parent).as_posix() + (sign and f"::test_{name}")
 
 

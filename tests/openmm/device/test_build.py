@@ -8,6 +8,8 @@ import pytest
 from kcons.errors import UnsupportedError
 from kcons.openmm.device import build, wheel
 
+#: Half of the time goes into making the library faster, which no test here runs.
+QUICKLY = (*build._FLAGS, "-O0")
 pytestmark = pytest.mark.skipif(not build.compiler(), reason="no C++ compiler")
 
 
@@ -15,8 +17,9 @@ def test_it_is_compiled_once_for_these_sources(tmp_path, monkeypatch):
     """In processes of their own: a second copy of the library would take this one's integrators."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(build, "accelerated", list)
+    monkeypatch.setattr(build, "_FLAGS", QUICKLY)
     assert not build.is_built() and build.folder() == tmp_path / "kcons-device"
-    begin = "from kcons.openmm.device import build; build.accelerated = list; "
+    begin = f"from kcons.openmm.device import build; build.accelerated, build._FLAGS = list, {QUICKLY}; "
     subprocess.run([sys.executable, "-c", begin + "build.library()"], check=True)
     made = build.folder() / build.digest() / "libKcons.so"
     when = made.stat().st_mtime_ns
@@ -56,6 +59,7 @@ def test_a_source_that_does_not_compile_is_told(tmp_path, monkeypatch):
 def test_a_wheel_is_found_before_the_cache(tmp_path, monkeypatch):
     """Linked with empty libraries of OpenMM's names, for platforms that need not be here."""
     monkeypatch.setattr(build, "ACCELERATED", ("CUDA",))
+    monkeypatch.setattr(build, "_FLAGS", QUICKLY)
     made = wheel.make_wheel(tmp_path)
     target = tmp_path / "site"
     install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(target), str(made)]

@@ -59,10 +59,10 @@ def test_velocities_straight_against_a_strong_force():
 def test_of_velocities_set_between_calls_only_the_direction_counts(platform):
     """K is brought back before the kick that follows, not by it."""
     system, x, v = waters()
+    integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0))
+    context = run(system, integrator, x, v, 1, platform)
 
     def end(factor, start=x):
-        integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0))
-        context = run(system, integrator, x, v, 1, platform)
         context.setPositions(start)
         context.setVelocities(factor * v)
         integrator.step(20)

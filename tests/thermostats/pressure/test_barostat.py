@@ -172,7 +172,7 @@ def test_shapes_of_a_flexible_cell():
 
     Of the lower triangular factor of such a matrix the diagonal is chi(3), chi(2), chi(1), the rest normal.
     """
-    cells = chain("flexible", 2, lambda h: -0.5 * (h**2).sum(), 30000)
+    cells = chain("flexible", 2, lambda h: -0.5 * (h**2).sum(), 10000)
     for i, expected in enumerate((stats.chi(3), stats.chi(2), stats.chi(1))):
         assert p_value(cells[:, i, i], expected) > 0.01
     for i, j in ((1, 0), (2, 0), (2, 1)):
@@ -267,7 +267,7 @@ def test_noise_of_few_pieces_stays_within_what_a_trial_may_change(kind):
     pressure = (n + 1) / side**3
     barostat = CellRescaling(pressure, 0.05, 1 / pressure, every=1, rng=2, kind=kind)
     state = started(system, x, barostat)
-    volumes = np.linalg.det(cells_of(system, state, barostat, 3000))
+    volumes = np.linalg.det(cells_of(system, state, barostat, 1500 if kind == "isotropic" else 3000))
     found = mean(volumes)
     assert len(np.unique(volumes)) > 0.6 * len(volumes)
     assert abs(found.off((n + 1) / pressure)) < 3.5 and found.error < 0.2 * side**3
