@@ -21,7 +21,6 @@ from ase import Atoms
 from ase.cell import Cell
 from numpy.typing import NDArray
 
-from kcons.ase.topology import velocities_of
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import as_float_array, finite_array
 from kcons.constraints.compilation import njit
@@ -217,8 +216,7 @@ def _acted_on(other: Any, n_atoms: int) -> IntArray:
         return np.flatnonzero(other.mode.reshape(-1, 3).any(axis=1))
     if hasattr(other, "touched"):  # another object of kcons
         return np.asarray(other.touched)
-    indices = other.get_indices() if hasattr(other, "get_indices") else slice(None)
-    return np.arange(n_atoms)[indices]
+    return np.arange(n_atoms)[other.get_indices() if hasattr(other, "get_indices") else slice(None)]
 
 
 @contextmanager
@@ -407,8 +405,8 @@ def require_on_surface(
 VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
 
 
-def stress_of_rows(motion: Motion, atoms: Atoms, time: float = 0.0) -> FloatArray:
-    """Stress of the rows, Voigt order, at the present positions and momenta, which are zero where there are none.
+def stress_of_rows(motion: Motion, atoms: Atoms, velocities: FloatArray, time: float = 0.0) -> FloatArray:
+    """Stress of the rows, Voigt order, at the present positions and these velocities.
 
     Raises
     ------
@@ -422,7 +420,7 @@ def stress_of_rows(motion: Motion, atoms: Atoms, time: float = 0.0) -> FloatArra
     why = "the stress is asked for there, as StrainFilter does; take FrechetCellFilter, or call Constraints.restore"
     require_on_surface(motion.constraint_set, x, time, why=why, by_class=True)
     forces = atoms.get_forces(apply_constraint=False)
-    return np.asarray(-constraint_virial(motion, x, velocities_of(atoms), forces, time)[VOIGT] / atoms.get_volume())
+    return np.asarray(-constraint_virial(motion, x, velocities, forces, time)[VOIGT] / atoms.get_volume())
 
 
 def deformation(before: FloatArray, after: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ from kcons.ase.binding import (
     FAR,
     FORCES_ONLY,
     IN_TURN,
+    START_TOLERANCE,
     UNKNOWN,
     VOIGT,
     AcceptedPositions,
@@ -205,8 +206,7 @@ class Constraints(FixConstraint):
         """
         if rand or not self._accepted.in_another(atoms.cell.array):
             return  # other edits are seen where positions are set
-        bound, accepted = self._bound(atoms), self._accepted
-        x = atoms.arrays["positions"]
+        bound, accepted, x = self._bound(atoms), self._accepted, atoms.arrays["positions"]
         if not accepted.look(bound.motion, x, atoms.cell.array):
             try:
                 self._move(atoms, bound.motion, bound.motion.project_positions(x, x))
@@ -223,10 +223,16 @@ class Constraints(FixConstraint):
         InputError
             The atoms are off the constraints, or were moved past them since the last step; see `restore`.
         UnsupportedError
-            They were moved within a step, or as if nothing was held: such dynamics do not respect constraints.
+            They were moved within a step, or as if nothing was held; or an ExternalForce would add to momenta, too.
         """
         bound, accepted = self._bound(atoms), self._accepted
         p = bound.kernel_array(momenta, "momentum")
+        for item in atoms.constraints:
+            if isinstance(item, FORCES_ONLY) and type(item).adjust_momenta is FixConstraint.adjust_momenta:
+                raise UnsupportedError(
+                    f"ASE adds the force of {type(item).__name__} to all momenta that are set, in its own dynamics at "
+                    "each step; take draw_velocities and a dynamics class of kcons.ase, which do not"
+                )
         accepted.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
         accepted.note_momenta()
         due = self._momenta_due <= 0
@@ -242,10 +248,17 @@ class Constraints(FixConstraint):
         ``get_stress(include_ideal_gas=True)`` is the full pressure (an ideal gas of rigid molecules gives N k T / V).
         Without momenta, or where they are zero, it is the static part, which makes the stress the derivative of the
         energy under a strain after which the constraints are restored. Rows with a place in space count as external
-        forces and have no part. Refused where atoms are off the constraints, or objects of ASE add forces.
+        forces and have no part. Refused where atoms or momenta leave the constraints, or objects of ASE add forces.
         """
-        stress += stress_of_rows(self._bound(atoms).motion, atoms)
-        self._accepted.know(atoms.arrays["positions"], atoms.cell.array)  # cell filters scale them next
+        motion, x, v = self._bound(atoms).motion, atoms.arrays["positions"], velocities_of(atoms)
+        added = stress_of_rows(motion, atoms, v)
+        if np.abs(motion.project_velocities(x, v) - v).max(initial=0.0) > START_TOLERANCE:
+            raise UnsupportedError(
+                "momenta leave the constraints, as where cell filters move atoms that have those of a run, whose "
+                "constraint forces are in the stress; to relax atoms: atoms.set_momenta(np.zeros((len(atoms), 3)))"
+            )
+        stress += added
+        self._accepted.know(x, atoms.cell.array)  # cell filters scale them next
 
     @in_turn
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
@@ -381,11 +394,9 @@ class Constraints(FixConstraint):
             If there is no way to fulfil the constraints from here with other bonds and angles as they are; nothing is
             changed.
         """
-        bound, accepted = self._bound(atoms), self._accepted
+        motion = self.engine(atoms)
         kept = (lambda: bonds_of(atoms)) if bonds is None else bonds
-        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept)
-        self._move(atoms, bound.motion, x)
-        accepted.between_steps = True
+        self._move(atoms, motion, motion.restore_positions(atoms.arrays["positions"], bonds=kept))
         self._binding = None  # which rows are independent is seen there anew
 
     def _move(self, atoms: Atoms, motion: Motion, x: FloatArray) -> None:
@@ -395,6 +406,7 @@ class Constraints(FixConstraint):
         if momenta is not None:
             atoms.set_momenta(momenta, apply_constraint=False)
         self._accepted.know(x, atoms.cell.array)
+        self._accepted.between_steps = True
 
     def report(self, atoms: Atoms) -> Report:
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
@@ -519,11 +531,13 @@ def constrain(
         atoms.set_constraint([*atoms.constraints, held])
         if project:
             held.restore(atoms)
-        bound, accepted = held._bound(atoms), held._accepted
-        accepted.look(bound.motion, atoms.arrays["positions"], atoms.cell.array)
+        bound, accepted, x = held._bound(atoms), held._accepted, atoms.arrays["positions"]
+        accepted.look(bound.motion, x, atoms.cell.array)
         accepted.between_steps = True
         if "momenta" in atoms.arrays:
-            atoms.set_momenta(atoms.arrays["momenta"])
+            momenta = bound.kernel_array(atoms.get_momenta(), "momentum")
+            _project(bound, x, momenta, "momentum", certified=True)
+            atoms.set_momenta(momenta, apply_constraint=False)
     return held
 
 
@@ -622,8 +636,7 @@ class ConstrainedCalculator(Calculator):
         if not hasattr(inner, "get_property"):
             raise InputError(f"inner is {inner!r:.80}; give a calculator of ASE, such as atoms.calc", item="inner")
         self.inner = inner
-        given = constraints if isinstance(constraints, Constraints) else Constraints(constraints)
-        self.constraints = given.copy()
+        self.constraints = (constraints if isinstance(constraints, Constraints) else Constraints(constraints)).copy()
         #: What the results belong to, beside the atoms.
         self._known = self._asked()
         #: Positions and cell at which stress was asked for last.
@@ -658,9 +671,8 @@ class ConstrainedCalculator(Calculator):
         assert self.atoms is not None
         work = self.atoms.copy()
         work.set_constraint()  # the inner calculator need not know of them: others write them into their input
-        motion = self.constraints.engine(work)
+        motion, x = self.constraints.engine(work), work.arrays["positions"]
         held = motion.constraint_set
-        x = work.arrays["positions"]
         if "stress" in properties:
             before, self._stressed = self._stressed, (x.copy(), work.cell.array.copy())
             if before is not None:
