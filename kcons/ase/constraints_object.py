@@ -325,8 +325,8 @@ class Constraints(FixConstraint):
     def repeat(self, m: Any, n: int) -> Constraints:
         """Refuse replicas of a cell: atoms of a row may be in different ones."""
         raise UnsupportedError(
-            f"{self!r} cannot be repeated; take the constraints off with atoms.set_constraint(), and hold the rows of "
-            "all replicas afterwards"
+            f"{self!r} cannot be repeated; take the constraints off with atoms.set_constraint() (after *=, which has "
+            "copied atoms by now, of atoms made anew), and hold the rows of all replicas afterwards"
         )
 
     # -- copies and files -----------------------------------------------------------------------
