@@ -30,6 +30,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion.certificate import off_row
 from kcons.motion.motion import Motion
+from kcons.steppers.state import KICK_ROUNDING
 from kcons.thermostats.cells import constraint_virial, rows_open
 
 #: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta: what the digits of
@@ -126,6 +127,16 @@ class Binding:
             refuse_not_finite(values, what)
             raise
 
+    def momenta_on_surface(self, atoms: Atoms, p: FloatArray, *, certified: bool) -> FloatArray:
+        """Momenta without what leaves the constraints, in their place unless they are certified."""
+        x = atoms.arrays["positions"]
+        left = self.projected(x, p, "momentum", None if certified else p)
+        if certified:  # positions may be as a file gave them, off by less than START_TOLERANCE
+            # Of momenta along the constraints alone, as of molecules at rest, the projection leaves rounding.
+            still = KICK_ROUNDING * float(np.abs(velocities_of(atoms, momenta=p)).max(initial=0.0))
+            self.motion.certify(x, velocities_of(atoms, momenta=left), still=still, moved=False)
+        return left
+
 
 def read_by_engine(atoms: Atoms) -> tuple[Any, ...]:
     """Periodicity and masses, of which an engine is made besides rows and cell; every hook asks, so bytes."""
@@ -204,8 +215,7 @@ def _acted_on(other: Any, n_atoms: int) -> IntArray:
         return np.flatnonzero(other.mode.reshape(-1, 3).any(axis=1))
     if hasattr(other, "touched"):  # another object of kcons
         return np.asarray(other.touched)
-    indices = other.get_indices() if hasattr(other, "get_indices") else slice(None)
-    return np.arange(n_atoms)[indices]
+    return np.arange(n_atoms)[other.get_indices() if hasattr(other, "get_indices") else slice(None)]
 
 
 @contextmanager
@@ -384,8 +394,8 @@ def require_on_surface(
 VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))
 
 
-def stress_of_rows(motion: Motion, atoms: Atoms, time: float = 0.0) -> FloatArray:
-    """Stress of the rows, Voigt order, at the present positions and momenta, which are zero where there are none.
+def stress_of_rows(motion: Motion, atoms: Atoms, velocities: FloatArray, time: float = 0.0) -> FloatArray:
+    """Stress of the rows, Voigt order, at the present positions and these velocities.
 
     Raises
     ------
@@ -399,7 +409,7 @@ def stress_of_rows(motion: Motion, atoms: Atoms, time: float = 0.0) -> FloatArra
     why = "the stress is asked for there, as StrainFilter does; take FrechetCellFilter, or call Constraints.restore"
     require_on_surface(motion.constraint_set, x, time, why=why, by_class=True)
     forces = atoms.get_forces(apply_constraint=False)
-    return np.asarray(-constraint_virial(motion, x, velocities_of(atoms), forces, time)[VOIGT] / atoms.get_volume())
+    return np.asarray(-constraint_virial(motion, x, velocities, forces, time)[VOIGT] / atoms.get_volume())
 
 
 def deformation(before: FloatArray, after: FloatArray) -> FloatArray:

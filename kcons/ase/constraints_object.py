@@ -21,6 +21,7 @@ from kcons.ase.binding import (
     FAR,
     FORCES_ONLY,
     IN_TURN,
+    START_TOLERANCE,
     UNKNOWN,
     VOIGT,
     AcceptedPositions,
@@ -46,7 +47,6 @@ from kcons.errors import CertificateError, ConvergenceError, InputError, Unsuppo
 from kcons.motion.certificate import CHECK_EVERY
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
-from kcons.steppers.state import KICK_ROUNDING
 from kcons.thermostats.cells import constraint_virial
 from kcons.topology.rows_by_name import Holding, rows_of
 
@@ -217,19 +217,20 @@ class Constraints(FixConstraint):
         InputError
             The atoms are off the constraints, or were moved past them since the last step; see `restore`.
         UnsupportedError
-            They were moved within a step, or as if nothing was held: such dynamics do not respect constraints.
+            They were moved within a step, or as if nothing was held; or an ExternalForce would add to momenta, too.
         """
         with IN_TURN:
             bound, accepted = self._bound(atoms), self._accepted
-            p = bound.kernel_array(momenta, "momentum")
-            x, due = atoms.arrays["positions"], accepted.momenta_due <= 0
-            accepted.look(bound.motion, x, bound.cell)
+            p, due = bound.kernel_array(momenta, "momentum"), accepted.momenta_due <= 0
+            for item in atoms.constraints:
+                if isinstance(item, FORCES_ONLY) and type(item).adjust_momenta is FixConstraint.adjust_momenta:
+                    raise UnsupportedError(
+                        f"ASE adds the force of {type(item).__name__} to all momenta that are set, in its own dynamics "
+                        "at each step; take draw_velocities and a dynamics class of kcons.ase, which do not"
+                    )
+            accepted.look(bound.motion, atoms.arrays["positions"], bound.cell)
             accepted.note_momenta()
-            left = bound.projected(x, p, "momentum", None if due else p)
-            if due:  # positions may be as a file gave them, off by less than START_TOLERANCE
-                # Of momenta along the constraints alone, as of molecules at rest, the projection leaves rounding.
-                still = KICK_ROUNDING * float(np.abs(velocities_of(atoms, p)).max(initial=0.0))
-                bound.motion.certify(x, velocities_of(atoms, left), still=still, moved=False)
+            left = bound.momenta_on_surface(atoms, p, certified=due)
             accepted.momenta_due = CHECK_EVERY - 1 if due else accepted.momenta_due - 1
             if left is not momenta:
                 np.copyto(momenta, left, casting="unsafe")  # integers are all 0
@@ -241,12 +242,18 @@ class Constraints(FixConstraint):
         ``get_stress(include_ideal_gas=True)`` is the full pressure (an ideal gas of rigid molecules gives N k T / V).
         Without momenta, or where they are zero, it is the static part, which makes the stress the derivative of the
         energy under a strain after which the constraints are restored. Rows with a place in space count as external
-        forces and have no part. Refused where atoms are off the constraints, or objects of ASE add forces.
+        forces and have no part. Refused where atoms or momenta leave the constraints, or objects of ASE add forces.
         """
         with IN_TURN:
-            bound = self._bound(atoms)
-            stress += stress_of_rows(bound.motion, atoms)
-            self._accepted.know(atoms.arrays["positions"], bound.cell)  # cell filters scale them next
+            bound, x, v = self._bound(atoms), atoms.arrays["positions"], velocities_of(atoms)
+            added = stress_of_rows(bound.motion, atoms, v)
+            if np.abs(bound.motion.project_velocities(x, v) - v).max(initial=0.0) > START_TOLERANCE:
+                raise UnsupportedError(
+                    "momenta leave the constraints, as where cell filters move atoms that have those of a run, whose "
+                    "constraint forces are in the stress; to relax atoms: atoms.set_momenta(np.zeros((len(atoms), 3)))"
+                )
+            stress += added
+            self._accepted.know(x, bound.cell)  # cell filters scale them next
 
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
@@ -316,8 +323,8 @@ class Constraints(FixConstraint):
     def repeat(self, m: Any, n: int) -> Constraints:
         """Refuse replicas of a cell: atoms of a row may be in different ones."""
         raise UnsupportedError(
-            f"{self!r} cannot be repeated; take the constraints off with atoms.set_constraint(), and hold the rows of "
-            "all replicas afterwards"
+            f"{self!r} cannot be repeated; take the constraints off with atoms.set_constraint() (after *=, which has "
+            "copied atoms by now, of atoms made anew), and hold the rows of all replicas afterwards"
         )
 
     # -- copies and files -----------------------------------------------------------------------
@@ -385,11 +392,9 @@ class Constraints(FixConstraint):
             changed.
         """
         with IN_TURN:
-            bound, accepted = self._bound(atoms), self._accepted
+            bound = self._bound(atoms)
             kept = (lambda: bonds_of(atoms)) if bonds is None else bonds
-            x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept)
-            self._move(atoms, bound, x)
-            accepted.between_steps = True
+            self._move(atoms, bound, bound.motion.restore_positions(atoms.arrays["positions"], bonds=kept))
             self._binding = None  # which rows are independent is seen there anew
 
     def _move(self, atoms: Atoms, bound: Binding, x: FloatArray) -> None:
@@ -399,6 +404,7 @@ class Constraints(FixConstraint):
         if momenta is not None:
             atoms.set_momenta(momenta, apply_constraint=False)
         self._accepted.know(x, bound.cell)
+        self._accepted.between_steps = True
 
     def report(self, atoms: Atoms) -> Report:
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
@@ -508,7 +514,8 @@ def constrain(
         accepted.look(bound.motion, atoms.arrays["positions"], bound.cell)
         accepted.between_steps = True
         if "momenta" in atoms.arrays:
-            atoms.set_momenta(atoms.arrays["momenta"])
+            momenta = bound.kernel_array(atoms.get_momenta(), "momentum")
+            atoms.set_momenta(bound.momenta_on_surface(atoms, momenta, certified=True), apply_constraint=False)
     return held
 
 
@@ -607,8 +614,7 @@ class ConstrainedCalculator(Calculator):
         if not hasattr(inner, "get_property"):
             raise InputError(f"inner is {inner!r:.80}; give a calculator of ASE, such as atoms.calc", item="inner")
         self.inner = inner
-        given = constraints if isinstance(constraints, Constraints) else Constraints(constraints)
-        self.constraints = given.copy()
+        self.constraints = (constraints if isinstance(constraints, Constraints) else Constraints(constraints)).copy()
         #: What the results belong to, beside the atoms.
         self._known = self._asked()
         #: Positions and cell at which stress was asked for last.
@@ -643,9 +649,8 @@ class ConstrainedCalculator(Calculator):
         assert self.atoms is not None
         work = self.atoms.copy()
         work.set_constraint()  # the inner calculator need not know of them: others write them into their input
-        motion = self.constraints.engine(work)
+        motion, x = self.constraints.engine(work), work.arrays["positions"]
         held = motion.constraint_set
-        x = work.arrays["positions"]
         if "stress" in properties:
             before, self._stressed = self._stressed, (x.copy(), work.cell.array.copy())
             if before is not None:

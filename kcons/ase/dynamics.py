@@ -453,7 +453,7 @@ class ConstraintLogger(MDLogger):
         self.coordinates = dict(coordinates or {})
         self._known: tuple[Motion, list[int]] | None = None
         if self.coordinates:
-            self._rows(_motion(dyn, atoms))
+            self._rows(engine_of(dyn, atoms))
         super().__init__(dyn, atoms, logfile, header=False, **kwargs)
         for name, item in self.coordinates.items():
             for column in [name] if item.n_rows == 1 else [f"{name}[{k}]" for k in range(item.n_rows)]:
@@ -469,6 +469,7 @@ class ConstraintLogger(MDLogger):
         dyn: Any = self.dyn
         ours = hasattr(dyn, "degrees_of_freedom")
         seen, time = dyn if ours else atoms, 0.0 if dyn is None else dyn.get_time()
+        v = velocities_of(atoms, dyn)
         count = len(atoms) if self.peratom else 1
         potential, kinetic = atoms.get_potential_energy() / count, seen.get_kinetic_energy() / count
         row = [] if dyn is None else [time / (1000 * units.fs)]
@@ -476,11 +477,11 @@ class ConstraintLogger(MDLogger):
         if self.stress:
             stress = atoms.get_stress(apply_constraint=not ours, include_ideal_gas=True)
             if ours:  # that of all rows that the dynamics holds
-                stress = stress + stress_of_rows(dyn.motion, atoms, time)
+                stress = stress + stress_of_rows(dyn.motion, atoms, v, time)
             row += (stress / units.GPa).tolist()
         if self.coordinates:
-            motion = _motion(dyn, atoms)
-            multipliers = motion.multipliers(atoms.positions, velocities_of(atoms), applied_forces(atoms), time)
+            motion = engine_of(dyn, atoms)
+            multipliers = motion.multipliers(atoms.positions, v, applied_forces(atoms), time)
             row += multipliers[self._rows(motion)].tolist()
         self.logfile.write(self.fmt % tuple(row))
         self.logfile.flush()
@@ -494,15 +495,15 @@ class ConstraintLogger(MDLogger):
         return self._known[1]
 
 
-def _motion(dyn: Any, atoms: Atoms) -> Motion:
+def engine_of(dyn: Any, atoms: Atoms) -> Motion:
     """The engine of a dynamics class of kcons, or that of the object on the atoms."""
     if hasattr(dyn, "motion"):
         return dyn.motion  # type: ignore[no-any-return]
     found = [item for item in atoms.constraints if isinstance(item, Constraints)]
-    if not found:
+    if len(found) != 1:
         raise InputError(
-            "the atoms carry no constraints of kcons, so that no coordinate is held; see kcons.ase.constrain, and "
-            "kcons.ase.attach for atoms from a file",
+            f"the atoms carry {len(found) or 'no'} Constraints objects of kcons, and a coordinate is held by one; see "
+            "kcons.ase.constrain, and kcons.ase.attach, which makes one of several and of those from a file",
             item="coordinates",
         )
     return found[0].engine(atoms)

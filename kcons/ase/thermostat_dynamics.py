@@ -451,14 +451,12 @@ def draw_velocities(
         `zero_momentum` where atoms are held in space.
     """
     require_atoms(atoms)
-    thermal = _thermal(temperature_K)
+    thermal, rng = _thermal(temperature_K), generator_of(rng)
     momenta = atoms.get_momenta()
     try:
         atoms.set_momenta(np.zeros_like(momenta), apply_constraint=False)
         held = ConstrainedDynamics(atoms, 0.0, constraints=constraints)
-        v = thermal_velocities(
-            held._systems(), atoms.positions, thermal, generator_of(rng), zero_momentum=zero_momentum
-        )
+        v = thermal_velocities(held._systems(), atoms.positions, thermal, rng, zero_momentum=zero_momentum)
         momenta = v * held._masses
     finally:
         atoms.set_momenta(momenta, apply_constraint=False)
@@ -507,9 +505,8 @@ class PressureReporter:
         dynamics, atoms = self.dynamics, self.dynamics.atoms
         system, pieces = self._system()
         state = dynamics.state.copied()
-        self.values.append(
-            instantaneous_pressure(system, state, self.virial, pieces=pieces, thermal_energy=self.thermal)
-        )
+        found = instantaneous_pressure(system, state, self.virial, pieces=pieces, thermal_energy=self.thermal)
+        self.values.append(found)
         self.volumes.append(float(atoms.get_volume()))
 
     @property

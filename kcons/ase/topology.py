@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from functools import partial
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from ase import Atoms, units
@@ -90,10 +90,11 @@ def require_atoms(atoms: object) -> None:
     require_kind(atoms, Atoms, "atoms", "an ase.Atoms object, as ase.io.read(file) gives it")
 
 
-def velocities_of(atoms: Atoms, momenta: FloatArray | None = None) -> FloatArray:
+def velocities_of(atoms: Atoms, dynamics: Any = None, *, momenta: FloatArray | None = None) -> FloatArray:
     """As ``atoms.get_velocities()``, or of other momenta, but 0 for fixed atoms without mass: ASE divides 0 by 0."""
-    momenta = atoms.get_momenta() if momenta is None else momenta
-    masses = atoms.get_masses()[:, np.newaxis]
+    if hasattr(dynamics, "motion"):  # of kcons, which knows those of fixed atoms that move: these have no momenta
+        return dynamics.state.velocities  # type: ignore[no-any-return]
+    momenta, masses = atoms.get_momenta() if momenta is None else momenta, atoms.get_masses()[:, np.newaxis]
     return np.divide(momenta, masses, out=np.zeros_like(momenta), where=(masses != 0.0) | (momenta != 0.0))
 
 

@@ -327,7 +327,7 @@ def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any
         if observed and "motion" not in options:
             writer.motion = _followed(writer, engine())
         forces = applied_forces(atoms) if (observed and writer.motion is not None) or options.get("forces") else None
-        time, v = float(dynamics.get_time()), velocities_of(atoms)
+        time, v = float(dynamics.get_time()), velocities_of(atoms, dynamics)
         writer.write(atoms.positions, v, time=time, cell=box(), forces=forces, step=dynamics.nsteps)
 
     dynamics.attach(report, interval=interval)

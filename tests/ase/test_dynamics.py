@@ -15,6 +15,7 @@ from ase.io import read
 from ase.io.trajectory import Trajectory
 from ase.md.verlet import VelocityVerlet
 from ase_systems import FS, Field, Free, equal, rigid, state, water
+from h5py import File
 
 from kcons.ase import (
     ConstrainedDynamics,
@@ -31,6 +32,7 @@ from kcons.ase import (
 from kcons.constraints import Angle, Dihedral, Distance, FixedAtoms
 from kcons.errors import InputError, KconsError
 from kcons.free_energy import AseRecorder
+from kcons.mdanalysis import write_ase
 from kcons.steppers import BlanesMoan6a, Rattle
 
 # -- ASE's conventions ------------------------------------------------------------------------------
@@ -38,9 +40,7 @@ from kcons.steppers import BlanesMoan6a, Rattle
 
 def test_trajectory_log_and_observers(tmp_path):
     atoms, _ = rigid()
-    seen = []
-    log = io.StringIO()
-    path = tmp_path / "md.traj"
+    seen, log, path = [], io.StringIO(), tmp_path / "md.traj"
     with ConstrainedDynamics(atoms, FS, Rattle(), trajectory=str(path), logfile=log, loginterval=2) as dyn:
         dyn.attach(lambda: seen.append(dyn.nsteps), interval=3)
         assert [done for done in dyn.irun(6)] == [False] * 6 + [True]
@@ -52,9 +52,7 @@ def test_trajectory_log_and_observers(tmp_path):
     assert np.array_equal(frames[-1].positions, atoms.positions)
     assert [row.family for row in attach(frames[-1]).constraints] == ["Distance"]
     with Trajectory(path) as file:
-        description = file.description
-    assert description["md-type"] == "ConstrainedDynamics"
-    assert description["stepper"] == "Rattle()"
+        assert [file.description[key] for key in ("md-type", "stepper")] == ["ConstrainedDynamics", "Rattle()"]
 
 
 def test_a_refused_start_leaves_the_files_of_an_older_run(tmp_path):
@@ -262,6 +260,23 @@ def test_a_rod_in_tension_and_atoms_that_are_fixed():
     atoms.set_constraint()
     constrain(atoms, FixedAtoms([0, 1]))
     assert ConstrainedDynamics(atoms, units.fs).get_temperature() == 0.0
+
+
+def test_fixed_atoms_that_move_have_velocities(tmp_path):
+    """No force holds a rod that is carried along, whoever asks; momenta that atoms of ASE have there are zero."""
+    atoms = Atoms("ArO", [[0, 0, 0], [0, 2.0, 0]], cell=[9.0] * 3, pbc=True, calculator=Free())
+    log, path = io.StringIO(), tmp_path / "a.h5md"
+    atoms.set_velocities([[0.5, 0, 0]] * 2)
+    rod, carried = Distance([[0, 1]]), FixedAtoms([0], lambda t: [[0.5 * t, 0, 0]])
+    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=[rod, carried])
+    dynamics.attach(recorder := AseRecorder(dynamics, {"rod": rod}))
+    dynamics.attach(ConstraintLogger(dynamics, atoms, log, {"rod": rod}, stress=True))
+    with write_ase(dynamics, path):
+        dynamics.run(2)
+    assert np.abs(columns(log)[:, [6, 11]]).max() <= 1e-12 >= np.abs(recorder.series.multiplier).max()
+    with File(path) as file:
+        assert np.ptp(file["particles/trajectory/velocity/value"], axis=1).max() <= 1e-9
+        assert np.abs(file["observables/multipliers/value"]).max() <= 1e-9
 
 
 @pytest.mark.parametrize("held_by", ["atoms", "dynamics", "ase"])

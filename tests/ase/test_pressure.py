@@ -268,10 +268,15 @@ def test_forces_of_a_filter_are_the_derivative_of_its_energy(name):
     assert whole.get_potential_energy() == pytest.approx(energies[1], abs=1e-9)
 
 
-def test_what_scales_atoms_past_their_constraints_is_refused():
+@pytest.mark.parametrize(
+    ("cls", "size", "said"), [(StrainFilter, 0.0, "StrainFilter"), (FrechetCellFilter, 1.0, "momenta leave .*to relax")]
+)
+def test_what_scales_atoms_past_their_constraints_is_refused(cls, size, said):
+    """And what moves them past their momenta, whose constraint forces are in the stress."""
     atoms = crystal()
-    optimizer = BFGS(StrainFilter(atoms), logfile=None)
-    with pytest.raises(UnsupportedError, match="StrainFilter"):
+    atoms.set_momenta(size * np.random.default_rng(0).normal(size=(8, 3)))
+    optimizer = BFGS(cls(atoms), logfile=None)
+    with pytest.raises(UnsupportedError, match=said):
         optimizer.run(fmax=0.01, steps=5)
 
 

@@ -277,14 +277,8 @@ def test_rows_are_not_repeated(rows):
 # -- as other programs know them ----------------------------------------------------------------------
 
 
-FORMATS = {
-    "vasp": "POSCAR",
-    "aims": "geometry.in",
-    "turbomole": "coord",
-    "extxyz": "a.xyz",
-    "castep-cell": "a.cell",
-    "espresso-in": "pw.in",
-}
+FORMATS = {"vasp": "POSCAR", "aims": "geometry.in", "turbomole": "coord", "extxyz": "a.xyz", "castep-cell": "a.cell"}
+FORMATS["espresso-in"] = "pw.in"
 
 
 def slab() -> Atoms:

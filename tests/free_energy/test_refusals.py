@@ -85,7 +85,7 @@ SAMPLERS = [
     (lambda: AseWindows(molecule("C2H2"), CALCULATOR, {"t": _ENDS}), None, "collinear", SingularGeometryError),
     (lambda: two_particles({"r": Distance([[0, 9]])}), "atoms", "no atom 9; the System has 2 part"),
     (lambda: two_particles({"r": LENGTH}, 0), "topology", "Topology has 0 atoms and the System 2 particle"),
-    (lambda: recorder("t", TURN), "dynamics", r"no kcons\.ase\.Constraints objects"),
+    (lambda: recorder("t", TURN), "coordinates", "no Constraints objects"),
     (lambda: recorder("t", TURN, [_OH]), "t", r"t, Dihedral\(0, 1, 2, 3\), is not among"),
     (lambda: HeldCoordinatesReporter(io.StringIO(), 0, {"t": TURN}), "reportInterval", "reportInterval is"),
     (lambda: HeldCoordinatesReporter(io.StringIO(), 1, None), "coordinates", "no coordinates are named; g"),

@@ -13,12 +13,12 @@ from ase.md.md import MolecularDynamics
 from kcons.ase import (
     ConstrainedDynamics,
     ConstrainedLangevin,
-    Constraints,
     IsokineticDynamics,
     draw_velocities,
     from_ase_constraints,
 )
 from kcons.ase.binding import applied_forces
+from kcons.ase.dynamics import engine_of
 from kcons.ase.named_calculators import described
 from kcons.ase.topology import bonds_of, velocities_of
 from kcons.constraints import Constraint, Dihedral
@@ -72,17 +72,7 @@ class AseRecorder:
     def _bound(self) -> HeldCoordinates:
         """The coordinates among what is held now: masses, constraints or periodicity may have been changed."""
         dynamics, atoms = self.dynamics, self.dynamics.atoms
-        found = [item for item in atoms.constraints if isinstance(item, Constraints)]
-        if isinstance(dynamics, ConstrainedDynamics):
-            motion = dynamics.motion
-        elif len(found) == 1:
-            motion = found[0].engine(atoms)
-        else:
-            raise InputError(
-                f"the atoms carry {len(found) or 'no'} kcons.ase.Constraints objects; a coordinate is held by one "
-                "(kcons.ase.constrain), or by a dynamics class of kcons",
-                item="dynamics",
-            )
+        motion = engine_of(dynamics, atoms)
         if motion is not self._motion:
             turns = any(isinstance(item, Dihedral) for item in self.coordinates.values())
             how: dict[str, Any] = {"time": dynamics.get_time(), "bonds": bonds_of(atoms) if turns else None}
@@ -109,7 +99,7 @@ def _state(dynamics: MolecularDynamics) -> tuple[FloatArray, FloatArray, FloatAr
     forces = dynamics.state.forces if isinstance(dynamics, ConstrainedDynamics) else None
     if forces is None:
         forces = applied_forces(dynamics.atoms)
-    return dynamics.atoms.positions, velocities_of(dynamics.atoms), forces, dynamics.get_time()
+    return dynamics.atoms.positions, velocities_of(dynamics.atoms, dynamics), forces, dynamics.get_time()
 
 
 class AseWindows(Sampler):

@@ -16,7 +16,7 @@ MUTANTS = {
         ),
         '("numbers",« "initial_charges", "initial_magmoms"→»)': "binding::forces_of_the_same_calculator_that_changed",
         "if «gone > 0→False» and self._more": "binding::what_was_given_by_numbers_of_atoms_is_no_longer_of_these",
-        "velocities_of(atoms), «applied_forces(atoms)→0 * atoms.positions», time)": "dynamics::multipliers_by_name",
+        "positions, v, «applied_forces(atoms)→0 * atoms.positions», time)": "dynamics::multipliers_by_name",
     },
     "ase/thermostat_dynamics.py": {
         'options["rng"] = self.seed = seed_from(«options.get("rng")→None»)': (
@@ -29,9 +29,11 @@ MUTANTS = {
     "ase/constraints_object.py": {
         "«self._binding = None→»  # which rows": "constraints_object::momenta_go_along_and_the_rank_is_that_of_the_end",
         "for item in self.constraints« if item.n_rows→»]": "translation::objects_without_rows_are_left_out_of_files",
+        "if isinstance(item, «FORCES_ONLY→()») and type(item).adjust": "binding::momenta_without_the_force_of_company",
+        "> «START_TOLERANCE→np.inf»:": "ase/pressure::what_scales_atoms_past_their_constraints_is_refused",
         "if «not self._own→False» and cell.tobytes() != bound.cell": "binding::copies_in_cells_of_their_own",
         "«WithFixedAtoms if fixed else Constraints→»  #": "translation::files_of_other_programs_have_the_fixed_atoms",
-        "«            self._accepted.between_steps = True\n→»": "binding::an_edit_is_named_before_a_class",
+        "«            self._accepted.between_steps = True\n→»": "binding::an_edit_between_runs_is_refused",
         "«with→if» IN_TURN:\n            bound = self._bound(atoms)\n            f,": (
             "binding::copies_are_asked_in_turn"
         ),
@@ -51,6 +53,9 @@ MUTANTS = {
         ),
         "        if «along < stayed→False»:": "ase/pressure::filters_beside_atoms_that_stay_are_refused",
         "if «self._again and self._repeats→False»:": "binding::classes_that_move_atoms_past_constraints_are_found",
+    },
+    "ase/topology.py": {
+        'hasattr(dynamics, "«motion→»")': "dynamics::fixed_atoms_that_move_have_velocities",
     },
     "constraints/arguments.py": {
         "«array.setflags(write=False)→pass»": "constraint::arrays_cannot_be_changed",
