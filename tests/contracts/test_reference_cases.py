@@ -252,7 +252,7 @@ FLOOR_STEPS = {
     "A10_isokinetic_constant_force": 0.025,
     "A10_isokinetic_dumbbell_quartic": 0.015,
     "A10_isokinetic_harmonic2d": 0.01,
-    "A10_isokinetic_lj4": 0.003,
+    "A10_isokinetic_lj4": 0.0015,
 }
 
 

@@ -736,18 +736,19 @@ def _up_to_forces(p: Program, then: Callable[[Program], None]) -> None:
         p.let_others_act()
     _see_who_moved(p)
     with p.when("failed = 0", "after a failure nothing moves"):
+        with p.when("moved+stale != 0", "others did"):
+            p.each("x_last", "x", "start here")
+        with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):
+            p.each("force", "f", "applied forces")
         if p.ensemble.noisy:
             # Reference and CPU draw random numbers with each computation: how steps are divided into calls must not
             # change the noise.
             with p.when("moved+stale+abs(call-2) = 0", "forces are known"):
                 p.each("force", "force", "as many random numbers are drawn")
-        with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):
-            p.each("force", "f", "applied forces")
-            with p.when("moved+stale != 0", "others did"):
-                p.each("x_last", "x", "start here")
-                for part in p.parts:
-                    part.begin(p)
         p.let("call", "select(call, 2, 0)", "forces are known in this call")
+        with p.when("moved+stale != 0", "others did"):
+            for part in p.parts:
+                part.begin(p)
         p.let("stale", "0", "what is kept belongs to x")
         p.each("v_last", "v", "to come back to")
         p.ensemble.open(p)
@@ -833,16 +834,16 @@ def _lean_step(p: Program) -> None:
         with p.when("looked != 0", "x and v may have been changed"):
             with p.when("moved+stale+abs(call-2) != 0", "others did, or a call begins"):
                 p.each("force", "f", "applied forces")
-                with p.when("moved+stale != 0", "others did"):
-                    p.each("x_last", "x", "start here")
-                    across = any(part.meets_system for part in p.parts)
-                    if across:
-                        p.each("u", "v", "v is needed to project the rows")
-                    for part in p.parts:
-                        part.begin(p)
-                    if across:
-                        p.each("v", "u", "v again")
             p.let("call", "select(call, 2, 0)", "forces are known in this call")
+            with p.when("moved+stale != 0", "others did"):
+                p.each("x_last", "x", "start here")
+                across = any(part.meets_system for part in p.parts)
+                if across:
+                    p.each("u", "v", "v is needed to project the rows")
+                for part in p.parts:
+                    part.begin(p)
+                if across:
+                    p.each("v", "u", "v again")
             p.each("u", "v+kick_share(0)*dt*force/m", "the applied forces act (kick)")
         with p.when("looked = 0", "in the middle of many steps"):
             p.let_others_act()
