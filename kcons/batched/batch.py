@@ -71,7 +71,6 @@ class Batch:
         No systems, no copies, or another type of number.
     """
 
-    @torch.inference_mode(False)  # whose tensors have no versions, by which it is seen that they were written to
     def __init__(
         self,
         motions: Motion | Sequence[Motion],
@@ -100,22 +99,23 @@ class Batch:
         self._numbers: dict[Motion, list[int]] = {}
         for number, each in enumerate(self.systems):
             self._numbers.setdefault(each, []).append(number)
-        self.system_idx = self._joined(lambda each: np.zeros(each.n_atoms), torch.int64, range(self.n_systems))
-        self.masses = self._joined(lambda each: each.masses)
-        self.targets = self._joined(lambda each: each.constraint_set.target(0.0))
-        self._calls = 0
-        # Fixed atoms, in the order of their rows.
-        self._fixed_rows = self._joined(lambda each: each.plan.pinned_rows, torch.int64, self.row_starts)
-        self._fixed = self._joined(lambda each: each.fixed_atoms, torch.int64, self.atom_starts)
-        self._free = self.masses > 0
-        self._free[self._fixed] = False
-        self._inverse_masses = self._inverse(self.masses)
-        self._is_position = self._joined(lambda each: each.constraint_set.holonomic, torch.bool)
-        self._holonomic = bool(self._is_position.all())
-        self._rates = torch.where(self._is_position, 0.0, self.targets)
-        self._set_lattices()
-        self._given, self._known = (self.masses, self.targets), dict[bool, list[Group]]()
-        self._groups(True)
+        with torch.inference_mode(False):  # whose tensors have no versions, by which it is seen that they were written to
+            self.system_idx = self._joined(lambda each: np.zeros(each.n_atoms), torch.int64, range(self.n_systems))
+            self.masses = self._joined(lambda each: each.masses)
+            self.targets = self._joined(lambda each: each.constraint_set.target(0.0))
+            self._calls = 0
+            # Fixed atoms, in the order of their rows.
+            self._fixed_rows = self._joined(lambda each: each.plan.pinned_rows, torch.int64, self.row_starts)
+            self._fixed = self._joined(lambda each: each.fixed_atoms, torch.int64, self.atom_starts)
+            self._free = self.masses > 0
+            self._free[self._fixed] = False
+            self._inverse_masses = self._inverse(self.masses)
+            self._is_position = self._joined(lambda each: each.constraint_set.holonomic, torch.bool)
+            self._holonomic = bool(self._is_position.all())
+            self._rates = torch.where(self._is_position, 0.0, self.targets)
+            self._set_lattices()
+            self._given, self._known = (self.masses, self.targets), dict[bool, list[Group]]()
+            self._groups(True)
 
     def _joined(self, of: Any, dtype: torch.dtype | None = None, starts: Any = None) -> Tensor:
         """Numbers of each system, one after another; those of atoms or rows from where these of a system begin."""
