@@ -99,7 +99,7 @@ class Batch:
         self._numbers: dict[Motion, list[int]] = {}
         for number, each in enumerate(self.systems):
             self._numbers.setdefault(each, []).append(number)
-        with torch.inference_mode(False):  # whose tensors have no versions, by which it is seen that they were written to
+        with torch.inference_mode(False):  # whose tensors have no versions, which tell that they were written to
             self.system_idx = self._joined(lambda each: np.zeros(each.n_atoms), torch.int64, range(self.n_systems))
             self.masses = self._joined(lambda each: each.masses)
             self.targets = self._joined(lambda each: each.constraint_set.target(0.0))
