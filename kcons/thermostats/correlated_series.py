@@ -180,7 +180,7 @@ def mean(values: ArrayLike) -> Estimate:
     Warns
     -----
     UserWarning
-        Fewer than 15 independent values. One in 20 runs of only 5 is not noticed; its error is half the true one.
+        Fewer than 15 independent values. Some runs with far fewer are not noticed: errors are too small.
     """
     series = as_float_array(values, "values")
     if series.ndim != 1 or len(series) < MIN_SAMPLES:
